@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from libero_env.sim.engine import MUJOCO, BackEnd
+from libero_env.sim.backend import MUJOCO, Backend
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
 from libero_eval.protocols.files import parse_card
@@ -83,7 +83,7 @@ def _same_back_end(args: argparse.Namespace, result: EvaluationResult) -> str | 
     """
     world = result.protocol.get("world")
     own = str(world.get("backend", MUJOCO)) if isinstance(world, dict) else MUJOCO
-    if args.backend is not None and (given := BackEnd.read(args.backend).name) != own:
+    if args.backend is not None and (given := Backend.read(args.backend).name) != own:
         raise ConfigError(f"--backend {given}: the result is of backend={own}, which it is repeated with")
     return args.backend
 

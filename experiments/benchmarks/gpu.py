@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from libero_env.envs.batch import BatchEnv
-from libero_env.sim.engine import BackEnd
+from libero_env.sim.backend import Backend
 
 WORLDS = (1, 4, 16, 64, 256, 512, 1024, 2048, 4096)
 
@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128, help="edge of a picture, pixels")
     parser.add_argument("--one", nargs=2, type=int, metavar=("WORLDS", "PICTURES"), help=argparse.SUPPRESS)
     args = parser.parse_args()
-    BackEnd.read(args.backend).require_installed()
+    Backend.read(args.backend).require_installed()
     if args.one:
         print(json.dumps(asdict(measure(args, args.one[0], bool(args.one[1])))))
         return

@@ -12,9 +12,9 @@ import numpy as np
 
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.init_states.pickles import read_states
-from libero_env.init_states.settle import start_faults
+from libero_env.init_states.placement import start_faults
 from libero_env.init_states.store import load_init_states
-from libero_env.sim.back_ends import make_simulations
+from libero_env.sim.engine import make_simulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.sim.state import StateView

@@ -17,9 +17,8 @@ import numpy as np
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.expert import Expert, Shapes
-from libero_env.sim.back_ends import make_simulations
-from libero_env.sim.engine import BackEnd
-from libero_env.sim.goals import ViewedGoals, make_goals
+from libero_env.sim.backend import Backend
+from libero_env.sim.engine import ViewedGoals, make_goals, make_simulations
 from libero_env.sim.scene import build_scene
 from libero_env.sim.simulation import Simulations
 from libero_env.sim.state import StateView
@@ -32,11 +31,11 @@ EXPERT = ["libero_object/3", "libero_spatial/0", "libero_goal/5", "libero_90/1"]
 STEPS, MAX_STEPS, BATCH = 50, 600, 50
 
 
-def motion(task: str, warp: BackEnd) -> dict[str, object]:
+def motion(task: str, warp: Backend) -> dict[str, object]:
     """Largest differences of positions [m, rad] over `STEPS` control steps in which the arm touches nothing."""
     env = BatchEnv(task, 2, cameras=(), observations=(), num_threads=1)
     seed, actions = next((seed, a) for seed in range(100) if (a := free_actions(env, seed)) is not None)
-    ours = make_simulations(env.scene.model, 2, fixture_bodies=env.scene.fixture_bodies, back_end=warp)
+    ours = make_simulations(env.scene.model, 2, fixture_bodies=env.scene.fixture_bodies, backend=warp)
     theirs = env.simulations
     env.reset(options={"init_state": [0, 1]})
     ours.reset([0, 1], theirs.fields["qpos"], theirs.fields["qvel"], fixtures=theirs.fixtures)
@@ -67,7 +66,7 @@ def free_actions(env: BatchEnv, seed: int) -> list[np.ndarray] | None:
     return found
 
 
-def truths(path: Path, warp: BackEnd) -> dict[str, object]:
+def truths(path: Path, warp: Backend) -> dict[str, object]:
     """Number of truths that differ between the back ends in recorded states, and from the original's."""
     with np.load(path) as z:
         states, atoms, recorded = z["qpos"], json.loads(str(z["atoms"])), z["truth"].astype(bool)
@@ -76,7 +75,7 @@ def truths(path: Path, warp: BackEnd) -> dict[str, object]:
     fixtures = np.array([poses[name] for name in scene.fixtures]).reshape(-1, 7)
     goals = [Atom(name.capitalize(), tuple(args)) for name, *args in atoms]
     told = {}
-    for name, back_end in (("mujoco", BackEnd()), ("warp", warp)):
+    for name, back_end in (("mujoco", Backend()), ("warp", warp)):
         simulations = make_simulations(scene.model, BATCH, 1, scene.fixture_bodies, back_end)
         views = [StateView(scene, simulations, i) for i in range(BATCH)]
         checker = make_goals(And(tuple(goals)), goals, views, "original", simulations)
@@ -111,10 +110,10 @@ def _truths_of(
     return check(ids)[1]
 
 
-def expert(task: str, warp: BackEnd, starts: Sequence[int]) -> dict[str, object]:
+def expert(task: str, warp: Backend, starts: Sequence[int]) -> dict[str, object]:
     """Success of the expert from stored starts on both back ends."""
     found: dict[str, object] = {"starts": list(starts)}
-    for name, back_end in (("mujoco", BackEnd()), ("warp", warp)):
+    for name, back_end in (("mujoco", Backend()), ("warp", warp)):
         env = BatchEnv(task, len(starts), cameras=(), observations=(), num_threads=1, backend=back_end)
         env.reset(options={"init_state": list(starts)})
         shapes, begin = Shapes(env.scene), time.perf_counter()
@@ -160,7 +159,7 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=25, help="of each task, for the expert (default: 25)")
     parser.add_argument("--recordings", type=Path, help="folder with the states recorded from the original")
     args = parser.parse_args()
-    warp = BackEnd.read(args.backend)
+    warp = Backend.read(args.backend)
     if args.what == "motion":
         found = resume(args.out, args.tasks or MOTION, lambda task: motion(task, warp))
         largest = {k: max(one[k] for one in found) for k in ("arm", "fingers", "objects", "grip_site")}

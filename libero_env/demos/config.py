@@ -20,7 +20,7 @@ from libero_env.errors import InvalidInputError
 from libero_env.perturbations.catalog import KINDS
 from libero_env.perturbations.episodes import checked_perturbations
 from libero_env.perturbations.value import Perturbation, format_perturbations
-from libero_env.sim.engine import MUJOCO, BackEnd
+from libero_env.sim.backend import MUJOCO, Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
 from libero_env.sim.scene import DRAWINGS, FAST, build_scene, default_drawing
@@ -154,7 +154,7 @@ class DemoConfig(_Settings):
         modalities: As for `RenderConfig`.
         drawing: As for `RenderConfig`.
         robot: Model of the arm, see `libero_env.assets.robot`.
-        backend: Back end of the physics, such as `warp,device=cuda:1`, see `libero_env.sim.engine`. Images are drawn
+        backend: Back end of the physics, such as `warp,device=cuda:1`, see `libero_env.sim.backend`. Images are drawn
             from the states by OpenGL with all of them.
     """
 
@@ -182,9 +182,9 @@ class DemoConfig(_Settings):
         return self.drawing or default_drawing(select_pack())
 
     @property
-    def back_end(self) -> BackEnd:
+    def back_end(self) -> Backend:
         """Back end of the physics."""
-        return BackEnd.read(self.backend)
+        return Backend.read(self.backend)
 
     @property
     def batch(self) -> int:

@@ -27,9 +27,8 @@ from libero_env.init_states.store import load_init_states
 from libero_env.memory import require_memory
 from libero_env.perturbations.drawing import start_name
 from libero_env.perturbations.episodes import TRIES
-from libero_env.sim.back_ends import make_simulations
-from libero_env.sim.goals import make_goals
-from libero_env.sim.observations import is_of_joints, make_observer
+from libero_env.sim.engine import make_goals, make_observer, make_simulations
+from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward
 from libero_env.sim.scene import InitialStates
 from libero_env.sim.simulation import WATCHED, Indices
@@ -413,6 +412,8 @@ class BatchEnv(LiberoVectorEnv):
         seen = self.proprioception()
 
         def watch(done: int, rows: np.ndarray) -> None:
+            if done not in WATCHED:
+                return
             now = self.proprioception()
             if done == WATCHED[0]:
                 self._render_observed(rows)

@@ -13,7 +13,7 @@ from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.perturbations.episodes import checked_perturbations
-from libero_env.sim.engine import BackEnd
+from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
@@ -81,7 +81,7 @@ class EnvConfig:
         observed: When a step is observed: `after` it, or in its last `substep` but one, as by the original: joints
             2 ms, poses and images 4 ms before the end.
         backend: Backend of the physics: `mujoco`, or `warp` for many simulations on a GPU, with settings as in
-            `warp,device=cuda:1,contacts=256`, see `libero_env.sim.engine`.
+            `warp,device=cuda:1,contacts=256`, see `libero_env.sim.backend`.
         perturb: Perturbations, as text such as `camera=0.3,light=0.5` or as values, see `libero_env.perturbations`; the
             default is none.
 
@@ -104,7 +104,7 @@ class EnvConfig:
     drawing: Drawing | None = None
     robot: Robot = DEFAULT_ROBOT
     observed: Annotated[str, _known("time of observation", OBSERVED)] = AFTER
-    backend: Annotated[BackEnd, PlainValidator(BackEnd.read)] = BackEnd()
+    backend: Annotated[Backend, PlainValidator(Backend.read)] = Backend()
     perturb: Annotated[tuple[Any, ...], PlainValidator(checked_perturbations)] = ()
 
     @property

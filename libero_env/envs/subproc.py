@@ -23,8 +23,7 @@ from libero_env.envs.checks import (
     checked_indices,
 )
 from libero_env.envs.config import EnvConfig, show_options
-from libero_env.envs.worker import Failure, Worker, checked_space, shut_down, wait_for
-from libero_env.envs.worker_host import open_libero
+from libero_env.envs.worker import Failure, Worker, checked_space, open_libero, shut_down, wait_for
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.text import shown
 from libero_env.validation import validate

@@ -1,4 +1,4 @@
-from .settle import sample_settled, settle, start_faults
+from .placement import sample_settled, settle, start_faults
 from .store import (
     NUM_INIT_STATES,
     cache_init_states,

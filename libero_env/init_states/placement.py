@@ -1,4 +1,7 @@
-"""Placement of objects and fixtures: samples of the regions and conditions of a problem's init atoms."""
+"""New initial states: samples of the regions and conditions of a problem's init atoms, simulated until nothing moves.
+
+They are checked against the task: its init atoms hold, its goal does not.
+"""
 
 from collections.abc import Iterator, Mapping
 from copy import copy
@@ -10,7 +13,10 @@ import numpy as np
 from libero_env.errors import PlacementError
 from libero_env.geometry import quat_from_axis_angle, quat_to_mat
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY
+from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import ROBOT, Scene, fixture_pose, initial_qpos
+from libero_env.sim.simulation import Simulations
+from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom, Region
 
 ARM_NOISE = 0.02  # [rad] standard deviation of the arm's joints around the rest pose, as in the original
@@ -18,6 +24,11 @@ _CLEARANCE = 0.001  # [m] above the surface
 _MAX_TRIES = 500
 _USUAL_GEOMS = 1500  # that may touch; scenes with more have fewer tries, each of which takes longer
 _OVER_SITE = 0.03  # [m] height over a site's box at which the surface that it marks may be
+_STILL_CHANGE = 2e-4  # [m, or quaternion units] largest change of an object at rest in half a second
+_MAX_HALF_SECONDS = 10
+_MAX_SAMPLES = 20
+_USUAL_FREEDOMS = 250  # of a scene; those with more have fewer samples, each of which takes longer
+_TOLERANCE = 0.02  # [m] distance by which an object may slide out of its rectangle
 _SITE_FRACTION = 0.3  # of the edges of a site's box, around its middle, in which objects are placed
 
 
@@ -37,7 +48,7 @@ class Start:
 def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | None = None) -> Start:
     """Sample a start: entities in the regions of their init atoms, joints as in the atoms, no contact.
 
-    Objects hover by a millimetre and are not at rest; see `libero_env.init_states.settle`.
+    Objects hover by a millimetre and are not at rest; see `libero_env.init_states.placement`.
 
     Args:
         scene: Scene to sample.
@@ -261,3 +272,107 @@ def _touching_entities(scene: Scene, data: mujoco.MjData) -> set[str]:
         if a != b and (names & set(scene.objects)) and "" not in names:
             touching |= names
     return touching
+
+
+def settle(
+    simulations: Simulations, i: int, qpos: np.ndarray, nq_robot: int, fixtures: np.ndarray | None = None
+) -> np.ndarray:
+    """Simulate until the objects of one simulation are at rest, while the arm holds its pose.
+
+    Args:
+        simulations: Simulations, with a controller whose zero action holds the pose.
+        i: Index of the simulation.
+        qpos: Positions to start from, (nq,).
+        nq_robot: Number of positions of the robot.
+        fixtures: Poses of the fixtures, (nfixtures, 7); None keeps them.
+
+    Returns:
+        Positions at rest, (nq,), with those of the robot as they were.
+
+    Raises:
+        PlacementError: An object still moves after five seconds.
+    """
+    hold = np.zeros((simulations.num, 7))
+    simulations.reset(
+        [i],
+        qpos[None],
+        np.zeros((1, simulations.model.nv)),
+        fixtures=None if fixtures is None else fixtures[None],
+    )
+    for _ in range(_MAX_HALF_SECONDS):
+        before = simulations.fields["qpos"][i].copy()
+        for _ in range(10):
+            simulations.step([i], hold)
+        after = simulations.fields["qpos"][i].copy()
+        if np.abs(after - before)[nq_robot:].max(initial=0.0) < _STILL_CHANGE:
+            after[:nq_robot] = qpos[:nq_robot]
+            return after
+    raise PlacementError(
+        f"objects still move after {_MAX_HALF_SECONDS * 0.5:.0f} s; do their regions lie on a surface?"
+    )
+
+
+def sample_settled(
+    scene: Scene,
+    simulations: Simulations,
+    i: int,
+    rng: np.random.Generator,
+    fixtures: np.ndarray | None = None,
+) -> Start:
+    """Sample a start that is at rest, where the init atoms are true and the goal is false.
+
+    Args:
+        scene: Scene to sample.
+        simulations: Simulations of the scene.
+        i: Index of the simulation to settle the objects in.
+        rng: Random generator.
+        fixtures: Poses of the fixtures, (nfixtures, 7); None samples them.
+
+    Raises:
+        PlacementError: As `sample_start`; or no sample of 20 comes to rest where it should. Scenes of unusual size have
+            fewer samples.
+    """
+    view, reason = StateView(scene, simulations, i), ""
+    samples = fewer(_MAX_SAMPLES, scene.model.nv, _USUAL_FREEDOMS)
+    for _ in range(samples):
+        start = sample_start(scene, rng, fixtures)
+        try:
+            qpos = settle(simulations, i, start.qpos, scene.nq_robot, start.fixtures)
+        except PlacementError as error:
+            reason = str(error)
+            continue
+        simulations.reset([i], qpos[None], np.zeros((1, simulations.model.nv)))
+        if not (reason := "; ".join(start_faults(view))):
+            return Start(qpos, start.fixtures)
+    raise PlacementError(
+        f"{scene.problem.language!r}: none of {samples} sampled starts agrees with the task: {reason}"
+    )
+
+
+def start_faults(view: StateView) -> list[str]:
+    """Return the reasons why a state is no valid start: init atoms that are false, a goal that is true."""
+    faults = []
+    for atom in view.scene.problem.init:
+        if atom.args[0] in view.scene.fixtures:
+            continue
+        region = view.scene.problem.region(atom.args[-1])
+        if atom.predicate == "On" and region is not None:
+            is_true = _rests_on(view, atom.args[0], region)
+        else:
+            is_true = evaluate(atom, view)
+        if not is_true:
+            faults.append(f"{atom} does not hold")
+    if evaluate(view.scene.problem.goal, view):
+        faults.append("the goal holds already")
+    return faults
+
+
+def _rests_on(view: StateView, name: str, region: Region) -> bool:
+    """Return whether an object is over a region, seen from above, and touches its target; unlike `On` at any height."""
+    if region.ranges:
+        point = view.body_pos(name)[:2] - np.asarray(view.scene.workspace.offset)[:2]
+        low, high = np.split(np.array(region.ranges), 2, axis=1)
+        return bool(((point > low - _TOLERANCE) & (point < high + _TOLERANCE)).all(axis=1).any())
+    half = np.abs(view.site_mat(region.address) @ view.scene.model.site(region.address).size)
+    near = np.abs(view.body_pos(name) - view.site_pos(region.address))[:2] < half[:2]
+    return bool(near.all()) and view.in_contact(name, region.target)

@@ -11,13 +11,12 @@ import numpy as np
 from libero_env.assets.pack import BUILTIN
 from libero_env.errors import BrokenFileError, LiberoError, PlacementError
 from libero_env.init_states.original_resets import drawn_fixtures
-from libero_env.init_states.pickle_reader import StateFileError
-from libero_env.init_states.pickles import read_states
-from libero_env.init_states.settle import sample_settled
+from libero_env.init_states.pickles import StateFileError, read_states
+from libero_env.init_states.placement import sample_settled
 from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
-from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.scene import InitialStates, Scene, build_scene
+from libero_env.sim.simulation import LoopSimulations
 from libero_env.storage import atomic_write_npz, cached_arrays, read_npz, read_packaged_npz
 from libero_env.tasks.published.task import PublishedTask
 from libero_env.tasks.task import Task

@@ -10,12 +10,11 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import PlacementError
-from libero_env.init_states.placement import collision_boxes, lowest_point
-from libero_env.init_states.settle import settle
+from libero_env.init_states.placement import collision_boxes, lowest_point, settle
 from libero_env.perturbations.drawing import DrawKey
 from libero_env.perturbations.starts import contacts, posed
-from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.scene import Scene, zone_boxes
+from libero_env.sim.simulation import LoopSimulations
 from libero_env.tasks.problem import Problem, Region
 
 _GAP = 0.02  # [m] between a new object and what is there, seen from above

@@ -1,92 +1,128 @@
-"""Back ends of the physics: MuJoCo on the processor, or MuJoCo Warp with many simulations on a GPU.
+"""What works by the means of a backend: simulations of a model, the truth of goals in them, and their observer."""
 
-A back end is named in a line of text: `mujoco`, `warp`, or with settings `warp,device=cuda:1,contacts=256`.
-"""
+from collections.abc import Sequence
+from typing import Protocol
 
-import importlib.util
-from dataclasses import dataclass
+import mujoco
+import numpy as np
 
-from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
-from libero_env.text import shown
-
-MUJOCO, WARP = BACK_ENDS = ("mujoco", "warp")
-DEFAULT_CONTACTS = 192  # of a simulation; scenes rest on 24 to 90, and a hand that works adds up to 60
-MOST_CONTACTS = 4096
-_SETTINGS = ("device", "contacts")
-MISSING = (
-    "backend=warp needs MuJoCo Warp, which is not installed: pip install 'libero-lifelong[warp]'; backend=mujoco runs "
-    "without it"
-)
+from libero_env.sim.backend import Backend
+from libero_env.sim.observations import Observer
+from libero_env.sim.predicates import evaluate
+from libero_env.sim.scene import Scene
+from libero_env.sim.simulation import Batch, BatchSimulations, Indices, LoopSimulations, Simulations
+from libero_env.sim.state import StateView
+from libero_env.tasks.problem import And, Atom, Expression
 
 
-@dataclass(frozen=True)
-class BackEnd:
-    """A back end of the physics with its settings.
+class Goals(Protocol):
+    """The truth of one goal in simulations of its scene.
 
     Attributes:
-        name: `mujoco` or `warp`.
-        device: Device of Warp, such as `cpu` or `cuda:1`; None for the first GPU, or the processor where there is none.
-        contacts: Largest number of contacts of a simulation, for which Warp allocates memory.
+        atoms: Atoms whose truth `check` returns.
     """
 
-    name: str = MUJOCO
-    device: str | None = None
-    contacts: int = DEFAULT_CONTACTS
+    atoms: tuple[Atom, ...]
 
-    @classmethod
-    def read(cls, value: "BackEnd | str") -> "BackEnd":
-        """Return a back end from its text.
-
-        Args:
-            value: Text such as `warp` or `warp,device=cpu,contacts=256`, or a back end.
-
-        Raises:
-            UnknownNameError: The back end or a setting does not exist.
-            InvalidInputError: A value is not valid.
-        """
-        if isinstance(value, cls):
-            return value
-        if not isinstance(value, str):
-            raise InvalidInputError(f"backend is {shown(value)}; expected a text such as mujoco or warp")
-        name, *settings = value.split(",")
-        if name not in BACK_ENDS:
-            raise UnknownNameError("back end", name, BACK_ENDS)
-        found: dict[str, str] = {}
-        for setting in settings:
-            key, _, text = setting.partition("=")
-            if key not in _SETTINGS:
-                raise UnknownNameError("setting of a back end", key, _SETTINGS)
-            found[key] = text
-        if name == MUJOCO and found:
-            raise InvalidInputError(
-                f"backend={value}: mujoco has no settings; device and contacts are warp's"
-            )
-        if found.get("device") == "":
-            raise InvalidInputError(f"backend={value}: device is a device of Warp, such as cpu or cuda:0")
-        return cls(name, found.get("device"), _contacts(found.get("contacts"), value))
-
-    def __str__(self) -> str:
-        parts = [self.name, *([f"device={self.device}"] if self.device else [])]
-        return ",".join(parts + ([f"contacts={self.contacts}"] if self.contacts != DEFAULT_CONTACTS else []))
-
-    @property
-    def is_warp(self) -> bool:
-        """Whether the physics is that of MuJoCo Warp."""
-        return self.name == WARP
-
-    def require_installed(self) -> None:
-        """Check that the packages of the back end are there.
-
-        Raises:
-            LiberoError: They are not; the message says how to install them.
-        """
-        if self.is_warp and any(importlib.util.find_spec(name) is None for name in ("warp", "mujoco_warp")):
-            raise LiberoError(MISSING)
+    def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return whether the goal is reached in simulations, (k,) bool, and the truth of its atoms, (k, natoms)."""
 
 
-def _contacts(text: str | None, value: str) -> int:
-    if text is None:
-        return DEFAULT_CONTACTS
-    if not (text.isascii() and text.isdigit() and 1 <= int(text[:9]) <= MOST_CONTACTS):
-        raise InvalidInputError(f"backend={value}: contacts is a whole number from 1 to {MOST_CONTACTS}")
-    return int(text)
+class ViewedGoals:
+    """Whether a goal holds as the predicates say, one simulation after the other.
+
+    Args:
+        goal: The goal.
+        atoms: Atoms that `check` evaluates.
+        views: State view of each simulation.
+        semantics: Semantics of the predicates, `original` or `strict`.
+    """
+
+    def __init__(self, goal: Expression, atoms: Sequence[Atom], views: Sequence[StateView], semantics: str):
+        self._goal, self.atoms, self._views, self._semantics = goal, tuple(atoms), views, semantics
+        parts = goal.parts if isinstance(goal, And) else (goal,)
+        self._is_conjunction = all(part in self.atoms for part in parts)  # no atom is evaluated twice then
+
+    def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return whether the goal is reached in simulations, (k,) bool, and the truth of its atoms, (k, natoms)."""
+        reached, truths = np.zeros(len(ids), bool), np.zeros((len(ids), len(self.atoms)), bool)
+        for k, i in enumerate(ids):
+            view = self._views[i]
+            truths[k] = [evaluate(atom, view, self._semantics) for atom in self.atoms]
+            if self._is_conjunction:
+                reached[k] = truths[k].all()
+            else:
+                reached[k] = evaluate(self._goal, view, self._semantics)
+        return reached, truths
+
+
+def make_simulations(
+    model: mujoco.MjModel,
+    num: int,
+    threads: int = 0,
+    fixture_bodies: Indices = (),
+    backend: Backend | None = None,
+) -> Simulations:
+    """Return `num` simulations of a model; MuJoCo's are batched where it offers that and there are several.
+
+    Args:
+        model: Model to simulate; it is copied.
+        num: Number of simulations.
+        threads: Number of threads of the batch; 0 is one for each core.
+        fixture_bodies: Indices of the fixed bodies whose pose differs between simulations.
+        backend: Backend of the physics; by default `mujoco`.
+
+    Raises:
+        LiberoError: The backend is not installed, has no such device, or cannot simulate the model.
+    """
+    if backend is not None and backend.is_warp:
+        backend.require_installed()
+        from libero_env.sim.mjwarp.simulations import WarpSimulations  # with the extra `warp` only
+
+        return WarpSimulations(model, num, fixture_bodies, backend)
+    if num > 1 and Batch is not None:
+        return BatchSimulations(model, num, threads, fixture_bodies)
+    return LoopSimulations(model, num, fixture_bodies)
+
+
+def make_goals(
+    goal: Expression,
+    atoms: Sequence[Atom],
+    views: Sequence[StateView],
+    semantics: str,
+    simulations: Simulations,
+) -> Goals:
+    """Return the truth of a goal in simulations, by the means of their backend.
+
+    Args:
+        goal: The goal.
+        atoms: Atoms whose truth `check` returns, such as `Scene.goal_atoms`.
+        views: State view of each simulation.
+        semantics: Semantics of the predicates, `original` or `strict`.
+        simulations: The simulations.
+    """
+    if simulations.backend.is_warp:
+        from libero_env.sim.mjwarp.goals import WarpGoals  # with the extra `warp` only
+
+        return WarpGoals(goal, atoms, views, semantics, simulations)  # type: ignore[arg-type]
+    return ViewedGoals(goal, atoms, views, semantics)
+
+
+def make_observer(
+    scene: Scene,
+    simulations: Simulations,
+    *,
+    observations: Sequence[str],
+    cameras: Sequence[str],
+    camera_size: tuple[int, int],
+) -> Observer:
+    """Return an observer that draws by the means of the simulations' backend; arguments as of `Observer`.
+
+    Raises:
+        UnknownNameError: An observation or a camera does not exist.
+        LiberoError: The backend does not offer an observation.
+    """
+    kind = Observer
+    if simulations.backend.is_warp:
+        from libero_env.sim.mjwarp.pictures import WarpObserver as kind  # with the extra `warp` only
+    return kind(scene, simulations, observations=observations, cameras=cameras, camera_size=camera_size)

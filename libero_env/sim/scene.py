@@ -21,10 +21,11 @@ from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.mujoco_compat import log_warnings, set_damping
-from libero_env.objects.model import ROOT_BODY, ObjectModel
-from libero_env.sim.model_checks import check_models
-from libero_env.tasks.checks import check_problem
+from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY, ObjectModel
+from libero_env.tasks.checks import ProblemError, check_problem
 from libero_env.tasks.problem import Atom, Problem, Region
+from libero_env.tasks.problem_types import Fault
+from libero_env.text import suggest
 from libero_env.timing import TIMESTEP
 
 InitialStates = (
@@ -228,8 +229,37 @@ def _compile_scene(problem: Problem, pack: Pack, drawing: str, robot: str, spare
     objects = {n: entities[n] for n in problem.objects}
     fixtures = {n: entities[n] for n in problem.fixtures if n != name}
     scene = Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot, spare_materials)
-    check_models(scene)
+    _check_sites(scene)
+    _check_states(scene)
     return scene
+
+
+def _check_sites(scene: Scene) -> None:
+    """Check that a region in an atom, which has no rectangle, is a site of its target's model."""
+    problem, model = scene.problem, scene.model
+    for atom in (*problem.init, *problem.goal.atoms()):
+        for region in filter(None, map(problem.region, atom.args)):
+            if region.ranges or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, region.address) >= 0:
+                continue
+            prefix = f"{region.target}_"
+            sites = [model.site(i).name for i in range(model.nsite)]
+            own = [s.removeprefix(prefix) for s in sites if s.startswith(prefix) and not s.endswith("_site")]
+            near = suggest(region.name, own)
+            what = f"{region.target} has no region {region.name!r}{'.' if near else ''}{near}"
+            expected = f"one of {', '.join(own)}" if own else f"{region.target} itself, which has no regions"
+            raise ProblemError(Fault("no-site", what, expected, ":regions", region.address), problem.language)
+
+
+def _check_states(scene: Scene) -> None:
+    """Check that what a goal wants open or turned on has a range for that state, if it has a joint at all."""
+    for i, atom in enumerate(scene.problem.goal.atoms()):
+        state, owner = atom.predicate.lower(), scene.owner(atom.args[0]) if atom.args else None
+        if state not in OPPOSITE_STATES or owner is None or not scene.joints.get(atom.args[0]):
+            continue
+        if state not in (known := scene.entities[owner].articulation):
+            what = f"{atom}: the state {state!r} of a {scene.entities[owner].category} is not defined"
+            fault = Fault("no-joint", what, f"one of {', '.join(sorted(known)) or 'no state'}", ":goal", i)
+            raise ProblemError(fault, scene.problem.language)
 
 
 class _SceneCache:

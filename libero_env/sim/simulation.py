@@ -1,45 +1,63 @@
 """Closed-loop simulations of one model: physics and controller, without tasks and images.
 
 A control step has 25 substeps. Each substep runs the controller on the current kinematics, then the rest of the step,
-then the kinematics. How the physics is stepped is a matter of `libero_env.sim.back_ends`.
+then the kinematics. `LoopSimulations` steps one MjData after another (one simulation, or MuJoCo without
+`mujoco.batch`), `BatchSimulations` steps on a thread pool, to the same bits. `libero_env.sim.mjwarp` steps on a GPU in
+single precision.
 """
 
+import os
+import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import mujoco
 import numpy as np
 
-from libero_env.errors import ClosedEnvironmentError
-from libero_env.mujoco_compat import MASS_FIELD, log_warnings
+from libero_env.errors import ClosedEnvironmentError, LiberoError
+from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD, log_warnings
+from libero_env.sim.backend import Backend
 from libero_env.sim.controller import ControllerState, get_controller
-from libero_env.sim.engine import BackEnd
 from libero_env.sim.osc import REST, ArmIndex
 from libero_env.timing import SUBSTEPS
 
+try:
+    from mujoco.batch import Batch
+except ImportError:  # before MuJoCo 4
+    Batch = None
+
 # Fields of MjData that controllers and state views read.
 FIELDS = (
+    *("qpos", "qvel", "ctrl", "xpos", "xquat", "xanchor", "xaxis", "site_xpos", "site_xmat"),
+    *(MASS_FIELD, "qfrc_bias"),
+)
+_CONTROLLED = (
     "qpos",
     "qvel",
-    "ctrl",
-    "xpos",
-    "xquat",
     "xanchor",
     "xaxis",
     "site_xpos",
     "site_xmat",
     MASS_FIELD,
-    "qfrc_bias",
-)
+)  # of the arm, not of contacts
 
-# Substeps after which the original observes: kinematics of the first, positions of the second
+# Substeps after which the original observes: kinematics of the first, positions of the second.
 WATCHED = (SUBSTEPS - 2, SUBSTEPS - 1)
+INTEGRATED = -1  # between integration and kinematics of the second, where it does; of `LoopSimulations` only
+
+# The original calls mj_forward twice in each substep. Where that moves the solver's warm start we do it, too.
+_SOLVES_BEFORE_STEP = 2 if FORWARD_WARM_STARTS else 0
+
+FORKED = (
+    "this process was forked from the one that made the environment, and can neither step nor render it. Make "
+    "environments after the fork, or start processes with multiprocessing.get_context('spawn')"
+)
 Indices = Sequence[int] | np.ndarray
-KinematicsHook = Callable[[mujoco.MjData], None]
-Watch = Callable[[int, np.ndarray], None]  # number of substeps done, indices of the simulations
+Watch = Callable[[int, np.ndarray], None]  # one of `WATCHED` or `INTEGRATED`, indices of the simulations
+Inputs = tuple[np.ndarray, ...]  # fields that the kernel of a controller takes, (num, ...)
 
 
 class Closed(dict[Any, Any]):
@@ -64,11 +82,11 @@ class Simulations(ABC):
         fixtures: Pose of each fixed body of `fixture_bodies`, (num, nfixtures, 7): position, quaternion wxyz.
         arm: Indices of the arm in the model.
         fields: Field of MjData by name, (num, ...), for reading. Kinematics are those of the current state.
-        back_end: Back end that steps them.
+        backend: Backend that steps them.
         controller_state: Controller that runs, its goals and gripper commands; may be replaced by another.
     """
 
-    back_end = BackEnd()
+    backend = Backend()
 
     def __init__(self, model: mujoco.MjModel, num: int, fixture_bodies: Indices = ()):
         log_warnings()
@@ -88,14 +106,16 @@ class Simulations(ABC):
 
     @abstractmethod
     def _substeps(
-        self,
-        ids: np.ndarray,
-        actions: np.ndarray,
-        before_last_kinematics: KinematicsHook | None,
-        believed: Mapping[str, np.ndarray],
-        watch: Watch | None,
+        self, ids: np.ndarray, actions: np.ndarray, first: Inputs | None, watch: Watch | None
     ) -> None:
-        """Run one control period with the goals that are set; in its first substep the controller sees `believed`."""
+        """Run one control period with the goals that are set.
+
+        Args:
+            ids: Indices of the simulations.
+            actions: Action of each simulation, (num, action_dim).
+            first: What the controller sees in the first substep, where that is not the arm as it is.
+            watch: See `step`.
+        """
 
     @abstractmethod
     def _warm_start(self, i: int) -> list[np.ndarray]:
@@ -120,8 +140,8 @@ class Simulations(ABC):
         return data.contact.geom[: data.ncon]
 
     def record(self) -> dict[str, str]:
-        """Return the back end and what of it the numbers depend on, as plain data."""
-        return {"backend": self.back_end.name}
+        """Return the backend and what of it the numbers depend on, as plain data."""
+        return {"backend": self.backend.name}
 
     def set_controller(self, name: str, control_delta: bool = True, rest: np.ndarray = REST) -> None:
         """Choose the controller, before the first reset.
@@ -162,7 +182,7 @@ class Simulations(ABC):
             self.fixtures[ids] = fixtures
         self._start(ids, qpos, qvel, time)
         self._outdated[ids] = False
-        pos, mat = self._grip_site()
+        pos, mat = self._grip_site(self.fields)
         self.controller_state.restart(ids, pos[ids], mat[ids])
 
     def outdate_controller(self, ids: Indices) -> None:
@@ -171,14 +191,10 @@ class Simulations(ABC):
         The original's controller does so between `reset`, which measures the arm in its rest pose, and the first
         substep after `set_init_state`, which moves it: robosuite 1.4.0, controllers/base_controller.py, `new_update`.
         The first goal is therefore relative to the rest pose.
-
-        Args:
-            ids: Indices of the simulations.
         """
         ids = np.asarray(ids, np.int64)
         self._outdated[ids] = True
-        site, rest = self.arm.site, self._rest_fields
-        pos, mat = (np.repeat(rest[name][:, site], len(ids), 0) for name in ("site_xpos", "site_xmat"))
+        pos, mat = (np.repeat(part, len(ids), 0) for part in self._grip_site(self._rest_fields))
         self.controller_state.restart(ids, pos, mat)
 
     def update_controller(self, ids: Indices) -> None:
@@ -191,46 +207,42 @@ class Simulations(ABC):
         data = mujoco.MjData(self.model)
         data.qpos[: len(self.rest)] = self.rest
         mujoco.mj_forward(self.model, data)
-        found = {name: np.array(getattr(data, name))[None] for name in FIELDS}
-        return {**found, "site_xmat": found["site_xmat"].reshape(1, self.model.nsite, 9)}
+        return {name: np.array(rows) for name, rows in self._views_of(data).items()}
 
-    def _believed(self, ids: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Return the fields that the controller believes, (num, ...): those of the rest pose where it is outdated."""
+    def _views_of(self, data: mujoco.MjData) -> dict[str, np.ndarray]:
+        """Return views of the fields of one simulation, (1, ...)."""
+        views = {name: getattr(data, name)[None] for name in FIELDS}
+        return {**views, "site_xmat": data.site_xmat.reshape(1, self.model.nsite, 9)}
+
+    def _controlled_fields(self, ids: np.ndarray) -> Mapping[str, np.ndarray]:
+        """Return the fields that the controller sees, (num, ...): those of the rest pose where it is outdated."""
         if not self._outdated[ids].any():
             return self.fields
-        believed = dict(self.fields)
-        for name in ("qpos", "qvel", "xanchor", "xaxis", "site_xpos", "site_xmat", MASS_FIELD):
-            believed[name] = self.fields[name].copy()
-            believed[name][self._outdated] = self._rest_fields[name]
-        return believed
+        fields = dict(self.fields)
+        for name in _CONTROLLED:
+            fields[name] = self.fields[name].copy()
+            fields[name][self._outdated] = self._rest_fields[name]
+        return fields
 
     def pose_fixtures(self, i: int) -> None:
         """Write the poses of the fixtures of simulation i to the model."""
         self.model.body_pos[self.fixture_bodies] = self.fixtures[i, :, :3]
         self.model.body_quat[self.fixture_bodies] = self.fixtures[i, :, 3:]
 
-    def step(
-        self,
-        ids: Indices,
-        actions: np.ndarray,
-        before_last_kinematics: KinematicsHook | None = None,
-        watch: Watch | None = None,
-    ) -> None:
+    def step(self, ids: Indices, actions: np.ndarray, watch: Watch | None = None) -> None:
         """Advance simulations by one control period.
 
         Args:
             ids: Indices of the simulations.
-            actions: Action of each simulation, (num, action_dim); rows of other simulations are not used.
-            before_last_kinematics: Function that is called with each MjData in the last but one substep, after its
-                integration and before its kinematics; there the original LIBERO observes. `LoopSimulations` only.
-            watch: Function that is called after each substep of `WATCHED`, with the number of substeps done
-                and the indices of the simulations whose fields are of that moment.
+            actions: Action of each simulation, (num, action_dim), finite; rows of other simulations are not used.
+            watch: Function that is called after each substep of `WATCHED`, with the number of substeps done and the
+                indices of the simulations whose fields are of that moment; by `LoopSimulations` at `INTEGRATED`, too.
         """
         ids = np.asarray(ids, np.int64)
-        state, believed, site = self.controller_state, self._believed(ids), self.arm.site
-        pos, mat = believed["site_xpos"][:, site], believed["site_xmat"][:, site]
-        state.controller.set_goals(ids, actions, believed["qpos"], pos, mat, state.goal, state.memory)
-        self._substeps(ids, actions, before_last_kinematics, believed, watch)
+        state, fields = self.controller_state, self._controlled_fields(ids)
+        pos, mat = self._grip_site(fields)
+        state.controller.set_goals(ids, actions, fields["qpos"], pos, mat, state.goal, state.memory)
+        self._substeps(ids, actions, None if fields is self.fields else self._inputs(fields), watch)
         self._outdated[ids] = False
 
     def get_state(self, i: int) -> np.ndarray:
@@ -238,8 +250,8 @@ class Simulations(ABC):
 
         It consists of time, qpos, qvel, fixtures, warm start, controls and the state of the controller.
         """
-        parts = [[self.time(i)], self.fields["qpos"][i], self.fields["qvel"][i], self.fixtures[i].ravel()]
-        return np.concatenate([*parts, *self._warm_start(i), self.controller_state.pack(i)])
+        parts = [self.physics_state(i), self.fixtures[i].ravel(), *self._warm_start(i)]
+        return np.concatenate([*parts, self.controller_state.pack(i)])
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Restore a state of `get_state`; the simulation continues from there to the same bits."""
@@ -266,23 +278,172 @@ class Simulations(ABC):
         warm_start = model.nv + model.nu
         return 1 + model.nq + model.nv + fixtures + warm_start + self.controller_state.controller.state_size
 
-    def _grip_site(self) -> tuple[np.ndarray, np.ndarray]:
+    def _grip_site(self, fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return position (num, 3) and orientation (num, 9) of the grip site."""
         site = self.arm.site
-        return self.fields["site_xpos"][:, site], self.fields["site_xmat"][:, site]
+        return fields["site_xpos"][:, site], fields["site_xmat"][:, site]
 
-    def _inputs(self, fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        """Return the fields that the kernel of a controller takes."""
-        site = self.arm.site
-        names = ("qpos", "qvel", "xanchor", "xaxis")
-        return (
-            *(fields[n] for n in names),
-            fields["site_xpos"][:, site],
-            fields["site_xmat"][:, site],
-            fields[MASS_FIELD],
-            fields["qfrc_bias"],
-        )
+    def _inputs(self, fields: Mapping[str, np.ndarray]) -> Inputs:
+        arm = (fields[name] for name in ("qpos", "qvel", "xanchor", "xaxis"))
+        return *arm, *self._grip_site(fields), fields[MASS_FIELD], fields["qfrc_bias"]
 
-    def _constants(self) -> tuple[np.ndarray, ...]:
-        """Return the constants that the kernel of a controller takes."""
+    @property
+    def _constants(self) -> Inputs:
+        """Constants that the kernel of a controller takes."""
         return self.arm.mass_address, self.arm.torque_limit, self.arm.finger_range, self.rest
+
+
+class LoopSimulations(Simulations):
+    """Simulations that are stepped one after the other in the calling thread."""
+
+    def __init__(self, model: mujoco.MjModel, num: int = 1, fixture_bodies: Indices = ()):
+        super().__init__(model, num, fixture_bodies)
+        self._datas: Any = [mujoco.MjData(self.model) for _ in range(num)]
+        self._views: Any = [self._views_of(data) for data in self._datas]
+        # One simulation is read in place; several are copied together after each step.
+        self.fields = (
+            self._views[0] if num == 1 else {k: np.concatenate([v[k] for v in self._views]) for k in FIELDS}
+        )
+        self._inputs_of: Any = [self._inputs(view) for view in self._views]
+
+    def _gather(self, ids: np.ndarray) -> None:
+        """Copy the fields of simulations to `fields`, unless they are read in place."""
+        if self.num > 1:
+            for i in ids:
+                for name, array in self.fields.items():
+                    array[i] = self._views[i][name][0]
+
+    def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
+        for k, i in enumerate(ids):
+            data = self._datas[i]
+            self.pose_fixtures(i)
+            mujoco.mj_resetData(self.model, data)
+            data.qpos[:], data.qvel[:], data.time = qpos[k], qvel[k], time
+            mujoco.mj_forward(self.model, data)
+            data.qacc_warmstart[:] = 0.0
+        self._gather(ids)
+
+    def _substeps(
+        self, ids: np.ndarray, actions: np.ndarray, first: Inputs | None, watch: Watch | None
+    ) -> None:
+        model, constants, only = self.model, self._constants, np.zeros(1, np.int64)
+        kernel, state = self.controller_state.controller.kernel, self.controller_state.arrays
+        for i in ids:
+            data, ctrl, row = self._datas[i], self._views[i]["ctrl"], slice(i, i + 1)
+            if self.num > 1:
+                self.pose_fixtures(i)
+            goals = [array[row] for array in state]
+            for substep in range(SUBSTEPS):
+                for _ in range(_SOLVES_BEFORE_STEP):
+                    mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, True)
+                seen = self._inputs_of[i] if first is None or substep else [field[row] for field in first]
+                kernel(only, actions[row], *seen, *goals, ctrl, *constants)
+                mujoco.mj_step2(model, data)
+                if watch is not None and substep == WATCHED[0]:
+                    watch(INTEGRATED, np.array([i]))
+                mujoco.mj_step1(model, data)
+                if watch is not None and substep + 1 in WATCHED:
+                    self._gather(np.array([i]))
+                    watch(substep + 1, np.array([i]))
+        self._gather(ids)
+
+    def _warm_start(self, i: int) -> list[np.ndarray]:
+        return [self._datas[i].qacc_warmstart, self._datas[i].ctrl]
+
+    def time(self, i: int) -> float:
+        return self._datas[i].time
+
+    def data(self, i: int) -> mujoco.MjData:
+        return self._datas[i]
+
+    def close(self) -> None:
+        super().close()
+        self._views = self._inputs_of = self._datas = Closed()
+
+
+class BatchSimulations(Simulations):
+    """Simulations that are stepped together on a thread pool; results do not depend on the number of threads.
+
+    Args:
+        model: Model to simulate; it is copied.
+        num: Number of simulations.
+        threads: Number of threads; 0 is one for each core.
+        fixture_bodies: Indices of the fixed bodies whose pose differs between simulations.
+    """
+
+    def __init__(self, model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Indices = ()):
+        super().__init__(model, num, fixture_bodies)
+        self._batch: Any = Batch(model, num, nthread=threads, persistent=True)
+        _watch_forks()
+        _batches.add(self)
+        fields = {name: self._batch.bind(name) for name in FIELDS}
+        self.fields = {**fields, "site_xmat": fields["site_xmat"].reshape(num, model.nsite, 9)}
+        self._own_inputs = self._inputs(self.fields)
+        self._time, self._qacc_warmstart = self._batch.bind("time"), self._batch.bind("qacc_warmstart")
+        if self.fixture_bodies.size:  # per-simulation values of the model
+            self._body_pos, self._body_quat = self._batch.expand("body_pos"), self._batch.expand("body_quat")
+        self._data = mujoco.MjData(model)  # for reading one simulation at a time
+
+    def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
+        self._batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
+        if self.fixture_bodies.size:
+            rows = np.ix_(ids, self.fixture_bodies)
+            self._body_pos[rows], self._body_quat[rows] = self.fixtures[ids, :, :3], self.fixtures[ids, :, 3:]
+        self.fields["qpos"][ids], self.fields["qvel"][ids], self._time[ids] = qpos, qvel, time
+        self._batch.forward(ids, stage=mujoco.mjtStage.mjSTAGE_VEL)
+        self._qacc_warmstart[ids] = 0.0
+
+    def _substeps(
+        self, ids: np.ndarray, actions: np.ndarray, first: Inputs | None, watch: Watch | None
+    ) -> None:
+        kernel, state = self.controller_state.controller.kernel, self.controller_state.arrays
+        ctrl, constants, stage = self.fields["ctrl"], self._constants, mujoco.mjtStage.mjSTAGE_VEL
+        for substep in range(SUBSTEPS):
+            seen = self._own_inputs if first is None or substep else first
+            kernel(ids, actions, *seen, *state, ctrl, *constants)
+            self._batch.step(ids, nstep=1, stage=stage)
+            if watch is not None and substep + 1 in WATCHED:
+                watch(substep + 1, ids)
+
+    def _warm_start(self, i: int) -> list[np.ndarray]:
+        return [self._qacc_warmstart[i], self.fields["ctrl"][i]]
+
+    def time(self, i: int) -> float:
+        return float(np.ravel(self._time[i])[0])
+
+    def data(self, i: int) -> mujoco.MjData:
+        return self._batch.get_data(i, self._data)
+
+    def close(self) -> None:
+        super().close()
+        self._batch = _NoBatch("this simulation is closed; make another environment", ClosedEnvironmentError)
+        self._time = self._qacc_warmstart = self._body_pos = self._body_quat = Closed()
+        self._own_inputs = ()
+
+
+class _NoBatch:
+    """What a batch is replaced by where it cannot be used."""
+
+    def __init__(self, message: str, error: type[LiberoError] = LiberoError):
+        self._error = error(message)
+
+    def __getattr__(self, name: str) -> Any:
+        raise self._error
+
+
+_batches: "weakref.WeakSet[BatchSimulations]" = weakref.WeakSet()
+_inherited: list[Any] = []  # never freed: their threads are not in this process
+
+
+@cache
+def _watch_forks() -> None:
+    """Let a forked process raise where it uses a batch of its parent, whose threads it would wait for without end."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=_leave_batches)
+
+
+def _leave_batches() -> None:
+    for simulations in list(_batches):
+        _inherited.append(simulations._batch)
+        simulations._batch = _NoBatch(FORKED)
+    _batches.clear()

@@ -116,7 +116,7 @@ def _episodes(args: argparse.Namespace, tasks: "Sequence[Task]") -> int | None:
 def _protocol(args: argparse.Namespace, card: "Card", tasks: "Sequence[Task]") -> "Card":
     """Return the protocol on this machine, with what the arguments change; what was chosen is printed."""
     from libero_env.perturbations import format_perturbations, parse_perturbations
-    from libero_env.sim.engine import BackEnd
+    from libero_env.sim.backend import Backend
     from libero_eval.protocols.environment import resolve_world
 
     protocol, notes = resolve_world(card, tasks, args.assets)
@@ -128,8 +128,8 @@ def _protocol(args: argparse.Namespace, card: "Card", tasks: "Sequence[Task]") -
     if args.robot:
         protocol = protocol.changed({"world.robot": args.robot})
     if args.backend is not None:
-        protocol = protocol.changed({"world.backend": BackEnd.read(args.backend).name})
-    BackEnd.read(args.backend or protocol.world.backend).require_installed()
+        protocol = protocol.changed({"world.backend": Backend.read(args.backend).name})
+    Backend.read(args.backend or protocol.world.backend).require_installed()
     protocol.require()
     for note in notes:
         print(f"note: {note}", file=sys.stderr, flush=True)

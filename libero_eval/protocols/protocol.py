@@ -44,7 +44,7 @@ class World:
         predicates: Semantics of the goals, see `libero_env.sim.predicates`.
         perturb: Perturbations, such as `camera=0.3,light=0.5`, see `libero_env.perturbations`; empty for none. A card
             without it has none.
-        backend: Back end of the physics and the pictures, see `libero_env.sim.engine`. A card without it has `mujoco`.
+        backend: Back end of the physics and the pictures, see `libero_env.sim.backend`. A card without it has `mujoco`.
     """
 
     models: Literal["original", "builtin", "any"]

@@ -7,7 +7,7 @@ from typing import Literal
 from libero_env.errors import LiberoError
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.perturbations import Perturbation
-from libero_env.sim.engine import MUJOCO, BackEnd
+from libero_env.sim.backend import MUJOCO, Backend
 from libero_env.validation import validate_arguments
 from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
@@ -88,9 +88,9 @@ class EvalSettings:
             )
 
     @property
-    def back_end(self) -> BackEnd:
+    def back_end(self) -> Backend:
         """Back end of the rollouts."""
-        return BackEnd.read(self.backend)
+        return Backend.read(self.backend)
 
     @property
     def transfer_estimate(self) -> Transfer:

@@ -25,8 +25,7 @@ from libero_env.expert.skills.drop_into_container import DropIntoContainer
 from libero_env.expert.skills.pick_place import PickPlace
 from libero_env.expert.skills.transport import Move, Transport
 from libero_env.geometry import Pose, rotation_between, surface_points
-from libero_env.sim.predicates import evaluate
-from libero_env.sim.regions import contains, is_over, region_boxes
+from libero_env.sim.predicates import contains, evaluate, is_over, region_boxes
 from libero_env.tasks import get_suite, get_task
 from libero_env.tasks.problem import And, Atom, Not, Or
 

@@ -14,10 +14,10 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import PlacementError, RenderError, UnknownNameError
 from libero_env.geometry import quat_to_axis_angle
 from libero_env.init_states.placement import lowest_point, sample_start
-from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.render import Renderer, open_context
 from libero_env.sim.scene import _SceneCache, build_scene
+from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import bddl, get_suite, get_task
 from libero_env.tasks.problem import And, Atom, ForAll, Not, Or

@@ -12,10 +12,9 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.rollout import MAX_STEPS
-from libero_env.sim import engine
-from libero_env.sim.back_ends import make_simulations
-from libero_env.sim.engine import BackEnd
-from libero_env.sim.goals import ViewedGoals, make_goals
+from libero_env.sim import backend as backends
+from libero_env.sim.backend import Backend
+from libero_env.sim.engine import ViewedGoals, make_goals, make_simulations
 from libero_env.sim.look import Look
 from libero_env.sim.predicates import register_predicate
 from libero_env.tasks.problem import And, Atom, ForAll, Not, Or
@@ -301,21 +300,21 @@ def test_looks_need_the_other_back_end(pair):
 )
 def test_a_back_end_that_is_not_valid_is_said(text, error, told):
     with pytest.raises(error, match=told):
-        BackEnd.read(text)
+        Backend.read(text)
 
 
 @pytest.mark.unit
 def test_a_back_end_is_written_as_it_is_read():
     for text in ("mujoco", "warp", "warp,device=cuda:1", "warp,device=cpu,contacts=256"):
-        assert str(BackEnd.read(text)) == text
+        assert str(Backend.read(text)) == text
 
 
 @pytest.mark.unit
 def test_a_missing_package_is_said_in_one_line(monkeypatch):
-    monkeypatch.setattr(engine.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(LiberoError, match=r"pip install 'libero-lifelong\[warp\]'"):
-        BackEnd("warp").require_installed()
-    BackEnd("mujoco").require_installed()
+        Backend("warp").require_installed()
+    Backend("mujoco").require_installed()
 
 
 @pytest.mark.unit
@@ -380,7 +379,7 @@ def test_free_motion_is_that_of_mujoco(task):
     """50 control steps within 1e-5 rad and m."""
     env = BatchEnv(task, NUM, cameras=(), num_threads=1)
     fixtures = env.scene.fixture_bodies
-    ours = make_simulations(env.scene.model, NUM, fixture_bodies=fixtures, back_end=BackEnd.read(WARP))
+    ours = make_simulations(env.scene.model, NUM, fixture_bodies=fixtures, backend=Backend.read(WARP))
     theirs, actions = env.simulations, next(filter(None, (free_actions(env, seed) for seed in range(20))))
     env.reset(options={"init_state": list(range(NUM))})
     ours.reset(range(NUM), theirs.fields["qpos"], theirs.fields["qvel"], fixtures=theirs.fixtures)

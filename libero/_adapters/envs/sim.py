@@ -12,8 +12,8 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.render import Renderer, RenderTarget
+from libero_env.sim.simulation import LoopSimulations
 
 # Kind of element in robosuite -> kind in MuJoCo.
 _NAMES = ("body", "joint", "geom", "site", "light", "camera", "actuator", "sensor", "tendon", "mesh")

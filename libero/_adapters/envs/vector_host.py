@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from libero_env.envs.worker_host import CallHost, Shared
+from libero_env.envs.worker import CallHost, Shared
 
 
 class Layout(NamedTuple):

@@ -15,8 +15,7 @@ import numpy as np
 from gymnasium.vector import utils
 
 from libero._adapters.envs.vector_host import Layout, VectorHost, arrays_of, observation_of
-from libero_env.envs.worker import Worker, shut_down, wait_for
-from libero_env.envs.worker_host import Shared
+from libero_env.envs.worker import Shared, Worker, shut_down, wait_for
 from libero_env.errors import ClosedEnvironmentError, LiberoError
 
 CALL_TIMEOUT = 600.0  # [s] for a call, unless told otherwise; making an environment may take minutes

@@ -36,12 +36,12 @@ from libero_env.errors import (
     UnknownNameError,
 )
 from libero_env.init_states.original_resets import OriginalResets
-from libero_env.init_states.placement import Start
-from libero_env.init_states.settle import sample_settled
+from libero_env.init_states.placement import Start, sample_settled
 from libero_env.paths import read_config
 from libero_env.sim.controller import ControllerState
 from libero_env.sim.predicates import evaluate, glowing_sites
 from libero_env.sim.scene import DRAWINGS, FAITHFUL, build_scene, scene_spec
+from libero_env.sim.simulation import INTEGRATED
 from libero_env.sim.state import StateView
 from libero_env.text import shown
 
@@ -306,11 +306,15 @@ class BDDLBaseDomain(RobosuiteMethods):
         command = self.robots[0].command(action)
         self.timestep += 1
         mujoco.mj_step1(self.sim.model._model, self.sim.data._data)  # what clients wrote since
-        self.simulations.step([0], command[None], before_last_kinematics=lambda _: self._update_observables())
+        self.simulations.step([0], command[None], watch=self._watch)
         self.cur_time += 1.0 / self.control_freq
         reward, self.done, info = self._post_action(action)
         success = self._check_success()
         return self._get_observations(), reward, success, {"success": success, **info}
+
+    def _watch(self, moment: int, _: np.ndarray) -> None:
+        if moment == INTEGRATED:
+            self._update_observables()
 
     def _pre_action(self, action: Any, policy_step: bool = False) -> None:
         """Do nothing; a subclass may change the simulation before each control step."""

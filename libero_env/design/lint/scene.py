@@ -11,13 +11,12 @@ from libero_env.assets.arena import Workspace
 from libero_env.assets.pack import BUILTIN, Pack
 from libero_env.design.lint.report import Report
 from libero_env.errors import LiberoError, PlacementError
-from libero_env.init_states.placement import sample_start
-from libero_env.init_states.settle import settle, start_faults
+from libero_env.init_states.placement import sample_start, settle, start_faults
 from libero_env.init_states.store import load_init_states
 from libero_env.objects.model import OPPOSITE_STATES
-from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene, build_scene, initial_qpos
+from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
 from libero_env.tasks.authoring import FILE

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 from libero_env.errors import LiberoError
 from libero_env.objects.model import OPPOSITE_STATES
-from libero_env.sim.predicates import evaluate
-from libero_env.sim.regions import contains, region_boxes
+from libero_env.sim.predicates import contains, evaluate, region_boxes
 from libero_env.sim.scene import Scene
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or

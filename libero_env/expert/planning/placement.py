@@ -9,7 +9,7 @@ import numpy as np
 from libero_env.expert.clearance import Voxels
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.geometry import Pose
-from libero_env.sim.regions import Box, contains, is_over, region_boxes
+from libero_env.sim.predicates import Box, contains, is_over, region_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 

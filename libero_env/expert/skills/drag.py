@@ -7,8 +7,7 @@ from libero_env.expert.arm.servo import CLOSE, downward, finger_axis, lateral_ra
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.skills.skill import Skill, gripper_opening
 from libero_env.expert.variation import MotionStyle
-from libero_env.sim.predicates import evaluate
-from libero_env.sim.regions import region_boxes
+from libero_env.sim.predicates import evaluate, region_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 

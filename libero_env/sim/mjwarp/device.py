@@ -11,7 +11,7 @@ import warp as wp
 
 from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import MASS_FIELD
-from libero_env.sim.engine import BackEnd
+from libero_env.sim.backend import Backend
 from libero_env.sim.osc import ArmIndex
 from libero_env.sim.simulation import FIELDS, Closed
 
@@ -79,7 +79,7 @@ def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray)
 
 
 @contextmanager
-def room_for(num: int, back_end: BackEnd) -> Iterator[None]:
+def room_for(num: int, backend: Backend) -> Iterator[None]:
     """Say in one line where the device's memory does not suffice for so many simulations.
 
     Raises:
@@ -91,8 +91,8 @@ def room_for(num: int, back_end: BackEnd) -> Iterator[None]:
         if "allocate" not in str(error) and not isinstance(error, MemoryError):
             raise
         raise LiberoError(
-            f"backend={back_end}: no room for {num} simulations ({error}); take fewer, smaller images, or "
-            f"fewer contacts than {back_end.contacts}"
+            f"backend={backend}: no room for {num} simulations ({error}); take fewer, smaller images, or "
+            f"fewer contacts than {backend.contacts}"
         ) from error
 
 

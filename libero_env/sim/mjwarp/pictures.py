@@ -120,7 +120,7 @@ class _RayTracer:
         drawn = sorted(cameras, key=cameras.__getitem__)  # numbered in the order of the model
         self._places = {name: drawn.index(name) for name in cameras}
         (height, width), num = size, simulations.num
-        with wp.ScopedDevice(simulations.device), room_for(num, simulations.back_end):
+        with wp.ScopedDevice(simulations.device), room_for(num, simulations.backend):
             self._context = mjw.create_render_context(
                 model,
                 nworld=num,

@@ -1,6 +1,5 @@
 """Simulations of one model that MuJoCo Warp steps together, on a GPU or on the processor."""
 
-from collections.abc import Mapping
 from importlib import metadata
 from typing import Any
 
@@ -10,11 +9,11 @@ import numpy as np
 import warp as wp
 
 from libero_env.errors import InvalidInputError, LiberoError
-from libero_env.sim.engine import BackEnd
+from libero_env.sim.backend import Backend
 from libero_env.sim.mjwarp import kernels
 from libero_env.sim.mjwarp.device import DeviceFields, Freed, allocate, choose_device, room_for
 from libero_env.sim.osc import REST, osc_torques
-from libero_env.sim.simulation import WATCHED, Indices, KinematicsHook, Simulations, Watch
+from libero_env.sim.simulation import WATCHED, Indices, Inputs, Simulations, Watch
 from libero_env.timing import SUBSTEPS
 
 _ROWS_PER_CONTACT = 4  # of constraints; contacts with rolling friction, which have 6, are few
@@ -37,7 +36,7 @@ class WarpSimulations(Simulations):
         model: Model to simulate; it is copied.
         num: Number of simulations.
         fixture_bodies: Indices of the fixed bodies whose pose differs between simulations.
-        back_end: Device, and the largest number of contacts of a simulation.
+        backend: Device, and the largest number of contacts of a simulation.
 
     Attributes:
         device: Device of Warp.
@@ -51,13 +50,13 @@ class WarpSimulations(Simulations):
     """
 
     def __init__(
-        self, model: mujoco.MjModel, num: int, fixture_bodies: Indices = (), back_end: BackEnd | None = None
+        self, model: mujoco.MjModel, num: int, fixture_bodies: Indices = (), backend: Backend | None = None
     ):
         super().__init__(model, num, fixture_bodies)
-        self.back_end = back_end or BackEnd("warp")
-        self.device = choose_device(self.back_end.device)
+        self.backend = backend or Backend("warp")
+        self.device = choose_device(self.backend.device)
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # nothing reads them
-        contacts = self.back_end.contacts
+        contacts = self.backend.contacts
         with wp.ScopedDevice(self.device):
             try:
                 self.device_model = mjw.put_model(self.model, {"body_pos": num, "body_quat": num})
@@ -66,7 +65,7 @@ class WarpSimulations(Simulations):
                     f"backend=warp cannot simulate this model: {error}; backend=mujoco can"
                 ) from error
             self.device_model.opt.warn_overflow = 0  # raised instead, see _check_room
-            with room_for(num, self.back_end):
+            with room_for(num, self.backend):
                 self.device_data = mjw.make_data(
                     self.model,
                     nworld=num,
@@ -86,7 +85,7 @@ class WarpSimulations(Simulations):
 
     def record(self) -> dict[str, str]:
         versions = {name: metadata.version(name) for name in ("mujoco-warp", "warp-lang")}
-        return {"backend": self.back_end.name, "backend_device": self.device.name, **versions}
+        return {"backend": self.backend.name, "backend_device": self.device.name, **versions}
 
     def set_controller(self, name: str, control_delta: bool = True, rest: np.ndarray = REST) -> None:
         super().set_controller(name, control_delta, rest)
@@ -166,20 +165,13 @@ class WarpSimulations(Simulations):
         self._copies.forget()
 
     def _substeps(
-        self,
-        ids: np.ndarray,
-        actions: np.ndarray,
-        before_last_kinematics: KinematicsHook | None,
-        believed: Mapping[str, np.ndarray],
-        watch: Watch | None,
+        self, ids: np.ndarray, actions: np.ndarray, first: Inputs | None, watch: Watch | None
     ) -> None:
-        if before_last_kinematics is not None:
-            raise LiberoError("backend=warp takes no before_last_kinematics hook; backend=mujoco does")
         self._upload(ids, actions)
         done = 0
         with wp.ScopedDevice(self.device):
-            if believed is not self.fields:
-                self._control_on_host(ids, actions, believed)
+            if first is not None:
+                self._control_on_host(ids, actions, first)
                 self._physics()
                 done = 1
             for until in (*WATCHED, SUBSTEPS) if watch is not None else (SUBSTEPS,):
@@ -214,14 +206,10 @@ class WarpSimulations(Simulations):
             arrays.active.assign(_mask(self.num, ids))
             data.overflow.zero_()
 
-    def _control_on_host(
-        self, ids: np.ndarray, actions: np.ndarray, believed: Mapping[str, np.ndarray]
-    ) -> None:
-        """Compute the controls of a substep in which the controller believes the arm elsewhere than it is."""
+    def _control_on_host(self, ids: np.ndarray, actions: np.ndarray, inputs: Inputs) -> None:
+        """Compute the controls of a substep in which the controller takes the arm to be elsewhere than it is."""
         state, ctrl = self.controller_state, self.fields["ctrl"].copy()
-        state.controller.kernel(
-            ids, actions, *self._inputs(believed), *state.arrays, ctrl, *self._constants()
-        )
+        state.controller.kernel(ids, actions, *inputs, *state.arrays, ctrl, *self._constants)
         self.device_data.ctrl.assign(ctrl.astype(np.float32))
         self._arrays.gripper.assign(state.gripper)
 
@@ -293,7 +281,7 @@ class WarpSimulations(Simulations):
         overflow = self.device_data.overflow.numpy() & int(_FULL)
         if overflow.any():
             kinds = mjw.OverflowType(int(np.bitwise_or.reduce(overflow))).name
-            contacts = self.back_end.contacts
+            contacts = self.backend.contacts
             raise LiberoError(
                 f"backend=warp: {np.count_nonzero(overflow)} simulations have more contacts or constraints than there "
                 f"is room for ({kinds}); set backend='warp,contacts={2 * contacts}' (now {contacts})"

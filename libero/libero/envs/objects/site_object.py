@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.sim.regions import Box, contains, is_over
+from libero_env.sim.predicates import Box, contains, is_over
 
 
 class SiteObject:

@@ -1,0 +1,92 @@
+"""Backends of the physics: MuJoCo on the processor, or MuJoCo Warp with many simulations on a GPU.
+
+A backend is named in a line of text: `mujoco`, `warp`, or with settings `warp,device=cuda:1,contacts=256`.
+"""
+
+import importlib.util
+from dataclasses import dataclass
+
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.text import shown
+
+MUJOCO, WARP = BACKENDS = ("mujoco", "warp")
+DEFAULT_CONTACTS = 192  # of a simulation; scenes rest on 24 to 90, and a hand that works adds up to 60
+MOST_CONTACTS = 4096
+_SETTINGS = ("device", "contacts")
+MISSING = (
+    "backend=warp needs MuJoCo Warp, which is not installed: pip install 'libero-lifelong[warp]'; backend=mujoco runs "
+    "without it"
+)
+
+
+@dataclass(frozen=True)
+class Backend:
+    """A backend of the physics with its settings.
+
+    Attributes:
+        name: `mujoco` or `warp`.
+        device: Device of Warp, such as `cpu` or `cuda:1`; None for the first GPU, or the processor where there is none.
+        contacts: Largest number of contacts of a simulation, for which Warp allocates memory.
+    """
+
+    name: str = MUJOCO
+    device: str | None = None
+    contacts: int = DEFAULT_CONTACTS
+
+    @classmethod
+    def read(cls, value: "Backend | str") -> "Backend":
+        """Return a backend from its text.
+
+        Args:
+            value: Text such as `warp` or `warp,device=cpu,contacts=256`, or a backend.
+
+        Raises:
+            UnknownNameError: The backend or a setting does not exist.
+            InvalidInputError: A value is not valid.
+        """
+        if isinstance(value, cls):
+            return value
+        if not isinstance(value, str):
+            raise InvalidInputError(f"backend is {shown(value)}; expected a text such as mujoco or warp")
+        name, *settings = value.split(",")
+        if name not in BACKENDS:
+            raise UnknownNameError("backend", name, BACKENDS)
+        found: dict[str, str] = {}
+        for setting in settings:
+            key, _, text = setting.partition("=")
+            if key not in _SETTINGS:
+                raise UnknownNameError("setting of a backend", key, _SETTINGS)
+            found[key] = text
+        if name == MUJOCO and found:
+            raise InvalidInputError(
+                f"backend={value}: mujoco has no settings; device and contacts are warp's"
+            )
+        if found.get("device") == "":
+            raise InvalidInputError(f"backend={value}: device is a device of Warp, such as cpu or cuda:0")
+        return cls(name, found.get("device"), _contacts(found.get("contacts"), value))
+
+    def __str__(self) -> str:
+        parts = [self.name, *([f"device={self.device}"] if self.device else [])]
+        return ",".join(parts + ([f"contacts={self.contacts}"] if self.contacts != DEFAULT_CONTACTS else []))
+
+    @property
+    def is_warp(self) -> bool:
+        """Whether the physics is that of MuJoCo Warp."""
+        return self.name == WARP
+
+    def require_installed(self) -> None:
+        """Check that the packages of the backend are there.
+
+        Raises:
+            LiberoError: They are not; the message says how to install them.
+        """
+        if self.is_warp and any(importlib.util.find_spec(name) is None for name in ("warp", "mujoco_warp")):
+            raise LiberoError(MISSING)
+
+
+def _contacts(text: str | None, value: str) -> int:
+    if text is None:
+        return DEFAULT_CONTACTS
+    if not (text.isascii() and text.isdigit() and 1 <= int(text[:9]) <= MOST_CONTACTS):
+        raise InvalidInputError(f"backend={value}: contacts is a whole number from 1 to {MOST_CONTACTS}")
+    return int(text)
