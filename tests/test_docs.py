@@ -21,7 +21,7 @@ def blocks(file: str, language: str) -> list[str]:
 
 
 def test_there_is_something_to_run():
-    assert len(blocks("README.md", "python")) == 2
+    assert len(blocks("README.md", "python")) == 1
     assert len(blocks("CONTRIBUTING.md", "python")) == 2
     assert len(blocks("CONTRIBUTING.md", "yaml")) == 2
 
@@ -32,8 +32,8 @@ def test_examples_are_short(block):
 
 
 @pytest.mark.sim
-@pytest.mark.parametrize("block", blocks("README.md", "python"), ids=["single", "batch"])
-def test_the_environments_of_the_readme(block, capsys):
+@pytest.mark.parametrize("block", blocks("README.md", "python"))
+def test_the_environment_of_the_readme(block, capsys):
     exec(compile(block, "README.md", "exec"), {})  # noqa: S102
     assert "128, 128, 3)" in capsys.readouterr().out
 

@@ -30,7 +30,7 @@ class Block:
 
     Attributes:
         text: file it is in.
-        id: name by which checks and the table call it.
+        id: name by which checks call it.
         chapter: blocks of one chapter run one after the other, in one scope.
         lines: first and last line, counted from 1.
         digest: of the lines, so that a changed text is noticed.
@@ -170,17 +170,3 @@ def execute(block: Block, text: Sequence[str], scope: dict[str, Any]) -> None:
         if block.helpers:
             scope.update(getattr(completions, block.helpers)(scope))
         exec(compile(block.source(text), name, "exec"), scope)  # noqa: S102
-
-
-def table(blocks: Iterable[Block]) -> str:
-    """What runs how, in Markdown."""
-    rows = ["| block | lines | kind | runs | what is given or changed, and why |", "|---|---|---|---|---|"]
-    texts = list(dict.fromkeys(block.text for block in blocks))
-    for text in texts:
-        rows.append(f"| **{text}** | | | | |")
-        rows += [
-            f"| {b.id} | {b.lines[0]}–{b.lines[1]} | {b.kind} | {b.runs} | {' '.join(b.why.split())} |"
-            for b in sorted(blocks, key=lambda b: b.lines)
-            if b.text == text
-        ]
-    return "\n".join(rows) + "\n"
