@@ -19,9 +19,9 @@ from typing_extensions import TypedDict
 from libero_env.storage import atomic_write_text
 from libero_env.validation import validate
 from lifelong.errors import EvaluationFileError, ResultsError
-from lifelong.results.metrics import Estimate, combine_intervals, wilson_interval
 from lifelong.results.subgoals import predicate_of
 from lifelong.results.summary import json_safe
+from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"

@@ -4,7 +4,7 @@ from .evaluation.rollout import rollout
 from .evaluation.settings import EvalSettings
 from .policies.base import Policy
 from .report.page import write_report
-from .results.metrics import lifelong_metrics
+from .stats.metrics import lifelong_metrics
 from .training.fit import fit
 from .training.settings import FitSettings
 from .types import Batch, PolicySpec

@@ -9,7 +9,7 @@ from typing import get_args
 import numpy as np
 from scipy.special import ndtri
 
-from lifelong.results.curves import Curve, Transfer
+from lifelong.stats.metrics import Curve, Transfer
 
 CURVES = {
     "rises to 80 %": (0.0, 0.3, 0.5, 0.65, 0.75, 0.8),

@@ -13,16 +13,16 @@ from functools import cache
 import numpy as np
 from scipy import stats
 
-from libero_eval.judging.sequential import sequential_test
-from lifelong.results.differences import (
+from lifelong.stats.episodes import (
     Counts,
     Pairs,
     bootstrap_starts,
     mcnemar_exact,
     score_interval,
+    sequential_test,
     sign_flip_test,
 )
-from lifelong.results.intervals import holm
+from lifelong.stats.intervals import holm
 
 TASKS = 10
 

@@ -16,7 +16,7 @@ from libero.lifelong.metric import evaluate_loss, rollouts
 from libero.lifelong.run import fill_in
 from libero.lifelong.utils import control_seed, get_task_embs, latest_run, safe_device, torch_load_model
 from lifelong.errors import CheckpointError
-from lifelong.results.metrics import wilson_interval
+from lifelong.stats.intervals import wilson_interval
 
 
 def evaluate(args: argparse.Namespace) -> dict[str, Any]:

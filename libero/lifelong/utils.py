@@ -18,7 +18,7 @@ from libero._adapters.lifelong.config import Config, assign, plain
 from libero_env.storage import atomic_path
 from lifelong.errors import CheckpointError
 from lifelong.language import LanguageEncoder
-from lifelong.results.metrics import wilson_interval
+from lifelong.stats.intervals import wilson_interval
 from lifelong.training.costs import count_flops
 
 

@@ -12,7 +12,7 @@ from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
     from libero_eval.judging.comparability import Side
-    from libero_eval.judging.power import Question
+    from lifelong.stats.power import Question
 
 RESULT_HELP = "a file eval.json or its folder; NAME=RESULT names it in the tables"
 
@@ -167,7 +167,7 @@ def run_export(args: argparse.Namespace) -> None:
 
 
 def _question(args: argparse.Namespace) -> "Question":
-    from libero_eval.judging.power import Question, discordance_of
+    from lifelong.stats.power import Question, discordance_of
 
     base, gap, discordance = args.base, args.difference, args.discordance
     if args.results:
@@ -189,7 +189,7 @@ def _question(args: argparse.Namespace) -> "Question":
 def _observed(words: Sequence[str]) -> tuple[float, float, float]:
     """Return the success of the first of two results, the second's minus it, and their discordance."""
     from libero_eval.judging.comparability import match
-    from lifelong.results.differences import count
+    from lifelong.stats.episodes import count
 
     if len(words) != 2:
         raise ConfigError(f"libero power takes two results, not {len(words)}")

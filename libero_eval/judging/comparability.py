@@ -9,7 +9,7 @@ import numpy as np
 from libero_eval.evaluation_file import EvaluationResult
 from lifelong.errors import ComparisonError
 from lifelong.report.comparison import MUJOCO, check_same_back_end
-from lifelong.results.differences import Pairs
+from lifelong.stats.episodes import Pairs
 
 # What the outcome of an episode depends on by design. Other entries of the environment (renderer, processor) and
 # versions change little; a difference in them is told, and the comparison goes on.

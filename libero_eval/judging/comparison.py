@@ -21,19 +21,21 @@ from libero_eval.judging.comparability import (
     settings,
 )
 from libero_eval.judging.group_scores import GroupScores, group_scores
-from libero_eval.judging.power import Question, shown_difference
-from libero_eval.judging.sequential import ALPHA, SequentialTest, sequential_test
 from lifelong.errors import ConfigError, ResultsError
 from lifelong.report.comparison import MUJOCO
-from lifelong.results.differences import (
+from lifelong.results.summary import json_safe
+from lifelong.stats.episodes import (
+    ALPHA,
     Difference,
+    SequentialTest,
     count,
     difference,
     mcnemar_exact,
     score_interval,
+    sequential_test,
 )
-from lifelong.results.intervals import Estimate, holm, wilson_interval
-from lifelong.results.summary import json_safe
+from lifelong.stats.intervals import Estimate, holm, wilson_interval
+from lifelong.stats.power import Question, shown_difference
 
 FORMAT = "libero-comparison/1"
 
@@ -144,7 +146,7 @@ def judge(
     Raises:
         ComparisonError: The results were made differently, or have no start in common.
         ConfigError: There are fewer than two policies, or two of one name.
-        MissingPackageError: SciPy, statsmodels or rliable is not installed.
+        MissingPackageError: rliable, for several runs of a policy, is not installed.
     """
     if len(sides) < 2 and not (control and not sides):
         raise ConfigError("a comparison needs two results, or --control with two results of one policy")

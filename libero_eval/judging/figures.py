@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 
 from libero_eval.judging.comparison import Comparison, Part
 from libero_eval.judging.group_scores import Profile
-from libero_eval.judging.sequential import SequentialTest
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, hide_spines, legend_below, shorten
+from lifelong.stats.episodes import SequentialTest
 
 MOST_ROWS = 60  # of a forest plot
 

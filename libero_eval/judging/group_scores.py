@@ -14,7 +14,7 @@ from itertools import combinations
 import numpy as np
 
 from lifelong.errors import require_package
-from lifelong.results.metrics import Estimate, Floats
+from lifelong.stats.intervals import Estimate, Floats
 
 DRAWS = 2000
 SEED = 2023

@@ -3,14 +3,14 @@
 import math
 from dataclasses import replace
 
-from libero_eval.judging.power import (
+from lifelong.errors import ConfigError
+from lifelong.stats.power import (
     Question,
     paired_episodes,
     sequential_stopping,
     shown_difference,
     unpaired_episodes,
 )
-from lifelong.errors import ConfigError
 
 DIFFERENCES = (0.01, 0.02, 0.03, 0.05, 0.10)
 DISCORDANCES = (0.05, 0.10, 0.20)

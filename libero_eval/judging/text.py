@@ -4,8 +4,8 @@ import math
 from collections.abc import Sequence
 
 from libero_eval.judging.comparison import Comparison, Judgement, Part
-from lifelong.results.differences import Difference
-from lifelong.results.metrics import Estimate
+from lifelong.stats.episodes import Difference
+from lifelong.stats.intervals import Estimate
 
 WORST = 5  # tasks in the table of a terminal
 

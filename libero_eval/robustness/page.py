@@ -15,8 +15,8 @@ from libero_eval.robustness.results import Axis, Interaction, Outcomes, name_of
 from lifelong.errors import ResultsError
 from lifelong.report.figures import as_svg
 from lifelong.report.templates import page_template
-from lifelong.results.intervals import Estimate, holm
 from lifelong.results.summary import json_safe
+from lifelong.stats.intervals import Estimate, holm
 
 ALPHA = 0.05  # of the kinds together
 

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from libero_eval.evaluation_file import EvaluationResult
 from lifelong.errors import ResultsError
-from lifelong.results.components import ONE_EPISODE
-from lifelong.results.curves import Floats
-from lifelong.results.intervals import Estimate, combine_intervals, wilson_interval
+from lifelong.stats.intervals import Estimate, Floats, combine_intervals, wilson_interval
 
 DRAWS, SEED, CONFIDENCE = 2000, 2023, 0.95
+ONE_EPISODE = 0.96  # z²/4 at 95 %: the variance that Wilson's interval adds, in units of one episode
 Condition = tuple[tuple[str, float], ...]  # (kind, severity) of each perturbation, by kind; () is the base
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from libero_env.tasks.published import parse_plus_id
 from libero_eval.evaluation_file import TaskResult, overall
 from libero_eval.work.folder import UnitResult
-from lifelong.results.metrics import Estimate
+from lifelong.stats.intervals import Estimate
 
 PLUS = "libero_plus_"  # beginning of the names of suites of LIBERO-Plus
 RECENT = 50  # units from which the speed is taken

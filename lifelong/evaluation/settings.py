@@ -12,7 +12,7 @@ from libero_env.validation import validate_arguments
 from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
 from lifelong.results.coverage import MatrixCells, measured_tasks
-from lifelong.results.curves import Transfer
+from lifelong.stats.metrics import Transfer
 from lifelong.types import Count, Natural
 
 
@@ -94,7 +94,7 @@ class EvalSettings:
 
     @property
     def transfer_estimate(self) -> Transfer:
-        """Estimate of forward transfer by its name in `lifelong.results.curves`."""
+        """Estimate of forward transfer by its name in `lifelong.stats.metrics`."""
         if self.transfer == "published":
             return "published"
         return "plain" if self.select == "last" else "cross_fitted"

@@ -1,11 +1,11 @@
 """Comparison of groups of runs: means over seeds, intervals, differences, forgetting by task, costs.
 
-The number after ± is the standard error over seeds; intervals and tests are those of `lifelong.report.statistics`.
+The number after ± is the standard error over seeds; intervals and tests are those of `lifelong.stats.methods`.
 """
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,64 +14,130 @@ import numpy as np
 from libero_env.storage import atomic_write_text
 from lifelong.errors import ComparisonError
 from lifelong.report.runs import Group, Run, other_demonstrations
-from lifelong.report.statistics import statistics
-from lifelong.results.metrics import METRIC_NAMES, mean_and_standard_error
-from lifelong.results.results import has_later_tasks
-from lifelong.results.samples import Member, metric_values
 from lifelong.results.summary import json_safe
+from lifelong.stats.intervals import mean_and_standard_error
+from lifelong.stats.methods import MARGIN, MethodRun, statistics
+from lifelong.stats.metrics import METRIC_NAMES, metric_values
 
 MUJOCO = "mujoco"  # back end of results that name none
 
 
-def compare(groups: Sequence[Group]) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Plan:
+    """Which pairs of methods are compared, as it was decided before their results were seen.
+
+    Attributes:
+        references: Labels of the methods that each other one is compared with.
+        all_pairs: Whether every method is compared with every other instead.
+        margin: Difference in success from which on two methods are not equivalent.
+    """
+
+    references: tuple[str, ...] = ()
+    all_pairs: bool = False
+    margin: float = MARGIN
+
+
+def compare(groups: Sequence[Group], plan: Plan | None = None) -> dict[str, Any]:
     """Compute all statistics of the groups, as plain data with NaN where something is unknown.
 
     Args:
         groups: Groups of runs that differ in seed and order only. Runs without a learned task are ignored.
+        plan: Pairs to be compared; None for the default one. Two groups are compared in any case.
 
     Returns:
         `groups`: by label, with `runs`, `seeds`, `orders`, `metrics` (mean, standard_error, low, high, the value of
-        each seed or order, standard deviations between these and of the starts), `published` (FWT and AUC of eq. 3 as
-        written), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`. `differences`: of each pair, the
-        first minus the second, with its interval, its p-value, that adjusted for all pairs (`significant` if below
-        0.05), the number of `seeds` needed to show it, and the difference `detectable` with the present ones.
-        `statistics`: how they were computed. `after_base_stage`: `metrics` by label and `differences` over the later
-        tasks alone, as if the sequence began with them, of the methods whose runs all learned a task after a base
-        stage; None if there are none. `backend`: what simulated all rollouts. `other_demonstrations`: sentences about
-        runs that learned from other demonstrations than the rest.
+        each seed or order), `published` (FWT and AUC of eq. 3 as written), `forgetting_by_task` (NBT by task name),
+        `subgoals` and `costs`. `differences` and `statistics`: see `lifelong.stats.methods.statistics`.
+        `after_base_stage`: `metrics` by label and `differences` over the later tasks alone, as if the sequence began
+        with them, of the methods whose runs all learned a task after a base stage; None if there are none. `backend`:
+        what simulated all rollouts. `other_demonstrations`: sentences about runs that learned from other demonstrations
+        than the rest.
 
     Raises:
-        ComparisonError: The runs are of different back ends.
+        ComparisonError: The runs are of different back ends, or a reference is not a method.
     """
+    plan = plan or Plan()
     measured = {g.label: [r for r in g.runs if r.metrics is not None] for g in groups}
     check_same_back_end(
         {f"{g.label} ({r.path})": r.record.backend for g in groups for r in measured[g.label]}
     )
-    found = statistics({label: members_of(runs) for label, runs in measured.items() if runs})
+    found = _statistics({label: runs_of(runs) for label, runs in measured.items() if runs}, plan)
+    later = {
+        label: [replace(m, scores=m.scores.without_first()) for m in runs_of(runs)]
+        for label, runs in measured.items()
+        if runs and all(r.results.has_later_tasks() for r in runs)
+    }
+    plan_later = replace(plan, references=tuple(r for r in plan.references if r in later))
     return {
         "backend": next((r.record.backend for runs in measured.values() for r in runs), MUJOCO),
         "groups": {g.label: _group(g, measured[g.label], found["metrics"].get(g.label)) for g in groups},
         "differences": found["differences"],
         "statistics": found["statistics"],
-        "after_base_stage": _after_base_stage(measured),
+        "after_base_stage": _statistics(later, plan_later) if later else None,
         "other_demonstrations": other_demonstrations(groups),
     }
 
 
-def _after_base_stage(measured: Mapping[str, Sequence[Run]]) -> dict[str, Any] | None:
-    """Return metrics and differences over the later tasks alone, of the methods that learned some; None without any."""
-    later = {
-        label: [replace(m, scores=m.scores.without_first()) for m in members_of(runs)]
-        for label, runs in measured.items()
-        if runs and all(has_later_tasks(r.results) for r in runs)
-    }
-    found = statistics(later) if later else {}
-    return {name: found[name] for name in ("metrics", "differences")} if found else None
+def _statistics(methods: Mapping[str, Sequence[MethodRun]], plan: Plan) -> dict[str, Any]:
+    try:
+        return statistics(methods, plan.references, all_pairs=plan.all_pairs, margin=plan.margin)
+    except ValueError as error:
+        raise ComparisonError(str(error)) from error
 
 
-def members_of(runs: Sequence[Run]) -> list[Member]:
+def runs_of(runs: Sequence[Run]) -> list[MethodRun]:
     """Return runs as what the statistics take."""
-    return [Member(r.results.scores(), r.record.seed, r.record.tasks) for r in runs]
+    return [MethodRun(r.results.scores(), r.record.seed, r.record.tasks) for r in runs]
+
+
+def findings(found: Mapping[str, Any], names: Mapping[str, str], most: int = 12) -> list[str]:
+    """Return in sentences which of the compared pairs differ, which are equivalent, and which are left open.
+
+    Args:
+        found: Result of `lifelong.stats.methods.statistics`, or of `compare`.
+        names: Metrics to name, and how.
+        most: Number of pairs that are named of each kind; of further ones, their number.
+    """
+    pairs, lines = found["differences"], []
+    if not pairs and len(found.get("groups") or found["metrics"]) > 2:
+        return [
+            "No difference is tested: name the method to compare the others with (--reference), or --all-pairs."
+        ]
+    margin = found["statistics"]["margin"]
+    for metric, name in names.items():
+        rows = [(f"{d['of']} − {d['less']}", d["metrics"][metric]) for d in pairs]
+        rows = [(pair, m) for pair, m in rows if _known(m["value"])]
+        tested = sorted(((p, m) for p, m in rows if _known(m["p_value"])), key=lambda row: row[1]["p_value"])
+        kinds = {
+            "Different": [_named(p, m) for p, m in tested if m["significant"]],
+            f"Equivalent within ±{100 * margin:g} points": [p for p, m in tested if m["equivalent"]],
+            "Open": [
+                _named(p, m, m["seeds"]) for p, m in tested if not m["significant"] and not m["equivalent"]
+            ],
+            "Not tested (fewer than three seeds, or no spread between them)": [
+                _named(p, m) for p, m in rows if not _known(m["p_value"])
+            ],
+        }
+        texts = [f"{kind}: {_list(of_kind, most)}." for kind, of_kind in kinds.items() if of_kind]
+        lines += [f"{name}. {' '.join(texts)}"] if texts else []
+    return lines
+
+
+def _list(names: Sequence[str], most: int) -> str:
+    return ", ".join(names[:most]) + (f", and {len(names) - most} more" if len(names) > most else "")
+
+
+def _named(pair: str, m: Mapping[str, Any], seeds: int | None = None) -> str:
+    """Return a pair with its difference in percentage points, its interval, and how many seeds would show it."""
+    text = f"{100 * m['value']:+.1f}"
+    if _known(m["low"]):
+        text += f" [{100 * m['low']:.1f}, {100 * m['high']:.1f}]"
+    return f"{pair} ({text.replace('-', '−')}{f'; {seeds} seeds needed' if seeds else ''})"
+
+
+def _known(value: float | None) -> bool:
+    """Return whether a number is known; JSON has null where it is not."""
+    return value is not None and bool(np.isfinite(value))
 
 
 def write_comparison(found: Mapping[str, Any], path: Path) -> None:
@@ -95,10 +161,7 @@ def _group(group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None)
     }
 
 
-_UNKNOWN = {
-    **dict.fromkeys(("mean", "standard_error", "low", "high", "sd_of_runs", "sd_of_starts"), float("nan")),
-    "values": [],
-}
+_UNKNOWN = {**dict.fromkeys(("mean", "standard_error", "low", "high"), float("nan")), "values": []}
 
 
 def _published(runs: Sequence[Run]) -> dict[str, float]:

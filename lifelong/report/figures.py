@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from lifelong.results.metrics import Curve, mean_and_standard_error, wilson_interval
+from lifelong.stats.intervals import mean_and_standard_error, wilson_interval
+from lifelong.stats.metrics import Curve
 
 # Okabe and Ito's colours, distinguishable for colour-blind readers, without yellow, which is too light on white
 LINE_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7F7F7F")

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from lifelong.report.figures import cell_colours
-from lifelong.results.metrics import mean_and_standard_error, wilson_interval
 from lifelong.results.results import Results
+from lifelong.stats.intervals import mean_and_standard_error, wilson_interval
 
 
 def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from libero_env.storage import atomic_write_text
 from lifelong.errors import LifelongError
-from lifelong.report.comparison import MUJOCO, compare, write_comparison
+from lifelong.report.comparison import MUJOCO, Plan, compare, findings, write_comparison
 from lifelong.report.figures import (
     Line,
     Panel,
@@ -23,7 +23,6 @@ from lifelong.report.figures import (
 )
 from lifelong.report.heat_table import mean_heatmap, run_heatmap
 from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
-from lifelong.report.statistics import findings
 from lifelong.report.tables import (
     atom_rows,
     cost_table,
@@ -35,12 +34,11 @@ from lifelong.report.tables import (
 )
 from lifelong.report.templates import page_template, percent
 from lifelong.results.episode_table import write_episodes
-from lifelong.results.metrics import METRIC_NAMES, Metrics, average_success
 from lifelong.results.records import RunRecord
 from lifelong.results.relearning import by_measure, read_relearning, savings_heads, savings_rows
-from lifelong.results.results import after_base_stage
-from lifelong.results.samples import metric_values
 from lifelong.results.shifts import shift_scores
+from lifelong.stats.methods import MARGIN
+from lifelong.stats.metrics import METRIC_NAMES, Metrics, average_success, metric_values
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -64,13 +62,23 @@ MEDIA_TYPES = {
 MEDIA_LIMIT = 48 * 2**20  # [bytes] of rollout recordings in one page
 
 
-def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
+def write_report(
+    run_dirs: Sequence[Path],
+    out: Path | None = None,
+    *,
+    references: Sequence[str] = (),
+    all_pairs: bool = False,
+    margin: float = MARGIN,
+) -> Path:
     """Write report.html and heatmap.png, .pdf; of several runs also forgetting.png, comparison.json, episodes.csv.gz.
 
     Args:
         run_dirs: Directory of one run to describe, or of several to compare. Runs need not be finished.
         out: File of the page, or a folder for it. Default: the run directory; for several runs, `comparison` in the
             current folder, which git ignores.
+        references: Labels of the methods that each other one is compared with; two methods are compared in any case.
+        all_pairs: Whether every method is compared with every other instead.
+        margin: Difference in success from which on two methods are not equivalent.
 
     Returns:
         Path of the page. It needs no other file and no network.
@@ -78,6 +86,7 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
     Raises:
         LifelongError: No run is given, a run directory has no results, or `out` cannot be written.
     """
+    plan = Plan(tuple(references), all_pairs, margin)
     if not run_dirs:
         raise LifelongError("no run directory given; name one or more, such as runs/libero_object/er/seed1")
     runs = [load_run(Path(d)) for d in run_dirs]
@@ -86,7 +95,7 @@ def write_report(run_dirs: Sequence[Path], out: Path | None = None) -> Path:
         if out.is_dir() or out.suffix == "":
             out = out / "report.html"
         out.parent.mkdir(parents=True, exist_ok=True)
-        context = _single_run(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent)
+        context = _single_run(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent, plan)
         page = page_template("page.html").render(**context, metric_texts=METRIC_TEXTS)
         atomic_write_text(out, page)
     except OSError as error:
@@ -140,11 +149,12 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "facts": _facts(run),
         "notes": run.notes,
         "metrics": _metric_rows(run.metrics),
-        "later_metrics": _metric_rows(after_base_stage(run.results)),
+        "later_metrics": _metric_rows(run.results.after_base_stage()),
         "base_tasks": _base_tasks(record),
         "transfer": TRANSFER_TEXTS[run.results.transfer],
         "published": _published(run),
-        "bar_low": min([0.0, *(row["estimate"].low for row in _metric_rows(run.metrics))]),
+        "ring": run.results.transfer != "plain",
+        "bar_low": min(0.0, run.metrics.nbt.value) if run.metrics else 0.0,
         "heatmaps": [run_heatmap(run.results, labels)],
         "learning": as_svg(learning_figure(curves, losses, labels)) if curves or losses else None,
         "forgetting": as_svg(forgetting_figure([Line("", average)])) if run.learned > 1 else None,
@@ -168,10 +178,10 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
     }
 
 
-def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
+def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]:
     """Return the template's variables for several runs, and write figures and numbers beside the page."""
     groups = group_runs(runs)
-    found = compare(groups)
+    found = compare(groups, plan)
     later = found["after_base_stage"]
     write_comparison(found, folder / "comparison.json")
     write_episodes(folder / "episodes.csv.gz", [(g.label, run.results) for g in groups for run in g.runs])
@@ -202,6 +212,7 @@ def _comparison(runs: Sequence[Run], folder: Path) -> dict[str, Any]:
         "differences": found["differences"],
         "later_differences": later["differences"] if later else [],
         "findings": _findings(found),
+        "margin": plan.margin,
         "later_findings": _findings(later),
         "published": _published_of(found),
         "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[r.results.transfer] for r in runs)),

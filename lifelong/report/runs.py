@@ -12,9 +12,9 @@ import yaml
 from lifelong.errors import LifelongError, ResultsError
 from lifelong.results.conditions import few_of, resume_notes
 from lifelong.results.log import ResultLog
-from lifelong.results.metrics import Metrics, lifelong_metrics
 from lifelong.results.records import RunRecord
 from lifelong.results.results import Results
+from lifelong.stats.metrics import Metrics, lifelong_metrics
 
 _BASICS = ("algo", "benchmark", "policy", "preset")
 # sections of the config

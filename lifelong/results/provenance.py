@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from lifelong.results.coverage import MatrixCells
-from lifelong.results.curves import Transfer
 from lifelong.results.records import RunRecord
 from lifelong.results.run_directory import config_digest
+from lifelong.stats.metrics import Transfer
 
 VERSIONED_PACKAGES = (
     "libero-lifelong",
@@ -41,7 +41,7 @@ def start_record(
     group_sizes: Sequence[int] = (),
     conditions: Mapping[str, str] | None = None,
     cells: MatrixCells = "all",
-    transfer: Transfer | Literal[""] = "",
+    transfer: Transfer = "cross_fitted",
     perturbed: Sequence[str] = (),
     backend: str = "mujoco",
 ) -> RunRecord:
@@ -59,7 +59,7 @@ def start_record(
         group_sizes: Number of tasks in each group that is one step of the sequence; () for one at a time.
         conditions: What decides the bits of its results, see `lifelong.results.conditions`.
         cells: Cells of the success matrix that are measured.
-        transfer: Estimate of forward transfer, see `lifelong.results.curves`.
+        transfer: Estimate of forward transfer, see `lifelong.stats.metrics`.
         perturbed: Perturbations under which each task is learned and evaluated, as text; () for none at all.
         backend: Name of the back end of rollouts.
     """

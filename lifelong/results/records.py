@@ -13,7 +13,7 @@ from pydantic import Field, WrapValidator
 from libero_env.errors import InvalidInputError
 from libero_env.validation import validate
 from lifelong.results.coverage import MatrixCells
-from lifelong.results.curves import Transfer
+from lifelong.stats.metrics import Transfer
 
 _CHECKSUM = "crc32"
 
@@ -44,10 +44,10 @@ class RunRecord:
     cells: MatrixCells = "all"  # of the success matrix, which are measured
     # of each group, where they are not all of group_size
     group_sizes: tuple[Annotated[int, Field(ge=1)], ...] = ()
-    transfer: Transfer | Literal[""] = ""  # estimate of forward transfer; older records do not say
+    transfer: Transfer = "cross_fitted"  # estimate of forward transfer, see `lifelong.stats.metrics`
     # perturbations of each task, in learning and evaluation; () for none at all
     perturbed: tuple[str, ...] = ()
-    backend: str = "mujoco"  # of the rollouts: mujoco or warp; older records have none and are of mujoco
+    backend: str = "mujoco"  # of the rollouts: mujoco or warp
 
     def __post_init__(self) -> None:
         if not len(self.tasks) == len(self.instructions) > 0:

@@ -3,8 +3,9 @@
 `lifelong.results.log.ResultLog` reads and appends the records. Tasks are positions in the sequence.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -12,8 +13,6 @@ from numpy.typing import NDArray
 
 from lifelong.errors import ResultsError
 from lifelong.results.coverage import measured_tasks
-from lifelong.results.curves import Curve, Transfer, mean_curve
-from lifelong.results.metrics import Metrics, lifelong_metrics
 from lifelong.results.records import (
     CostRecord,
     DemonstrationsRecord,
@@ -25,9 +24,10 @@ from lifelong.results.records import (
     RunRecord,
     TaskEndRecord,
 )
-from lifelong.results.repeats import repeated_rows
-from lifelong.results.scores import Cell, Scores
 from lifelong.results.subgoals import Subgoals, subgoals
+from lifelong.stats.metrics import Curve, Metrics, Scores, Transfer, lifelong_metrics, mean_curve
+
+Diagonal = Literal["matrix", "curve"]
 
 
 @dataclass(frozen=True)
@@ -46,18 +46,18 @@ class Results:
         """Return the records of one class, in the order they were written."""
         return [r for r in self.records if isinstance(r, kind)]
 
-    @property
+    @cached_property
     def run(self) -> RunRecord:
         """Record that names the run.
 
         Raises:
             ResultsError: There is none.
         """
-        runs = self.of(RunRecord)
-        if not runs:
-            found = self.problems[0] if self.problems else "the run was stopped before it began"
-            raise ResultsError(f"the results have no 'run' record: {found}. Give the run's command again")
-        return runs[0]
+        first = next((r for r in self.records if isinstance(r, RunRecord)), None)
+        if first is None:
+            reason = self.problems[0] if self.problems else "the run was stopped before it began"
+            raise ResultsError(f"the results have no 'run' record: {reason}. Give the run's command again")
+        return first
 
     @property
     def finished(self) -> bool:
@@ -67,20 +67,16 @@ class Results:
     @property
     def demonstrations(self) -> DemonstrationsRecord | None:
         """What the tasks are learned from, after the last resume; None where it is not recorded."""
-        found = self.of(DemonstrationsRecord)
-        return found[-1] if found else None
+        recorded = self.of(DemonstrationsRecord)
+        return recorded[-1] if recorded else None
 
     def evaluation(
         self, phase: str, learned: int, task: int, epoch: int | None = None, *, shift: str = ""
     ) -> EvalRecord | None:
         """Return the evaluation with this key, of any epoch if none is given; None if it is not recorded."""
         key = (phase, learned, task, shift)
-        found = [
-            r
-            for r in self.of(EvalRecord)
-            if (r.phase, r.learned, r.task, r.shift) == key and epoch in (None, r.epoch)
-        ]
-        return found[-1] if found else None
+        same = (r for r in reversed(self.of(EvalRecord)) if (r.phase, r.learned, r.task, r.shift) == key)
+        return next((r for r in same if epoch in (None, r.epoch)), None)
 
     def original(self, decided_by: str) -> EvalRecord | None:
         """Return the rollouts that were run under the same digest of all they depend on; None without any."""
@@ -89,17 +85,13 @@ class Results:
 
     def episodes(self) -> tuple[int, int]:
         """Return the numbers of episodes that were run, and that were copied from those they would have repeated."""
-        count = {
-            copied: sum(len(r.successes) for r in self.of(EvalRecord) if (r.same_as is not None) == copied)
-            for copied in (False, True)
-        }
-        return count[False], count[True]
+        counts = [(r.same_as is not None, len(r.successes)) for r in self.of(EvalRecord)]
+        return sum(n for copied, n in counts if not copied), sum(n for copied, n in counts if copied)
 
     def evaluations(self) -> list[EvalRecord]:
         """Return every evaluation of curves and matrix once, in the order of the run: the episodes behind metrics."""
-        measured = [r for r in self.of(EvalRecord) if r.phase != "shift"]
-        found = {(r.learned, r.phase, r.epoch, r.task): r for r in measured}
-        return [found[key] for key in sorted(found, key=lambda k: (k[0], k[1], k[2], k[3]))]
+        last = {(r.learned, r.phase, r.epoch, r.task): r for r in self.of(EvalRecord) if r.phase != "shift"}
+        return [last[key] for key in sorted(last)]
 
     def has_loss(self, task: int, epoch: int) -> bool:
         """Return whether the loss of this epoch is recorded."""
@@ -116,30 +108,37 @@ class Results:
     def learned_tasks(self) -> int:
         """Count the tasks, from the first, with a complete row in the matrix; all count if the last row is complete."""
         rates, _ = self.success_matrix()
-        groups = self.run.groups
-        full = [self._is_complete(rates[group[-1]], group) for group in groups]
-        return groups[full.index(False)].start if False in full and not full[-1] else len(rates)
 
-    def _is_complete(self, rates: NDArray[np.float64], stage: range) -> bool:
-        """Return whether a row of the matrix has all cells that the run measures; without any, whether it has ended."""
-        columns = measured_tasks(self.run.cells, stage, len(self.run.tasks))
-        return bool(np.isfinite(rates[columns]).all()) if columns else self.task_end(stage[-1]) is not None
+        def is_complete(group: range) -> bool:  # without cells to be measured: whether it has ended
+            columns = measured_tasks(self.run.cells, group, len(rates))
+            row = rates[group[-1], columns]
+            return bool(np.isfinite(row).all()) if columns else self.task_end(group[-1]) is not None
+
+        complete = [is_complete(group) for group in self.run.groups]
+        return len(rates) if complete[-1] else self.run.groups[complete.index(False)].start
 
     def curves(self) -> dict[int, Curve]:
         """Return the learning curve of each task that has one."""
-        names = self.run.tasks
-        return {
-            task: _curve([by_epoch[e] for e in sorted(by_epoch)], names[task])
-            for task, by_epoch in self._curve_points().items()
-        }
+        return {task: _curve(r for _, r in sorted(p.items())) for task, p in self._curve_points.items()}
 
+    @cached_property
     def _curve_points(self) -> dict[int, dict[int, EvalRecord]]:
-        """Return the evaluations of each learning curve by task and epoch."""
+        """Evaluations of each learning curve by task and epoch."""
         points: dict[int, dict[int, EvalRecord]] = {}
         for r in self.of(EvalRecord):
             if r.phase == "curve" and r.learned == self.last_of_group(r.task):
                 points.setdefault(r.task, {})[r.epoch] = r
         return points
+
+    @cached_property
+    def _group_curves(self) -> dict[int, Curve]:
+        """Each group's learning curve by its last task, at the epochs where all its tasks were evaluated."""
+        curves = self.curves()
+        return {
+            group[-1]: mean_curve([curves[task] for task in group])
+            for group in self.run.groups
+            if all(task in curves for task in group)
+        }
 
     def losses(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Return the epochs and mean training losses of each task."""
@@ -151,24 +150,8 @@ class Results:
             for task, p in points.items()
         }
 
-    def success_matrix(
-        self, diagonal: Literal["matrix", "curve"] = "matrix"
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def success_matrix(self, diagonal: Diagonal = "matrix") -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return success rates c[i,j] (K, K), NaN where not evaluated, and their numbers of episodes (K, K).
-
-        Args:
-            diagonal: Source of c[i,i], see `matrix_evaluations`.
-        """
-        size = len(self.run.tasks)
-        rates, episodes = np.full((size, size), np.nan), np.zeros((size, size), dtype=np.int64)
-        for cell, record in self.matrix_evaluations(diagonal).items():
-            rates[cell], episodes[cell] = record.rate, len(record.successes)
-        return rates, episodes
-
-    def matrix_evaluations(
-        self, diagonal: Literal["matrix", "curve"] = "matrix"
-    ) -> dict[tuple[int, int], EvalRecord]:
-        """Return the evaluation behind every c[i,j], by (i, j).
 
         Args:
             diagonal: Source of c[i,i]. "matrix": the evaluation after learning task i, like the rest of its
@@ -176,88 +159,50 @@ class Results:
                 the learning curve where there is none, in a run that measures all cells. "curve": always the latter,
                 c[i,i] = max over e of c[i,i,e], as eq. 3 is written.
         """
+        return self._matrices[diagonal]
+
+    @cached_property
+    def _matrices(self) -> dict[Diagonal, tuple[NDArray[np.float64], NDArray[np.int64]]]:
         size = len(self.run.tasks)
-        found = {
+        cells = {
             (r.learned, r.task): r
             for r in self.of(EvalRecord)
             if r.phase == "matrix" and r.task <= r.learned < size
         }
-        points = self._curve_points()
-        curves = self._group_curves(self.curves())
-        best = {last: int(curve.epochs[curve.best]) for last, curve in curves.items()}
-        for task, by_epoch in points.items():
-            row = self.last_of_group(task)
-            measured = (row, task) in found
+        best: dict[tuple[int, int], EvalRecord] = {}  # of the curves of tasks that are learned
+        for group in self.run.groups:
+            row, curve = group[-1], self._group_curves.get(group[-1])
             ended = self.task_end(row) is not None and self.run.cells == "all"
-            if row in best and ((diagonal == "curve" and measured) or (not measured and ended)):
-                found[row, task] = by_epoch[best[row]]
-        return found
+            for task in group if curve is not None else ():
+                if (row, task) in cells or ended:
+                    best[row, task] = self._curve_points[task][int(curve.epochs[curve.best])]
+        return {"matrix": _matrix(size, best | cells), "curve": _matrix(size, cells | best)}
 
     @property
     def transfer(self) -> Transfer:
-        """Estimate of forward transfer: the run's own; for runs that do not say, by which weights they kept."""
-        if self.run.transfer:
-            return self.run.transfer
-        kept = {r.task: r.best_epoch for r in self.of(TaskEndRecord)}
-        curves = {last: c for last, c in self._group_curves(self.curves()).items() if last in kept}
-        last = all(kept[task] == curve.epochs[-1] for task, curve in curves.items())
-        chosen = all(kept[task] == curve.epochs[curve.best] for task, curve in curves.items())
-        return "plain" if last and not chosen else "cross_fitted"
+        """Estimate of forward transfer."""
+        return self.run.transfer
 
-    def scores(
-        self, diagonal: Literal["matrix", "curve"] = "matrix", transfer: Transfer | None = None
-    ) -> Scores:
+    def scores(self, diagonal: Diagonal = "matrix", transfer: Transfer | None = None) -> Scores:
         """Return the input of the metrics, with the tasks learned so far as the whole sequence.
 
         A group of tasks that were learned together counts as one task; its success is the mean over its tasks.
 
         Args:
-            diagonal: Source of c[i,i], see `matrix_evaluations`.
+            diagonal: Source of c[i,i], see `success_matrix`.
             transfer: Estimate of forward transfer; None for the run's own.
         """
         size = self.learned_tasks()
         groups = [g for g in self.run.groups if g.stop <= size]
         rates, episodes = self.success_matrix(diagonal)
-        curves, empty = self._group_curves(self.curves()), _curve([], "")
         rows = [g[-1] for g in groups]
         return Scores(
-            tuple(curves.get(row, empty) for row in rows),
+            tuple(self._group_curves.get(row, _curve(())) for row in rows),
             np.stack([rates[rows, g.start : g.stop].mean(1) for g in groups], axis=1),
             np.stack([episodes[rows, g.start : g.stop].sum(1) for g in groups], axis=1),
             tuple(map(len, groups)),
-            self._cells(diagonal, groups),
             transfer or self.transfer,
         )
-
-    def _cells(self, diagonal: Literal["matrix", "curve"], groups: Sequence[range]) -> tuple[Cell, ...]:
-        """Return the episodes of the matrix; rollouts are repeated where outcomes and lengths are."""
-        names, row_of = self.run.tasks, {g[-1]: number for number, g in enumerate(groups)}
-        column_of = {task: number for number, g in enumerate(groups) for task in g}
-        used = {
-            (row, task): record
-            for (row, task), record in sorted(self.matrix_evaluations(diagonal).items())
-            if row in row_of and task in column_of
-        }
-        same = repeated_rows(used)
-        return tuple(
-            Cell(
-                row=row_of[row],
-                column=column_of[task],
-                task=names[task],
-                starts=np.array(record.init_states, dtype=np.int64),
-                successes=np.array(record.successes, dtype=bool),
-                same_as=row_of[same[row, task]],
-            )
-            for (row, task), record in used.items()
-        )
-
-    def _group_curves(self, curves: Mapping[int, Curve]) -> dict[int, Curve]:
-        """Return each group's learning curve by its last task, at the epochs where all its tasks were evaluated."""
-        groups: dict[int, list[Curve]] = {}
-        for task, curve in sorted(curves.items()):
-            groups.setdefault(self.last_of_group(task), []).append(curve)
-        sizes = {group[-1]: len(group) for group in self.run.groups}
-        return {last: mean_curve(found) for last, found in groups.items() if len(found) == sizes[last]}
 
     def costs(self, task: int) -> dict[str, float]:
         """Return the costs of learning a task, by the names of `lifelong.training.costs`; empty if not recorded."""
@@ -282,37 +227,36 @@ class Results:
         times["training"] = sum(r.seconds for r in self.of(LossRecord))
         times["evaluation"] = sum(r.seconds for r in self.of(EvalRecord))
         between = sum(r.costs.get("end_task_seconds", 0.0) for r in self.of(CostRecord))
-        if between:
-            times["between tasks"] = between
-        return times
+        return times | ({"between tasks": between} if between else {})
+
+    def has_later_tasks(self) -> bool:
+        """Return whether the run has a base stage, and has learned a task after it."""
+        return self.run.has_base_stage and self.learned_tasks() > len(self.run.groups[0])
+
+    def after_base_stage(self) -> Metrics | None:
+        """Compute the metrics over the tasks after the base stage, as if the sequence began with them.
+
+        None if the run has no base stage, or no later task is learned.
+        """
+        return lifelong_metrics(self.scores().without_first()) if self.has_later_tasks() else None
 
 
-def after_base_stage(results: Results) -> Metrics | None:
-    """Compute the metrics over the tasks after the base stage, as if the sequence began with them.
-
-    Args:
-        results: Records of a run.
-
-    Returns:
-        The metrics; None if the run has no base stage, or no later task is learned.
-    """
-    return lifelong_metrics(results.scores().without_first()) if has_later_tasks(results) else None
+def _matrix(
+    size: int, cells: dict[tuple[int, int], EvalRecord]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    rates, episodes = np.full((size, size), np.nan), np.zeros((size, size), dtype=np.int64)
+    for cell, record in cells.items():
+        rates[cell], episodes[cell] = record.rate, len(record.successes)
+    return rates, episodes
 
 
-def has_later_tasks(results: Results) -> bool:
-    """Return whether a run has a base stage, and has learned a task after it."""
-    run = results.run
-    return run.has_base_stage and results.learned_tasks() > len(run.groups[0])
-
-
-def _curve(records: list[EvalRecord], task: str) -> Curve:
+def _curve(evaluations: Iterable[EvalRecord]) -> Curve:
     """Return a learning curve; if points have other starts than the first, episodes correspond by their number."""
+    records = list(evaluations)
     count = min((len(r.successes) for r in records), default=0)
     return Curve(
         np.array([r.epoch for r in records], dtype=np.int64),
         np.array([r.rate for r in records], dtype=float),
         np.array([len(r.successes) for r in records], dtype=np.int64),
         np.array([r.successes[:count] for r in records], dtype=float)[..., None] if records else None,
-        np.array(records[0].init_states[:count], dtype=np.int64) if records else None,
-        (task,) if records else (),
     )

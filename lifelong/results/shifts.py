@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lifelong.results.intervals import UNKNOWN, Estimate, combine_intervals, wilson_interval
 from lifelong.results.records import EvalRecord
 from lifelong.results.results import Results
+from lifelong.stats.intervals import UNKNOWN, Estimate, combine_intervals, wilson_interval
 
 Cell = EvalRecord | None
 

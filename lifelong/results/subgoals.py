@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from lifelong.results.metrics import Estimate, combine_intervals, wilson_interval
 from lifelong.results.records import EvalRecord
+from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ import numpy as np
 from libero_env.storage import atomic_write_text
 from lifelong.errors import ResultsError
 from lifelong.results.conditions import resume_notes
-from lifelong.results.metrics import METRIC_NAMES, Metrics, lifelong_metrics, wilson_interval
 from lifelong.results.records import DemonstrationsRecord, RunRecord, TaskEndRecord
-from lifelong.results.results import Results, after_base_stage
-from lifelong.results.scores import Scores
+from lifelong.results.results import Results
 from lifelong.results.shifts import shift_summary
+from lifelong.stats.intervals import wilson_interval
+from lifelong.stats.metrics import METRIC_NAMES, Metrics, Scores, lifelong_metrics
 
 # Grows when the same records give other metrics. 2: intervals of clusters, forward transfer without a held maximum.
 STATISTICS = 2
@@ -63,7 +63,7 @@ def summarize(results: Results) -> dict[str, Any]:
         "tasks_learned": size,
         "statistics": {
             "version": STATISTICS,
-            "interval": "of this run's starts, 95 %",
+            "interval": "Wilson's over the episodes, 95 %; none for FWT, NBT and AUC",
             "transfer": results.transfer,
         },
         "metrics": _metrics(results.scores()) if size else None,
@@ -112,7 +112,7 @@ def _metrics(scores: Scores) -> dict[str, Any]:
 
 def _metrics_after_base_stage(results: Results) -> dict[str, Any] | None:
     """Return the metrics over the later tasks alone; None without a base stage, or before one of them is learned."""
-    found = after_base_stage(results)
+    found = results.after_base_stage()
     return None if found is None else _as_data(found)
 
 

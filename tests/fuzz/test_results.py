@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from libero_eval.check import examine
 from lifelong.results.log import ResultLog
-from lifelong.results.metrics import lifelong_metrics
 from lifelong.results.provenance import start_record
 from lifelong.results.records import (
     CostRecord,
@@ -23,6 +22,7 @@ from lifelong.results.records import (
     to_line,
 )
 from lifelong.results.summary import summarize
+from lifelong.stats.metrics import lifelong_metrics
 from tests.harness.fuzz import examples, survive
 
 pytestmark = pytest.mark.unit

@@ -6,9 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("scipy")
-pytest.importorskip("statsmodels")
-
 from libero_env.cli.main import main  # noqa: E402
 from libero_eval.exports import export_lerobot, export_vla_eval  # noqa: E402
 from libero_eval.judging.comparability import Side, check_comparable, match, settings  # noqa: E402

@@ -18,7 +18,7 @@ from libero_eval.evaluation_file import EvaluationResult, overall
 from libero_eval.protocols.packaged import PROTOCOLS, choose_init_states
 from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
 from lifelong.evaluation.actors import ORIGINAL_NAMES, CallableActor, as_original
-from lifelong.results.metrics import wilson_interval
+from lifelong.stats.intervals import wilson_interval
 from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate
 
 pytestmark = pytest.mark.unit

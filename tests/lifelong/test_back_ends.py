@@ -47,7 +47,6 @@ def test_results_of_different_ones_are_not_compared():
 
 @pytest.mark.parametrize("backend", [None, "warp"])
 def test_a_comparison_names_it(backend):
-    pytest.importorskip("statsmodels")
     found = judge([Side("a", (result(1, backend),)), Side("b", (result(2, backend),))])
     assert found.to_plain()["backend"] == (backend or "mujoco")
     assert any("backend=warp" in note for note in found.notes) == (backend == "warp")

@@ -14,11 +14,10 @@ from lifelong.context import RunContext
 from lifelong.evaluation.restore import LoadedRun
 from lifelong.report.page import comparison_text, write_report
 from lifelong.results.log import ResultLog
-from lifelong.results.metrics import Curve, Scores, lifelong_metrics
 from lifelong.results.provenance import start_record
 from lifelong.results.records import EvalRecord, RunRecord, TaskEndRecord, from_line, to_line
-from lifelong.results.results import after_base_stage
 from lifelong.results.summary import summarize
+from lifelong.stats.metrics import Curve, Scores, lifelong_metrics
 from lifelong.streams import StreamSettings
 from tests.harness import sequences
 from tests.harness.configs import FILES, composed
@@ -129,7 +128,7 @@ def test_metrics_count_the_base_stage_as_one_task_and_the_later_tasks_are_measur
     log.append(record((3, 1, 1)))
     fill_base(log)
     assert log.read().learned_tasks() == 3
-    assert after_base_stage(log.read()) is None, "no later task is learned"
+    assert log.read().after_base_stage() is None, "no later task is learned"
     fill_later(log, 0.8)
     results = log.read()
     assert results.learned_tasks() == 5
@@ -144,7 +143,7 @@ def test_metrics_count_the_base_stage_as_one_task_and_the_later_tasks_are_measur
     np.testing.assert_allclose(found.nbt_by_task, np.repeat(nbt, (3, 1, 1)))
     np.testing.assert_allclose(found.final_success.value, (0.2 + 0.6 + 1.0) / 3)
 
-    later = after_base_stage(results)
+    later = results.after_base_stage()
     assert later is not None
     np.testing.assert_allclose(later.fwt_by_task, fwt[1:])
     np.testing.assert_allclose(later.nbt_by_task, nbt[1:])
@@ -164,12 +163,12 @@ def test_a_comparison_measures_the_later_tasks_alone(tmp_path) -> None:
         fill_base(log)
         if learned is not None:
             fill_later(log, learned)
-    page = write_report(list(runs.values()), tmp_path / "page")
+    page = write_report(list(runs.values()), tmp_path / "page", all_pairs=True)
     found = json.loads((page.parent / "comparison.json").read_text(encoding="utf-8"))
     later = found["after_base_stage"]
     assert list(later["metrics"]) == ["first", "second"], "without a later task there is nothing to measure"
     for algo in later["metrics"]:
-        alone = after_base_stage(ResultLog(runs[algo] / "results.jsonl").read())
+        alone = ResultLog(runs[algo] / "results.jsonl").read().after_base_stage()
         for name in ("fwt", "nbt", "auc", "final_success", "just_learned"):
             assert later["metrics"][algo][name]["mean"] == pytest.approx(getattr(alone, name).value)
     (pair,) = later["differences"]

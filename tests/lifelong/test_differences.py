@@ -5,13 +5,25 @@ import math
 
 import numpy as np
 import pytest
+from scipy import stats
 
-pytest.importorskip("scipy")
-pytest.importorskip("statsmodels")
-
-from scipy import stats  # noqa: E402
-
-from libero_eval.judging.power import (  # noqa: E402
+from libero_eval.judging.power_text import shown, table
+from lifelong.errors import ConfigError
+from lifelong.stats.episodes import (
+    Counts,
+    Pairs,
+    bootstrap_starts,
+    bootstrap_tasks,
+    chance_difference,
+    difference,
+    log_evidence,
+    mcnemar_exact,
+    rounds,
+    score_interval,
+    sequential_test,
+    sign_flip_test,
+)
+from lifelong.stats.power import (
     Question,
     discordance_of,
     paired_episodes,
@@ -19,20 +31,6 @@ from libero_eval.judging.power import (  # noqa: E402
     sequential_stopping,
     shown_difference,
     unpaired_episodes,
-)
-from libero_eval.judging.power_text import shown, table  # noqa: E402
-from libero_eval.judging.sequential import log_evidence, rounds, sequential_test  # noqa: E402
-from lifelong.errors import ConfigError  # noqa: E402
-from lifelong.results.differences import (  # noqa: E402
-    Counts,
-    Pairs,
-    bootstrap_starts,
-    bootstrap_tasks,
-    chance_difference,
-    difference,
-    mcnemar_exact,
-    score_interval,
-    sign_flip_test,
 )
 
 pytestmark = pytest.mark.unit

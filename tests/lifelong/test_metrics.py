@@ -5,18 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lifelong.results.metrics import (
-    METRIC_NAMES,
+from lifelong.stats.intervals import combine_intervals, mean_and_standard_error, wilson_interval
+from lifelong.stats.metrics import (
     Curve,
     Scores,
     area_under_curve,
     average_success,
-    combine_intervals,
     forward_transfer,
     lifelong_metrics,
-    mean_and_standard_error,
     negative_backward_transfer,
-    wilson_interval,
 )
 
 NAN = float("nan")
@@ -31,13 +28,6 @@ def worked_example() -> Scores:
     curves = (curve(0.0, 0.8, 0.6), curve(0.2, 0.4, 0.4), curve(0.0, 0.0, 0.6))
     matrix = np.array([[0.8, NAN, NAN], [0.5, 0.4, NAN], [0.1, 0.3, 0.6]])
     return Scores(curves, matrix, np.tril(np.full((3, 3), 10)))
-
-
-def random_scores(rng: np.random.Generator, size: int = 6, episodes: int = 20) -> Scores:
-    rates = lambda shape: rng.integers(0, episodes + 1, shape) / episodes  # noqa: E731
-    matrix = np.where(np.tril(np.ones((size, size))) > 0, rates((size, size)), np.nan)
-    curves = tuple(Curve(np.arange(5), rates(5), np.full(5, episodes)) for _ in range(size))
-    return Scores(curves, matrix, np.tril(np.full((size, size), episodes)))
 
 
 def test_worked_example():
@@ -67,58 +57,12 @@ def test_best_epoch_is_the_earliest_of_equals_and_holding_changes_nothing_else()
     assert c.rates.tolist() == [0.1, 0.5, 0.2, 0.5]
 
 
-def test_interval_weights_agree_with_the_formulas():
-    rng = np.random.default_rng(0)
-    for size in (1, 2, 6):
-        scores = random_scores(rng, size)
-        found = lifelong_metrics(scores)
-        for name in ("fwt", "nbt", "auc"):
-            by_task = getattr(found, f"{name}_by_task").mean()
-            assert getattr(found, name).value == pytest.approx(by_task, nan_ok=True)
-        assert found.final_success.value == pytest.approx(scores.matrix[-1].mean())
-        assert found.just_learned.value == pytest.approx(np.diag(scores.matrix).mean())
-
-
-@pytest.mark.parametrize("rate", [0.0, 1.0])
-def test_intervals_have_width_and_hold_the_value_at_the_ends(rate: float):
-    scores = Scores(
-        (curve(rate, rate), curve(rate, rate)),
-        np.array([[rate, NAN], [rate, rate]]),
-        np.tril(np.full((2, 2), 20)),
-    )
-    found = lifelong_metrics(scores)
-    for name in METRIC_NAMES:
-        estimate = getattr(found, name)
-        assert estimate.low <= estimate.value <= estimate.high
-        assert estimate.high - estimate.low > 0.01, name
-
-
-def test_more_episodes_give_narrower_intervals():
-    few, many = (random_scores(np.random.default_rng(1), episodes=20) for _ in range(2))
-    many = dataclasses.replace(
-        many,
-        episodes=many.episodes * 25,
-        curves=tuple(dataclasses.replace(c, episodes=c.episodes * 25) for c in many.curves),
-    )
-    for name in METRIC_NAMES:
-        wide, narrow = getattr(lifelong_metrics(few), name), getattr(lifelong_metrics(many), name)
-        assert narrow.value == pytest.approx(wide.value)
-        assert narrow.high - narrow.low < 0.35 * (wide.high - wide.low)
-
-
-def test_intervals_cover_the_truth():
-    rng = np.random.default_rng(2)
-    size, episodes, truth = 4, 20, 0.7
-    inside = np.zeros(2)
-    for _ in range(400):
-        matrix = np.tril(rng.binomial(episodes, truth, (size, size)) / episodes)
-        scores = Scores((curve(1.0),) * size, matrix, np.tril(np.full((size, size), episodes)))
-        found = lifelong_metrics(scores)
-        inside += [
-            found.nbt.low <= 0 <= found.nbt.high,
-            found.final_success.low <= truth <= found.final_success.high,
-        ]
-    assert (inside / 400 > 0.92).all()
+def test_success_rates_of_a_run_have_wilsons_interval_and_other_metrics_none():
+    found = lifelong_metrics(worked_example())
+    low, high = wilson_interval(10, 30)
+    assert (found.final_success.low, found.final_success.high) == pytest.approx((float(low), float(high)))
+    assert found.just_learned.low < 0.6 < found.just_learned.high
+    assert all(np.isnan(getattr(found, name).low) for name in ("fwt", "nbt", "auc"))
 
 
 def test_wilson_against_a_published_value_and_its_symmetry():
@@ -165,7 +109,7 @@ def test_a_chosen_maximum_is_held_without_its_luck():
     found: dict[str, list[float]] = {"published": [], "cross_fitted": [], "plain": [], "kept": []}
     for _ in range(1500):
         won = (rng.random((6, 5)) < truth[:, None]).astype(float)
-        c = Curve(np.arange(6), won.mean(1), np.full(6, 5), won[..., None], np.arange(5), ("task",))
+        c = Curve(np.arange(6), won.mean(1), np.full(6, 5), won[..., None])
         for kind in ("published", "cross_fitted", "plain"):
             found[kind].append(c.transfer(kind))
         found["kept"].append(truth[c.best] * (6 - c.best) / 6 + truth[: c.best].sum() / 6)

@@ -20,12 +20,12 @@ from lifelong.errors import CheckpointError, ConfigError
 from lifelong.pretraining import load_initial_weights, pretraining_context, pretraining_directory
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
-from lifelong.results.metrics import lifelong_metrics
 from lifelong.results.provenance import start_record, utc_now
 from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.sequence import TaskSequence
 from lifelong.settings import BenchmarkSettings, PretrainSettings
+from lifelong.stats.metrics import lifelong_metrics
 from lifelong.streams import StageData, StageWindows, StreamSettings, learning_stages
 from tests.harness.fakes import Windows
 from tests.harness.sequences import Killed, Killer, assert_same, dataset, run_context, sequence

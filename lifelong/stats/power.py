@@ -4,9 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
-from libero_eval.judging.sequential import log_evidence
-from lifelong.errors import ConfigError, require_package
+from lifelong.errors import ConfigError
+from lifelong.stats.episodes import log_evidence
 
 MOST = 2_000_000  # episodes of each policy
 
@@ -88,9 +89,6 @@ def paired_power(question: Question, pairs: int) -> float:
 
     Exact: the number of discordant pairs is binomial, and given it, so is the number of those that are won.
     """
-    require_package("scipy", "judge")
-    from scipy import stats
-
     spread = 12 * math.sqrt(pairs * question.differing) + 12
     middle = pairs * question.differing
     m = np.arange(max(0, math.floor(middle - spread)), min(pairs, math.ceil(middle + spread)) + 1)
@@ -122,14 +120,16 @@ def paired_episodes(question: Question) -> int:
 
 
 def unpaired_episodes(question: Question) -> int:
-    """Return the number of episodes of each policy if their starts differ, as statsmodels computes it (z-test)."""
-    require_package("statsmodels", "judge")
-    from statsmodels.stats.proportion import samplesize_proportions_2indep_onetail
+    """Return the number of episodes of each policy if their starts differ.
 
-    found = samplesize_proportions_2indep_onetail(
-        question.other - question.base, question.base, question.power, alpha=question.level
-    )
-    return math.ceil(found)
+    Of the z-test of two proportions (Fleiss, Levin & Paik, "Statistical Methods for Rates and Proportions", 2003,
+    eq. 4.14).
+    """
+    first, second = question.base, question.other
+    mean = (first + second) / 2
+    pooled = stats.norm.isf(question.level / 2) * math.sqrt(2 * mean * (1 - mean))
+    apart = stats.norm.ppf(question.power) * math.sqrt(first * (1 - first) + second * (1 - second))
+    return math.ceil(((pooled + apart) / question.difference) ** 2)
 
 
 def shown_difference(question: Question, pairs: int) -> float:

@@ -1,18 +1,18 @@
-"""Values with their confidence intervals, and p-values of several tests."""
+"""Values with confidence intervals, and p-values of several tests."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from lifelong.results.curves import Floats
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A value with its confidence interval."""
+    """A value with its confidence interval, whose ends are NaN where it is not known."""
 
     value: float
     low: float
@@ -39,18 +39,14 @@ def wilson_interval(
         Lower and upper ends in [0, 1], of the broadcast shape.
     """
     s, n = np.broadcast_arrays(np.asarray(successes, dtype=float), np.asarray(episodes, dtype=float))
-    return score_interval(s, n, NormalDist().inv_cdf(0.5 + confidence / 2))
-
-
-def score_interval(successes: Floats, episodes: Floats, z: float) -> tuple[Floats, Floats]:
-    """Return Wilson's interval for a quantile z; numbers of episodes may be effective ones, and no integers."""
-    safe = np.where(episodes > 0, episodes, 1.0)
-    p = np.where(episodes > 0, successes, 0.0) / safe
+    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    safe = np.where(n > 0, n, 1.0)
+    p = np.where(n > 0, s, 0.0) / safe
     centre = (p + z**2 / (2 * safe)) / (1 + z**2 / safe)
     half = z * np.sqrt(np.maximum(p * (1 - p), 0) / safe + z**2 / (4 * safe**2)) / (1 + z**2 / safe)
     # At the ends the bound is exactly 0 or 1; rounding must not put it on the wrong side of p.
     low, high = np.clip(centre - half, 0, p), np.clip(centre + half, p, 1)
-    return np.where(episodes > 0, low, 0.0), np.where(episodes > 0, high, 1.0)
+    return np.where(n > 0, low, 0.0), np.where(n > 0, high, 1.0)
 
 
 def combine_intervals(weights: ArrayLike, rates: ArrayLike, low: ArrayLike, high: ArrayLike) -> Estimate:
@@ -66,22 +62,26 @@ def combine_intervals(weights: ArrayLike, rates: ArrayLike, low: ArrayLike, high
         high: (C,) upper ends of their intervals.
     """
     w, p, lo, hi = (np.asarray(x, dtype=float) for x in (weights, rates, low, high))
-    used = w != 0
-    w, p, lo, hi = w[used], p[used], lo[used], hi[used]
     value = float(np.sum(w * p))
     down = np.where(w > 0, w * (p - lo), w * (p - hi))
     up = np.where(w > 0, w * (hi - p), w * (lo - p))
     return Estimate(value, value - float(np.hypot.reduce(down)), value + float(np.hypot.reduce(up)))
 
 
+def mean_and_standard_error(values: ArrayLike) -> tuple[float, float]:
+    """Return the mean over seeds and its standard error, s/sqrt(n) with n-1 in s; NaN for the error of one seed."""
+    v = np.asarray(values, dtype=float)
+    mean = float(v.mean()) if v.size else float("nan")
+    return mean, float(v.std(ddof=1) / np.sqrt(v.size)) if v.size > 1 else float("nan")
+
+
 def holm(p_values: Sequence[float]) -> list[float]:
     """Return the p-values of a family of tests, adjusted by Holm: p_(i) · (m - i), never falling, at most 1.
 
-    NaN stands for what was not tested: it stays, and does not count among the m.
+    NaN stands for what was not tested: it stays, and does not count among the m (Holm, Scand. J. Stat. 1979).
     """
     p = np.asarray(p_values, dtype=float)
     order = np.argsort(p, kind="stable")[: np.isfinite(p).sum()]
-    steps = np.minimum(1.0, np.maximum.accumulate(p[order] * (len(order) - np.arange(len(order)))))
-    found = np.full(len(p), np.nan)
-    found[order] = steps
-    return [float(value) for value in found]
+    adjusted = np.full(len(p), np.nan)
+    adjusted[order] = np.minimum(1, np.maximum.accumulate(p[order] * (len(order) - np.arange(len(order)))))
+    return [float(value) for value in adjusted]

@@ -1,8 +1,8 @@
-"""Differences of two policies in the same episodes: exact tests, intervals, and what chance alone makes.
+"""Two policies in the same episodes: exact and sequential tests, intervals, and what chance alone makes.
 
 An episode is identified by its task and its initial state, so the outcomes of two policies are pairs, and only pairs
 in which they differ (discordant ones) carry evidence. The tests and intervals hold for the two sets of weights that
-were evaluated; how much training again would change needs several runs of each (`libero_eval.judging.group_scores`).
+were evaluated; how much training again would change needs several runs of each.
 """
 
 import math
@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize, special, stats
 
-from lifelong.errors import require_package
-from lifelong.results.metrics import Estimate, Floats
+from lifelong.stats.intervals import Estimate, Floats
 
+ALPHA = 0.05
 DRAWS = 9999
 CONFIDENCE = 0.95
 SEED = 2023
@@ -123,7 +124,6 @@ def difference(pairs: Pairs, *, draws: int = DRAWS, seed: int = SEED) -> Differe
 
     Raises:
         ValueError: There are no pairs.
-        MissingPackageError: SciPy or statsmodels is not installed.
     """
     if len(pairs) == 0:
         raise ValueError("no pairs: the policies were not evaluated in the same starts")
@@ -151,16 +151,12 @@ def count(pairs: Pairs) -> Counts:
 
 
 def mcnemar_exact(counts: Counts) -> float:
-    """Return McNemar's exact two-sided p-value (McNemar 1947), as statsmodels computes it.
+    """Return McNemar's exact two-sided p-value (McNemar 1947).
 
     Given the number of discordant pairs, those that the first policy wins are binomial with share 1/2 if both are
     equally good in every start. Where they are equal on average only, the test rejects less often than it may.
     """
-    require_package("statsmodels", "judge")
-    from statsmodels.stats.contingency_tables import mcnemar
-
-    table = [[counts.both, counts.only_first], [counts.only_second, counts.neither]]
-    return float(min(1.0, mcnemar(table, exact=True).pvalue))
+    return float(stats.binomtest(counts.only_first, counts.discordant).pvalue) if counts.discordant else 1.0
 
 
 def sign_flip_test(differences: Floats, draws: int = DRAWS, seed: int = SEED) -> float:
@@ -174,9 +170,6 @@ def sign_flip_test(differences: Floats, draws: int = DRAWS, seed: int = SEED) ->
         draws: Number of random swaps.
         seed: Seed of the swaps.
     """
-    require_package("scipy", "judge")
-    from scipy import stats
-
     moved = differences[differences != 0]  # the others stay what they are when they are swapped
     if len(moved) < 2:
         return 1.0
@@ -204,12 +197,8 @@ def score_interval(counts: Counts, confidence: float = CONFIDENCE) -> Estimate:
         counts: Pairs by outcome.
         confidence: Two-sided confidence level.
     """
-    require_package("scipy", "judge")
-    from scipy.optimize import brentq
-    from scipy.special import ndtri
-
     b, c, n = counts.only_first, counts.only_second, counts.pairs
-    value, z = (b - c) / n, float(ndtri(0.5 + confidence / 2))
+    value, z = (b - c) / n, float(special.ndtri(0.5 + confidence / 2))
 
     def excess(d: float) -> float:
         root = 2 * n * d - (b - c) * d - b - c
@@ -217,8 +206,8 @@ def score_interval(counts: Counts, confidence: float = CONFIDENCE) -> Estimate:
         return (b - c - n * d) ** 2 - z**2 * n * (2 * q + d * (1 - d))
 
     aside = 1e-12  # at the value itself the excess is at most 0, and exactly 0 at the edges
-    low = -1.0 if value == -1 else brentq(excess, -1.0, value - aside)
-    high = 1.0 if value == 1 else brentq(excess, value + aside, 1.0)
+    low = -1.0 if value == -1 else optimize.brentq(excess, -1.0, value - aside)
+    high = 1.0 if value == 1 else optimize.brentq(excess, value + aside, 1.0)
     return Estimate(value, float(low), float(high))
 
 
@@ -247,9 +236,6 @@ def bootstrap_tasks(pairs: Pairs, *, draws: int = DRAWS, seed: int = SEED) -> Es
 
 def _bootstrap(strata: Sequence[Floats], draws: int, seed: int) -> Estimate:
     """Return the percentile interval of the mean of all values, which are drawn within their strata."""
-    require_package("scipy", "judge")
-    from scipy import stats
-
     sizes = np.array([len(s) for s in strata])
     value = float(np.concatenate(strata).mean())
     if sizes.max() < 2:
@@ -276,9 +262,87 @@ def _bootstrap(strata: Sequence[Floats], draws: int, seed: int) -> Estimate:
 
 def chance_difference(counts: Counts, confidence: float = CONFIDENCE) -> float:
     """Return the absolute difference that two equal policies with as many discordant pairs exceed in 1 of 20 cases."""
-    require_package("scipy", "judge")
-    from scipy import stats
-
     m = counts.discordant
     most = stats.binom.ppf(0.5 + confidence / 2, m, 0.5)
     return float(abs(2 * most - m) / counts.pairs)
+
+
+@dataclass(frozen=True)
+class SequentialTest:
+    """The evidence after every pair.
+
+    Attributes:
+        log_e: (N,) natural logarithm of e after each pair.
+        wins: (N,) pairs that the first won minus those that the second won, so far.
+        alpha: Probability of a false decision.
+        decided_after: Number of pairs after which e first reached 1/alpha; None if it never did.
+        first_better: Whether the first policy led then; None if it is not decided.
+        p_value: Anytime-valid p-value, 1 / the largest e so far.
+    """
+
+    log_e: Floats
+    wins: NDArray[np.int64]
+    alpha: float
+    decided_after: int | None
+    first_better: bool | None
+    p_value: float
+
+
+def sequential_test(pairs: Pairs, alpha: float = ALPHA) -> SequentialTest:
+    """Test as the episodes come in, so that the evaluation may be stopped as soon as it is decided.
+
+    If two policies are equally good in a start, each pair in which exactly one of them succeeds is won by either with
+    probability 1/2. After m such pairs, w of them won by the first, the evidence against equality is
+
+        e = ∫ (2π)^w (2(1 - π))^(m - w) dπ = 2^m / ((m + 1) · C(m, w)),
+
+    the likelihood of a share π of wins, averaged over all shares, relative to that of 1/2 (Robbins, "Statistical
+    methods related to the law of the iterated logarithm", 1970; as an e-process: Ramdas et al., "Game-theoretic
+    statistics and safe anytime-valid inference", Statistical Science 2023). While the policies are equal, e is a
+    martingale of mean 1, so it ever reaches 1/α with probability at most α (Ville 1939): the test may be stopped, and
+    episodes added, at any time. Snyder et al. (arXiv 2503.10966 and 2603.13616) propose such tests for robot policies.
+    A test of a number of pairs that was fixed beforehand needs fewer of them; a single look at the end should use
+    McNemar's.
+
+    The order is the first start of every task, then the second start of every task, and so on. Rounds over all tasks
+    keep every prefix balanced, so that a few tasks in which one policy is better do not decide alone; the order does
+    not depend on outcomes, as the test requires.
+
+    Args:
+        pairs: Outcomes of two policies with one run each.
+        alpha: Probability of a false decision.
+
+    Raises:
+        ValueError: A policy has several runs.
+    """
+    if not pairs.single:
+        raise ValueError("the sequential test is for one run of each policy")
+    order = rounds(pairs)
+    signs = pairs.first[order, 0].astype(np.int64) - pairs.second[order, 0]
+    log_e = log_evidence(np.cumsum(signs > 0), np.cumsum(signs < 0))
+    reached = np.flatnonzero(log_e >= -np.log(alpha))
+    wins = np.cumsum(signs)
+    decided = int(reached[0]) if len(reached) else None
+    return SequentialTest(
+        log_e=log_e,
+        wins=wins,
+        alpha=alpha,
+        decided_after=None if decided is None else decided + 1,
+        first_better=None if decided is None else bool(wins[decided] > 0),
+        p_value=float(min(1.0, np.exp(-max(log_e.max(initial=0.0), 0.0)))),
+    )
+
+
+def rounds(pairs: Pairs) -> NDArray[np.int64]:
+    """Return the (N,) order of the pairs: the n-th start of every task before the (n+1)-th of any."""
+    by_task = np.lexsort((pairs.starts, pairs.tasks))
+    turn = np.empty(len(pairs), dtype=np.int64)
+    for task in np.unique(pairs.tasks):
+        mine = by_task[pairs.tasks[by_task] == task]
+        turn[mine] = np.arange(len(mine))
+    return np.lexsort((pairs.tasks, turn))
+
+
+def log_evidence(won: NDArray[np.int64], lost: NDArray[np.int64]) -> Floats:
+    """Return log e for numbers of discordant pairs that the first policy won and lost, of any common shape."""
+    return (won + lost) * np.log(2.0) + special.betaln(won + 1, lost + 1)
