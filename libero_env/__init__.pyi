@@ -7,9 +7,8 @@ from .errors import LiberoError, UnknownNameError
 from .expert.expert import Expert
 from .objects.catalog import register_object
 from .sim.predicates import register_predicate
-from .tasks.authoring import make_task
-from .tasks.files import get_task, read_task
-from .tasks.suites import get_suite
+from .tasks.builder import make_task
+from .tasks.suites import get_suite, get_task, read_task
 from .tasks.task import Suite, Task
 
 __all__ = [

@@ -57,7 +57,13 @@ class MissingPackageError(LiberoError):
 
 
 class InvalidInputError(LiberoError, ValueError):
-    """A file or value from outside that is not valid; the message names file and line, or key, and what is valid."""
+    """A file or value from outside that is not valid; the message names file and line, or key, and what is valid.
+
+    Attributes:
+        path: Fields and keys that lead to the value, where it is part of an object; empty where that is not known.
+    """
+
+    path: tuple[str | int, ...] = ()
 
 
 class ClosedEnvironmentError(LiberoError):

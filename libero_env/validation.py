@@ -102,7 +102,7 @@ def validate_arguments(
         validate(kind, dict(arguments), prefix=prefix, error=error)
 
 
-@dataclass_transform(frozen_default=True)
+@dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field,))
 def checked(cls: Class) -> Class:
     """Make a class a frozen dataclass whose constructor checks its arguments against the annotations.
 
@@ -126,10 +126,15 @@ def checked(cls: Class) -> Class:
                 if isinstance(original := one.get("ctx", {}).get("error"), LiberoError):
                     raise original from None
                 first, *rest = one["loc"]
-                errors.append({**one, "loc": (names[first] if isinstance(first, int) else first, *rest)})
+                loc = (names[first] if isinstance(first, int) else first, *rest)
+                kind = one["type"].replace("tuple_type", "python_tuple_type")
+                errors.append({**one, "loc": loc, "type": kind})
             values = {**dict(zip(names, args, strict=False)), **kwargs}
-            parts = [_joined(path, text) for path, text in _describe_all(errors, cls, values)]
-            raise InvalidInputError(f"{cls.__name__}: {_limited(parts)}") from None
+            described = _describe_all(errors, cls, values)
+            message = _limited([_joined(path, text) for path, text in described])
+            invalid = InvalidInputError(f"{cls.__name__}: {message}")
+            invalid.path = described[0][0]
+            raise invalid from None
 
     made.__init__ = __init__
     return made
@@ -338,6 +343,7 @@ _WORDS = {
     **dict.fromkeys(("list_type", "tuple_type", "sequence_type"), "a list"),
     **dict.fromkeys(("dict_type", "mapping_type", "model_type"), "keys with values"),
     **dict.fromkeys(("dataclass_type", "dataclass_exact_type"), "keys with values"),
+    "python_tuple_type": "a tuple",
     "float_type": "a number",
     "finite_number": "a finite number",
     "bool_type": "true or false",

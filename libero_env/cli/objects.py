@@ -104,7 +104,7 @@ def show(names: Names) -> None:
         names: Names of objects.
     """
     from libero_env.objects import folder, get_object
-    from libero_env.tasks.authoring import model_regions
+    from libero_env.tasks.builder import model_regions
 
     for name in names:
         item, directory = get_object(name), folder.find(name)

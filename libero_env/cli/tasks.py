@@ -32,7 +32,7 @@ def find_tasks(names: Sequence[str]) -> list["Task"]:
         LiberoError: A suite, task or file does not exist, or a file is not a task.
     """
     from libero_env.tasks import get_suite, get_task, is_suite
-    from libero_env.tasks.files import read_yaml_tasks
+    from libero_env.tasks.suites import read_yaml_tasks
 
     tasks: dict[tuple[str, str], Task] = {}
     for name in names:
@@ -88,8 +88,7 @@ def init_states(
     """
     from libero_env.init_states.store import cache_init_states, shipped_path, write_suite
     from libero_env.tasks import get_suite
-    from libero_env.tasks.files import ENDINGS
-    from libero_env.tasks.published import is_published
+    from libero_env.tasks.suites import ENDINGS, is_published
 
     if suite.endswith(ENDINGS) and not out:
         for task in find_tasks([suite]):
@@ -224,7 +223,7 @@ def new(
     """
     from libero_env.design.template import task_template
     from libero_env.tasks import read_task
-    from libero_env.tasks.files import write_task
+    from libero_env.tasks.suites import write_task
     from libero_env.tasks.task import check_name
 
     if name.startswith(".") or Path(name).name != name:

@@ -27,7 +27,7 @@ from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.sim.scene import build_scene
 from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
-from libero_env.tasks.authoring import FILE
+from libero_env.tasks.builder import FILE
 
 BATCH = 16  # initial states simulated together
 NO_HORIZON = 1_000_000  # [steps] `run_experts` ends the attempts

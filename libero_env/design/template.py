@@ -8,8 +8,7 @@ import yaml
 
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.storage import parse_yaml_text
-from libero_env.tasks.authoring import EMPTY, make_task, model_regions
-from libero_env.tasks.builder import load_scene, scene_names
+from libero_env.tasks.builder import EMPTY, load_scene, make_task, model_regions, scene_names
 from libero_env.tasks.task import Task
 
 # Places of objects (x, y) [m] in the original's scenes, and of furniture (x, y, yaw).

@@ -16,7 +16,7 @@ from libero_env.perturbations.value import Perturbation
 from libero_env.sim.scene import InitialStates, Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.tasks import Task, get_task
-from libero_env.tasks.published.task import require_available
+from libero_env.tasks.published.suites import require_available
 from libero_env.text import shown
 
 

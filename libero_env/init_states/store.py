@@ -18,7 +18,7 @@ from libero_env.paths import cache_dir, read_config
 from libero_env.sim.scene import InitialStates, Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.storage import atomic_write_npz, cached_arrays, read_npz, read_packaged_npz
-from libero_env.tasks.published.task import PublishedTask
+from libero_env.tasks.published.suites import PublishedTask
 from libero_env.tasks.task import Task
 
 NUM_INIT_STATES = 50

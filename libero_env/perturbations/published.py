@@ -10,8 +10,8 @@ from libero_env.perturbations.corruptions import corrupt
 from libero_env.perturbations.drawing import DrawKey
 from libero_env.perturbations.starts import RobotJoints, StartChange
 from libero_env.sim.look import CameraView, Look
-from libero_env.tasks.published.plus_values import camera_pose, joint_pose
-from libero_env.tasks.published.task import PublishedTask
+from libero_env.tasks.published.plus import camera_pose, joint_pose
+from libero_env.tasks.published.suites import PublishedTask
 from libero_env.tasks.task import Task
 
 CAMERA = "agentview"  # the only camera that LIBERO-Plus changes

@@ -14,8 +14,7 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.model import GLOW_GROUP, ObjectModel
 from libero_env.sim.scene import ROBOT, Scene, zone_boxes
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Region
-from libero_env.tasks.signatures import declare
+from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Region, declare_predicate
 
 BOX_BELOW = 0.01  # [m] depth below its box in which a region still contains a point
 ON_BELOW, ON_ABOVE = 0.005, 0.10  # [m] range of heights around the top of a box that are on the region
@@ -229,7 +228,7 @@ def register_predicate(name: str, predicate: Predicate) -> None:
         )
     for table in SEMANTICS.values():
         table[name.capitalize()] = predicate
-    declare(name.capitalize(), predicate)
+    declare_predicate(name.capitalize(), predicate)
 
 
 def evaluate(expression: Expression, view: StateView, semantics: str = "original") -> bool:

@@ -22,9 +22,7 @@ from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.mujoco_compat import log_warnings, set_damping
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY, ObjectModel
-from libero_env.tasks.checks import ProblemError, check_problem
-from libero_env.tasks.problem import Atom, Problem, Region
-from libero_env.tasks.problem_types import Fault
+from libero_env.tasks.problem import Atom, Problem, ProblemError, Region, Violation
 from libero_env.text import suggest
 from libero_env.timing import TIMESTEP
 
@@ -196,12 +194,10 @@ def build_scene(
             `libero_env.sim.look.Look`. Nothing else depends on it.
 
     Raises:
-        ProblemError: The problem is not valid, see `libero_env.tasks.checks`; or a region is no site of its target's
-            model, or a goal has a state that the model does not have.
+        ProblemError: A region is not a site of its target's model, or a goal has a state that the model does not have.
         UnknownNameError: A category of objects or fixtures has no model.
         LiberoError: MuJoCo refuses the models, such as those with the same names.
     """
-    check_problem(problem)
     pack = pack or select_pack()
     return _build_scene(problem, pack, drawing or default_drawing(pack), robot, spare_materials)
 
@@ -247,7 +243,8 @@ def _check_sites(scene: Scene) -> None:
             near = suggest(region.name, own)
             what = f"{region.target} has no region {region.name!r}{'.' if near else ''}{near}"
             expected = f"one of {', '.join(own)}" if own else f"{region.target} itself, which has no regions"
-            raise ProblemError(Fault("no-site", what, expected, ":regions", region.address), problem.language)
+            violation = Violation("no-site", what, expected, ":regions", region.address)
+            raise ProblemError(problem, violation)
 
 
 def _check_states(scene: Scene) -> None:
@@ -258,8 +255,8 @@ def _check_states(scene: Scene) -> None:
             continue
         if state not in (known := scene.entities[owner].articulation):
             what = f"{atom}: the state {state!r} of a {scene.entities[owner].category} is not defined"
-            fault = Fault("no-joint", what, f"one of {', '.join(sorted(known)) or 'no state'}", ":goal", i)
-            raise ProblemError(fault, scene.problem.language)
+            violation = Violation("no-joint", what, f"one of {', '.join(sorted(known)) or 'no state'}", ":goal", i)
+            raise ProblemError(scene.problem, violation)
 
 
 class _SceneCache:

@@ -1,7 +1,7 @@
-from .authoring import make_task
-from .files import get_task, read_suite, read_task, write_task
+from .benchmark import suite_names
+from .builder import make_task
 from .problem import And, Atom, ForAll, Not, Or, Problem, Region
-from .suites import get_suite, is_suite, suite_names
+from .suites import get_suite, get_task, is_suite, read_suite, read_task, write_task
 from .task import Suite, Task
 
 __all__ = [

@@ -7,15 +7,14 @@ arithmetic with `pi`; nothing in a file is ever executed.
 """
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NoReturn
 
-from libero_env.tasks.checks import faults
-from libero_env.tasks.lines import Lines
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, Region
-from libero_env.tasks.sexpr import List, Word, fail, number, parse_tree, show
+from libero_env.errors import BDDLError, InvalidInputError
+from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, ProblemError, Region
+from libero_env.tasks.sexpr import MAX_CHARACTERS, List, Word, fail, number, parse_tree, show
 
 SECTIONS = (
     ":domain",
@@ -30,30 +29,45 @@ SECTIONS = (
     ":goal",
 )
 
-MAX_CHARACTERS = 1 << 20  # of a task file; the original's have 4,000
+_SECTIONS_OF = {"name": ":domain"}  # field of a problem -> section, where its name is another
 _PREDICATE = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
 
 
-def parse(text: str, file: str = "<string>", *, check: bool = True) -> Problem:
+def parse(text: str, file: str = "<string>") -> Problem:
     """Return the problem of a BDDL text.
 
     Args:
         text: Content of a task file.
         file: Name of the file for error messages.
-        check: Whether to check what the text means, see `libero_env.tasks.checks`, and not only that it is of the
-            dialect.
 
     Raises:
         BDDLError: The text is not of the dialect, declares a name twice, or has an atom with a name that it does not
             declare; or no scene can be built from it. The message is "file:line: what; expected ...".
     """
-    if len(text) > MAX_CHARACTERS:
-        fail(file, 1, f"{len(text)} characters", f"a task file of at most {MAX_CHARACTERS}")
     tree = parse_tree(text, file)
-    problem = _Reader(file).problem(tree)
-    for fault in faults(problem) if check else ():
-        fail(file, Lines(tree).of_part(fault.section, fault.part), fault.what, fault.expected)
-    return problem
+    try:
+        return problem_of(tree, file)
+    except ProblemError as error:
+        first = error.violations[0]
+        line = Lines(tree).of_part(first.section, first.part)
+        raise BDDLError(f"{file}:{line}: {first.what}; expected {first.expected}") from None
+
+
+def problem_of(tree: List, file: str) -> Problem:
+    """Return the problem of a text that is parsed to a tree; see `parse`.
+
+    Raises:
+        BDDLError: As in `parse`.
+        ProblemError: No scene can be built from it.
+    """
+    try:
+        return _Reader(file).problem(tree)
+    except ProblemError:
+        raise
+    except InvalidInputError as error:  # of one field
+        field, part, *_ = (*error.path, None, None)
+        line = Lines(tree).of_part(_SECTIONS_OF.get(str(field), f":{field}"), part)
+        raise BDDLError(f"{file}:{line}: {str(error).removeprefix('Problem: ')}") from None
 
 
 def read(path: str | Path) -> Problem:
@@ -247,7 +261,7 @@ class _Reader:
         """Return the region of one entry of `:regions`."""
         if not isinstance(node, List) or len(node.items) < 2:
             self.fail(node.line, f"not a region: {show(node)}", "(NAME (:target NAME) ...)")
-        found: dict[str, Any] = {}
+        fields: dict[str, Any] = {}
         seen: set[str] = set()
         for part in node.items[1:]:
             head = part.head if isinstance(part, List) and len(part.items) == 2 else ""
@@ -256,20 +270,23 @@ class _Reader:
                 self.fail(part.line, f"a second {head} in a region", "one")
             seen.add(head)
             if head == ":target":
-                found["target"] = self.word(value)
+                fields["target"] = self.word(value)
             elif head in (":ranges", ":yaw_rotation"):
                 width, key = (4, "ranges") if head == ":ranges" else (2, "yaw")
                 if not isinstance(value, List):
                     self.fail(value.line, f"{head} {value.text}", "a list of lists of numbers")
-                found[key] = tuple(self.numbers(row, width, head) for row in value.items)
+                fields[key] = tuple(self.numbers(row, width, head) for row in value.items)
             elif head == ":rgba":
-                found["rgba"] = self.numbers(value, 4, head)
+                fields["rgba"] = self.numbers(value, 4, head)
             else:
                 valid = "(:target X), (:ranges (...)), (:yaw_rotation (...)) or (:rgba (...))"
                 self.fail(part.line, f"{show(part)} in a region", valid)
-        if "target" not in found:
+        if "target" not in fields:
             self.fail(node.line, f"region {show(node.items[0])} has no target", "(:target NAME)")
-        return Region(name=self.word(node.items[0]), **found)
+        try:
+            return Region(name=self.word(node.items[0]), **fields)
+        except InvalidInputError as error:
+            raise BDDLError(f"{self.file}:{node.line}: {error}") from None
 
     def numbers(self, node: Word | List, count: int, head: str) -> tuple[float, ...]:
         """Return the `count` numbers of a list."""
@@ -317,3 +334,63 @@ class _Reader:
         if head in ("not", "forall"):
             self.fail(node.line, show(node), "(Not EXPRESSION) or (ForAll (?x - CATEGORY) EXPRESSION)")
         return self.atom(node, known)
+
+
+class Lines:
+    """Line numbers of the parts of a task file.
+
+    Attributes:
+        entities: Name of an object or fixture -> line.
+        regions: Address of a region -> line.
+        init: Line of each init atom.
+        goal: Line of each atom of the goal, in reading order.
+    """
+
+    def __init__(self, tree: List):
+        self._sections = {node.head: node for node in tree.items if isinstance(node, List)}
+        self.entities = {name: line for head in (":fixtures", ":objects") for name, line in self._names(head)}
+        self.regions = dict(self._regions())
+        self.init = [item.line for item in self._items(":init")]
+        self.goal = [line for item in self._items(":goal") for line in _atom_lines(item)]
+
+    def section(self, head: str) -> int:
+        """Return the line of a section such as `:goal`; 1 where there is none."""
+        return self._sections[head].line if head in self._sections else 1
+
+    def of(self, name: str) -> int:
+        """Return the line of the declaration of an object, fixture or region."""
+        return self.entities.get(name, self.regions.get(name, 1))
+
+    def of_part(self, section: str, index: int | str | None) -> int:
+        """Return the line of a part of a section; see `libero_env.tasks.problem.Violation`."""
+        lines = {":init": self.init, ":goal": self.goal}.get(section, [])
+        if isinstance(index, int) and index < len(lines):
+            return lines[index]
+        known = {**self.entities, **self.regions} if isinstance(index, str) else {}
+        return known.get(str(index), self.section(section))
+
+    def _items(self, head: str) -> tuple[Word | List, ...]:
+        return self._sections[head].items[1:] if head in self._sections else ()
+
+    def _names(self, head: str) -> Iterator[tuple[str, int]]:
+        items = [item for item in self._items(head) if isinstance(item, Word)]
+        before = [None, *items[:-1]]
+        for item, last in zip(items, before, strict=False):
+            if item.text != "-" and (last is None or last.text != "-"):
+                yield item.text, item.line
+
+    def _regions(self) -> Iterator[tuple[str, int]]:
+        for node in self._items(":regions"):
+            if not isinstance(node, List) or not node.items or not isinstance(node.items[0], Word):
+                continue
+            for part in node.items[1:]:
+                if isinstance(part, List) and part.head == ":target" and isinstance(part.items[-1], Word):
+                    yield f"{part.items[-1].text}_{node.items[0].text}", node.line
+
+
+def _atom_lines(node: Word | List) -> Iterator[int]:
+    if isinstance(node, List) and node.head in ("and", "or", "not", "forall"):
+        for part in node.items[2:] if node.head == "forall" else node.items[1:]:
+            yield from _atom_lines(part)
+    else:
+        yield node.line

@@ -1,49 +1,79 @@
-"""Conversion of the YAML definition of a task into a `Problem`.
+"""From YAML to a `Problem`: the tasks of the benchmark, those of users' files, and those of one call.
 
-A scene gives objects and places. A task names its scene, sets the scene's parameters (`with`), and adds to or replaces
-keys of the scene. Keys of both:
+    scene: kitchen
+    furniture: [wooden_cabinet]
+    objects: [akita_black_bowl, plate]
+    place:
+      wooden_cabinet_1: {at: [0, -0.3], yaw: pi}
+      akita_black_bowl_1: [0, 0]
+      plate_1: {at: [0.05, 0.2], half: 0.02}
+    goal: On akita_black_bowl_1 plate_1
+    language: put the bowl on the plate
 
-    problem          name of the problem class, as in BDDL
-    language         `:language` of the task file; by default the words of the task's name
+A scene gives objects and places. A task names its scene, sets the scene's parameters (`with`), and adds to the keys of
+the scene or replaces their values. Keys of both:
+
+    scene            a scene of the benchmark with its objects (`kitchen_scene1`), an empty one (`kitchen`,
+                     `living_room`, `study`, `coffee`, `table`, `floor`), or the YAML file of a scene
+    with             parameter: value. `$x` is the value of the parameter x and `$x_0` the first of a list
+    furniture        categories of fixtures, in addition to those of the scene; numbered like objects
     fixtures         name: category
-    objects          categories in joint order; `plate` is plate_1, `{plate: 2}` is plate_1 and plate_2
+    objects          categories in joint order, in addition to those of the scene; `plate` is plate_1,
+                     `{plate: 2}` is plate_1 and plate_2
+    place            object or fixture: its initial place, instead of the one that the scene gives. Either [x, y] on the
+                     workspace in metres (x points away from the robot, y to its left), or `{at: [x, y], half: h,
+                     yaw: angle}` for any point within h of it, or its support: `plate_1`,
+                     `wooden_cabinet_1_top_side`, `In wooden_cabinet_1_top_region`
+    goal             one atom, a list of atoms that must all hold, or an expression: `(Or (Open a) (Not (On b c)))`;
+                     an atom is `On a b`, `(On a b)` or, in Python, `("On", "a", "b")`
+    language         `:language` of the task file; by default the words of the task's name
+    name             name of the task
+    problem          name of the problem class, as in BDDL; by default that of the workspace
     regions          target: {name: region}; the region is empty for a site of the target's model, else `at` (x, y)
                      and `half` (one number or two), or `ranges` [[x0, y0, x1, y1], ...], with `yaw` (one
                      angle or two) and `rgba`; metres and radians, angles may be arithmetic with pi.
-                     `target: [a, b]` are sites of the model
+                     `target: [a, b]` are sites of the model; a region that a task sets to `null` is removed
     init             atoms such as `On plate_1 stove_1`; those of a task's `init_also` come first
     obj_of_interest  names; by default the objects and then the fixtures that the goal refers to, where a region
                      stands for its target
     scene_properties key: value
-    goal             a list of atoms that must all hold, or one expression: `(Or (Open a) (Not (On b c)))`
 
-`$x` is the value of the parameter x and `$x_0` the first of a list; a region that a task sets to `null` is removed.
+Regions that are sites of a model, such as `basket_1_contain_region`, need no declaration.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 from string import Template
 from typing import Any
 
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.storage import parse_yaml
 from libero_env.tasks import bddl
-from libero_env.tasks.problem import And, Expression, Problem, Region
-from libero_env.tasks.sexpr import number
+from libero_env.tasks.problem import WORKSPACES, And, Expression, Problem, ProblemError, Region
+from libero_env.tasks.source import Source, Trace, read_definition, scene_file
+from libero_env.tasks.task import FILE, Task, check_name
+from libero_env.text import suggest
+from libero_env.validation import validate
 
-KEYS = (
-    "problem",
-    "language",
-    "fixtures",
-    "objects",
-    "regions",
-    "init",
-    "init_also",
-    "obj_of_interest",
-    "scene_properties",
-    "goal",
-)
+EMPTY: Mapping[str, str] = {
+    "kitchen": "kitchen_table",
+    "living_room": "living_room_table",
+    "study": "study_table",
+    "coffee": "coffee_table",
+    "table": "table",
+    "floor": "floor",
+}
+_HALF_EXTENT = {"object": 0.025, "fixture": 0.01}  # [m] default, as in the original's scenes
+_PLACING = ("On", "In")  # predicates of init atoms that give an entity its place
+_TABLE = "main_table"  # name of the fixture `table` in the original's task files
+_NESTED = re.compile(r"\(\s*(and|or|not|forall)\b", re.IGNORECASE)
+_KEYS_OF = {"name": "problem", "domain": "problem"}  # field of a problem, or section of a task file -> key
+
+Values = Mapping[str, Any]
 
 
 @cache
@@ -60,74 +90,16 @@ def load_data(name: str) -> Any:
     return parse_yaml(file.read_text(encoding="utf-8"))
 
 
-def load_scene(name: str) -> Mapping[str, Any]:
+def load_scene(name: str) -> Values:
     """Return the definition of a scene of the benchmark."""
     return load_data(f"scenes/{name}.yaml")
 
 
+@cache
 def scene_names() -> tuple[str, ...]:
     """Return the names that `load_scene` accepts, sorted."""
     files = (resources.files("libero_env.tasks") / "data" / "scenes").iterdir()
     return tuple(sorted(file.name.removesuffix(".yaml") for file in files if file.name.endswith(".yaml")))
-
-
-def fill_parameters(definition: Mapping[str, Any], given: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return a definition in which every `$parameter` is replaced by its value.
-
-    Args:
-        definition: Definition of a task or scene.
-        given: Parameter -> value.
-        where: Name of the source in error messages.
-
-    Raises:
-        UnknownNameError: A parameter has no value.
-    """
-    return _fill(definition, _parameters(given), where)
-
-
-def build_problem(scene: Mapping[str, Any], task: Mapping[str, Any]) -> Problem:
-    """Return the problem of a task in a scene.
-
-    Args:
-        scene: Keys shared by the tasks of the scene.
-        task: `name`, `scene`, `with` (values of the scene's parameters) and the keys of the task.
-
-    Raises:
-        LiberoError: A key or a parameter does not exist, or an atom refers to a name that is not declared.
-    """
-    where = f"task {task.get('name', '?')}"
-    own = {key: value for key, value in task.items() if key not in ("name", "scene", "with")}
-    for key in [*scene, *own]:
-        if key not in KEYS:
-            raise UnknownNameError(f"key of {where} or its scene", key, KEYS)
-    definition = {"language": language_from_name(task.get("name", "")), **scene, **own}
-    definition["regions"] = _merge(_sites(scene.get("regions")), _sites(own.get("regions")))
-    for key in ("fixtures", "scene_properties"):
-        definition[key] = _merge(scene.get(key) or {}, own.get(key) or {})
-    definition = _fill(definition, _parameters(task.get("with", {})), where)
-    for key in ("problem", "goal"):
-        if key not in definition:
-            raise LiberoError(f"{where}: neither it nor its scene has the key {key!r}; add it to the YAML")
-    regions = tuple(_regions(definition["regions"]))
-    objects = dict(_objects(definition.get("objects", [])))
-    known = {*definition["fixtures"], *objects, *(region.address for region in regions)}
-    atoms = lambda texts: tuple(bddl.parse_atom(text, known, where) for text in texts)  # noqa: E731
-    goal = definition["goal"]
-    goal = bddl.parse_expression(goal, known, where) if isinstance(goal, str) else And(atoms(goal))
-    interest = definition.get("obj_of_interest")
-    if interest is None:
-        interest = entities_in_goal(goal, regions, objects, definition["fixtures"])
-    return Problem(
-        name=definition["problem"],
-        language=definition["language"],
-        fixtures=definition["fixtures"],
-        objects=objects,
-        regions=regions,
-        init=atoms([*definition.get("init_also", []), *definition.get("init", [])]),
-        obj_of_interest=tuple(interest),
-        scene_properties=definition["scene_properties"],
-        goal=goal,
-    )
 
 
 def language_from_name(name: str) -> str:
@@ -137,6 +109,78 @@ def language_from_name(name: str) -> str:
     return " ".join(words[prefix:])
 
 
+def make_task(name: str | None = None, **definition: Any) -> Task:
+    """Return a user-defined task, from the keys that a task's YAML file may contain.
+
+    Args:
+        name: Name of the task and of its files; by default the words of the language, joined by underscores.
+        definition: Keys such as `scene`, `objects`, `place`, `goal` and `language`, and their values; see
+            `libero_env.tasks.builder`. Values that are None are ignored.
+
+    Returns:
+        The task; its suite is `file`.
+
+    Raises:
+        LiberoError: A key, scene, object or region does not exist, or an object has no place; the message lists the
+            valid names.
+
+    Example:
+        >>> task = make_task(
+        ...     scene="kitchen",
+        ...     objects=["red_coffee_mug", "plate"],
+        ...     place={"red_coffee_mug_1": (0, 0), "plate_1": (0.05, 0.2)},
+        ...     goal=("On", "red_coffee_mug_1", "plate_1"),
+        ...     language="put the red mug on the plate",
+        ... )
+        >>> task.name
+        'put_the_red_mug_on_the_plate'
+    """
+    return task_from_definition({**definition, **({"name": name} if name else {})}, Source("task"))
+
+
+def task_from_definition(definition: Values, source: Source) -> Task:
+    """Return the task of a definition; see `make_task`.
+
+    Args:
+        definition: Content of a YAML file.
+        source: Where it stands.
+
+    Raises:
+        LiberoError: The definition is not valid; the message starts with file and line and lists the valid names.
+    """
+    name, problem = _build(definition, source, check_models=True)
+    return Task(FILE, 0, name, problem.language, problem.language, problem)
+
+
+def build_problem(scene: Values | str | None, task: Values) -> Problem:
+    """Return the problem of a task in a scene, whose objects need no models.
+
+    Args:
+        scene: Keys shared by the tasks of the scene, or its name.
+        task: `name`, `with` (values of the scene's parameters) and the other keys of the task.
+
+    Raises:
+        LiberoError: A key or a parameter does not exist, a value is not valid, or an atom refers to a name that is not
+            declared.
+    """
+    return _build({**task, "scene": scene}, Source(f"task {task.get('name', '?')}"), check_models=False)[1]
+
+
+def check_keys(definition: Values, source: Source, *more: str) -> None:
+    """Check the keys of a definition.
+
+    Raises:
+        InvalidInputError: A key does not exist; the message has the nearest one.
+    """
+    from libero_env.tasks.schema import KEYS
+
+    for key in definition:
+        if key not in (*KEYS, *more):
+            raise InvalidInputError(
+                f"{source.at(key)}: {key} is an unknown key.{suggest(key, KEYS)} Valid: {', '.join(KEYS)}"
+            )
+
+
 def entities_in_goal(goal: Expression, regions: Iterable[Region], *declared: Iterable[str]) -> list[str]:
     """Return the declared names that a goal refers to, in the order declared; for a region its target."""
     targets = {region.address: region.target for region in regions}
@@ -144,32 +188,359 @@ def entities_in_goal(goal: Expression, regions: Iterable[Region], *declared: Ite
     return [name for names in declared for name in names if name in named]
 
 
-def _sites(regions: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return the regions with `target: [a, b]` expanded to `target: {a: {}, b: {}}`."""
+def model_regions(category: str) -> tuple[str, ...]:
+    """Return the regions that are sites of an object's or fixture's model, such as `contain_region`, sorted.
+
+    Raises:
+        UnknownNameError: No object has this name.
+    """
+    from libero_env.assets.pack import select_pack
+
+    names = {site.name for site in select_pack().build(category).spec.sites}
+    return tuple(
+        sorted(name for name in names if name and name != "default_site" and not name.endswith("_site"))
+    )
+
+
+def _build(definition: Values, source: Source, *, check_models: bool) -> tuple[str, Problem]:
+    """Return the name and the problem of a task's definition.
+
+    Args:
+        definition: Keys and values.
+        source: Where it stands.
+        check_models: Whether categories must be those of objects, and undeclared regions are looked up in their models.
+    """
+    check_keys(definition, source)
+    merge = _Merge(Trace(source), check_models)
+    content = merge.content({k: v for k, v in definition.items() if v is not None}, {}, source)
+    language = content.texts.get("language") or language_from_name(content.texts.get("name", ""))
+    name = content.texts.get("name") or re.sub(r"\W+", "_", language.strip().lower()).strip("_")
+    if not language:
+        raise InvalidInputError(
+            f"{source.at()}: it has neither a name nor a language; add `language:` with the instruction"
+        )
+    try:
+        check_name(name)
+    except LiberoError as error:
+        raise InvalidInputError(f"{source.at('language')}: {error}; add `name:`") from None
+    return name, _problem(content, language, merge.trace)
+
+
+@dataclass
+class _Content:
+    """What a definition and its scenes say together.
+
+    Attributes:
+        fixtures: Name -> category.
+        objects: Name -> category.
+        regions: Target -> name -> keys of the region, or None for one that is removed.
+        init: Atoms such as `On a b`.
+        goal: Atoms, and expressions in brackets.
+        styles: Kind -> style.
+        texts: `name`, `language` and `problem`, where they are given.
+        interest: Names of interest; None for those of the goal.
+    """
+
+    fixtures: dict[str, str] = field(default_factory=dict)
+    objects: dict[str, str] = field(default_factory=dict)
+    regions: dict[str, dict[str, Any]] = field(default_factory=dict)
+    init: list[str] = field(default_factory=list)
+    goal: list[str] = field(default_factory=list)
+    styles: dict[str, str] = field(default_factory=dict)
+    texts: dict[str, str] = field(default_factory=dict)
+    interest: list[str] | None = None
+
+    def workspace(self, source: Source) -> tuple[str, str]:
+        """Return the name and category of the fixture that is the workspace."""
+        for name, category in self.fixtures.items():
+            if category in WORKSPACES:
+                return name, category
+        where = source.at("fixtures")
+        raise InvalidInputError(
+            f"{where}: none of its fixtures is a workspace; add a scene: {', '.join(EMPTY)}"
+        )
+
+
+class _Merge:
+    """Merging of a definition with its scene, and of that with its own.
+
+    Args:
+        trace: Notes where atoms and regions come from.
+        check_models: Whether models of objects are asked for, see `_build`.
+    """
+
+    def __init__(self, trace: Trace, check_models: bool):
+        self.trace, self._check_models = trace, check_models
+
+    def content(self, definition: Values, inherited: Values, source: Source) -> _Content:
+        """Return the content of a definition with that of its scene.
+
+        Args:
+            definition: Keys and values.
+            inherited: Parameter -> value, which takes precedence over the definition's.
+            source: Where the definition stands.
+        """
+        from libero_env.tasks.schema import check_definition
+
+        parameters = validate(
+            dict[str, Any],
+            definition.get("with") or {},
+            source=source.name,
+            prefix=("with",),
+            line_of=source.line_of,
+        )
+        parameters = {**parameters, **inherited}
+        content = self._scene(definition, parameters, source)
+        plain = {key: value for key, value in definition.items() if key not in ("scene", "with")}
+        keys: Values = check_definition(_fill(plain, _with_entries(parameters), source.name), source)
+        for name, category in keys.get("fixtures", {}).items():
+            self._check_category("fixture", category, source, "fixtures", name)
+            content.fixtures[name] = category
+        content.fixtures |= self._numbered(keys, "furniture", content.fixtures, source)
+        content.objects |= self._numbered(keys, "objects", content.objects, source)
+        for target, regions in keys.get("regions", {}).items():
+            known = content.regions.setdefault(target, {})
+            for name, region in regions.items():
+                known[name] = None if region is None else {**(known.get(name) or {}), **region}
+                self.trace.note(f"{target}_{name}", source, "regions", target, name)
+        placed = self._place(keys.get("place", {}), content, source)
+        init = self._atoms(keys, "init", source) if "init" in keys else content.init
+        moved = {atom.split()[1] for atom in placed}
+        content.init = [
+            *self._atoms(keys, "init_also", source),
+            *placed,
+            *(atom for atom in init if _placed_by(atom) not in moved),
+        ]
+        if keys.get("goal"):
+            content.goal, content.interest = self._atoms(keys, "goal", source), None
+        content.interest = keys.get("obj_of_interest", content.interest)
+        content.styles |= keys.get("scene_properties", {})
+        content.texts |= {key: keys[key] for key in ("name", "language", "problem") if key in keys}
+        if self._check_models:
+            self._declare_sites(content)
+        return content
+
+    def _scene(self, definition: Values, parameters: Values, source: Source) -> _Content:
+        """Return the content of the scene: one of the benchmark, an empty one, or that of a file."""
+        scene, valid = definition.get("scene"), (*EMPTY, *scene_names())
+        if scene is None:
+            fixtures = definition.get("fixtures")
+            if isinstance(fixtures, Mapping) and any(str(c) in WORKSPACES for c in fixtures.values()):
+                return _Content()
+            raise InvalidInputError(f"{source.at()}: it has no scene; add one of {', '.join(valid)}")
+        if isinstance(scene, Mapping):
+            inner = Source(f"{source.at('scene')}, scene", source.folder, source.root, source.files)
+        elif not isinstance(scene, str):
+            raise InvalidInputError(
+                f"{source.at('scene')}: scene is {scene!r:.60}; expected one of {', '.join(valid)}"
+            )
+        elif scene in EMPTY or scene in WORKSPACES:
+            category = EMPTY.get(scene, scene)
+            return _Content(fixtures={_TABLE if category == "table" else category: category})
+        elif scene.endswith((".yaml", ".yml")):
+            scene, inner = read_definition(scene_file(scene, source), source)
+        elif scene not in valid:
+            raise UnknownNameError(f"scene of {source.at('scene')}", scene, valid)
+        else:
+            scene, inner = load_scene(scene), Source(f"{source.at('with')}, in {scene}")
+        content = self.content(scene, parameters, inner)
+        content.texts = {key: text for key, text in content.texts.items() if key == "problem"}
+        return content
+
+    def _check_category(self, kind: str, category: str, source: Source, *path: str | int) -> None:
+        if self._check_models:
+            from libero_env.assets.pack import select_pack
+
+            known = {*select_pack().categories(), *WORKSPACES}
+            if category not in known:
+                raise UnknownNameError(f"{kind} category of {source.at(*path)}", category, known)
+
+    def _numbered(
+        self, keys: Values, key: str, existing: Mapping[str, str], source: Source
+    ) -> dict[str, str]:
+        """Return name -> category of entries such as `plate` or `{plate: 2}`, numbered after those that exist."""
+        counts, named = Counter(existing.values()), {}
+        for i, entry in enumerate(keys.get(key, ())):
+            for category, number in entry.items() if isinstance(entry, Mapping) else [(entry, 1)]:
+                self._check_category("object", category, source, key, i)
+                for _ in range(number):
+                    counts[category] += 1
+                    named[f"{category}_{counts[category]}"] = category
+        return named
+
+    def _place(self, places: Values, content: _Content, source: Source) -> list[str]:
+        """Add the regions of the key `place`, and return its init atoms."""
+        workspace = content.workspace(source)[0]
+        entities = {**content.fixtures, **content.objects}
+        atoms = []
+        for key, place in places.items():
+            entity = key if key in entities or f"{key}_1" not in entities else f"{key}_1"
+            if entity not in entities or entity == workspace:
+                what = f"object or fixture to place of {source.at('place', key)}"
+                raise UnknownNameError(what, entity, set(entities) - {workspace})
+            if isinstance(place, str):
+                predicate, _, support = place.strip("() ").rpartition(" ")
+                atoms.append(f"{predicate or 'On'} {entity} {support}")
+            else:
+                kind = "fixture" if entity in content.fixtures else "object"
+                content.regions.setdefault(workspace, {})[f"{entity}_start"] = _rectangle(place, kind)
+                atoms.append(f"On {entity} {workspace}_{entity}_start")
+                self.trace.note(f"{workspace}_{entity}_start", source, "place", key)
+            self.trace.note(atoms[-1], source, "place", key)
+        return atoms
+
+    def _atoms(self, keys: Values, key: str, source: Source) -> list[str]:
+        """Return atoms such as `On a b` without brackets, and expressions with them."""
+        atoms = []
+        for i, text in enumerate(keys.get(key, ())):
+            is_nested = text.startswith("(") and (text.count("(") > 1 or _NESTED.match(text))
+            atoms.append(text if is_nested else text.removeprefix("(").removesuffix(")").strip())
+            self.trace.note(atoms[-1], source, key, i)
+        return atoms
+
+    def _declare_sites(self, content: _Content) -> None:
+        """Declare the regions of models that atoms refer to.
+
+        Raises:
+            UnknownNameError: The region does not exist; the message lists the valid ones.
+        """
+        entities = {**content.fixtures, **content.objects}
+        declared = {f"{target}_{name}" for target, names in content.regions.items() for name in names}
+        for atom in (*content.init, *content.goal):
+            words = re.findall(r"[^\s()]+", atom)
+            for name in words if atom.startswith("(") else words[1:]:
+                target = max((t for t in entities if name.startswith(f"{t}_")), key=len, default=None)
+                if name in entities or name in declared or target is None or entities[target] in WORKSPACES:
+                    continue
+                site = name.removeprefix(f"{target}_")
+                if site not in (valid := model_regions(entities[target])):
+                    what = f"region of {target} ({self.trace.at(atom)}: {atom})"
+                    raise UnknownNameError(what, site, valid or ("none",))
+                content.regions.setdefault(target, {})[site] = {}
+
+
+def _problem(content: _Content, language: str, trace: Trace) -> Problem:
+    """Return the problem of what all definitions say together."""
+    source = trace.source
+    if not content.goal:
+        raise InvalidInputError(
+            f"{source.at()}: it has no goal; add one, such as `goal: On red_coffee_mug_1 plate_1`"
+        )
+    counts = Counter(content.objects.values())  # those of a category stand together
+    objects = {f"{category}_{i + 1}": category for category, n in counts.items() for i in range(n)}
+    placed = {_placed_by(atom) for atom in content.init}
+    if missing := [
+        name
+        for name, category in {**content.fixtures, **objects}.items()
+        if name not in placed and category not in WORKSPACES
+    ]:
+        raise InvalidInputError(
+            f"{source.at('place')}: {', '.join(missing)} has no place; add it below place: `{missing[0]}: [0, 0]`"
+        )
+    regions = tuple(
+        _region(name, target, keys, trace)
+        for target, named in content.regions.items()
+        for name, keys in named.items()
+        if keys is not None
+    )
+    known = {*content.fixtures, *objects, *(region.address for region in regions)}
+    parts: tuple[Expression, ...] = ()
+    try:
+        init = tuple(bddl.parse_atom(atom, known, *trace.of(atom)) for atom in content.init)
+        for text in content.goal:
+            parse = bddl.parse_expression if text.startswith("(") else bddl.parse_atom
+            parts += (parse(text, known, *trace.of(text)),)
+        goal = parts[0] if len(parts) == 1 and content.goal[0].startswith("(") else And(parts)
+        interest = content.interest
+        if interest is None:
+            interest = entities_in_goal(goal, regions, objects, content.fixtures)
+        return Problem(
+            name=content.texts.get("problem") or _problem_class(content, source),
+            language=language,
+            fixtures=content.fixtures,
+            objects=objects,
+            regions=regions,
+            init=init,
+            obj_of_interest=tuple(interest),
+            scene_properties=content.styles,
+            goal=goal,
+        )
+    except ProblemError as error:
+        first = error.violations[0]
+        label: object = first.part
+        if isinstance(label, int):
+            atoms = content.init if first.section == ":init" else [str(a)[1:-1] for a in goal.atoms()]
+            label = atoms[label] if label < len(atoms) else None
+        key = first.section.removeprefix(":")
+        where = trace.at(str(label), _KEYS_OF.get(key, key))
+        raise InvalidInputError(f"{where}: {first.what}; expected {first.expected}") from None
+    except InvalidInputError as error:
+        key = str(error.path[0]) if error.path else "goal"
+        where = source.at(_KEYS_OF.get(key, key))
+        raise InvalidInputError(f"{where}: {str(error).removeprefix('Problem: ')}") from None
+
+
+def _problem_class(content: _Content, source: Source) -> str:
+    """Return the name of the problem class of the workspace."""
+    from libero_env.assets.arena import load_workspace
+
+    return load_workspace(content.workspace(source)[1]).problem
+
+
+def _placed_by(atom: str) -> str | None:
+    """Return the object or fixture that an init atom gives its place; None where it places nothing."""
+    words = atom.split()
+    return words[1] if len(words) == 3 and words[0].capitalize() in _PLACING else None
+
+
+def _rectangle(place: Values, kind: str) -> dict[str, Any]:
+    """Return the keys of the region of a place: `ranges`, `yaw` and `rgba`."""
+    region = dict(place)
+    if "ranges" in region:
+        return region
+    at, half = region.pop("at"), region.pop("half", (_HALF_EXTENT[kind],) * 2)
+    region["ranges"] = [[round(at[k % 2] + (-1, 1)[k // 2] * half[k % 2], 6) for k in range(4)]]
+    return region
+
+
+def _region(name: str, target: str, keys: Values, trace: Trace) -> Region:
+    """Return the region of its keys."""
+    where = trace.at(f"{target}_{name}", "regions", target, name)
+    ranges = [tuple(row) for row in keys.get("ranges", ())]
+    if "at" in keys:
+        if "half" not in keys:
+            raise InvalidInputError(
+                f"{where}: {target}_{name}: it has at, but no half; add such as half: 0.02, metres"
+            )
+        (x, y), (half_x, half_y) = keys["at"], keys["half"]
+        ranges.append((x - half_x, y - half_y, x + half_x, y + half_y))
+    yaw = (tuple(keys["yaw"]),) if "yaw" in keys else ()
+    try:
+        return Region(name, target, tuple(ranges), yaw, tuple(keys.get("rgba", ())))
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{where}: {error}") from None
+
+
+def _with_entries(parameters: Values) -> dict[str, Any]:
+    """Return parameters, those that are lists also entry by entry: `x_0`, `x_1`."""
+    lists = {key: value for key, value in parameters.items() if isinstance(value, list)}
     return {
-        target: {name: {} for name in named} if isinstance(named, list) else named
-        for target, named in (regions or {}).items()
+        **parameters,
+        **{f"{key}_{i}": item for key, items in lists.items() for i, item in enumerate(items)},
     }
 
 
-def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `base` updated by `over`, with mappings merged at every level; keys of `base` come first."""
-    merged = dict(base)
-    for key, value in over.items():
-        nested = isinstance(value, Mapping) and isinstance(merged.get(key), Mapping)
-        merged[key] = _merge(merged[key], value) if nested else value
-    return merged
+def _fill(node: Any, values: Values, where: str) -> Any:
+    """Return `node` with every `$parameter` replaced; a text that is only a parameter becomes its value.
 
-
-def _parameters(given: Mapping[str, Any]) -> dict[str, Any]:
-    lists = {key: value for key, value in given.items() if isinstance(value, list)}
-    return {**given, **{f"{key}_{i}": item for key, items in lists.items() for i, item in enumerate(items)}}
-
-
-def _fill(node: Any, values: Mapping[str, Any], where: str) -> Any:
-    """Return `node` with every `$parameter` replaced; a string that is only a parameter becomes its value."""
+    Raises:
+        UnknownNameError: A parameter has no value.
+    """
     if isinstance(node, Mapping):
-        return {_fill_key(key, values, where): _fill(value, values, where) for key, value in node.items()}
+        filled = {_fill(key, values, where): _fill(value, values, where) for key, value in node.items()}
+        if wrong := [key for key in filled if not isinstance(key, str)]:
+            raise LiberoError(f"{where}: the key {wrong[0]!r:.60} is not a text")
+        return filled
     if isinstance(node, list | tuple):
         return [_fill(item, values, where) for item in node]
     if not isinstance(node, str) or "$" not in node:
@@ -180,47 +551,3 @@ def _fill(node: Any, values: Mapping[str, Any], where: str) -> Any:
         return Template(node).substitute(values)
     except (KeyError, ValueError) as error:
         raise UnknownNameError(f"parameter of {where} in {node!r}", str(error), values) from error
-
-
-def _fill_key(key: Any, values: Mapping[str, Any], where: str) -> str:
-    filled = _fill(key, values, where)
-    if not isinstance(filled, str):
-        raise LiberoError(f"{where}: the key {key!r:.60} is {filled!r:.60}; expected a text")
-    return filled
-
-
-def _objects(entries: Sequence[str | Mapping[str, int]]):
-    for entry in entries:
-        for category, count in entry.items() if isinstance(entry, Mapping) else [(entry, 1)]:
-            for i in range(1, count + 1):
-                yield f"{category}_{i}", category
-
-
-def _regions(targets: Mapping[str, Mapping[str, Any]]):
-    for target, regions in targets.items():
-        for name, region in regions.items():
-            if region is not None:
-                yield _region(name, target, region)
-
-
-def _region(name: str, target: str, region: Mapping[str, Any]) -> Region:
-    for key in region:
-        if key not in ("at", "half", "ranges", "yaw", "rgba"):
-            raise UnknownNameError(
-                f"key of region {target}_{name}", key, ("at", "half", "ranges", "yaw", "rgba")
-            )
-    ranges = [(float(x0), float(y0), float(x1), float(y1)) for x0, y0, x1, y1 in region.get("ranges", [])]
-    if "at" in region:
-        if "half" not in region:
-            raise LiberoError(
-                f"region {target}_{name}: it has at, but no half; add such as half: 0.02, metres"
-            )
-        (x, y), half = region["at"], region["half"]
-        half_x, half_y = half if isinstance(half, list | tuple) else (half, half)
-        ranges.append((x - half_x, y - half_y, x + half_x, y + half_y))
-    yaw: tuple[tuple[float, float], ...] = ()
-    if "yaw" in region:
-        angles = region["yaw"] if isinstance(region["yaw"], list | tuple) else [region["yaw"]] * 2
-        low, high = (number(str(angle)) for angle in angles)
-        yaw = ((low, high),)
-    return Region(name, target, tuple(ranges), yaw, tuple(map(float, region.get("rgba", ()))))

@@ -1,13 +1,97 @@
-"""The dataclass `Problem`, its parts, and the comparison of two problems."""
+"""The dataclass `Problem`: what a task file says. Its parts, what makes one valid, and the comparison of two.
 
-from collections.abc import Callable, Iterator, Mapping
+Every value is checked when it is made, so that whoever has a problem has a valid one. What needs the models of objects
+is checked when its scene is built.
+"""
+
+import inspect
+import re
+from collections import Counter
+from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, field, fields
-from typing import TypeVar
+from typing import Annotated, TypeVar
+
+from pydantic import AfterValidator, Field
+
+from libero_env.errors import InvalidInputError
+from libero_env.validation import checked
+
+MAX_DEPTH = 64  # levels of a goal, and of brackets in a task file
+MAX_PARTS = 1000  # regions, init atoms, parts of a goal, rectangles of a region
+MAX_ENTITIES = 100  # objects and fixtures of a scene
+MAX_NAME = 100  # characters of a name
+_MAX_EVALUATIONS = 10_000  # atoms of a goal, counted for each object that its quantifiers stand for
+
+WORKSPACES = ("table", "kitchen_table", "living_room_table", "study_table", "coffee_table", "floor")
+"""Categories of the fixtures that a task takes place on, see `libero_env.assets.arena`."""
+
+_NAME = re.compile(rf"\w[\w.-]{{0,{MAX_NAME - 1}}}")
+_NAME_RULE = f"letters, digits, _ . and -, at most {MAX_NAME} characters"
+_UNWRITABLE = re.compile("[();\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+_RESERVED = ("robot", "world", "ee")  # the robot in contacts, MuJoCo's root, the hand in observations
+_RESERVED_PREFIXES = ("robot0", "gripper0", "mount0")
+_VARIABLE = re.compile(r"\??\w[\w.-]*")
+_PLACING = ("On", "In")
 
 Value = TypeVar("Value")
 
 
-@dataclass(frozen=True)
+def _check_name(text: str) -> str:
+    if not _NAME.fullmatch(text):
+        raise ValueError(f"the name {text!r:.60} is not valid; expected {_NAME_RULE}")
+    return text
+
+
+def _check_entity(name: str) -> str:
+    if name in _RESERVED or name.startswith(_RESERVED_PREFIXES):
+        raise ValueError(
+            f"the name {name} is one of the robot or of MuJoCo; expected another, such as plate_1"
+        )
+    return name
+
+
+def _check_writable(text: str) -> str:
+    if _UNWRITABLE.search(text):
+        raise ValueError(f"{text!r:.60} cannot be written; expected one line without ( ) and ;")
+    return text
+
+
+def check_corners(rectangle: Value) -> Value:
+    """Return a rectangle (x0, y0, x1, y1), whose corners must be in order."""
+    x0, y0, x1, y1 = rectangle  # type: ignore[misc]
+    if x1 < x0 or y1 < y0:
+        raise ValueError(
+            f"{rectangle} has swapped corners; expected (X0 Y0 X1 Y1) with X0 <= X1 and Y0 <= Y1"
+        )
+    return rectangle
+
+
+def check_order(limits: Value) -> Value:
+    """Return a range (low, high), which must be in order."""
+    low, high = limits  # type: ignore[misc]
+    if high < low:
+        raise ValueError(f"{limits} is not a range; expected (LOW HIGH) with LOW <= HIGH")
+    return limits
+
+
+def _check_colour(rgba: tuple[float, ...]) -> tuple[float, ...]:
+    if len(rgba) not in (0, 4):
+        raise ValueError(f"{rgba} is not a colour; expected 4 numbers")
+    return rgba
+
+
+Name = Annotated[str, AfterValidator(_check_name)]
+EntityName = Annotated[Name, AfterValidator(_check_entity)]
+Words = Annotated[str, Field(max_length=MAX_NAME), AfterValidator(_check_writable)]
+Language = Annotated[str, Field(max_length=1000), AfterValidator(_check_writable)]
+Metres = Annotated[float, Field(ge=-10, le=10)]  # in the frame of the workspace
+Radians = Annotated[float, Field(ge=-100, le=100)]
+Rectangle = Annotated[tuple[Metres, Metres, Metres, Metres], AfterValidator(check_corners)]
+YawRange = Annotated[tuple[Radians, Radians], AfterValidator(check_order)]
+Colour = Annotated[tuple[float, ...], AfterValidator(_check_colour)]  # none, or red, green, blue, opacity
+
+
+@checked
 class Region:
     """A place on or in a fixture, object or workspace.
 
@@ -20,11 +104,11 @@ class Region:
         rgba: Colour in task files; nothing is drawn.
     """
 
-    name: str
-    target: str
-    ranges: tuple[tuple[float, float, float, float], ...] = ()
-    yaw: tuple[tuple[float, float], ...] = ()
-    rgba: tuple[float, ...] = ()
+    name: Name
+    target: Name
+    ranges: Annotated[tuple[Rectangle, ...], Field(max_length=MAX_PARTS)] = ()
+    yaw: tuple[YawRange, ...] = ()
+    rgba: Colour = ()
 
     @property
     def address(self) -> str:
@@ -34,6 +118,17 @@ class Region:
 
 class Expression:
     """A condition on a state: an atom, or one made of other conditions. As a text it is as in task files."""
+
+    levels: int  # of conditions within each other
+    size: int  # number of conditions
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "levels", 1 + max((child.levels for child in self.children), default=0))
+        object.__setattr__(self, "size", 1 + sum(child.size for child in self.children))
+        if self.levels > MAX_DEPTH or self.size > MAX_PARTS:
+            raise InvalidInputError(
+                f"the goal is too large; expected at most {MAX_DEPTH} levels and {MAX_PARTS} parts"
+            )
 
     @property
     def children(self) -> "tuple[Expression, ...]":
@@ -60,12 +155,12 @@ class Expression:
         return f"({' '.join((type(self).__name__, *map(str, self.children)))})"
 
 
-@dataclass(frozen=True)
+@checked
 class Atom(Expression):
     """A predicate applied to names, such as `On butter_1 floor_bin_region`; its predicate is capitalised."""
 
     predicate: str
-    args: tuple[str, ...]
+    args: Annotated[tuple[str, ...], Field(min_length=1)]
 
     def atoms(self) -> "tuple[Atom, ...]":
         """Return the atom itself."""
@@ -88,21 +183,21 @@ class _Several(Expression):
         return type(self)(tuple(map(function, self.parts)))
 
 
-@dataclass(frozen=True)
+@checked
 class And(_Several):
     """Conjunction: holds if all parts hold."""
 
     parts: tuple[Expression, ...]
 
 
-@dataclass(frozen=True)
+@checked
 class Or(_Several):
     """Disjunction: holds if any part holds."""
 
     parts: tuple[Expression, ...]
 
 
-@dataclass(frozen=True)
+@checked
 class Not(Expression):
     """Negation: holds if the part does not."""
 
@@ -118,7 +213,7 @@ class Not(Expression):
         return Not(function(self.part))
 
 
-@dataclass(frozen=True)
+@checked
 class ForAll(Expression):
     """Quantifier: holds if the body holds for each object of the categories; variables are (`?name`, category)."""
 
@@ -139,7 +234,7 @@ class ForAll(Expression):
         return f"(ForAll ({variables}) {self.body})"
 
 
-@dataclass(frozen=True)
+@checked
 class Problem:
     """Content of a task file.
 
@@ -154,18 +249,26 @@ class Problem:
         obj_of_interest: Names of the objects that the task is about.
         scene_properties: Kind (`floor`, `wall`, `scene`) -> style.
         domain: Name of the planning domain.
+
+    Raises:
+        ProblemError: No scene can be built from it.
+        InvalidInputError: A field is of another type, or too large.
     """
 
-    name: str
-    language: str
+    name: Name
+    language: Language
     goal: Expression
-    fixtures: Mapping[str, str] = field(hash=False)
-    objects: Mapping[str, str] = field(hash=False)
-    regions: tuple[Region, ...] = ()
-    init: tuple[Atom, ...] = ()
-    obj_of_interest: tuple[str, ...] = ()
-    scene_properties: Mapping[str, str] = field(default_factory=dict, hash=False)
-    domain: str = "robosuite"
+    fixtures: Mapping[EntityName, Name] = field(hash=False)
+    objects: Mapping[EntityName, Name] = field(hash=False)
+    regions: Annotated[tuple[Region, ...], Field(max_length=MAX_PARTS)] = ()
+    init: Annotated[tuple[Atom, ...], Field(max_length=MAX_PARTS)] = ()
+    obj_of_interest: tuple[Name, ...] = ()
+    scene_properties: Mapping[Name, Words] = field(default_factory=dict, hash=False)
+    domain: Words = "robosuite"
+
+    def __post_init__(self) -> None:
+        if violations := tuple(_violations(self)):
+            raise ProblemError(self, *violations)
 
     def __eq__(self, other: object) -> bool:
         """Return whether all fields are equal, the order of fixtures and objects included."""
@@ -178,6 +281,221 @@ class Problem:
     def region(self, address: str) -> Region | None:
         """Return the region with an address such as `floor_bin_region`; None where it is not declared."""
         return next((region for region in self.regions if region.address == address), None)
+
+    def kind_of(self, name: str) -> str | None:
+        """Return `object`, `fixture`, `workspace` or `region`; None for a name that is not declared."""
+        if category := self.fixtures.get(name):
+            return "workspace" if category in WORKSPACES else "fixture"
+        if name in self.objects:
+            return "object"
+        return None if self.region(name) is None else "region"
+
+
+@dataclass(frozen=True)
+class Violation:
+    """What is wrong with a problem, and where.
+
+    Attributes:
+        rule: Name of the rule, such as `region-ranges`.
+        what: What is wrong.
+        expected: What is valid.
+        section: Section of a task file, such as `:regions`.
+        part: Name of an object, fixture or region in it, or the number of an atom; None for all of the section.
+    """
+
+    rule: str
+    what: str
+    expected: str
+    section: str
+    part: str | int | None = None
+
+
+class ProblemError(InvalidInputError):
+    """A problem that no scene can be built from; the message names the task and the first thing that is wrong.
+
+    Attributes:
+        problem: The problem, for reports.
+        violations: All that is wrong.
+    """
+
+    def __init__(self, problem: Problem, *violations: Violation):
+        first, language = violations[0], problem.language
+        super().__init__(f"task {language!r:.80}, {first.section}: {first.what}; expected {first.expected}")
+        self.problem, self.violations = problem, violations
+
+    def __reduce__(self) -> tuple[type, tuple[object, ...]]:
+        """Let worker processes send the error: its arguments are not its message."""
+        return type(self), (self.problem, *self.violations)
+
+
+# Kinds of names that the arguments of predicates may have; predicates that are not in `KINDS` take anything.
+_ENTITY = frozenset({"object", "fixture"})
+_PLACE = _ENTITY | {"region"}
+_SOLID = _ENTITY | {"workspace"}
+KINDS: dict[str, tuple[frozenset[str], ...]] = {
+    "On": (_ENTITY, _PLACE),
+    "In": (_ENTITY, frozenset({"region"})),
+    "Stack": (_ENTITY, _PLACE),
+    "Up": (_ENTITY,),
+    "Open": (_PLACE,),
+    "Close": (_PLACE,),
+    "Turnon": (_PLACE,),
+    "Turnoff": (_PLACE,),
+    "Incontact": (_SOLID, _SOLID),
+    "Printjointstate": (_PLACE,),
+}
+
+
+def declare_predicate(predicate: str, function: Callable[..., bool]) -> None:
+    """Set the number of arguments of a predicate from those of its function, of any kind.
+
+    Args:
+        predicate: Name of the predicate, capitalised.
+        function: Function of a state and of the arguments. One that takes any number of them may have any number.
+    """
+    KINDS.pop(predicate, None)
+    try:
+        parameters = list(inspect.signature(function).parameters.values())
+    except (TypeError, ValueError):  # of some functions in C
+        return
+    plain = all(
+        p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty for p in parameters
+    )
+    if plain and len(parameters) > 1:
+        KINDS[predicate] = (_PLACE | {"workspace"},) * (len(parameters) - 1)
+
+
+def _violations(problem: Problem) -> Iterator[Violation]:
+    """Yield what is wrong with a problem whose fields have the right types."""
+    if (count := len(problem.objects) + len(problem.fixtures)) > MAX_ENTITIES:
+        yield Violation("size", f"{count} objects and fixtures", f"at most {MAX_ENTITIES}", ":objects")
+        return
+    for name in sorted(problem.fixtures.keys() & problem.objects.keys()):
+        yield Violation("name", f"{name} is a fixture too", "each name declared once", ":objects", name)
+    for kind in problem.scene_properties:
+        if kind != kind.casefold():
+            yield Violation("name", f"the scene property {kind}", "floor, wall or scene", ":scene_properties")
+    used = {name for atom in (*problem.init, *problem.goal.atoms()) for name in atom.args}
+    count_of = Counter(region.address for region in problem.regions)
+    for region in problem.regions:
+        for rule, what, expected in _region(
+            problem, region, region.address in used, count_of[region.address]
+        ):
+            yield Violation(rule, f"{region.address}{what}", expected, ":regions", region.address)
+    for i, atom in enumerate(problem.init):
+        for rule, what, expected in _atom(problem, atom):
+            yield Violation(rule, f"{atom}{what}", expected, ":init", i)
+    yield from _places(problem)
+    yield from _goal(problem)
+
+
+def _region(problem: Problem, region: Region, is_used: bool, count: int) -> Iterator[tuple[str, str, str]]:
+    """Check that a region has a name of its own, and is a rectangle on the workspace or a site of something else.
+
+    Yields:
+        Rule, what is wrong (after the address of the region), and what is valid.
+    """
+    if count > 1:
+        yield "name", " is declared twice", "each region of a target once"
+    elif region.address in problem.objects or region.address in problem.fixtures:
+        yield "name", f" is both a region of {region.target} and an object or fixture", "different names"
+    if not is_used:
+        return
+    kind = problem.kind_of(region.target)
+    if kind is None or kind == "region":
+        entities = ", ".join(sorted({**problem.fixtures, **problem.objects}))
+        yield "region-target", f": its target {region.target} is not declared", f"one of {entities}"
+    elif kind == "workspace" and not region.ranges:
+        yield "region-ranges", " has no extent", "(:ranges ((X0 Y0 X1 Y1))), metres"
+    elif kind != "workspace" and region.ranges:
+        what = f": ranges are for the workspace only, but {region.target} is {_article(kind)}"
+        yield "region-ranges", what, "no :ranges; the region is then the site of that name"
+
+
+def _atom(problem: Problem, atom: Atom, bound: Container[str] = ()) -> Iterator[tuple[str, str, str]]:
+    """Check number and kinds of the arguments of an atom; what is yielded is as of `_region`."""
+    kinds, count = KINDS.get(atom.predicate), len(atom.args)
+    if kinds is not None and count != len(kinds):
+        yield "arity", f" has {_names(count)}", f"{len(kinds)}: {atom.predicate} takes {_names(len(kinds))}"
+        return
+    for i, name in enumerate(atom.args):
+        kind = "object" if name in bound else problem.kind_of(name)
+        if kind is None:
+            yield "unknown-name", f": {name} is not declared", "a declared name"
+        elif kinds is not None and kind not in kinds[i]:
+            yield (
+                "kind",
+                f": {name} is {_article(kind)}",
+                f"{' or '.join(map(_article, sorted(kinds[i])))} there",
+            )
+    if kinds is not None and count == 2 and atom.args[0] == atom.args[1]:
+        yield "kind", f" is of {atom.args[0]} and itself", "two names"
+
+
+def _article(kind: str) -> str:
+    return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
+
+
+def _names(count: int) -> str:
+    return f"{count} name{'s' if count != 1 else ''}"
+
+
+def _places(problem: Problem) -> Iterator[Violation]:
+    """Check that nothing is placed twice or, by way of others, on itself."""
+    placing = [
+        (i, atom) for i, atom in enumerate(problem.init) if atom.predicate in _PLACING and len(atom.args) == 2
+    ]
+    counts = Counter(atom.args[0] for _, atom in placing)
+    carriers: dict[str, str] = {}
+    for i, atom in placing:
+        name, place = atom.args
+        if name in carriers and (count := counts.pop(name, 1)) > 1:
+            what = f"{name} is placed {count} times"
+            yield Violation("placed-twice", what, "one atom that places it", ":init", i)
+        region = problem.region(place)
+        carriers[name] = place if region is None else region.target
+    for i, atom in placing:
+        seen, name = set[str](), atom.args[0]
+        while name in carriers and name not in seen:
+            seen.add(name)
+            name = carriers[name]
+        if name == atom.args[0] and name in seen and atom.args[0] != atom.args[1]:
+            what = f"{atom} places it, by way of others, on itself"
+            yield Violation("placed-in-a-circle", what, "one of them on the workspace", ":init", i)
+
+
+def _goal(problem: Problem) -> Iterator[Violation]:
+    """Check the atoms of a goal, that no part of it is empty, and how often quantifiers repeat it."""
+    categories = Counter(problem.objects.values())
+    index = evaluations = 0
+
+    def visit(node: Expression, bound: frozenset[str], times: int) -> Iterator[Violation]:
+        nonlocal index, evaluations
+        if isinstance(node, Atom):
+            for rule, what, expected in _atom(problem, node, bound):
+                yield Violation(rule, f"{node}{what}", expected, ":goal", index)
+            index, evaluations = index + 1, evaluations + times
+        elif not node.children:
+            always = "always" if isinstance(node, And) else "never"
+            what = f"an empty {type(node).__name__} is {always} true"
+            yield Violation("empty-goal", what, "the conditions that must hold", ":goal")
+        elif isinstance(node, ForAll):
+            for variable, category in node.variables:
+                times *= categories[category]
+                if not categories[category]:
+                    what = f"no object is a {category}: {variable} has no values and the part is always true"
+                    yield Violation("empty-goal", what, f"one of {', '.join(sorted(categories))}", ":goal")
+                if not _VARIABLE.fullmatch(variable) or problem.kind_of(variable) is not None:
+                    what = f"the variable {variable!r:.80}"
+                    yield Violation("name", what, "a new name such as ?x", ":goal")
+            bound |= {name for name, _ in node.variables}
+        for child in node.children:
+            yield from visit(child, bound, times)
+
+    yield from visit(problem.goal, frozenset(), 1)
+    if evaluations > _MAX_EVALUATIONS:
+        what = f"its quantifiers stand for {evaluations} atoms"
+        yield Violation("size", what, f"at most {_MAX_EVALUATIONS}", ":goal")
 
 
 def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
@@ -202,13 +520,13 @@ def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
         "init": (set(a.init), set(b.init)),
         "goal": (a.goal.fold(_meaning), b.goal.fold(_meaning)),
     }
-    found = [f"{what}: {x} is not {y}" for what, (x, y) in pairs.items() if x != y]
+    lines = [f"{what}: {x} is not {y}" for what, (x, y) in pairs.items() if x != y]
     regions_a, regions_b = ({region.address: region for region in p.regions} for p in (a, b))
     for address in sorted(regions_a.keys() | regions_b.keys()):
         x, y = regions_a.get(address), regions_b.get(address)
         if x is None or y is None or not _same_region(x, y, tolerance):
-            found.append(f"region {address}: {x} is not {y}")
-    return found
+            lines.append(f"region {address}: {x} is not {y}")
+    return lines
 
 
 def same_meaning(a: Problem, b: Problem) -> bool:

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from typing import NoReturn
 
 from libero_env.errors import BDDLError
+from libero_env.tasks.problem import MAX_DEPTH
+from libero_env.text import shorten
 
-MAX_DEPTH = 64  # nested brackets; deeper is an error, and the functions on trees are recursive
+MAX_CHARACTERS = 1 << 20  # of a task file; the original's have 4,000
 
 _TOKEN = re.compile(r";[^\n]*|[()]|\n|[^\s();]+")
 _UNREADABLE = re.compile("[\x00-\x08\x0e-\x1f\x7f\ud800-\udfff]")
-_MAX_SHOWN = 80  # characters of a node in a message
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,7 @@ def fail(file: str, line: int, what: str, expected: str) -> NoReturn:
 
 def show(node: Word | List) -> str:
     """Return a node as text on one line, truncated where it is long."""
-    text = _text(node)
-    return text if len(text) <= _MAX_SHOWN else f"{text[:_MAX_SHOWN]}..."
+    return shorten(_text(node))
 
 
 def _text(node: Word | List) -> str:
@@ -62,6 +62,8 @@ def parse_tree(text: str, file: str, first: int = 1) -> List:
         BDDLError: Brackets do not match or nest too deeply, the text is not one list, or it contains characters that
             are not text.
     """
+    if len(text) > MAX_CHARACTERS:
+        fail(file, 1, f"{len(text)} characters", f"a task file of at most {MAX_CHARACTERS}")
     if bad := _UNREADABLE.search(text):
         line = text.count("\n", 0, bad.start()) + first
         fail(file, line, f"the character {bad[0]!a}", "text; is this a complete task file?")

@@ -39,6 +39,12 @@ class Source:
         """Return `file:line` of a path of keys; the name where there are no lines."""
         return f"{self.name}:{self.line(*path)}" if self.line_of else self.name
 
+    def shared_with(self, own: Sequence[Key], index: int) -> LineOf | None:
+        """Return the lines of one of the tasks of the file: its own keys are below `tasks`, the others are shared."""
+        if (line_of := self.line_of) is None:
+            return None
+        return lambda path: line_of(("tasks", index, *path) if not path or path[0] in own else path)
+
 
 def read_definition(path: Path, source: Source | None = None) -> tuple[dict[str, Any], Source]:
     """Return the content of a task's or scene's YAML file, and where it stands.
@@ -53,13 +59,13 @@ def read_definition(path: Path, source: Source | None = None) -> tuple[dict[str,
     files = source.files if source else ()
     resolved = path.resolve()
     if source and (resolved in files or len(files) >= MAX_FILES):
-        shown = " -> ".join(file.name for file in (*files, resolved)[-4:])
-        raise InvalidInputError(f"{source.at('scene')}: scenes include each other without end: {shown}")
+        names = " -> ".join(file.name for file in (*files, resolved)[-4:])
+        raise InvalidInputError(f"{source.at('scene')}: scenes include each other without end: {names}")
     content = read_yaml_file(path)
     if not isinstance(content.data, dict):
         raise InvalidInputError(f"{content.at()}: expected keys such as scene, objects, place and goal")
     if wrong := [key for key in content.data if not isinstance(key, str)]:
-        raise InvalidInputError(f"{content.at()}: the key {wrong[0]!r:.60} is no text")
+        raise InvalidInputError(f"{content.at()}: the key {wrong[0]!r:.60} is not a text")
     root = source.root if source and source.root else path.parent
     return content.data, Source(str(path), path.parent, root, (*files, resolved), content.line_of)
 
@@ -70,16 +76,16 @@ def scene_file(name: str, source: Source) -> Path:
     Raises:
         InvalidInputError: The file is missing, or is not in the folder of the task's file.
     """
-    path = source.folder / name
+    path, at = source.folder / name, source.at("scene")
     if not name.isprintable() or len(name.encode()) > MAX_NAME_BYTES:
-        raise InvalidInputError(f"{source.at('scene')}: its scene {name!r:.80} is no name of a file")
+        raise InvalidInputError(f"{at}: its scene {name!r:.80} is not the name of a file")
     if source.root is not None and not path.resolve().is_relative_to(source.root.resolve()):
         raise InvalidInputError(
-            f"{source.at('scene')}: its scene {name} is not in the folder of the task's file, {source.root}; put a "
-            f"copy there, and give its name"
+            f"{at}: its scene {name} is not in the folder of the task's file, {source.root}; put a copy there, and "
+            "give its name"
         )
     if not path.is_file():
-        raise InvalidInputError(f"{source.at('scene')}: its scene {path} is missing")
+        raise InvalidInputError(f"{at}: its scene {path} is missing")
     return path
 
 
@@ -98,19 +104,12 @@ class Trace:
         """Note where something stands; the first note about it counts."""
         self._notes.setdefault(label, (source, path))
 
-    def of(self, label: str, *otherwise: Key) -> tuple[Source, int]:
-        """Return the source and line of what was noted, or of a key of the task."""
+    def of(self, label: str, *otherwise: Key) -> tuple[str, int]:
+        """Return the file and line of what was noted, or of a key of the task."""
         source, path = self._notes.get(label, (self.source, otherwise))
-        return source, source.line(*path)
+        return source.name, source.line(*path)
 
     def at(self, label: str, *otherwise: Key) -> str:
         """Return `file:line` of what was noted, or of a key of the task."""
         source, path = self._notes.get(label, (self.source, otherwise))
         return source.at(*path)
-
-
-def merged_lines(line_of: LineOf | None, own: Sequence[Key], index: int) -> LineOf | None:
-    """Return the lines of one of the tasks of a file: its own keys are below `tasks`, the others are shared."""
-    if line_of is None:
-        return None
-    return lambda path: line_of(("tasks", index, *path) if not path or path[0] in own else path)

@@ -1,24 +1,25 @@
-"""Suites of the benchmark by name."""
+"""Suites and tasks by name, and from user-defined files: one task, several, or a suite of files."""
 
-from functools import cache
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
 
-from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.tasks.builder import build_problem, language_from_name, load_data, load_scene
-from libero_env.tasks.published.folders import is_published
-from libero_env.tasks.task import Suite, Task
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.tasks import bddl
+from libero_env.tasks.benchmark import benchmark_suite, suite_names
+from libero_env.tasks.builder import check_keys, language_from_name, task_from_definition
+from libero_env.tasks.source import read_definition
+from libero_env.tasks.task import FILE, Suite, Task
+from libero_env.text import closest
+
+MAX_TASKS = 1000  # of a file
+OWN = "own"  # suite of user-defined task files
+ENDINGS = (".bddl", ".yaml", ".yml")  # of the names of task files
 
 
-def suite_names() -> tuple[str, ...]:
-    """Return the names that `get_suite` accepts; a suite that consists of others comes after them."""
-    return tuple(_parts())
-
-
-def _parts() -> dict[str, list[str]]:
-    """Return suite -> the suites that it consists of; an empty list for a suite with tasks in its file."""
-    found: dict[str, list[str]] = {}
-    for entry in load_data("suites.yaml"):
-        found |= entry if isinstance(entry, dict) else {entry: []}
-    return found
+def is_published(name: str) -> bool:
+    """Return whether a name is that of a suite by others or of a part of it, whether its files are here or not."""
+    return name.startswith(("libero_plus_", "libero_pro_"))
 
 
 def is_suite(name: str) -> bool:
@@ -41,29 +42,143 @@ def get_suite(name: str) -> Suite:
         MissingPackageError: The suite is one of others, and its files are not here.
     """
     if not is_published(name):
-        return _own_suite(name)
+        return benchmark_suite(name)
     from libero_env.tasks.published.suites import published_suite  # which needs models of objects
 
     return published_suite(name)
 
 
-@cache
-def _own_suite(name: str) -> Suite:
-    parts = _parts()
-    if name not in parts:
-        raise UnknownNameError("suite", name, parts)
-    if parts[name]:
-        return Suite(name, tuple(task for part in parts[name] for task in _own_suite(part).tasks))
-    definition = load_data(f"{name}.yaml")
-    return Suite(
-        name, tuple(_task(name, i, {**definition, **task}) for i, task in enumerate(definition["tasks"]))
-    )
+def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
+    """Return the tasks of a YAML file: one, or the list below `tasks`, which share the other keys of the file.
+
+    Raises:
+        LiberoError: The file is not valid YAML, or a task is not valid (see `make_task`); the message names the file.
+    """
+    path = Path(path)
+    definition, source = read_definition(path)
+    check_keys(definition, source, "tasks")
+    if "tasks" not in definition:
+        return (task_from_definition({"name": path.stem, **definition}, source),)
+    shared = {key: value for key, value in definition.items() if key != "tasks"}
+    tasks = definition["tasks"]
+    if not isinstance(tasks, list) or len(tasks) > MAX_TASKS:
+        raise InvalidInputError(f"{source.at('tasks')}: expected a list of at most {MAX_TASKS} tasks")
+    made = []
+    for i, own in enumerate(tasks):
+        if not isinstance(own, dict) or not all(isinstance(key, str) for key in own):
+            raise InvalidInputError(f"{source.at('tasks', i)}: expected keys such as name, goal and language")
+        place = replace(source, line_of=source.shared_with(list(own), i))
+        made.append(task_from_definition({**shared, **own}, place))
+    return tuple(made)
 
 
-def _task(suite: str, index: int, definition: dict) -> Task:
-    name = definition["name"]
-    if "scene" not in definition:
-        raise LiberoError(f"task {name}: neither it nor {suite}.yaml has the key 'scene'; add it to the YAML")
-    own = {key: value for key, value in definition.items() if key != "tasks"}
-    problem = build_problem(load_scene(definition["scene"]), own)
-    return Task(suite, index, name, language_from_name(name), problem.language, problem)
+def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
+    """Return a suite of user-defined tasks.
+
+    Args:
+        files: BDDL and YAML files, in the order of the tasks.
+        name: Name of the suite.
+
+    Returns:
+        The suite; its tasks have its name and consecutive indices.
+
+    Raises:
+        LiberoError: A file cannot be read, two tasks have the same name, or there is no file.
+    """
+    tasks: list[Task] = []
+    for file in files:
+        tasks += read_yaml_tasks(file) if Path(file).suffix in (".yaml", ".yml") else [read_task(file)]
+    names = [task.name for task in tasks]
+    if twice := sorted({n for n in names if names.count(n) > 1}):
+        raise LiberoError(
+            f"two tasks of the suite {name} are named {', '.join(twice)}; rename one of their files"
+        )
+    if not tasks:
+        raise LiberoError(f"the suite {name} has no files; give files that end in .yaml or .bddl")
+    return Suite(name, tuple(replace(task, suite=name, index=i) for i, task in enumerate(tasks)))
+
+
+def write_task(task: Task, path: str | Path) -> Path:
+    """Write a task as a BDDL file. Readers derive the instruction from the name of the file, as in the original.
+
+    Args:
+        task: Task to write.
+        path: File to write, whose name ends in .bddl; its folder is created.
+
+    Returns:
+        `path`.
+
+    Raises:
+        LiberoError: The name of the file does not end in .bddl.
+    """
+    path = Path(path)
+    if path.suffix != ".bddl":
+        raise LiberoError(f"{path}: the name of a task file must end in .bddl")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(task.bddl_text, encoding="utf-8")
+    return path
+
+
+def get_task(key: str) -> Task:
+    """Return a task of the benchmark, or that of a file.
+
+    Args:
+        key: `suite/index` or `suite-index` (`libero_object/3`), the name of a task, or the path of a file that ends in
+            .bddl, .yaml or .yml (see `read_task`).
+
+    Returns:
+        The task.
+
+    Raises:
+        UnknownNameError: The suite, index or task does not exist; the message lists the valid ones.
+        LiberoError: The file is not a valid task, or the name is that of a suite.
+    """
+    if key.endswith(ENDINGS):
+        return read_task(key)
+    if is_suite(key):
+        last = len(get_suite(key)) - 1
+        raise LiberoError(
+            f"{key} is a suite of {last + 1} tasks, not a task; write {key}/0 to {key}/{last}, or the name of a task "
+            f"(`libero tasks list {key}`)"
+        )
+    for mark in "/-":
+        suite_name, found, index = key.rpartition(mark)
+        if found and (mark == "/" or index.isdecimal() or is_suite(suite_name)):
+            suite = get_suite(suite_name)
+            if not index.isdecimal() or len(index) > 9 or int(index) >= len(suite):
+                raise UnknownNameError(f"index of {suite_name}", index, range(len(suite)))
+            return suite.tasks[int(index)]
+    named = {task.name: task for name in suite_names() for task in get_suite(name).tasks}
+    if key in named:
+        return named[key]
+    if closest(key, suite_names()):
+        raise UnknownNameError("suite", key, suite_names())
+    indices = [f"{name}/0 to {name}/{len(get_suite(name)) - 1}" for name in suite_names()]
+    raise UnknownNameError("task", key, indices, unlisted=named)
+
+
+def read_task(path: str | Path) -> Task:
+    """Return the user-defined task of a BDDL or YAML file.
+
+    The instruction of a BDDL file is derived from its name, as in the original; that of a YAML file is its `language`
+    (see `libero_env.tasks.builder`).
+
+    Args:
+        path: File to read. Without `name` in a YAML file, its stem is the name of the task.
+
+    Returns:
+        The task; its suite is `file` and its index 0.
+
+    Raises:
+        BDDLError: The BDDL file is not valid; the message starts with file:line.
+        LiberoError: The YAML file is not valid, or contains several tasks.
+    """
+    if str(path).endswith(ENDINGS[1:]):
+        tasks = read_yaml_tasks(path)
+        if len(tasks) != 1:
+            raise LiberoError(
+                f"{path} contains {len(tasks)} tasks, expected one; put each in a separate file"
+            )
+        return tasks[0]
+    problem, name = bddl.read(path), Path(path).stem
+    return Task(FILE, 0, name, language_from_name(name), problem.language, problem)

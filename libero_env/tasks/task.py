@@ -3,10 +3,11 @@
 from dataclasses import dataclass
 
 from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.storage import read_yaml
 from libero_env.tasks import bddl
-from libero_env.tasks.builder import load_data
 from libero_env.tasks.problem import Problem
 
+FILE = "file"  # suite of a task that was read from a file on its own
 MAX_NAME_BYTES = 200  # of a task or suite; names of files made of them are a little longer
 
 
@@ -24,8 +25,8 @@ def check_name(name: str, what: str = "task") -> str:
     plain = isinstance(name, str) and name.isprintable() and name == name.strip()
     if not plain or not name or name[0] == "." or {*name} & {*"/\\"} or len(name.encode()) > MAX_NAME_BYTES:
         raise InvalidInputError(
-            f"{name!r:.60} is no valid name of a {what}; expected one line without / and \\ that does not begin with a "
-            f"point, at most {MAX_NAME_BYTES} bytes"
+            f"{name!r:.60} is not a valid name of a {what}; expected one line without / and \\ that does not begin "
+            f"with a point, at most {MAX_NAME_BYTES} bytes"
         )
     return name
 
@@ -114,7 +115,7 @@ class Suite:
         Raises:
             UnknownNameError: The suite has no such order.
         """
-        orders = load_data("task_orders.yaml") if len(self) == 10 else [list(range(len(self)))]
+        orders = read_yaml("tasks/data/task_orders.yaml") if len(self) == 10 else [list(range(len(self)))]
         if order_index not in range(len(orders)):
             raise UnknownNameError(f"task order of {self.name}", order_index, range(len(orders)))
         return tuple(self.tasks[i] for i in orders[order_index])

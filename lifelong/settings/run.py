@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field
 
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Suite, Task, get_suite, suite_names
-from libero_env.tasks.files import OWN, read_suite
+from libero_env.tasks.suites import OWN, read_suite
 from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
 from lifelong.types import Count, Natural, PathText

@@ -28,8 +28,7 @@ from libero_env.tasks import (
     suite_names,
     write_task,
 )
-from libero_env.tasks.authoring import EMPTY, model_regions
-from libero_env.tasks.builder import load_data
+from libero_env.tasks.builder import EMPTY, load_data, model_regions
 from libero_env.tasks.problem import Atom, Not, Or, differences
 from lifelong.errors import ConfigError
 from lifelong.settings import BenchmarkSettings

@@ -178,7 +178,10 @@ def test_numbers_are_arithmetic_and_nothing_else():
         ({"objects": dict(sorted(bddl.parse(GOOD).objects.items()))}, "objects"),
         ({"init": ()}, "init"),
         ({"goal": Atom("On", ("pot_2", "stove_1_cook_region"))}, "goal"),
-        ({"regions": ()}, "region stove_1_cook_region"),
+        (
+            {"regions": bddl.parse(GOOD).regions[:1], "goal": Atom("Up", ("pot_1",))},
+            "region stove_1_cook_region",
+        ),
     ],
 )
 def test_differences_are_found(change, where):

@@ -29,4 +29,4 @@ def test_examples_run(name, monkeypatch):
 
 
 def test_there_are_examples():
-    assert {"libero_env.objects.catalog", "libero_env.tasks.authoring"} <= set(MODULES)
+    assert {"libero_env.objects.catalog", "libero_env.tasks.builder"} <= set(MODULES)

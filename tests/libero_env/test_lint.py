@@ -17,7 +17,7 @@ from libero_env.design.lint.scene import furthest_reach, reach
 from libero_env.sim.predicates import PREDICATES
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, suite_names
-from libero_env.tasks.signatures import KINDS
+from libero_env.tasks.problem import KINDS
 
 SOUND = get_task("libero_goal/3").bddl_text  # open the top layer of the drawer and put the bowl inside
 GOAL = "(And (In akita_black_bowl_1 wooden_cabinet_1_top_region))"
@@ -56,7 +56,7 @@ FAULTS = [
     (" (:ranges ((0.04 -0.03 0.060000000000000005 -0.01)))", "", "region-ranges", "error", "no extent"),
     ("(top_region (:target wooden_cabinet_1))", "(top_region (:target wooden_cabinet_1) (:ranges ((0 0 1 1))))",
      "region-ranges", "error", "workspace only"),
-    ("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.06 -0.03 0.04 -0.01)", "region-ranges", "error",
+    ("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.06 -0.03 0.04 -0.01)", "syntax", "error",
      "swapped corners.*X0 <= X1"),
     ("(-0.060000000000000005 0.12000000000000001 -0.04 0.14)", "(0.04 -0.03 0.060000000000000005 -0.01)",
      "duplicate-region", "warning", "same region as main_table_plate_region"),

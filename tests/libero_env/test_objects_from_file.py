@@ -25,7 +25,7 @@ from libero_env.errors import LiberoError
 from libero_env.objects import catalog, folder, get_object, object_names
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
-from libero_env.tasks.authoring import model_regions
+from libero_env.tasks.builder import model_regions
 
 pytestmark = pytest.mark.sim
 

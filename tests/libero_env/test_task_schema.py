@@ -39,39 +39,39 @@ BAD = [  # old, new, line, message
     ("scene: kitchen", "scene: ../scene.yaml", 1, "is not in the folder of the task's file"),
     ("scene: kitchen", "scene: /etc/scene.yaml", 1, "is not in the folder of the task's file"),
     ("scene: kitchen", "scene: mine.yaml", 1, "scenes include each other without end: mine.yaml -> mine.yaml"),
-    ("scene: kitchen", f"scene: {'x' * 300}.yaml", 1, "is no name of a file"),
+    ("scene: kitchen", f"scene: {'x' * 300}.yaml", 1, "is not the name of a file"),
     ("[wooden_cabinet]", "{wooden_cabinet: many}", 2, "wooden_cabinet is 'many'; expected a whole number"),
     ("plate: 1", "plate: 1000000000", 5, "plate is 1000000000; expected at most 100"),
     ("plate: 1", "plate: 1.5", 5, "plate is 1.5; expected a whole number"),
     ("- akita_black_bowl", "- [akita_black_bowl]", 4, "objects.0 is ['akita_black_bowl']; expected a category, or"),
-    ("- akita_black_bowl", "- ../akita", 4, "is no valid name"),
+    ("- akita_black_bowl", "- ../akita", 4, "is not valid; expected letters"),
     ("- akita_black_bowl", "- akita_bowl", 4, "Did you mean 'akita_black_bowl'"),
     ("furniture: [wooden_cabinet]", "regions: 7", 2, "regions is 7; expected keys with values"),
     ("[0, 0]", "[0, 0, 0]", 8, "place.akita_black_bowl_1 is [0, 0, 0]; expected at most 2 entries"),
     ("[0, 0]", "[0, .nan]", 8, "place.akita_black_bowl_1.1 is nan; expected a finite number"),
     ("[0, 0]", "[0, 1e30]", 8, "place.akita_black_bowl_1.1 is 1e+30; expected at most 10"),
     ("[0, 0]", "[0, true]", 8, "place.akita_black_bowl_1.1 is True; expected a number"),
-    ("[0, 0]", "[0, there]", 8, "'there' is no finite number; expected one such as 0.25 or -pi/4"),
-    ("[0, 0]", "{ranges: [[0, 0, -1, 1]]}", 8, "has swapped corners; expected [x0, y0, x1, y1]"),
+    ("[0, 0]", "[0, there]", 8, "'there' is not a finite number; expected one such as 0.25 or -pi/4"),
+    ("[0, 0]", "{ranges: [[0, 0, -1, 1]]}", 8, "has swapped corners"),
     ("[0, 0]", "{half: 0.1}", 8, "it has neither at nor ranges"),
     ("[0, 0]", "{at: [0, 0], hafl: 0.1}", 8, "hafl is an unknown key"),
     ("[0, 0]", "12", 8, "is 12; expected [x, y], {at: [x, y], half: h}, or the name of what it is on"),
-    ("[0, 0]", "'On On On'", 8, "'On On On' is no place; expected such as plate_1"),
+    ("[0, 0]", "'On On On'", 8, "'On On On' is not a place; expected such as plate_1"),
     ("[0, 0]", "akita_black_bowl_1", 8, "is of akita_black_bowl_1 and itself"),
     ("half: [0.01, 0.02]", "half: -1", 11, "plate_1.half"),
-    ("half: [0.01, 0.02]", "half: wide", 11, "'wide' is no finite number"),
-    ("yaw: pi", "yaw: [pi, 0]", 7, "is no range; expected [low, high]"),
+    ("half: [0.01, 0.02]", "half: wide", 11, "'wide' is not a finite number"),
+    ("yaw: pi", "yaw: [pi, 0]", 7, "is not a range; expected (LOW HIGH)"),
     ("yaw: pi", "yaw: 1e9", 7, "expected at most 100"),
     ("init: [Open", "init: [Opened", 12, "unknown predicate|Opened"),
     ("  - Up plate_1", "  - Up", 15, "not an atom"),
     ("  - Up plate_1", "  - 5", 15, "goal.1 is 5; expected a text"),
     ("  - Up plate_1", "  - Up plate_1 plate_1", 15, "Up takes 1 name"),
-    ("  - Up plate_1", "  - (Or (Up plate_1)", 15, "is no atom or expression"),
+    ("  - Up plate_1", "  - (Or (Up plate_1)", 15, "is not an atom or expression"),
     ("  - Up plate_1", "  - Up plate_2", 15, "plate_2 is not declared"),
-    ("Put the bowl on the plate", '"Put the bowl\\non the plate"', 16, "is no valid instruction; expected one line"),
+    ("Put the bowl on the plate", '"Put the bowl\\non the plate"', 16, "cannot be written; expected one line"),
     ("Put the bowl on the plate", "Put the bowl (the black one)", 16, "without ( ) and ;"),
     ("Put the bowl on the plate", "[1]", 16, "language is [1]; expected a text"),
-    ("Put the bowl on the plate", "x\nname: ../../x", 17, "is no valid name of a name"),
+    ("Put the bowl on the plate", "x\nname: ../../x", 17, "is not a valid name of a name"),
     ("Put the bowl on the plate", "x\nobj_of_interest: bowl", 17, "obj_of_interest is 'bowl'; expected a list"),
     ("Put the bowl on the plate", "x\nregions: {kitchen_table: {a: {at: [0, 0]}}}", 1, "it has at, but no half"),
     ("Put the bowl on the plate", "x\nfixtures: {x: nothing}", 17, "fixture category"),
@@ -81,7 +81,7 @@ BAD = [  # old, new, line, message
     ("Put the bowl on the plate", "x\ntasks: [7]", 17, "expected keys such as name, goal and language"),
     ("{floor: light-gray}", "[light-gray]", 17, "scene_properties is ['light-gray']"),
     ("scene: kitchen", "scene: kitchen\nscene: floor", 2, "the key scene occurs twice"),
-    ("scene: kitchen", "5: kitchen", 1, "the key 5 is no text"),
+    ("scene: kitchen", "5: kitchen", 1, "the key 5 is not a text"),
 ]  # fmt: skip
 
 
@@ -151,9 +151,9 @@ def test_a_task_has_a_name_that_files_can_have(name):
     problem = make_task(
         "x", scene="table", objects="plate", place={"plate": [0, 0]}, goal="Up plate_1"
     ).problem
-    with pytest.raises(InvalidInputError, match="is no valid name of a task"):
+    with pytest.raises(InvalidInputError, match="is not a valid name of a task"):
         Task("file", 0, name, "x", "x", problem)
-    with pytest.raises(InvalidInputError, match="is no valid name of a suite"):
+    with pytest.raises(InvalidInputError, match="is not a valid name of a suite"):
         Task(name, 0, "x", "x", "x", problem)
 
 

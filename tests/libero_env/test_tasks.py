@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from libero_env.errors import BDDLError, LiberoError, UnknownNameError
-from libero_env.tasks import bddl, builder, get_suite, get_task, read_task, suite_names, suites
+from libero_env.tasks import bddl, benchmark, builder, get_suite, get_task, read_task, suite_names
 from libero_env.tasks.builder import build_problem, language_from_name, load_data
 from libero_env.tasks.problem import And, Atom, Not, Or
 from tests.libero_env.compare_bddl import all_tasks, compare
@@ -29,7 +29,12 @@ SCENE = {
         },
         "stove_1": {"cook_region": {}},
     },
-    "init": ["On stove_1 kitchen_table_stove_region", "On ${thing}_1 black_bowl_2"],
+    "init": [
+        "On stove_1 kitchen_table_stove_region",
+        "On ${thing}_1 black_bowl_2",
+        "On black_bowl_1 kitchen_table_front",
+        "On black_bowl_2 stove_1_cook_region",
+    ],
     "obj_of_interest": ["${thing}_1"],
 }
 TASK = {
@@ -169,11 +174,12 @@ def test_a_scene_with_fixtures_yaw_and_parameters():
 def test_a_task_adds_to_its_scene():
     regions = {"kitchen_table": {"front": None, "back": {"at": [0, 0], "half": 0.1}}}
     goal = "(Or (On plate_1 kitchen_table_back) (Not (Turnon stove_1)))"
-    problem = build_problem(SCENE, {**TASK, "regions": regions, "goal": goal, "init": []})
+    init = [atom.replace("front", "back").replace("$thing", "plate") for atom in SCENE["init"]]
+    problem = build_problem(SCENE, {**TASK, "regions": regions, "goal": goal, "init": init})
     assert problem.region("kitchen_table_front") is None
     back = Atom("On", ("plate_1", "kitchen_table_back"))
     assert problem.goal == Or((back, Not(Atom("Turnon", ("stove_1",)))))
-    assert problem.init == ()
+    assert Atom("On", ("black_bowl_1", "kitchen_table_back")) in problem.init
     assert SCENE["regions"]["kitchen_table"].keys() == {"stove_region", "front"}
 
 
@@ -204,11 +210,11 @@ def test_what_a_task_need_not_say():
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
-        ({"goals": []}, UnknownNameError, "key of task cook_it or its scene 'goals'. Did you mean 'goal'?"),
-        ({"with": {}}, UnknownNameError, "parameter of task cook_it in '$thing'"),
+        ({"goals": []}, LiberoError, "task cook_it: goals is an unknown key. Did you mean 'goal'?"),
+        ({"with": {}}, UnknownNameError, "parameter of task cook_it, scene in '$thing'"),
         ({"goal": ["On plate_1 table"]}, BDDLError, "table is not declared; expected one of black_bowl_1"),
         ({"goal": "Turnon"}, BDDLError, "not an atom"),
-        ({"regions": {"stove_1": {"cook_region": {"hlaf": 1}}}}, UnknownNameError, "Did you mean 'half'?"),
+        ({"regions": {"stove_1": {"cook_region": {"hlaf": 1}}}}, LiberoError, "Did you mean 'half'?"),
     ],
 )
 def test_wrong_facts_are_refused(change, error, message):
@@ -219,13 +225,13 @@ def test_wrong_facts_are_refused(change, error, message):
 
 def test_a_task_without_scene_is_refused(monkeypatch):
     monkeypatch.setattr(
-        suites, "load_data", lambda name: {"tasks": [TASK]} if name == "mine.yaml" else ["mine"]
+        benchmark, "load_data", lambda name: {"tasks": [TASK]} if name == "mine.yaml" else ["mine"]
     )
-    with pytest.raises(LiberoError, match="task cook_it: neither it nor mine.yaml has the key 'scene'"):
-        suites._own_suite.__wrapped__("mine")
+    with pytest.raises(LiberoError, match="task cook_it: it has no scene; add one of"):
+        benchmark.benchmark_suite.__wrapped__("mine")
 
 
 def test_a_task_without_goal_is_refused():
-    with pytest.raises(LiberoError, match="neither it nor its scene has the key 'goal'"):
+    with pytest.raises(LiberoError, match="task cook_it: it has no goal"):
         build_problem(SCENE, {"name": "cook_it", "language": "cook it", "with": {"thing": "plate"}})
     assert build_problem(SCENE, TASK).goal == And((Atom("On", ("plate_1", "stove_1_cook_region")),))

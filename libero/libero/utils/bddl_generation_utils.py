@@ -15,6 +15,7 @@ from libero._adapters.lookup import lookup
 from libero.libero.envs.bddl_utils import as_expression
 from libero.libero.utils.object_utils import get_affordance_regions
 from libero_env.assets.arena import load_workspace
+from libero_env.errors import BDDLError, InvalidInputError
 from libero_env.tasks import bddl
 from libero_env.tasks.problem import And, Atom, Expression, Problem, Region
 
@@ -77,9 +78,11 @@ class PDDLDefinition:
 
         @functools.wraps(facts)
         def write(*args: Any, **kwargs: Any) -> str:
-            problem = Problem(name=self.problem_name, domain=self.domain, **facts(*args, **kwargs))
-            bddl.parse(text := bddl.write(problem), f"task {problem.language!r}")
-            return text
+            fields = facts(*args, **kwargs)
+            try:
+                return bddl.write(Problem(name=self.problem_name, domain=self.domain, **fields))
+            except InvalidInputError as error:
+                raise BDDLError(str(error)) from None
 
         return write
 

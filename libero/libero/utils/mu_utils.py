@@ -18,6 +18,7 @@ from libero.libero.utils.bddl_generation_utils import (
 )
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.tasks.builder import build_problem, load_scene
+from libero_env.tasks.problem import Problem
 
 MU_DICT: dict[str, Any] = {}  # name -> class
 SCENE_DICT: dict[str, list[type["InitialSceneTemplates"]]] = {"kitchen": [], "living_room": [], "study": []}
@@ -142,10 +143,16 @@ class BenchmarkScene(InitialSceneTemplates):
     scene: ClassVar[str]
 
     def __init__(self) -> None:
-        self.problem = build_problem(load_scene(self.scene), {"name": self.scene, "goal": []})
+        self.problem = self._problem()
         fixtures, objects = self.problem.fixtures, self.problem.objects
         workspace = next(name for name, category in fixtures.items() if name == category)
         super().__init__(workspace, Counter(fixtures.values()), Counter(objects.values()))
+
+    def _problem(self) -> Problem:
+        """Return the scene as a problem; its goal, which a problem needs, is of no interest."""
+        (first, *_) = load_scene(self.scene)["objects"]
+        name = first if isinstance(first, str) else next(iter(first))
+        return build_problem(self.scene, {"name": self.scene, "goal": [f"Up {name}_1"]})
 
     def define_regions(self) -> None:
         """Fill `regions` with the rectangles of the scene, as centre and half size."""

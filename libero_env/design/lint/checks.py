@@ -15,10 +15,8 @@ from libero_env.design.lint.scene import check_scene
 from libero_env.errors import BDDLError, UnknownNameError
 from libero_env.sim.predicates import PREDICATES
 from libero_env.tasks import Task, bddl
-from libero_env.tasks.authoring import FILE
-from libero_env.tasks.builder import language_from_name
-from libero_env.tasks.checks import faults, kind_of
-from libero_env.tasks.problem import Problem
+from libero_env.tasks.builder import FILE, language_from_name
+from libero_env.tasks.problem import Problem, ProblemError
 from libero_env.tasks.sexpr import List, Word, parse_tree
 
 __all__ = ["Finding", "lint_file", "lint_task", "lint_text"]
@@ -70,7 +68,12 @@ def lint_text(
     report = Report(file, tree)
     _check_declared(report, tree)
     try:
-        problem = bddl.parse(text, file, check=False)
+        problem = bddl.problem_of(tree, file)
+    except ProblemError as error:
+        problem = error.problem
+        report.violations(error)
+        if any(one.rule == "size" for one in error.violations):
+            return report.sorted()
     except BDDLError as error:
         finding = _syntax(error, file)
         if all(known.line != finding.line for known in report.findings):
@@ -79,10 +82,6 @@ def lint_text(
     if task is None:
         name = Path(file).stem
         task = Task(FILE, 0, name, language_from_name(name), problem.language, problem)
-    for fault in faults(problem):
-        report.fault(fault)
-        if fault.rule == "size":
-            return report.sorted()
     _check_categories(report, problem, pack)
     _check_atoms(report, problem)
     _check_regions(report, problem)
@@ -198,7 +197,7 @@ def _check_places(report: Report, problem: Problem) -> None:
     """Check that every object and fixture is placed."""
     placed = {atom.args[0] for atom in problem.init if atom.predicate in ("On", "In") and len(atom.args) == 2}
     for name in (*problem.objects, *problem.fixtures):
-        if name not in placed and kind_of(problem, name) != "workspace":
+        if name not in placed and problem.kind_of(name) != "workspace":
             add = report.error if name in problem.objects else report.warning
             where = "" if name in problem.objects else "; it stands in the centre of the workspace"
             remedy = f"add (On {name} REGION) to :init"

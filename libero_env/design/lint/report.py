@@ -5,8 +5,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
-from libero_env.tasks.lines import Lines
-from libero_env.tasks.problem_types import Fault
+from libero_env.tasks.bddl import Lines
+from libero_env.tasks.problem import ProblemError
 from libero_env.tasks.sexpr import List
 
 Level = Literal["error", "warning", "info"]
@@ -53,10 +53,11 @@ class Report:
         """Add a finding because of which the task does not work."""
         self.findings.append(Finding(self.file, line, "error", rule, what, remedy))
 
-    def fault(self, fault: Fault) -> None:
-        """Add a fault of the problem, from which no scene can be built."""
-        line = self.lines.of_part(fault.section, fault.part)
-        self.error(line, fault.rule, fault.what, f"expected {fault.expected}")
+    def violations(self, error: ProblemError) -> None:
+        """Add all that is wrong with a problem from which no scene can be built."""
+        for one in error.violations:
+            line = self.lines.of_part(one.section, one.part)
+            self.error(line, one.rule, one.what, f"expected {one.expected}")
 
     def warning(self, line: int, rule: str, what: str, remedy: str) -> None:
         """Add a finding because of which the task probably does not work as intended."""

