@@ -9,7 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Container, Iterator, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, Field
 
@@ -56,9 +56,9 @@ def _check_writable(text: str) -> str:
     return text
 
 
-def check_corners(rectangle: Value) -> Value:
+def check_corners(rectangle: Any) -> Any:
     """Return a rectangle (x0, y0, x1, y1), whose corners must be in order."""
-    x0, y0, x1, y1 = rectangle  # type: ignore[misc]
+    x0, y0, x1, y1 = rectangle
     if x1 < x0 or y1 < y0:
         raise ValueError(
             f"{rectangle} has swapped corners; expected (X0 Y0 X1 Y1) with X0 <= X1 and Y0 <= Y1"
@@ -66,9 +66,9 @@ def check_corners(rectangle: Value) -> Value:
     return rectangle
 
 
-def check_order(limits: Value) -> Value:
+def check_order(limits: Any) -> Any:
     """Return a range (low, high), which must be in order."""
-    low, high = limits  # type: ignore[misc]
+    low, high = limits
     if high < low:
         raise ValueError(f"{limits} is not a range; expected (LOW HIGH) with LOW <= HIGH")
     return limits
@@ -180,7 +180,7 @@ class _Several(Expression):
         return self.parts
 
     def map(self, function: Callable[[Expression], Expression]) -> Expression:
-        return type(self)(tuple(map(function, self.parts)))
+        return type(self)(tuple(map(function, self.parts)))  # type: ignore[call-arg]
 
 
 @checked
