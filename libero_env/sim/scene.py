@@ -255,7 +255,9 @@ def _check_states(scene: Scene) -> None:
             continue
         if state not in (known := scene.entities[owner].articulation):
             what = f"{atom}: the state {state!r} of a {scene.entities[owner].category} is not defined"
-            violation = Violation("no-joint", what, f"one of {', '.join(sorted(known)) or 'no state'}", ":goal", i)
+            violation = Violation(
+                "no-joint", what, f"one of {', '.join(sorted(known)) or 'no state'}", ":goal", i
+            )
             raise ProblemError(scene.problem, violation)
 
 
