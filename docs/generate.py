@@ -8,7 +8,7 @@ import contextlib
 import inspect
 import io
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from typing import Any
 import yaml
 
 from libero_env.cli.main import ALL, bind
+from libero_env.objects import object_names
+from libero_env.tasks import get_suite, suite_names
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = ROOT / "configs"
@@ -257,7 +259,62 @@ def protocol_table() -> str:
     return "\n".join(lines)
 
 
+FAMILIES = {
+    "groceries": "Groceries",
+    "kitchenware": "Kitchenware",
+    "articulated": "Objects with doors, drawers and knobs",
+    "furniture": "Books, trays and shelves",
+    "": "Others",
+}
+
+
+def gallery() -> str:
+    """Tables of pictures: objects by family, and tasks by suite. experiments/objects/gallery.py draws them."""
+    parts = ["## Objects"]
+    for family, names in families().items():
+        cells = [f"{_picture(f'objects/{name}', name, 150)}<br>`{name}`" for name in names]
+        parts += [f"### {FAMILIES[family]}", _picture_table(5, cells)]
+    parts += [
+        "## Tasks",
+        "The first initial state of each task as the camera `agentview` sees it, and the instruction. "
+        "A task's id is its suite and number, such as `libero_goal/3`.",
+    ]
+    for suite in suite_names():
+        cells = [
+            f"{_picture(f'tasks/{suite}-{task.index}', task.id, 190)}<br>{task.index}: {task.language}"
+            for task in get_suite(suite).tasks
+            if task.suite == suite
+        ]
+        parts += [f"### {suite}", _picture_table(4, cells)] if cells else []
+    return "\n\n".join(parts)
+
+
+def families() -> dict[str, list[str]]:
+    """Family -> its categories, sorted; those without parameters are of the family ''."""
+    folder = ROOT / "libero_env" / "objects" / "builtin" / "parameters"
+    owner = {
+        name: family
+        for family in filter(None, FAMILIES)
+        for name in yaml.safe_load((folder / f"{family}.yaml").read_text(encoding="utf-8"))
+    }
+    names = object_names()
+    return {family: [n for n in names if owner.get(n, "") == family] for family in FAMILIES}
+
+
+def _picture(file: str, name: str, width: int) -> str:
+    """HTML, because Markdown has no widths and the tables must fit the page."""
+    return f'<img src="images/gallery/{file}.jpg" alt="{name}" width="{width}">'
+
+
+def _picture_table(columns: int, cells: Sequence[str]) -> str:
+    """A Markdown table; its first row of cells stands where the header would."""
+    padded = [*cells, *[""] * (-len(cells) % columns)]
+    rows = [f"| {' | '.join(padded[i : i + columns])} |" for i in range(0, len(padded), columns)]
+    return "\n".join([rows[0], "|" + " :-: |" * columns, *rows[1:]])
+
+
 PARTS = {
+    "gallery": gallery,
     "commands": command_reference,
     "configuration": configuration_reference,
     "protocols": protocol_table,

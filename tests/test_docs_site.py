@@ -21,6 +21,8 @@ from libero._adapters.lifelong.config import load_config
 from libero_env.cli.main import ALL, bind, find, load, main
 from libero_env.cli.options import options_of
 from libero_env.objects import catalog
+from libero_env.objects.builtin import builtin_names
+from libero_env.tasks import get_suite, suite_names
 from lifelong.algorithms import Algorithm
 from lifelong.composition import check_choices, swept
 
@@ -335,3 +337,20 @@ def test_the_site_builds_and_fetches_nothing(tmp_path):
 def anchors(page: Path) -> set[str]:
     """What links can point at in a page."""
     return set(re.findall(r'\bid="([^"]+)"', page.read_text(encoding="utf-8")))
+
+
+@pytest.mark.unit
+def test_the_gallery_is_whole():
+    text = generate().gallery()
+    shown = re.findall(r'src="([^"]+)"', text)
+    tasks = {
+        f"images/gallery/tasks/{task.suite}-{task.index}.jpg": task
+        for suite in suite_names()
+        for task in get_suite(suite).tasks
+    }
+    assert sorted(shown) == sorted(
+        [*tasks, *(f"images/gallery/objects/{name}.jpg" for name in builtin_names())]
+    )
+    assert not [path for path in shown if not (DOCS / path).exists()]
+    for path, task in tasks.items():
+        assert re.search(f'"{re.escape(path)}"[^>]*><br>{task.index}: {task.language} \\|', text), task.id

@@ -1,4 +1,4 @@
-"""Draws the gallery: a picture of every object and of every task, a labelled sheet, and docs/gallery.md.
+"""Draws the gallery: a picture of every object and of every task, and a labelled sheet.
 
 MUJOCO_GL=egl python experiments/objects/gallery.py               everything, into docs/
 MUJOCO_GL=egl python experiments/objects/gallery.py --objects     only the objects, with their sheet
@@ -12,7 +12,6 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-from page import object_file, task_file, write_page
 from PIL import Image, ImageDraw, ImageFont
 
 from libero_env.envs.batch import BatchEnv
@@ -68,7 +67,6 @@ def main() -> None:
         if everything or args.tasks or args.suite:
             for suite in args.suite or suite_names():
                 draw_tasks(args.docs, suite)
-        write_page(args.docs)
 
 
 def draw_objects(docs: Path, out: Path, size: int, columns: int) -> None:
@@ -76,7 +74,7 @@ def draw_objects(docs: Path, out: Path, size: int, columns: int) -> None:
     names, tiles = object_names(), []
     for name in names:
         tiles.append(portrait(get_object(name), size=size))
-        save(Image.fromarray(tiles[-1]), docs / object_file(name))
+        save(Image.fromarray(tiles[-1]), docs / f"images/gallery/objects/{name}.jpg")
     save(sheet(tiles, names, columns), out)
     print(f"{len(names)} objects drawn")
 
@@ -85,7 +83,8 @@ def draw_tasks(docs: Path, suite: str) -> None:
     """A picture of each task's first initial state; a suite that consists of others has none of its own."""
     for task in get_suite(suite).tasks:
         if task.suite == suite:
-            save(Image.fromarray(first_view(task)), docs / task_file(task))
+            file = docs / f"images/gallery/tasks/{task.suite}-{task.index}.jpg"
+            save(Image.fromarray(first_view(task)), file)
     print(f"{suite} drawn")
 
 
