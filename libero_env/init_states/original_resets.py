@@ -10,7 +10,6 @@ environments/base.py.
 """
 
 from collections.abc import Iterator, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 
 import mujoco
@@ -221,11 +220,7 @@ class _Plan:
         """Return the sites that objects are placed on, with the joints as drawn and the fixtures at the origin."""
         if not self.on_sites:
             return {}
-        model = copy(scene.model)
-        model.body_pos[scene.fixture_bodies], model.body_quat[scene.fixture_bodies] = (
-            0.0,
-            (1.0, 0.0, 0.0, 0.0),
-        )
+        model = scene.model_with(np.tile((0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), (len(scene.fixtures), 1)))
         data = mujoco.MjData(model)
         for name, value in zip(self.joint_names, joints, strict=True):
             for joint in scene.joints.get(name, ()):

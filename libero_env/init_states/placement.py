@@ -4,7 +4,6 @@ They are checked against the task: its init atoms hold, its goal does not.
 """
 
 from collections.abc import Iterator, Mapping
-from copy import copy
 from dataclasses import dataclass
 
 import mujoco
@@ -59,18 +58,15 @@ def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | 
         PlacementError: No placement without contact was found in 500 tries, or an init atom cannot be placed. Scenes of
             unusual size have fewer tries.
     """
-    places = _places(scene)
-    model = copy(scene.model) if scene.fixtures else scene.model
-    data = mujoco.MjData(model)
-    data.qpos[:] = initial_qpos(scene)
-    data.qpos[:7] += ARM_NOISE * rng.standard_normal(7)
+    places, qpos = _places(scene), initial_qpos(scene)
+    qpos[:7] += ARM_NOISE * rng.standard_normal(7)
     fixtures = _sample_fixtures(scene, rng) if fixtures is None else fixtures
-    if scene.fixtures:
-        model.body_pos[scene.fixture_bodies] = fixtures[:, :3]
-        model.body_quat[scene.fixture_bodies] = fixtures[:, 3:]
+    model = scene.model_with(fixtures)
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
     _sample_joints(scene, data, rng)
     touching: set[str] = set()
-    solid = int(np.count_nonzero(model.geom_contype | model.geom_conaffinity))
+    solid = sum(len(geoms) for geoms in scene.collision_geoms.values())
     tries = fewer(_MAX_TRIES, solid, _USUAL_GEOMS)
     for _ in range(tries):
         for name, place in places.items():
@@ -96,16 +92,13 @@ def fewer(tries: int, size: int, usual: int) -> int:
 def lowest_point(scene: Scene, name: str, quat: np.ndarray) -> float:
     """Return the height of an object's lowest collision point over its origin, m, when rotated by `quat` (wxyz)."""
     model, lowest = scene.model, np.inf
-    for body in scene.bodies[name]:
-        pos, rotation = _in_root_frame(model, body, quat_to_mat(quat))
-        start = model.body_geomadr[body]
-        for geom in range(start, start + model.body_geomnum[body]):
-            if model.geom_contype[geom] == 0 and model.geom_conaffinity[geom] == 0:
-                continue
-            centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
-            up = (rotation @ quat_to_mat(model.geom_quat[geom]))[2]
-            middle = pos[2] + rotation[2] @ model.geom_pos[geom] + up @ centre
-            lowest = min(lowest, middle - np.abs(up) @ half)
+    frames = {body: _in_root_frame(model, body, quat_to_mat(quat)) for body in scene.bodies[name]}
+    for geom in scene.collision_geoms[name]:
+        pos, rotation = frames[model.geom_bodyid[geom]]
+        centre, half = model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+        up = (rotation @ quat_to_mat(model.geom_quat[geom]))[2]
+        middle = pos[2] + rotation[2] @ model.geom_pos[geom] + up @ centre
+        lowest = min(lowest, middle - np.abs(up) @ half)
     return float(lowest)
 
 
@@ -211,7 +204,7 @@ def _place(scene: Scene, data: mujoco.MjData, name: str, place: Place, rng: np.r
         quat = scene.objects[name].rest_quat(rng)
         x, y, surface = _sample_on_carrier(scene, data, place, rng)
     height = surface - lowest_point(scene, name, quat) + _CLEARANCE
-    address = scene.model.joint(f"{name}_joint0").qposadr[0]
+    address = scene.pose_address(name)
     data.qpos[address : address + 7] = (x, y, height, *quat)
 
 
@@ -249,14 +242,11 @@ def collision_boxes(
 ) -> Iterator[tuple[np.ndarray, np.ndarray, float]]:
     """Yield the collision geoms of an entity seen from above: centre (2,), half size (2,), height of the top; m."""
     model = scene.model
-    for body in scene.bodies[name]:
-        start = model.body_geomadr[body]
-        for geom in range(start, start + model.body_geomnum[body]):
-            if model.geom_contype[geom] or model.geom_conaffinity[geom]:
-                mat = data.geom_xmat[geom].reshape(3, 3)
-                half = np.abs(mat) @ model.geom_aabb[geom, 3:]
-                centre = data.geom_xpos[geom] + mat @ model.geom_aabb[geom, :3]
-                yield centre[:2], half[:2], float(centre[2] + half[2])
+    for geom in scene.collision_geoms[name]:
+        mat = data.geom_xmat[geom].reshape(3, 3)
+        half = np.abs(mat) @ model.geom_aabb[geom, 3:]
+        centre = data.geom_xpos[geom] + mat @ model.geom_aabb[geom, :3]
+        yield centre[:2], half[:2], float(centre[2] + half[2])
 
 
 def _touching_entities(scene: Scene, data: mujoco.MjData) -> set[str]:

@@ -88,7 +88,7 @@ class Pairing:
             old, new = base.model.jnt_dofadr[j], model.joint(name).dofadr[0]
             speed[new : new + freedom] = qvel[old : old + freedom]
         for name, shift in self._shifts.items():
-            address = model.joint(f"{name}_joint0").qposadr[0]
+            address = self.scene.pose_address(name)
             now[address : address + 2] += shift
         return np.concatenate([row[:1], now, speed, fixtures.ravel()])
 
@@ -101,7 +101,7 @@ class Pairing:
         taken = _stacked(self._taken(row))
         for name in self.added:
             region, quat = self._region(name), scene.objects[name].rest_quat(rng)
-            address = 1 + scene.model.joint(f"{name}_joint0").qposadr[0]
+            address = 1 + scene.pose_address(name)
             row[address : address + 7] = (0.0, 0.0, surface - lowest_point(scene, name, quat) + _LIFT, *quat)
             own = _stacked(self._boxes(row, name))  # about the origin
             for _ in range(_TRIES):
@@ -121,7 +121,7 @@ class Pairing:
     def _stand(self, row: np.ndarray, name: str, rng: np.random.Generator) -> None:
         """Let an object of another category stand where the one before stood, on the workspace."""
         quat = self.scene.objects[name].rest_quat(rng)
-        address = 1 + self.scene.model.joint(f"{name}_joint0").qposadr[0]
+        address = 1 + self.scene.pose_address(name)
         surface = self.scene.workspace.surface_height
         row[address + 2] = surface - lowest_point(self.scene, name, quat) + _LIFT
         row[address + 3 : address + 7] = quat
@@ -159,7 +159,7 @@ class Pairing:
         rest, settled = settle(self._simulations, 0, qpos[0], scene.nq_robot, fixtures[0]), row.copy()
         new = [*self.added, *self.exchanged]
         for name in new:
-            address = model.joint(f"{name}_joint0").qposadr[0]
+            address = self.scene.pose_address(name)
             settled[1 + address : 8 + address] = rest[address : address + 7]
         own = {int(scene.bodies[name][0]) for name in new}
         others = {int(body) for name in scene.entities if name not in new for body in scene.bodies[name]}

@@ -124,7 +124,7 @@ def shifted(
 ) -> np.ndarray:
     """Return a state in which objects are moved by (2,) [m] and turned about the vertical through the first, [rad]."""
     moved, turn = row.copy(), quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), angle)
-    addresses = [1 + scene.model.joint(f"{name}_joint0").qposadr[0] for name in names]
+    addresses = [1 + scene.pose_address(name) for name in names]
     centre = row[addresses[0] : addresses[0] + 2].copy()
     cosine, sine = np.cos(angle), np.sin(angle)
     for a in addresses:

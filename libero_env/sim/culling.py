@@ -74,8 +74,8 @@ class Culling:
             return []
         elements = [(i, g.objid) for i, g in enumerate(geoms) if g.objtype == _GEOM]
         places, ids = (np.array(column, np.int64) for column in zip(*elements, strict=True))
-        boxes = _Boxes(self._model, data, ids)
-        kept = ~self._can_cull[ids] | boxes.inside(view.eye, view.normals)
+        boxes = self._boxes(data, ids)
+        kept = ~self._can_cull[ids] | _reach_inside(boxes, view.eye, view.normals)
         flat = [(k, i) for k, (i, geom) in enumerate(elements) if self._is_flat[geom]]
         mirror = next((k for k, i in flat if _is_mirror(geoms[i], view.eye)), None)
         if mirror is not None:
@@ -91,6 +91,12 @@ class Culling:
         for geom, _ in left_out:
             geom.type = _NONE
         return left_out
+
+    def _boxes(self, data: mujoco.MjData, ids: np.ndarray) -> "_Boxes":
+        model, boxes = self._model, _Boxes(ids, np.empty((len(ids), 3)), np.empty((len(ids), 3, 3)))
+        bounds = model.geom_aabb.reshape(-1, 6)  # of meshes: sizes of others may have changed
+        _bound(boxes, model.geom_type, model.geom_size, bounds, data.geom_xpos, data.geom_xmat)
+        return boxes
 
     def _view(self, data: mujoco.MjData, camera: int, aspect: float, fovy: float | None) -> "_View | None":
         """Return what a camera shows, None for cameras of other kinds."""
@@ -110,24 +116,12 @@ class Culling:
         self, box: int, data: mujoco.MjData, view: "_View", boxes: "_Boxes", kept: np.ndarray
     ) -> None:
         """Drop from the kept geoms (n,) those that the upper face of a box hides."""
-        rotation = data.geom_xmat[box]
+        rotation, size = data.geom_xmat[box], self._model.geom_size[box]
         if rotation[8] < 0.5:  # a wall hides nothing in a room
             return
-        size = self._model.geom_size[box]
-        _drop_hidden(
-            size,
-            data.geom_xpos[box] + size[2] * rotation[2::3] - view.eye,
-            rotation.reshape(3, 3),
-            *view,
-            self._near + _MARGIN,
-            boxes.ids,
-            boxes.centres,
-            boxes.axes,
-            self._is_costly,
-            self._model.geom_type,
-            data.geom_xmat,
-            kept,
-        )
+        centre = data.geom_xpos[box] + size[2] * rotation[2::3] - view.eye
+        face = _Face(size, centre, rotation.reshape(3, 3), self._near + _MARGIN)
+        _drop_hidden(face, view, boxes, self._is_costly, self._model.geom_type, data.geom_xmat, kept)
 
     def _in_mirror(self, data: mujoco.MjData, view: "_View", boxes: "_Boxes", mirror: int) -> np.ndarray:
         """Return which geoms (n,) the reflection in a plane, or in the upper face of a box, can show."""
@@ -139,15 +133,17 @@ class Culling:
         if height < -_MARGIN:
             return np.zeros(len(boxes.centres), bool)
         # What is seen in a mirror is what the mirrored eye sees, through the face.
-        seen = boxes.inside(eye - 2 * height * up, normals - 2 * np.outer(normals @ up, up))
-        seen &= boxes.inside(centre, up[None])
+        seen: np.ndarray = _reach_inside(
+            boxes, eye - 2 * height * up, normals - 2 * np.outer(normals @ up, up)
+        )
+        seen &= _reach_inside(boxes, centre, up[None])
         if is_box and height > _MARGIN:
             signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
             corners = centre + signs * size[:2] @ rotation[:, :2].T - (eye - 2 * height * up)
             edges = np.cross(corners, np.roll(corners, -1, axis=0))
             edges *= np.sign(edges @ corners.mean(axis=0))[:, None]
             edges /= np.linalg.norm(edges, axis=1, keepdims=True)
-            seen &= boxes.inside(eye - 2 * height * up, edges)
+            seen &= _reach_inside(boxes, eye - 2 * height * up, edges)
         return seen
 
 
@@ -165,33 +161,40 @@ class _View(NamedTuple):
     rays: np.ndarray
 
 
-class _Boxes:
-    """Bounding boxes of geoms: centres (n, 3) and half axes (n, 3, 3), one in each column, world frame, m."""
+class _Boxes(NamedTuple):
+    """Bounding boxes of geoms in the world frame, m.
 
-    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData, ids: np.ndarray):
-        self.ids, self.centres, self.axes = ids, np.empty((len(ids), 3)), np.empty((len(ids), 3, 3))
-        bounds = model.geom_aabb.reshape(-1, 6)  # of meshes: sizes of others may have changed
-        shapes = (model.geom_type, model.geom_size, bounds, data.geom_xpos, data.geom_xmat)
-        _bound(ids, *shapes, self.centres, self.axes)
+    Attributes:
+        ids: Indices of the geoms, (n,).
+        centres: Their centres, (n, 3).
+        axes: Their half axes, one in each column, (n, 3, 3).
+    """
 
-    def inside(self, apex: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return which boxes (n,) reach inside all planes through `apex` (3,) with inward `normals` (k, 3)."""
-        found: np.ndarray = _reach_inside(self.centres, self.axes, apex, normals)
-        return found
+    ids: np.ndarray
+    centres: np.ndarray
+    axes: np.ndarray
+
+
+class _Face(NamedTuple):
+    """The upper face of a box.
+
+    Attributes:
+        size: Half edges of the box, (3,).
+        centre: Centre of the face from the eye, (3,).
+        rotation: Axes of the box, in columns, (3, 3).
+        near: Least distance along the view at which something is drawn.
+    """
+
+    size: np.ndarray
+    centre: np.ndarray
+    rotation: np.ndarray
+    near: float
 
 
 @compiled
-def _bound(
-    ids: np.ndarray,
-    kinds: np.ndarray,
-    sizes: np.ndarray,
-    bounds: np.ndarray,
-    positions: np.ndarray,
-    rotations: np.ndarray,
-    centres: np.ndarray,
-    axes: np.ndarray,
-) -> None:
+def _bound(boxes, kinds, sizes, bounds, positions, rotations):
     """Write the bounding boxes of geoms."""
+    ids, centres, axes = boxes
     half = np.empty(3)
     for n in range(len(ids)):
         g = ids[n]
@@ -214,8 +217,9 @@ def _bound(
 
 
 @compiled
-def _reach_inside(centres: np.ndarray, axes: np.ndarray, apex: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def _reach_inside(boxes, apex, normals):
     """Return which boxes (n,) reach inside all planes through a point (3,) with inward normals (k, 3)."""
+    _, centres, axes = boxes
     inside = np.ones(len(centres), np.bool_)
     for n in range(len(centres)):
         for k in range(len(normals)):
@@ -235,19 +239,13 @@ def _reach_inside(centres: np.ndarray, axes: np.ndarray, apex: np.ndarray, norma
 
 
 @compiled
-def _is_hidden(
-    point: np.ndarray,
-    size: np.ndarray,
-    face: np.ndarray,
-    rotation: np.ndarray,
-    forward: np.ndarray,
-    near: float,
-) -> bool:
+def _is_hidden(point, face, forward):
     """Return whether the face of a box is on the way from the eye to a point, which is relative to the eye."""
+    size, centre, rotation, near = face
     down = point[0] * rotation[0, 2] + point[1] * rotation[1, 2] + point[2] * rotation[2, 2]
     if down >= 0.0:
         return False
-    share = (face[0] * rotation[0, 2] + face[1] * rotation[1, 2] + face[2] * rotation[2, 2]) / down
+    share = (centre[0] * rotation[0, 2] + centre[1] * rotation[1, 2] + centre[2] * rotation[2, 2]) / down
     ahead = 0.0
     for r in range(3):
         ahead += share * point[r] * forward[r]
@@ -256,22 +254,14 @@ def _is_hidden(
     for c in range(2):
         beside = 0.0
         for r in range(3):
-            beside += (share * point[r] - face[r]) * rotation[r, c]
+            beside += (share * point[r] - centre[r]) * rotation[r, c]
         if abs(beside) > size[c] - _MARGIN:
             return False
     return True
 
 
 @compiled
-def _is_behind(
-    centre: np.ndarray,
-    axes: np.ndarray,
-    normals: np.ndarray,
-    size: np.ndarray,
-    face: np.ndarray,
-    rotation: np.ndarray,
-    near: float,
-) -> bool:
+def _is_behind(centre, axes, normals, face):
     """Return whether the face of a box hides all that is seen of a bounding box, whose centre is relative to the eye.
 
     What is behind the face is convex. So a box is behind it if its corners are, or those of its part on the inner side
@@ -283,7 +273,7 @@ def _is_behind(
         for c in range(3):
             for r in range(3):
                 corners[k, r] += _SIGNS[k, c] * axes[r, c]
-        hidden[k] = _is_hidden(corners[k], size, face, rotation, normals[4], near)
+        hidden[k] = _is_hidden(corners[k], face, normals[4])
         for j in range(4):
             depths[k, j] = _MARGIN
             for r in range(3):
@@ -301,54 +291,33 @@ def _is_behind(
                 share = depths[a, j] / (depths[a, j] - depths[b, j])
                 for r in range(3):
                     point[r] = corners[a, r] + share * (corners[b, r] - corners[a, r])
-                behind = _is_hidden(point, size, face, rotation, normals[4], near)
+                behind = _is_hidden(point, face, normals[4])
         if behind:
             return True
     return False
 
 
 @compiled
-def _drop_hidden(
-    size: np.ndarray,
-    face: np.ndarray,
-    rotation: np.ndarray,
-    eye: np.ndarray,
-    normals: np.ndarray,
-    rays: np.ndarray,
-    near: float,
-    ids: np.ndarray,
-    centres: np.ndarray,
-    axes: np.ndarray,
-    costly: np.ndarray,
-    kinds: np.ndarray,
-    rotations: np.ndarray,
-    kept: np.ndarray,
-) -> None:
+def _drop_hidden(face, view, boxes, costly, kinds, rotations, kept):
     """Drop from the kept geoms (n,) those that the upper face of a box hides, as far as they are worth a look.
 
     Args:
-        size: Half edges of the box, (3,).
-        face: Centre of its upper face from the eye, (3,).
-        rotation: Its axes, in columns, (3, 3).
-        eye: Position of the camera, (3,).
-        normals: See `_View`.
-        rays: See `_View`.
-        near: Least distance along the view at which something is drawn.
-        ids: Indices of the geoms, (n,).
-        centres: Centres of their bounding boxes, (n, 3).
-        axes: Half axes of these, (n, 3, 3).
+        face: The face.
+        view: What the camera shows.
+        boxes: Bounding boxes of the geoms.
         costly: Which geoms of the model are worth a look.
         kinds: Types of the geoms of the model.
         rotations: Their orientations, (ngeom, 9).
         kept: Whether each geom is drawn, (n,); changed.
     """
-    up = rotation[:, 2].copy()
-    level = (face * up).sum()  # of the face over the eye
+    (ids, centres, axes), (eye, normals, rays) = boxes, view
+    up = face.rotation[:, 2].copy()
+    level = (face.centre * up).sum()  # of the face over the eye
     if level > -_MARGIN:
         return
     fills_view = True
     for k in range(4):
-        fills_view = fills_view and _is_hidden(rays[k], size, face, rotation, normals[4], near)
+        fills_view = fills_view and _is_hidden(rays[k], face, normals[4])
     for n in range(len(ids)):
         g = ids[n]
         if not kept[n] or not (fills_view or costly[g]):
@@ -362,7 +331,7 @@ def _drop_hidden(
             for c in range(3):
                 top += abs(axes[n, 0, c] * up[0] + axes[n, 1, c] * up[1] + axes[n, 2, c] * up[2])
         if top < level - _MARGIN:
-            kept[n] = not (fills_view or _is_behind(centre, axes[n], normals, size, face, rotation, near))
+            kept[n] = not (fills_view or _is_behind(centre, axes[n], normals, face))
 
 
 def _is_mirror(geom: mujoco.MjvGeom, eye: np.ndarray) -> bool:

@@ -8,6 +8,7 @@ that states of the original have the same layout. The poses of fixtures belong t
 import hashlib
 from collections import OrderedDict
 from collections.abc import Hashable, Mapping
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from threading import RLock
@@ -109,6 +110,28 @@ class Scene:
                 if (body := int(model.site_bodyid[site])) in bodies:
                     owners[model.site(site).name] = tuple(j for j in own if model.jnt_bodyid[j] == body)
         return owners
+
+    @cached_property
+    def collision_geoms(self) -> Mapping[str, np.ndarray]:
+        """Indices of the geoms that touch others, by the names of `bodies`."""
+        solid = (self.model.geom_contype | self.model.geom_conaffinity) != 0
+        owned = {name: np.isin(self.model.geom_bodyid, bodies) for name, bodies in self.bodies.items()}
+        return {name: np.flatnonzero(solid & own) for name, own in owned.items()}
+
+    def pose_address(self, name: str) -> int:
+        """Return the index in qpos of the pose of a movable object: position and quaternion wxyz, (7,)."""
+        return int(self.model.joint(f"{name}_joint0").qposadr[0])
+
+    def model_with(self, fixtures: np.ndarray) -> mujoco.MjModel:
+        """Return a copy of the model with poses of the fixtures, (nfixtures, 7); without any, the model itself."""
+        if not self.fixtures:
+            return self.model
+        model = copy(self.model)
+        model.body_pos[self.fixture_bodies], model.body_quat[self.fixture_bodies] = (
+            fixtures[:, :3],
+            fixtures[:, 3:],
+        )
+        return model
 
     @cached_property
     def digest(self) -> str:

@@ -100,19 +100,15 @@ class StateView:
     def bounds(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return the low and the high corner (3,) of an entity's collision geoms along the world axes."""
         model, corners = self.scene.model, []
-        for body in self._bodies(name):
+        self._bodies(name)  # or it does not exist
+        for geom in self.scene.collision_geoms[name]:
+            body = model.geom_bodyid[geom]
             mat = quat_to_mat(self._field("xquat")[body])
-            start = model.body_geomadr[body]
-            for geom in range(start, start + model.body_geomnum[body]):
-                if model.geom_contype[geom] or model.geom_conaffinity[geom]:
-                    geom_mat = mat @ quat_to_mat(model.geom_quat[geom])
-                    centre = (
-                        self._field("xpos")[body]
-                        + mat @ model.geom_pos[geom]
-                        + geom_mat @ model.geom_aabb[geom, :3]
-                    )
-                    half = np.abs(geom_mat) @ model.geom_aabb[geom, 3:]
-                    corners.append((centre - half, centre + half))
+            geom_mat = mat @ quat_to_mat(model.geom_quat[geom])
+            origin = self._field("xpos")[body] + mat @ model.geom_pos[geom]
+            centre = origin + geom_mat @ model.geom_aabb[geom, :3]
+            half = np.abs(geom_mat) @ model.geom_aabb[geom, 3:]
+            corners.append((centre - half, centre + half))
         low, high = zip(*corners, strict=True)
         return np.min(low, axis=0), np.max(high, axis=0)
 

@@ -248,7 +248,7 @@ class BDDLBaseDomain(RobosuiteMethods):
             qpos[: self.scene.nq_robot] = REST_QPOS + OPEN_FINGERS
         if self.placement_initializer is not None:
             for name, (pos, quat, *_) in self.placement_initializer.sample().items():
-                joint = self.scene.model.joint(f"{name}_joint0").qposadr[0]
+                joint = self.scene.pose_address(name)
                 qpos[joint : joint + 7] = [*pos, *quat]
         self.restart(np.concatenate([[0.0], qpos, np.zeros(self.scene.model.nv), start.fixtures.ravel()]))
         self._glowing = set()

@@ -133,12 +133,11 @@ def _surfaces(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
     model, data, found = scene.model, mujoco.MjData(scene.model), []
     data.qpos[:] = initial_qpos(scene)
     mujoco.mj_kinematics(model, data)
-    for geom in np.flatnonzero(np.isin(model.geom_bodyid, scene.bodies[scene.workspace_name])):
+    for geom in scene.collision_geoms[scene.workspace_name]:
         centre, half = data.geom_xpos[geom], np.array([np.inf, np.inf, 0.0])
         if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
             half = np.abs(data.geom_xmat[geom].reshape(3, 3)) @ model.geom_aabb[geom, 3:]
-        touchable = model.geom_contype[geom] or model.geom_conaffinity[geom]
-        if touchable and abs(centre[2] + half[2] - scene.workspace.surface_height) < _LEVEL_TOLERANCE:
+        if abs(centre[2] + half[2] - scene.workspace.surface_height) < _LEVEL_TOLERANCE:
             found.append((centre[:2].copy(), half[:2]))
     return found
 
