@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.expert.arm import GRIPPER
 from libero_env.parallel import compiled
 
 _CELL, _COARSE_CELL = 0.006, 0.012  # [m] voxels for objects, and for the hand

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from libero_env.expert.arm.kinematics import limit_elbow_extension
-from libero_env.expert.arm.servo import OPEN
+from libero_env.expert.arm import OPEN, limit_elbow_extension
 from libero_env.expert.planning.goal_plan import Step, plan_goal
 from libero_env.expert.planning.pick_planner import is_graspable
 from libero_env.expert.shapes import Shapes
@@ -107,9 +106,9 @@ class Expert:
         atom, style = step.atom, self.style
         if atom.predicate.lower() in OPPOSITE_STATES:
             return MoveJoint(atom.args[0], atom.predicate.lower(), style=style)
-        container = DropIntoContainer.find_container(view, shapes, atom)
-        if container is not None:
-            return DropIntoContainer(atom, container, style=style, shapes=shapes)
+        drop = DropIntoContainer.for_atom(view, atom, style=style, shapes=shapes)
+        if drop is not None:
+            return drop
         if Drag.applies(view, shapes, atom) and not is_graspable(view, shapes, atom.args[0]):
             return Drag(atom, style=style, shapes=shapes)
         return PickPlace(atom, style=style, shapes=shapes, slot=step.slot)

@@ -4,7 +4,7 @@ from functools import cached_property
 
 import numpy as np
 
-from libero_env.expert.arm.kinematics import ArmKinematics
+from libero_env.expert.arm import ArmKinematics
 from libero_env.geometry import Pose, body_points, quat_to_mat, surface_points
 from libero_env.sim.scene import Scene
 from libero_env.sim.state import StateView

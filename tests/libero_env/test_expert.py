@@ -12,12 +12,11 @@ from libero_env.demos.record import DemoRecorder
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import LiberoEnv
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError, plan_goal
-from libero_env.expert.arm.gripper import GRIPPER
-from libero_env.expert.arm.kinematics import limit_elbow_extension
-from libero_env.expert.arm.servo import action_toward, downward
+from libero_env.expert.arm import GRIPPER, action_toward, downward, limit_elbow_extension
 from libero_env.expert.clearance import overhang
 from libero_env.expert.grasping.costs import finger_offset, grip_cost
-from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, collision_depth, find_grasps
+from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, find_grasps
+from libero_env.expert.grasping.kernels import open_hand_collision_depth
 from libero_env.expert.planning.pick_plan import SEARCH, FailedAttempt
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.rollout import run_experts
@@ -344,7 +343,7 @@ def test_an_object_in_a_drawer_is_grasped_where_the_hand_has_room(view_of):
     shapes = Shapes(view.scene)
     grasp = plan_pick(view, shapes, step.atom).grasp
     fixtures = np.concatenate([shapes.points(view, name, 0.006) for name in view.scene.fixtures])
-    assert collision_depth(fixtures, grasp.pos_world, grasp.mat) == 0.0
+    assert open_hand_collision_depth(fixtures, grasp.pos_world, grasp.mat) == 0.0
 
 
 def test_what_hangs_over_an_object_is_told_from_a_wall_beside_it():

@@ -5,10 +5,7 @@ import pytest
 
 from libero_env.assets.robot import REST_QPOS
 from libero_env.envs.batch import BatchEnv
-from libero_env.expert.arm.gripper import GRIPPER
-from libero_env.expert.arm.kinematics import ArmKinematics
-from libero_env.expert.arm.posture import posture_cost, reach_violation, wrist_bend
-from libero_env.expert.arm.servo import downward
+from libero_env.expert.arm import GRIPPER, ArmKinematics, downward, posture_cost, reach_violation, wrist_bend
 from libero_env.expert.grasping.handle_grasps import (
     grasp_handle,
     grasp_knob,
@@ -211,7 +208,11 @@ def test_the_collision_depth_of_the_hand():
 
     def depth(x, y, z):  # in the frame of the hand: along the fingers, across them, and where they point
         return hand_collision_depth(
-            pose.apply(np.array([[x, y, z]])), pose, GRIPPER.half_opening, GRIPPER.half_opening
+            pose.apply(np.array([[x, y, z]])),
+            pose.pos,
+            np.ascontiguousarray(pose.mat),
+            GRIPPER.half_opening,
+            GRIPPER.half_opening,
         )
 
     assert depth(0.0, 0.0, 0.0) == 0.0  # between the fingers

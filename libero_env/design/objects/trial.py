@@ -9,7 +9,7 @@ from PIL import Image
 
 from libero_env.design.objects.mesh_file import Notify
 from libero_env.errors import LiberoError
-from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.expert.arm import GRIPPER
 from libero_env.expert.grasping.grasps import Grasp, GraspError, find_grasps
 from libero_env.geometry import surface_points
 from libero_env.mujoco_compat import log_warnings, set_damping

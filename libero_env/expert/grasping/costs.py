@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from libero_env.expert.arm.gripper import GRIPPER
+from libero_env.expert.arm import GRIPPER
 from libero_env.expert.clearance import Voxels, hand_points
-from libero_env.expert.grasping.grasps import COLLISION_COST, DEPTH_COST, Grasp, collision_depth
+from libero_env.expert.grasping.grasps import COLLISION_COST, DEPTH_COST, Grasp
+from libero_env.expert.grasping.kernels import open_hand_collision_depth
 
 HAND = hand_points(
     GRIPPER.max_opening + 0.012
@@ -51,11 +52,14 @@ def collision_cost(voxels: Voxels, obstacles: np.ndarray, grasp: Grasp) -> float
         obstacles: Points on obstacles near the grasp, (M, 3).
         grasp: Grasp of a body.
     """
-    depth = collision_depth(obstacles, grasp.pos_world, grasp.mat)
+    depth = open_hand_collision_depth(obstacles, grasp.pos_world, grasp.mat)
     lowest = float((grasp.pos_world + HAND @ grasp.mat.T)[:, 2].min())
     below = max(voxels.surface_height - lowest, 0.0)
     cost = DEPTH_COST * depth + COLLISION_COST * (depth > 0) + 40.0 * below + 0.1 * (below > 0)
-    depths = [collision_depth(obstacles, grasp.pos_world - d * grasp.mat[:, 2], grasp.mat) for d in _APPROACH]
+    depths = [
+        open_hand_collision_depth(obstacles, grasp.pos_world - d * grasp.mat[:, 2], grasp.mat)
+        for d in _APPROACH
+    ]
     return cost + 5.0 * max(depths) + 0.1 * (max(depths) > 0)
 
 

@@ -5,13 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from libero_env.expert.arm.servo import finger_axis
+from libero_env.expert.arm import finger_axis
 from libero_env.expert.grasping.costs import HAND, collision_cost, grip_cost
 from libero_env.expert.grasping.grasps import Grasp, GraspError, find_grasps
-from libero_env.expert.planning.pick_plan import FLIPS, SEARCH, FailedAttempt, PickPlan
-from libero_env.expert.planning.place_poses import DOWN, PlacePose, find_place_poses
-from libero_env.expert.planning.placement import Placement
-from libero_env.expert.planning.reachability import first_reachable
+from libero_env.expert.planning.pick_plan import FLIPS, SEARCH, FailedAttempt, PickPlan, first_reachable
+from libero_env.expert.planning.place_poses import DOWN, Placement, PlacePose, find_place_poses
 from libero_env.expert.shapes import Shapes
 from libero_env.geometry import Pose, rotation_about_z
 from libero_env.sim.state import StateView

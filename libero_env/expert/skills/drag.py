@@ -2,16 +2,14 @@
 
 import numpy as np
 
-from libero_env.expert.arm.gripper import GRIPPER
-from libero_env.expert.arm.servo import CLOSE, downward, finger_axis, lateral_ramp
+from libero_env.expert.arm import CLOSE, GRIPPER, downward, finger_axis, lateral_ramp
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.skills.skill import Skill, gripper_opening
 from libero_env.expert.variation import MotionStyle
-from libero_env.sim.predicates import evaluate, region_boxes
+from libero_env.sim.predicates import region_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 
-MAX_RETRIES = 5
 HOLLOW_RADIUS, MIN_HOLLOW = 0.02, 0.006  # [m] around the origin, and its depth below the rim
 HOVER = 0.07  # [m] of the fingertips over the object on the way to it
 LEAD = 0.035  # [m] of the target ahead of the hand while it drags
@@ -34,8 +32,8 @@ class Drag(Skill):
     NOISE_SCALES = {"reach": 1.0, "carry": 0.3}
 
     def __init__(self, atom: Atom, *, style: MotionStyle, shapes: Shapes):
-        super().__init__(style)
-        self.atom, self.shapes = atom, shapes
+        super().__init__(atom, style)
+        self.shapes = shapes
         self._still_steps = 0  # just above the object, where something keeps the hand from going lower
 
     @staticmethod
@@ -47,10 +45,6 @@ class Drag(Skill):
         hollow = points[np.hypot(points[:, 0], points[:, 1]) < HOLLOW_RADIUS, 2]
         upright = pose_of(view, atom.args[0]).mat[2, 2] > 0.9
         return bool(flat and upright and len(hollow) > 0 and points[:, 2].max() - hollow.max() > MIN_HOLLOW)
-
-    def done(self, view: StateView) -> bool:
-        """Return whether the atom holds and the hand is away."""
-        return self.phase in ("reach", "rest") and evaluate(self.atom, view)
 
     def _next_action(self, view: StateView) -> np.ndarray:
         if self.phase == "rest":
@@ -79,7 +73,7 @@ class Drag(Skill):
         if left < 0.012 or lost:
             self._enter("withdraw")
             self.retries += int(lost)
-            if self.retries > MAX_RETRIES:
+            if self.retries > self.MAX_RETRIES:
                 self.failure_reason = f"{name} does not follow the hand"
         ahead = path / max(left, 1e-9) * min(left + 0.01, LEAD)
         return self._push(view, np.array([*(pos[:2] + ahead), contact[2]]), speed_scale=DRAG_SPEED)

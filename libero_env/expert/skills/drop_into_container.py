@@ -2,14 +2,10 @@
 
 import numpy as np
 
-from libero_env.expert.arm.gripper import GRIPPER
-from libero_env.expert.arm.kinematics import joint_angles
-from libero_env.expert.arm.servo import CLOSE, OPEN, downward, finger_axis, lateral_ramp
+from libero_env.expert.arm import CLOSE, GRIPPER, OPEN, downward, finger_axis, joint_angles, lateral_ramp
 from libero_env.expert.clearance import obstacle_height
-from libero_env.expert.grasping.grasps import GraspError
-from libero_env.expert.grasping.top_grasps import TopGrasp, choose_top_grasp
+from libero_env.expert.grasping.grasps import GraspError, TopGrasp, choose_top_grasp
 from libero_env.expert.shapes import Shapes, pose_of
-from libero_env.expert.skills.approach import BackOff, funnel_lift
 from libero_env.expert.skills.pick_place import (
     ARRIVED,
     ARRIVED_TURN,
@@ -19,14 +15,14 @@ from libero_env.expert.skills.pick_place import (
     PickPlace,
     has_moved,
 )
-from libero_env.expert.skills.skill import Skill
+from libero_env.expert.skills.skill import BackOff, Skill, funnel_lift
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 
-MAX_RETRIES, MAX_BACK_OFFS = 4, 3
+MAX_BACK_OFFS = 3
 MAX_REACH_ERROR = 0.005  # of inverse kinematics at the grasp, [m]
 MAX_SLIP = 0.03  # [m] that the object may move in the hand
 HAND_ABOVE_RIM = 0.045  # [m] of the grip site, so that the palm stays above the container
@@ -47,10 +43,11 @@ class DropIntoContainer(Skill):
     """
 
     NOISE_SCALES = {"reach": 1.0, "carry": 0.7}
+    MAX_RETRIES = 4
 
     def __init__(self, atom: Atom, container: str, *, style: MotionStyle, shapes: Shapes):
-        super().__init__(style)
-        self.atom, self.container, self.shapes = atom, container, shapes
+        super().__init__(atom, style)
+        self.container, self.shapes = container, shapes
         self._object, self._site = atom.args
         self._plan: tuple[TopGrasp, Pose] | None = None  # the grasp, and the pose of the object then
         self._clear_height = 0.0  # [m] above the grasp, at which the fingertips are clear of the object
@@ -59,24 +56,23 @@ class DropIntoContainer(Skill):
         self._back_off = BackOff()
 
     @classmethod
-    def find_container(cls, view: StateView, shapes: Shapes, atom: Atom) -> str | None:
-        """Return the container that an atom names, where it is movable and the object can be grasped from above."""
+    def for_atom(
+        cls, view: StateView, atom: Atom, *, style: MotionStyle, shapes: Shapes
+    ) -> "DropIntoContainer | None":
+        """Return the skill with its grasp, where the container is movable and the object can be grasped from above."""
         region = view.scene.problem.region(atom.args[-1])
         if atom.predicate != "In" or region is None or region.ranges:
             return None
         if region.target not in view.scene.objects:
             return None
         try:
-            grasp = cls(atom, region.target, style=MotionStyle(), shapes=shapes)._grasp_pose(view)
+            skill = cls(atom, region.target, style=style, shapes=shapes)
+            grasp = skill._grasp_pose(view, MotionStyle())
         except GraspError:
             return None
         above = Pose(grasp.pos + [0.0, 0.0, 0.1], grasp.mat)
         _, error = shapes.arm.follow(joint_angles(view), [above, grasp])
-        return region.target if error < MAX_REACH_ERROR else None
-
-    def done(self, view: StateView) -> bool:
-        """Return whether the object is in its place and the hand has released it."""
-        return self.phase in ("reach", "rest") and evaluate(self.atom, view)
+        return skill if error < MAX_REACH_ERROR else None
 
     def fallback(self) -> PickPlace | None:
         """Return `PickPlace`, which searches more grasps, after a failure."""
@@ -91,18 +87,10 @@ class DropIntoContainer(Skill):
         self._steps = 1  # here, the step in which a phase begins counts
         return self._run_phase(view)
 
-    def _retry(self) -> None:
-        """Begin again with another grasp."""
-        self.retries += 1
-        if self.retries > MAX_RETRIES:
-            self.failure_reason = f"{self.atom.args} not reached in {self.retries} attempts"
-        self._plan = None
-        self._enter("reach")
-
     def _reach(self, view: StateView) -> np.ndarray:
         pos, style = view.eef_pos, self.style
         try:
-            grasp = self._grasp_pose(view)
+            grasp = self._grasp_pose(view, self.style)
         except GraspError as error:
             self.failure_reason = str(error)
             return self._rise()
@@ -169,7 +157,7 @@ class DropIntoContainer(Skill):
                 self._retry()
         return self._toward(view, pose.pos, pose.mat, OPEN)
 
-    def _grasp_pose(self, view: StateView) -> Pose:
+    def _grasp_pose(self, view: StateView, style: MotionStyle) -> Pose:
         """Return the pose of the grip site at the grasp, which follows small motions of the object.
 
         Raises:
@@ -184,8 +172,8 @@ class DropIntoContainer(Skill):
             self._plan = choose_top_grasp(cloud, obstacles, surface, axis, self._object), now
             self._clear_height = cloud[:, 2].max() - self._plan[0].pos_world[2] + GRIPPER.tip_below
         grasp, then = self._plan
-        along = np.array([-np.sin(grasp.yaw), np.cos(grasp.yaw), 0.0]) * self.style.grasp_shift
-        mat = downward(grasp.yaw + self.style.yaw_error, finger_axis(view.eef_mat))
+        along = np.array([-np.sin(grasp.yaw), np.cos(grasp.yaw), 0.0]) * style.grasp_shift
+        mat = downward(grasp.yaw + style.yaw_error, finger_axis(view.eef_mat))
         return Pose(grasp.pos_world + now.pos - then.pos + along, mat)
 
     def _obstacle_height(self, view: StateView, goal: np.ndarray) -> float:

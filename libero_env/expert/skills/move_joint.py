@@ -2,24 +2,20 @@
 
 import numpy as np
 
-from libero_env.expert.arm.gripper import GRIPPER
-from libero_env.expert.arm.servo import CLOSE, OPEN, lateral_ramp
+from libero_env.expert.arm import CLOSE, GRIPPER, OPEN, lateral_ramp
 from libero_env.expert.clearance import obstacle_height
 from libero_env.expert.grasping.grasps import GraspError
-from libero_env.expert.grasping.handle_candidates import HandleGrasp
-from libero_env.expert.grasping.handle_grasps import grasp_handle, grasp_knob
+from libero_env.expert.grasping.handle_grasps import HandleGrasp, grasp_handle, grasp_knob
 from libero_env.expert.grasping.handles import Part, find_handle, find_inner_side, is_knob, nearby_points
-from libero_env.expert.skills.approach import funnel_lift
-from libero_env.expert.skills.skill import Skill
+from libero_env.expert.skills.skill import Skill, funnel_lift
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
 from libero_env.objects.model import OPPOSITE_STATES
-from libero_env.sim.predicates import evaluate
+from libero_env.sim.predicates import evaluate, state_bound
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 from libero_env.timing import CONTROL_HZ
 
-MAX_RETRIES = 5
 ARRIVED, ARRIVED_TURN = 0.008, 0.15  # [m], [rad] from where the fingers close
 APPROACH = 0.08  # [m] from which the hand comes along its approach
 OBSTACLE_RADIUS = 0.07  # [m] around the hand
@@ -50,7 +46,7 @@ class MoveJoint(Skill):
     NOISE_SCALES = {"reach": 1.0, "close": 0.3, "withdraw": 0.7, "move": 0.4}
 
     def __init__(self, address: str, state: str, *, style: MotionStyle | None = None):
-        super().__init__(style or MotionStyle())
+        super().__init__(Atom(state.capitalize(), (address,)), style or MotionStyle())
         self.address, self.state = address, state
         self._plan: tuple[Part, HandleGrasp] | None = None  # the grasp in the frame of the part
         self._failed: list[Pose] = []  # pre-grasps of earlier attempts
@@ -73,7 +69,7 @@ class MoveJoint(Skill):
         if self._plan is None and not self._make_plan(view):
             return self._rest(view)
         if self._steps > (MAX_MOVE_STEPS if self.phase == "move" else MAX_PHASE_STEPS):
-            return self._let_go(view)
+            return self._start("release", view)  # withdraw, and begin again
         return self._run_phase(view)
 
     @property
@@ -138,10 +134,9 @@ class MoveJoint(Skill):
         """Return (threshold, end, width, direction) of the state, [m] or [rad]."""
         owner = view.scene.owner(self.address)
         assert owner is not None
-        ranges = view.scene.entities[owner].articulation
-        low, high = sorted(ranges[self.state])
-        opposite = OPPOSITE_STATES[self.state]
-        upwards = opposite not in ranges or low + high > sum(ranges[opposite])
+        model = view.scene.entities[owner]
+        low, high = sorted(model.articulation[self.state])
+        _, upwards = state_bound(model, self.state, OPPOSITE_STATES[self.state])
         return (low, high, high - low, 1.0) if upwards else (high, low, high - low, -1.0)
 
     def _goal_value(self, view: StateView, part: Part) -> float:
@@ -156,7 +151,7 @@ class MoveJoint(Skill):
 
     def _is_reached(self, view: StateView) -> bool:
         """Return whether the state holds with a margin."""
-        if not evaluate(Atom(self.state.capitalize(), (self.address,)), view):
+        if not evaluate(self.atom, view):
             return False
         if self.state in ("close", "turnoff"):
             return True
@@ -167,14 +162,6 @@ class MoveJoint(Skill):
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
         self._still_steps = 0
-
-    def _retry(self) -> None:
-        """Begin again with another grasp."""
-        self.retries += 1
-        self._plan = None
-        if self.retries > MAX_RETRIES:
-            self.failure_reason = f"{self.address} did not get to {self.state} in {self.retries} attempts"
-        self._enter("reach")
 
     def _reach(self, view: StateView) -> np.ndarray:
         pos, frame = view.eef_pos, self._part.pose(view)
@@ -189,7 +176,7 @@ class MoveJoint(Skill):
         if away < ARRIVED and turn < ARRIVED_TURN or touching:
             return self._start("close" if self._grasp.gripping else "move", view)
         if self._still_steps > 8:
-            return self._let_go(view)
+            return self._start("release", view)
         lift = funnel_lift(self.style.funnel_slope, lateral_error - 0.006, turn - ARRIVED_TURN, APPROACH)
         target = goal.pos + lift * back
         lateral_scale = 1.0
@@ -203,7 +190,7 @@ class MoveJoint(Skill):
     def _close(self, view: StateView) -> np.ndarray:
         if self._fingers_stopped(view, max_steps=16):
             if self._opening < 0.004:
-                return self._let_go(view)
+                return self._start("release", view)
             self._previous_value = self._part.value(view)
             return self._start("move", view)
         goal = self._part.pose(view).to_world(self._grasp.contact)
@@ -226,7 +213,7 @@ class MoveJoint(Skill):
             self._pulled = fully_pulled
             return self._start("release", view)
         if grasp.gripping and np.linalg.norm(view.eef_pos - contact.pos) > MAX_SLIP:
-            return self._let_go(view)
+            return self._start("release", view)
         lead = min((PULL_LEAD if grasp.gripping else PUSH_LEAD) / radius, 0.5)
         ahead = np.sign(left) * min(abs(left) + 0.5 * lead, lead)  # beyond the target, as the hand gives way
         if self.state == "turnoff":
@@ -262,10 +249,6 @@ class MoveJoint(Skill):
     def _is_fully_pulled(self, left: float) -> bool:
         """Return whether a door is as far open as it is pulled; it is pushed the rest of the way."""
         return self.state == "open" and not self._part.slides and self._grasp.gripping and abs(left) < 0.05
-
-    def _let_go(self, view: StateView) -> np.ndarray:
-        """Release the part, withdraw, and begin again; return the first action."""
-        return self._start("release", view)
 
     def _release(self, view: StateView) -> np.ndarray:
         if self._steps <= 1:

@@ -3,16 +3,14 @@
 import numpy as np
 
 from libero_env.errors import LiberoError
-from libero_env.expert.arm.gripper import GRIPPER
-from libero_env.expert.arm.servo import CLOSE, OPEN, lateral_ramp
+from libero_env.expert.arm import CLOSE, GRIPPER, OPEN, lateral_ramp
 from libero_env.expert.clearance import hand_extent_below, obstacle_height
 from libero_env.expert.grasping.costs import finger_offset
-from libero_env.expert.grasping.grasps import collision_depth
+from libero_env.expert.grasping.kernels import open_hand_collision_depth
 from libero_env.expert.planning.pick_plan import FailedAttempt, PickPlan
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
-from libero_env.expert.skills.approach import BackOff, funnel_lift
-from libero_env.expert.skills.skill import Skill, gripper_opening
+from libero_env.expert.skills.skill import BackOff, Skill, funnel_lift, gripper_opening
 from libero_env.expert.skills.transport import SINKING, Move, Transport
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
@@ -20,7 +18,6 @@ from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 
-MAX_RETRIES = 6
 MAX_REPLANS = 3  # of the place of what is in the hand
 # wide, so that the fingers close in motion: a clone that creeps up to a threshold never passes it
 ARRIVED, ARRIVED_TURN = 0.012, 0.12  # [m], [rad]
@@ -53,10 +50,11 @@ class PickPlace(Skill):
     """
 
     NOISE_SCALES = {"reach": 1.0, "close": 0.3, "carry": 0.7, "withdraw": 0.7}
+    MAX_RETRIES = 6
 
     def __init__(self, atom: Atom, *, style: MotionStyle, shapes: Shapes, slot: tuple[int, int] = (0, 1)):
-        super().__init__(style)
-        self.atom, self.shapes, self.slot = atom, shapes, slot
+        super().__init__(atom, style)
+        self.shapes, self.slot = shapes, slot
         self._object = atom.args[0]
         self._plan: PickPlan | None = None
         self._failures: list[FailedAttempt] = []
@@ -75,10 +73,6 @@ class PickPlace(Skill):
         self._rise_xy: np.ndarray | None = None  # where the hand rises before it moves sideways, (2,)
         self._previous_pose: Pose | None = None  # of the object one step ago
         self._waiting_steps = 0
-
-    def done(self, view: StateView) -> bool:
-        """Return whether the atom holds and the hand is away from the object."""
-        return self.phase in ("reach", "rest") and evaluate(self.atom, view)
 
     def _next_action(self, view: StateView) -> np.ndarray:
         if self.failure_reason or self.phase in ("reach", "rest") and not self._update_plan(view):
@@ -127,11 +121,7 @@ class PickPlace(Skill):
         """Begin again with another plan; `placed`: the object was released at its place."""
         if self._plan is not None:
             self._failures.append(FailedAttempt.from_plan(self._plan, placed))
-        self.retries += 1
-        self._plan = None
-        if self.retries > MAX_RETRIES:
-            self.failure_reason = f"{self.atom.args} not reached in {self.retries} attempts"
-        self._enter("reach")
+        super()._retry()
 
     def _reach(self, view: StateView) -> np.ndarray:
         pos, style = view.eef_pos, self.style
@@ -246,7 +236,7 @@ class PickPlace(Skill):
         if self._steps == 0:
             self._closed_opening = gripper_opening(view)
             obstacles = self.shapes.obstacles(view, self._object, spacing=DENSE)
-            self._opens_partially = collision_depth(obstacles, view.eef_pos, view.eef_mat) > 0.0
+            self._opens_partially = open_hand_collision_depth(obstacles, view.eef_pos, view.eef_mat) > 0.0
         if self._steps > 10:
             self._enter("withdraw")
         target, speed = pose.pos, 1.0

@@ -1,27 +1,29 @@
-"""The interface of skills, and what they have in common."""
+"""The interface of skills, and what they have in common: the funnel of an approach, backing off from an obstacle."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
-from libero_env.expert.arm.servo import OPEN, action_toward
+from libero_env.expert.arm import OPEN, action_toward
 from libero_env.expert.variation import MotionStyle
+from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
+from libero_env.tasks.problem import Atom
 from libero_env.timing import CONTROL_HZ
 
 _STILL_HAND = 0.04  # [m/s] below which the hand hardly moves
 _STOPPED_FINGERS = 4e-4  # [m] of finger motion in one step, below which the fingers have stopped
 
 
-class Skill(ABC):
+class Skill:
     """Base class of skills, which act until an atom of the goal holds.
 
     A skill moves through phases; a method of the same name gives the action of each. It plans when it begins, and
-    begins again after a slip.
+    begins again after a slip, at most `MAX_RETRIES` times.
 
     Args:
+        atom: Atom to make true.
         style: Motion style.
 
     Attributes:
@@ -31,9 +33,11 @@ class Skill(ABC):
     """
 
     NOISE_SCALES: ClassVar[Mapping[str, float]] = {}  # phase -> noise scale; 0 without
+    MAX_RETRIES: ClassVar[int] = 5
 
-    def __init__(self, style: MotionStyle):
-        self.style = style
+    def __init__(self, atom: Atom, style: MotionStyle):
+        self.atom, self.style = atom, style
+        self._plan: Any = None  # what the phases follow; None where it is to be made
         self.phase, self.retries, self.failure_reason = "reach", 0, ""
         self._steps = 0  # since the phase began
         self._velocity = np.zeros(3)  # [m/s] of the grip site
@@ -45,9 +49,9 @@ class Skill(ABC):
         """Factor on the action noise that the phase tolerates, in [0, 1]."""
         return self.NOISE_SCALES.get(self.phase, 0.0)
 
-    @abstractmethod
     def done(self, view: StateView) -> bool:
         """Return whether the atom holds and the hand is free for the next skill."""
+        return self.phase in ("reach", "rest") and evaluate(self.atom, view)
 
     def act(self, view: StateView) -> np.ndarray:
         """Return the next action, (7,) in [-1, 1]."""
@@ -68,6 +72,14 @@ class Skill(ABC):
     def _enter(self, phase: str) -> None:
         """Begin a phase."""
         self.phase, self._steps = phase, 0
+
+    def _retry(self) -> None:
+        """Begin again with another plan."""
+        self.retries += 1
+        self._plan = None
+        if self.retries > self.MAX_RETRIES:
+            self.failure_reason = f"{self.atom} not reached in {self.retries} attempts"
+        self._enter("reach")
 
     def _run_phase(self, view: StateView) -> np.ndarray:
         """Return the action of the phase."""
@@ -132,3 +144,44 @@ class Skill(ABC):
 def gripper_opening(view: StateView) -> float:
     """Return the distance between the fingers, [m]."""
     return float(np.abs(view.finger_pos).sum())
+
+
+class BackOff:
+    """Detection of a finger that stands on something; the hand then goes back until it is clear.
+
+    Attributes:
+        active: Whether the hand goes back.
+        count: Number of times that the hand went back.
+    """
+
+    def __init__(self) -> None:
+        self.active, self.count, self._standing_steps = False, 0, 0
+
+    def update(self, *, standing: bool, clear: bool) -> None:
+        """Go back after three steps of standing, until the hand is clear.
+
+        Args:
+            standing: Whether the hand is further away than intended, and hardly moves.
+            clear: Whether the fingers are clear of the object and the hand is over its target.
+        """
+        self._standing_steps = self._standing_steps + 1 if standing else 0
+        if self._standing_steps >= 3 and not self.active:
+            self.active, self.count = True, self.count + 1
+        if clear:
+            self.active = False
+
+    def stop(self) -> None:
+        """Stop going back; the count stays."""
+        self.active, self._standing_steps = False, 0
+
+
+def funnel_lift(slope: float, distance: float, angle: float, largest: float) -> float:
+    """Return how far a hand stays back from its target, so that it approaches within a funnel, [m].
+
+    Args:
+        slope: Slope of the funnel.
+        distance: Lateral distance from the target beyond the tolerance, [m].
+        angle: Angle from the target orientation beyond the tolerance, [rad].
+        largest: Height of the funnel, [m].
+    """
+    return float(np.clip(slope * distance + 0.3 * max(angle, 0.0), 0.0, largest))

@@ -5,12 +5,11 @@ from typing import Literal
 
 import numpy as np
 
-from libero_env.expert.arm.servo import lateral_ramp
+from libero_env.expert.arm import lateral_ramp
 from libero_env.expert.clearance import hand_extent_below, obstacle_height, overhang
-from libero_env.expert.planning.pick_plan import PickPlan
-from libero_env.expert.planning.reachability import ENTRY_DISTANCE
+from libero_env.expert.planning.pick_plan import ENTRY_DISTANCE, PickPlan
 from libero_env.expert.shapes import COARSE, Shapes, pose_of
-from libero_env.expert.skills.approach import funnel_lift
+from libero_env.expert.skills.skill import funnel_lift
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
 from libero_env.sim.predicates import evaluate

@@ -1,1 +1,0 @@
-"""The arm and its gripper: dimensions, postures, inverse kinematics, servo control."""
