@@ -13,7 +13,7 @@ import mujoco
 import yaml
 
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
-from libero_env.objects.mjcf_gate import Mjcf, read_mjcf
+from libero_env.objects.mjcf import Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.paths import objects_dir
 from libero_env.storage import read_yaml_file
@@ -115,7 +115,7 @@ def read_spec(path: Path) -> mujoco.MjSpec:
 
     Raises:
         InvalidInputError: The file cannot be read, has what an object may not have, or a mesh or texture is missing or
-            elsewhere; see `libero_env.objects.mjcf_gate`.
+            elsewhere; see `libero_env.objects.mjcf`.
     """
     return spec_of(read_mjcf(path))
 

@@ -14,6 +14,7 @@ from PIL import Image
 from libero_env.design.objects import add_object
 from libero_env.design.objects.mesh_file import read_mesh
 from libero_env.design.objects.mjcf_file import store_mjcf
+from libero_env.limited import limited_process
 from libero_env.objects.folder import read_spec
 from tests.harness.fuzz import examples, survive
 
@@ -120,7 +121,8 @@ def place(tmp_path_factory) -> Path:
     for name in ("own/parts/m.stl", "own/parts/m.obj", "secret/m.stl"):
         box.export(root / name)
     Image.new("RGB", (8, 8)).save(root / "own" / "parts" / "t.png")
-    yield root
+    with limited_process():
+        yield root
     patch.undo()
 
 

@@ -12,15 +12,9 @@ from PIL import Image
 
 from libero_env.cli.main import main
 from libero_env.design.objects import add_object, register_object_file
-from libero_env.design.objects.add import DENSITY, Options
-from libero_env.design.objects.collision import (
-    boxes_of,
-    collision_pieces,
-    hull_mass,
-    solid_mass,
-    volume_filled,
-)
-from libero_env.design.objects.mesh_file import bounds, is_closed, merge_vertices, read_mesh, signed_volume
+from libero_env.design.objects.collision import boxes_of, collision_pieces, is_closed, volume_filled
+from libero_env.design.objects.mesh_file import bounds, read_mesh
+from libero_env.design.objects.mesh_object import DENSITY, Options, merge_vertices
 from libero_env.errors import LiberoError
 from libero_env.objects import catalog, folder, get_object, object_names
 from libero_env.sim.scene import build_scene
@@ -124,9 +118,9 @@ def test_every_format_gives_the_same_shape(tmp_path, ending):
     assert high - low == pytest.approx([0.04, 0.05, 0.06]) and low + high == pytest.approx(
         [0, 0, 0], abs=1e-9
     )
-    vertices, faces = merge_vertices(surfaces)
-    assert (len(vertices), len(faces), notes) == (8, 12, [])
-    assert signed_volume(vertices, faces) == pytest.approx(1.2e-4)
+    mesh = merge_vertices(surfaces)
+    assert (len(mesh.vertices), len(mesh.faces), notes) == (8, 12, [])
+    assert mesh.volume == pytest.approx(1.2e-4)
 
 
 def test_y_is_up_where_the_format_specifies_it(tmp_path):
@@ -148,20 +142,25 @@ def test_units_are_guessed_and_reported(tmp_path, scale, unit):
 
 
 def test_closed_means_that_every_edge_has_two_sides():
-    faces = trimesh.creation.box().faces
-    turned = faces.copy()
+    mesh = trimesh.creation.box()
+    turned = mesh.faces.copy()
     turned[0] = turned[0][::-1]
-    assert is_closed(faces) and not is_closed(faces[1:]) and not is_closed(turned)
+    open_, turned = (
+        trimesh.Trimesh(mesh.vertices, faces, process=False) for faces in (mesh.faces[1:], turned)
+    )
+    assert is_closed(mesh) and not is_closed(open_) and not is_closed(turned)
 
 
-def test_mass_and_inertia_are_those_of_the_solid():
+def test_mass_and_inertia_are_those_of_the_solid(tmp_path):
     mesh = cup()
-    found = solid_mass(np.array(mesh.vertices), np.array(mesh.faces), 1000.0)
-    assert found.volume == pytest.approx(mesh.volume, rel=1e-6)
-    assert found.centre == pytest.approx(mesh.center_mass, abs=1e-6)
-    tensor = 1000.0 * mesh.moment_inertia
-    assert found.inertia[:3] == pytest.approx(np.diag(tensor), rel=1e-3)
-    assert hull_mass(np.array(mesh.vertices), 1.0).volume > 2 * found.volume
+    mesh.export(tmp_path / "cup.stl")
+    add_object(tmp_path / "cup.stl", density=1000.0, collision="boxes")
+    model = get_object("cup").spec.compile()
+    assert model.body("main").mass[0] == pytest.approx(1000.0 * mesh.volume, rel=1e-4)
+    centre = mesh.center_mass - mesh.bounds.mean(axis=0)
+    assert model.body("main").ipos == pytest.approx(centre, abs=1e-5)
+    moments = sorted(np.linalg.eigvalsh(1000.0 * mesh.moment_inertia))
+    assert sorted(model.body("main").inertia) == pytest.approx(moments, rel=1e-3)
 
 
 def inside_any(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -170,16 +169,15 @@ def inside_any(boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 def test_boxes_cover_the_walls_and_leave_a_cup_hollow():
     mesh = cup()
-    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces)
-    boxes = boxes_of(vertices, faces)
+    boxes = boxes_of(mesh)
     assert 4 < len(boxes) <= 60
-    assert inside_any(boxes, vertices).all() and inside_any(boxes, vertices[faces].mean(axis=1)).all()
+    assert inside_any(boxes, mesh.vertices).all() and inside_any(boxes, mesh.triangles_center).all()
     assert not inside_any(boxes, np.array([[0, 0, 0.05], [0.01, 0, 0.08], [0, 0, 0.1]])).any()
 
 
 def test_boxes_of_a_solid_have_no_hole():
     mesh = trimesh.creation.icosphere(2, 0.05)
-    boxes = boxes_of(np.array(mesh.vertices), np.array(mesh.faces))
+    boxes = boxes_of(mesh)
     points = np.random.default_rng(0).uniform(-0.028, 0.028, (200, 3))
     assert inside_any(boxes, points).all()
     assert 8 * boxes[:, 3:].prod(axis=1).sum() < 1.5 * mesh.volume
@@ -187,11 +185,8 @@ def test_boxes_of_a_solid_have_no_hole():
 
 def test_what_is_convex_is_its_hull_and_what_is_not_is_taken_apart(monkeypatch):
     solid, hollow = trimesh.creation.icosphere(2, 0.05), cup()
-    assert (
-        collision_pieces(np.array(solid.vertices), np.array(solid.faces), "decompose", print).method == "hull"
-    )
-    vertices, faces = np.array(hollow.vertices), np.array(hollow.faces)
-    assert volume_filled(vertices, faces) < 0.5
+    assert collision_pieces(solid, "decompose", print).method == "hull"
+    assert volume_filled(hollow) < 0.5
     seen: dict = {}
 
     def run_coacd(mesh, **options):
@@ -203,24 +198,24 @@ def test_what_is_convex_is_its_hull_and_what_is_not_is_taken_apart(monkeypatch):
         run_coacd=run_coacd, set_log_level=print, Mesh=lambda v, f: SimpleNamespace(vertices=v)
     )
     monkeypatch.setitem(sys.modules, "coacd", fake)
-    found = collision_pieces(vertices, faces, "decompose", print)
+    found = collision_pieces(hollow, "decompose", print)
     assert (found.method, len(found), seen["seed"]) == ("decompose", 2, 0)
     assert seen["longest"] == pytest.approx(1.0)  # its threshold is for meshes of that size
-    assert np.ptp(np.concatenate(found.meshes), axis=0) == pytest.approx(np.ptp(vertices, axis=0))
+    assert np.ptp(np.concatenate(found.meshes), axis=0) == pytest.approx(np.ptp(hollow.vertices, axis=0))
 
 
 def test_without_coacd_boxes_are_used_and_reported(monkeypatch):
     monkeypatch.setitem(sys.modules, "coacd", None)
     notes: list[str] = []
     mesh = cup()
-    found = collision_pieces(np.array(mesh.vertices), np.array(mesh.faces), "decompose", notes.append)
+    found = collision_pieces(mesh, "decompose", notes.append)
     assert found.method == "boxes" and "libero-lifelong[objects]" in notes[0]
 
 
 def test_coacd_itself():
     pytest.importorskip("coacd")
     mesh = cup()
-    found = collision_pieces(np.array(mesh.vertices), np.array(mesh.faces), "decompose", print)
+    found = collision_pieces(mesh, "decompose", print)
     assert found.method == "decompose" and 3 < len(found) <= 24
     centre = np.array([0, 0, 0.05])
     assert not any((p.min(axis=0) < centre).all() and (p.max(axis=0) > centre).all() for p in found.meshes)
@@ -343,8 +338,8 @@ def broken(tmp_path: Path, kind: str) -> Path:
 @pytest.mark.parametrize(
     ("kind", "options", "message"),
     [
-        ("texture", {}, "skin.png is missing; put it at"),
-        ("mtl", {}, "material file mtl.mtl is missing"),
+        ("texture", {}, "skin.png is missing; put it there"),
+        ("mtl", {}, "mtl.mtl is missing; put it there"),
         ("flat", {}, "it is flat"),
         ("empty", {}, "empty.obj: "),
         ("two", {}, "2 bodies"),

@@ -10,79 +10,23 @@ import keyword
 import shutil
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
-from dataclasses import replace as changed
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import numpy as np
-from pydantic import Field
-
-from libero_env.design.objects.collision import Mass, collision_pieces, hull_mass, solid_mass
-from libero_env.design.objects.mesh_file import bounds, is_closed, merge_vertices, read_mesh, signed_volume
-from libero_env.design.objects.mjcf_file import INSIDE, store_mjcf
-from libero_env.design.objects.mjcf_write import Body, store_mesh
+from libero_env.design.objects.mesh_object import Options, store_mesh
+from libero_env.design.objects.mjcf_file import store_mjcf
 from libero_env.design.objects.trial import try_object
 from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.limited import limited_process
 from libero_env.objects import catalog, folder
 from libero_env.objects.builtin import builtin_names
 from libero_env.objects.model import ObjectModel
-from libero_env.objects.references import MAX_FACES
 from libero_env.paths import cache_dir, objects_dir
 from libero_env.storage import cached_folder
-from libero_env.validation import validate_arguments
 
-DENSITY = 400.0  # [kg/m^3] of groceries; the original's objects have a few hundred
-_MIN_DEFAULT_MASS = 0.02  # [kg] the fingers push lighter objects away
 _FORMAT = 1  # version of stored folders; increase it when the same file gives another object
-_LARGEST = 0.6  # [m] longest side
 _LONGEST_NAME = 60  # characters
-
-
-@dataclass(frozen=True)
-class Options:
-    """Options of the conversion. All but `container` are for meshes only.
-
-    Attributes:
-        size: Longest side, [m]; None keeps that of the file.
-        mass: Mass, [kg]; None computes it from `density`.
-        density: Density, [kg/m^3]; None is that of groceries.
-        up: Axis of the file that points up, `z` or `y`; None is the convention of the format.
-        collision: `decompose`, `hull` or `boxes`; see `libero_env.design.objects.collision`.
-        faces: Approximate largest number of triangles of the visual mesh.
-        container: Whether to add the region `contain_region`, the inside of the object's bounds, for goals such as
-            `In x box_1_contain_region`.
-    """
-
-    size: Annotated[float, Field(ge=1e-3, le=100)] | None = None
-    mass: Annotated[float, Field(gt=0, le=1e4)] | None = None
-    density: Annotated[float, Field(gt=0, le=1e5)] | None = None
-    up: Literal["y", "z"] | None = None
-    collision: Literal["decompose", "hull", "boxes"] = "decompose"
-    faces: Annotated[int, Field(ge=1, le=MAX_FACES)] = 3000
-    container: bool = False
-
-    def __post_init__(self) -> None:
-        validate_arguments(Options, {one.name: getattr(self, one.name) for one in fields(self)})
-        if self.mass is not None and self.density is not None:
-            raise InvalidInputError("mass and density are both given; give only one of them")
-
-    @classmethod
-    def of(cls, options: Mapping[str, Any]) -> "Options":
-        """Return options by their names.
-
-        Raises:
-            InvalidInputError: A name is unknown, or a value is not valid.
-        """
-        validate_arguments(cls, options)
-        return cls(**options)
-
-    @property
-    def mesh_options(self) -> tuple[str, ...]:
-        """Names of the options that are set and that are for meshes only."""
-        usual = Options()
-        names = ("size", "mass", "density", "up", "collision", "faces")
-        return tuple(name for name in names if getattr(self, name) != getattr(usual, name))
 
 
 @dataclass(frozen=True)
@@ -141,7 +85,8 @@ def add_object(
         raise InvalidInputError(
             f"{directory.parent} is not a folder that can be written ({error})"
         ) from error
-    return _make(path, name, directory, chosen)
+    with limited_process():
+        return _make(path, name, directory, chosen)
 
 
 def register_object_file(path: str | Path, name: str | None = None, **options: Any) -> str:
@@ -168,7 +113,8 @@ def register_object_file(path: str | Path, name: str | None = None, **options: A
         raise LiberoError(f"{name[:80]!r} is not a valid category; use letters, digits and underscores")
     content = repr((_FORMAT, chosen, hashlib.sha256(path.read_bytes()).hexdigest(), name))
     directory = cache_dir() / "objects" / hashlib.sha256(content.encode()).hexdigest()[:16] / name
-    cached_folder(directory, lambda: _make(path, name, directory, chosen))
+    with limited_process():
+        cached_folder(directory, lambda: _make(path, name, directory, chosen))
     catalog.register_object(name, lambda: folder.load(directory, name))
     return name
 
@@ -218,7 +164,7 @@ def _make(path: Path, name: str, directory: Path, options: Options) -> Added:
                 )
             properties = store_mjcf(path, name, scratch, container=options.container, notify=notes.append)
         else:
-            properties = _from_mesh(path, name, scratch, options, notes)
+            properties = store_mesh(path, name, scratch, options, notes.append)
         model = ObjectModel(name, folder.read_spec(scratch / folder.MODEL))
         properties |= try_object(model, notes.append, scratch / folder.PREVIEW)
         folder.write_properties(scratch, {"name": name, "source": path.name, **properties})
@@ -229,49 +175,3 @@ def _make(path: Path, name: str, directory: Path, options: Options) -> Added:
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     return Added(name, directory, folder.read_properties(directory), tuple(notes))
-
-
-def _from_mesh(path: Path, name: str, directory: Path, options: Options, notes: list[str]) -> dict[str, Any]:
-    """Write the files of an object that is made from a mesh; return its properties."""
-    surfaces = read_mesh(path, size=options.size, up=options.up, notify=notes.append)
-    low, high = bounds(surfaces)
-    if max(high - low) > _LARGEST:
-        raise LiberoError(
-            f"{path}: {max(high - low):.2f} m is too large for a table and the gripper, which opens 8 cm; give --size "
-            "(longest side, m)"
-        )
-    vertices, faces = merge_vertices(surfaces)
-    closed = is_closed(faces)
-    if not closed:
-        notes.append(
-            f"{path.name} is not watertight: its mass is that of its filled convex hull. Fix the mesh (fill its "
-            "holes), or give --mass"
-        )
-    if closed and signed_volume(vertices, faces) < 0:
-        notes.append(f"{path.name} was inside out; its faces have been reversed")
-        faces = faces[:, ::-1]
-        surfaces = [changed(surface, faces=surface.faces[:, ::-1]) for surface in surfaces]
-    pieces = collision_pieces(vertices, faces, options.collision, notes.append)
-    mass, kilograms = _compute_mass(vertices, faces, closed, options, notes)
-    inside = tuple(INSIDE * float(value) / 2 for value in high - low) if options.container else None
-    body = Body(name, kilograms, mass.centre, mass.inertia, pieces, inside)
-    store_mesh(directory, body, surfaces, options.faces, notes.append)
-    return {
-        "mass": round(kilograms, 5),
-        "watertight": closed,
-        "collision": {"method": pieces.method, "pieces": len(pieces)},
-    }
-
-
-def _compute_mass(
-    vertices: np.ndarray, faces: np.ndarray, closed: bool, options: Options, notes: list[str]
-) -> tuple[Mass, float]:
-    """Return the distribution of the mass, scaled to it, and the mass in kg."""
-    mass = solid_mass(vertices, faces, 1.0) if closed else hull_mass(vertices, 1.0)
-    kilograms = options.mass or mass.volume * (options.density or DENSITY)
-    if kilograms < _MIN_DEFAULT_MASS and options.mass is None and options.density is None:
-        notes.append(
-            f"{1000 * kilograms:.2g} g is too light to be grasped: 20 g is used instead; --mass sets another value"
-        )
-        kilograms = _MIN_DEFAULT_MASS
-    return Mass(mass.volume, mass.centre, mass.inertia * kilograms / mass.volume), kilograms

@@ -3,16 +3,16 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import permutations
+from typing import TYPE_CHECKING
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.simplify import decimate
-from libero_env.design.objects.mesh_file import Notify, is_closed, signed_volume
-from libero_env.errors import LiberoError
-from libero_env.geometry import quat_to_mat
+from libero_env.design.objects.mesh_file import Notify
 
-METHODS = ("decompose", "hull", "boxes")
+if TYPE_CHECKING:
+    from trimesh import Trimesh
+
 INSTALL = "pip install 'libero-lifelong[objects]'"
 _CONCAVITY = 0.05  # CoACD's threshold: deviation of a piece from its hull
 _MAX_PIECES = 24
@@ -27,7 +27,7 @@ class Pieces:
     """Collision geometry in the frame of the object.
 
     Attributes:
-        method: Method that was used, one of `METHODS`.
+        method: Method that was used, `hull`, `decompose` or `boxes`.
         meshes: Vertices (n, 3) [m] of each convex mesh.
         boxes: Centre and half size of each box, (k, 6) [m].
     """
@@ -40,23 +40,17 @@ class Pieces:
         return len(self.meshes) + len(self.boxes)
 
 
-def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, notify: Notify) -> Pieces:
+def collision_pieces(mesh: "Trimesh", method: str, notify: Notify) -> Pieces:
     """Return the collision geometry of a mesh.
 
     Args:
-        vertices: Vertices, (n, 3) [m], without duplicates.
-        faces: Vertex indices, (f, 3).
+        mesh: Mesh without duplicate vertices, [m].
         method: `hull`, `boxes`, or `decompose`, which uses CoACD (Wei et al. 2022, Approximate Convex Decomposition for
             3D Meshes with Collision-Aware Concavity and Tree Search). A convex mesh is replaced by its hull.
         notify: Function that receives a message where another method had to be used.
-
-    Raises:
-        LiberoError: The method does not exist.
     """
-    if method not in METHODS:
-        raise LiberoError(f"collision {method!r} does not exist; valid: {', '.join(METHODS)}")
-    filled = volume_filled(vertices, faces)
-    if method == "hull" or (method == "decompose" and filled >= _CONVEX):
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if method == "hull" or (method == "decompose" and volume_filled(mesh) >= _CONVEX):
         return Pieces("hull", (vertices,))
     if method == "decompose":
         try:
@@ -65,7 +59,7 @@ def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, notif
             notify(
                 f"CoACD is not installed: boxes are used for collisions; for a finer shape: {INSTALL}, and add it again"
             )
-            return Pieces("boxes", boxes=boxes_of(vertices, faces))
+            return Pieces("boxes", boxes=boxes_of(mesh))
         if len(faces) > _MAX_FACES:
             notify(f"its {len(faces)} triangles are simplified to {_MAX_FACES} for the decomposition")
             empty = np.zeros((0, 2)), np.zeros((0, 3), np.int64)
@@ -73,63 +67,17 @@ def collision_pieces(vertices: np.ndarray, faces: np.ndarray, method: str, notif
             found, faces, *_ = decimate(vertices / scale, faces, *empty, _MAX_FACES)
             vertices = found * scale
         return Pieces("decompose", _decomposed(coacd, vertices, faces))
-    return Pieces("boxes", boxes=boxes_of(vertices, faces))
+    return Pieces("boxes", boxes=boxes_of(mesh))
 
 
-def volume_filled(vertices: np.ndarray, faces: np.ndarray) -> float:
+def is_closed(mesh: "Trimesh") -> bool:
+    """Return whether every edge belongs to two triangles of consistent orientation."""
+    return bool(mesh.is_watertight and mesh.is_winding_consistent)
+
+
+def volume_filled(mesh: "Trimesh") -> float:
     """Return the share of its convex hull that a mesh fills, in [0, 1]; 0 for an open mesh."""
-    if not is_closed(faces):
-        return 0.0
-    return min(abs(signed_volume(vertices, faces)) / hull_mass(vertices, 1.0).volume, 1.0)
-
-
-@dataclass(frozen=True)
-class Mass:
-    """Mass distribution of a homogeneous solid.
-
-    Attributes:
-        volume: Volume, [m^3].
-        centre: Centre of mass, (3,) [m].
-        inertia: Inertia about the centre in the object's axes: xx, yy, zz, xy, xz, yz, [kg m^2].
-    """
-
-    volume: float
-    centre: np.ndarray
-    inertia: np.ndarray
-
-
-def hull_mass(vertices: np.ndarray, density: float) -> Mass:
-    """Return the mass distribution of the convex hull of points (n, 3) with a density in kg/m^3."""
-    return _mass(vertices, None, density, mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
-
-
-def solid_mass(vertices: np.ndarray, faces: np.ndarray, density: float) -> Mass:
-    """Return the mass distribution of a closed mesh with a density in kg/m^3."""
-    if signed_volume(vertices, faces) < 0:
-        faces = faces[:, ::-1]
-    return _mass(vertices, faces, density, mujoco.mjtMeshInertia.mjMESH_INERTIA_EXACT)
-
-
-def _mass(
-    vertices: np.ndarray, faces: np.ndarray | None, density: float, kind: mujoco.mjtMeshInertia
-) -> Mass:
-    scale = 1.0 / np.ptp(vertices, axis=0).max()  # MuJoCo rejects very small volumes
-    spec = mujoco.MjSpec()
-    mesh = spec.add_mesh(name="mesh", uservert=(vertices * scale).ravel(), inertia=kind)
-    if faces is not None:
-        mesh.userface = faces.astype(np.int32).ravel()
-    body = spec.worldbody.add_body(name="body")
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", density=1.0)
-    body.add_freejoint()
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise LiberoError(f"the mesh has no volume ({error}); fix it") from error
-    index = model.body("body").id
-    axes = quat_to_mat(model.body_iquat[index])
-    inertia = density / scale**5 * axes @ np.diag(model.body_inertia[index]) @ axes.T
-    order = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
-    return Mass(float(model.body_mass[index] / scale**3), model.body_ipos[index] / scale, inertia[order])
+    return min(abs(mesh.volume) / mesh.convex_hull.volume, 1.0) if is_closed(mesh) else 0.0
 
 
 def _decomposed(coacd, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -146,17 +94,18 @@ def _decomposed(coacd, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndar
     return tuple(np.asarray(points) / scale for points, _ in parts)
 
 
-def boxes_of(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def boxes_of(mesh: "Trimesh") -> np.ndarray:
     """Return boxes that cover a mesh, made of the cells of a grid: centre and half size, (k, 6) [m].
 
     Walls that are thinner than a cell become as thick as one; an open mesh has walls only.
     """
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0)
     cells = _CELLS
     while True:
         count = np.maximum(np.round(extent / extent.max() * cells), 1).astype(int)
         filled = _walls(vertices, faces, low, extent, count)
-        if is_closed(faces):
+        if is_closed(mesh):
             filled |= _inside(vertices, faces, low, extent, count)
         found = list(_merge_cells(filled))
         if len(found) <= _MAX_BOXES or cells <= 6:

@@ -1,21 +1,25 @@
 """Reading of mesh files (OBJ, GLB, glTF, STL, PLY) as surfaces: upright, in metres, centred at the origin."""
 
-import struct
-import zlib
+import shlex
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import log
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 from PIL import Image
 
-from libero_env.design.objects.mesh_gate import Folder, check_finite, check_mesh_file, check_picture
 from libero_env.errors import InvalidInputError
-from libero_env.objects.references import check_faces
+from libero_env.limited import call_limited
+from libero_env.objects.mjcf import check_size, file_inside
 
 FORMATS = (".obj", ".glb", ".gltf", ".stl", ".ply")
+MAX_FACES = 1_000_000
+PICTURES = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF", "GIF")  # formats of textures
+_FARTHEST = 1e9  # of a vertex
 _Y_UP = (".glb", ".gltf")  # formats whose specification says so
 _UNITS = {"centimetres": 0.01, "millimetres": 0.001}
 _PLAUSIBLE_METRES = (0.01, 0.6)  # longest side of files that are assumed to be in metres
@@ -63,12 +67,8 @@ def read_mesh(path: Path, *, size: float | None, up: str | None, notify: Notify)
         )
     if not path.is_file():
         raise InvalidInputError(f"{path}: no such file")
-    check_mesh_file(path)
-    parts = _parts(path)
-    check_faces(sum(len(part.faces) for part in parts), str(path))
-    surfaces = [_surface(part, path) for part in parts]
-    if not surfaces:
-        raise InvalidInputError(f"{path}: it contains no triangles; export the object as a mesh")
+    check_size(path, str(path))
+    surfaces = call_limited(load_surfaces, path, about=str(path))
     if up is None:
         up = "y" if path.suffix.lower() in _Y_UP else "z"
     if up == "y":
@@ -87,73 +87,113 @@ def bounds(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
     return points.min(axis=0), points.max(axis=0)
 
 
-def merge_vertices(surfaces: list[Surface]) -> tuple[np.ndarray, np.ndarray]:
-    """Return all surfaces as one mesh, (n, 3) and (f, 3); vertices at the same position are merged, also at seams."""
-    starts = np.cumsum([0, *(len(s.vertices) for s in surfaces)])
-    points = np.concatenate([s.vertices for s in surfaces])
-    faces = np.concatenate([s.faces + start for s, start in zip(surfaces, starts, strict=False)])
-    grain = 1e-5 * np.ptp(points, axis=0).max()
-    _, first, where = np.unique(np.round(points / grain), axis=0, return_index=True, return_inverse=True)
-    faces = where.reshape(-1)[faces]
-    return points[first], faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+def load_surfaces(path: Path) -> list[Surface]:
+    """Return the surfaces of a mesh file in its frame and unit, as trimesh reads them: call it with `call_limited`.
 
-
-def is_closed(faces: np.ndarray) -> bool:
-    """Return whether every edge of the triangles (f, 3) belongs to two triangles of consistent orientation."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
-    base = int(edges.max(initial=0)) + 1  # an edge as one number, which sorts faster than two
-    there, back = np.unique(edges @ (base, 1)), np.unique(edges @ (1, base))
-    return len(there) == len(edges) and np.array_equal(there, back)
-
-
-def signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    """Return the volume of a closed mesh, [m^3]; it is negative if the mesh is inside out."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6)
-
-
-def _parts(path: Path) -> list[Any]:
-    """Return the meshes of a file as trimesh reads them, transformed into the frame of the scene."""
+    Raises:
+        InvalidInputError: There are no triangles, too many or broken ones, or a file that it names is missing, broken
+            or outside of its folder.
+    """
     import trimesh
 
-    try:
-        found = trimesh.load(str(path), resolver=Folder(path), force="scene").dump()
-    except Exception as error:  # noqa: BLE001 - readers of formats raise errors of many types
-        if isinstance(error, InvalidInputError):
+    named = _NamedFiles(path)
+    scene = trimesh.load(str(path), resolver=named, force="scene", process=False)
+    if named.errors:  # trimesh omits materials and textures that it cannot read
+        raise named.errors[0]
+    parts = [part for part in scene.dump() if len(getattr(part, "faces", ()))]
+    if not parts:
+        raise InvalidInputError(f"{path}: it contains no triangles; export the object as a mesh")
+    if (count := sum(len(part.faces) for part in parts)) > MAX_FACES:
+        raise InvalidInputError(f"{path}: it has {count} triangles; simplify it to {MAX_FACES} or fewer")
+    return [_surface(part, path) for part in parts]
+
+
+class _NamedFiles:
+    """Access of trimesh to the files that a mesh file names: those in its folder or below.
+
+    Attributes:
+        file_name: Name of the mesh file.
+        errors: Why files could not be read.
+    """
+
+    def __init__(self, path: Path):
+        self.file_name = path.name
+        self.errors: list[InvalidInputError] = []
+        self._path = path
+
+    def get(self, name: str) -> bytes:
+        """Return the content of a file."""
+        if name == "model.gltf":  # what trimesh asks for where the file is not JSON
+            raise FileNotFoundError(name)
+        folder, names = self._path.parent, [name.strip(), unquote(name.strip())]
+        with suppress(ValueError, IndexError):
+            names.append(shlex.split(names[-1])[-1])  # the name of a texture comes after its options
+        try:
+            known = next((one for one in names if _is_file(folder / one.replace("\\", "/"))), names[-1])
+            file = file_inside(folder, known, str(self._path))
+            if file.suffix.lower() in Image.registered_extensions():
+                with Image.open(file, formats=PICTURES) as image:
+                    _picture(image, f"{self._path}: {file}")
+        except InvalidInputError as error:
+            self.errors.append(error)
             raise
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
-        raise InvalidInputError(f"{path}: it cannot be read ({reason}); export it again") from error
-    return [part for part in found if len(getattr(part, "faces", ()))]
+        except (OSError, ValueError, Image.DecompressionBombError) as error:
+            text = f"{self._path}: {file} is not a picture that can be read: {error}"
+            self.errors.append(InvalidInputError(text))
+            raise
+        return file.read_bytes()
+
+    __getitem__ = get
+
+    def keys(self) -> tuple[str, ...]:
+        """Return no names: files are only read by the name that the mesh file has."""
+        return ()
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def _surface(part: Any, path: Path) -> Surface:
+    _check_finite(part.vertices, path)
+    part.process()  # merges vertices; it would remove those that are not finite
     vertices, faces = np.array(part.vertices, float), np.array(part.faces, np.int64)
-    check_finite(vertices, path)
-    if not 0 <= faces.min() <= faces.max() < len(vertices):
+    if not len(faces) or not 0 <= faces.min() <= faces.max() < len(vertices):
         raise InvalidInputError(f"{path}: a triangle names a vertex that it does not have; export it again")
     material = getattr(part.visual, "material", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     texcoords = getattr(part.visual, "uv", None)
     if image is not None and texcoords is not None:
         points = np.array(texcoords, float)[:, :2]
-        check_finite(points, path)
+        _check_finite(points, path)
         if len(points) != len(vertices):
             raise InvalidInputError(
                 f"{path}: {len(vertices)} vertices have {len(points)} texture coordinates"
             )
-        return Surface(vertices, faces, points, _picture(image, path), (1.0,) * 4)
+        return Surface(vertices, faces, points, _picture(image, str(path)), (1.0,) * 4)
     known = getattr(part.visual, "defined", False) or material is not None
     colour = getattr(material if material is not None else part.visual, "main_color", None) if known else None
     rgba = _GREY if colour is None else tuple(round(float(value) / 255, 4) for value in colour)
     return Surface(vertices, faces, rgba=rgba)
 
 
-def _picture(image: Image.Image, path: Path) -> Image.Image:
-    check_picture(image, str(path))
+def _check_finite(points: np.ndarray, path: Path) -> None:
+    if not (np.abs(points) <= _FARTHEST).all():
+        raise InvalidInputError(f"{path}: it has vertices that are not finite, or beyond 1e9; fix the mesh")
+
+
+def _picture(image: Image.Image, where: str) -> Image.Image:
+    if image.format not in (None, *PICTURES):
+        raise InvalidInputError(
+            f"{where}: a texture is in the format {image.format}; valid: {', '.join(PICTURES)}"
+        )
     try:
         return image.convert("RGB")
-    except (OSError, SyntaxError, ValueError, struct.error, zlib.error) as error:
-        raise InvalidInputError(f"{path}: a texture is damaged ({error}); save it again") from error
+    except Exception as error:
+        raise InvalidInputError(f"{where}: a texture is damaged ({error}); save it again") from error
 
 
 def _unit(longest: float, path: Path, notify: Notify) -> float:

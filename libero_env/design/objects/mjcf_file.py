@@ -12,15 +12,15 @@ import numpy as np
 
 from libero_env.assets.original_mjcf import attachable_xml, written_out
 from libero_env.design.objects.mesh_file import Notify
+from libero_env.design.objects.mesh_object import INSIDE
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.geometry import surface_points
 from libero_env.mujoco_compat import delete
 from libero_env.objects.folder import MODEL, spec_of
-from libero_env.objects.mjcf_gate import LIMITS, Mjcf, read_mjcf
+from libero_env.objects.mjcf import LIMITS, Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY
 from libero_env.objects.xml_file import explain, parse_xml_text
 
-INSIDE = 0.8  # size of `contain_region`, as a share of the bounds
 _HIDDEN = 3  # first geom group that viewers hide by default
 _INNER = "worldbody/body/body[@name='object']"  # the object in files made for the original
 _LARGEST, _SMALLEST = 3.0, 1e-3  # [m] reach, and longest side

@@ -1,21 +1,24 @@
 """What an MJCF file from outside may contain, and which files it may name.
 
 MuJoCo sees no file of a user: it gets the text that is written here from the elements that passed. Elements that belong
-to a scene are left out; those that no object needs, or that grow without bound, are refused.
+to a scene are left out; those that no object needs, or that grow without bound, are refused. Meshes and textures are
+first read in a process with limits.
 """
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path, PurePath
+from functools import lru_cache
+from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
 from types import MappingProxyType
 from typing import NoReturn
 from xml.etree import ElementTree as ET
 
+import mujoco
 import numpy as np
 
 from libero_env.errors import InvalidInputError
-from libero_env.objects.references import MAX_FACES, MAX_PIXELS, file_inside, mesh_faces, texture_pixels
+from libero_env.limited import call_limited
 from libero_env.objects.xml_file import explain, parse_xml, place_of, write_xml
 from libero_env.text import suggest
 
@@ -23,10 +26,11 @@ from libero_env.text import suggest
 LIMITS = MappingProxyType(
     {"body": 1000, "geom": 2000, "site": 2000, "joint": 100, "mesh": 2000, "texture": 200}
 )
+MAX_FILE_BYTES = 256 << 20  # of a mesh or texture
 _MAX_INCLUDES = 50
 _LARGEST_NUMBER = 1e10  # as in MuJoCo
 _LARGEST_LENGTH = MappingProxyType({"size": 10.0, "fromto": 10.0, "pos": 1000.0, "offset": 1000.0})  # [m]
-_LARGEST_RESOLUTION = 8192  # [pixels] of a generated texture; its other counts are below it too
+_LARGEST_RESOLUTION = 4096  # [pixels] of a generated texture; its other counts are below it too
 
 _IN_BODY = frozenset({"body", "frame", "geom", "site", "joint", "freejoint", "inertial", "replicate"})
 _NONE: frozenset[str] = frozenset()
@@ -101,23 +105,95 @@ def read_mjcf(path: Path) -> Mjcf:
         path: File to read. The files that it names must lie in its folder or below.
 
     Raises:
-        InvalidInputError: The file is no MJCF, has an element or a value that an object may not have, or names a file
+        InvalidInputError: The file is not MJCF, has an element or a value that an object may not have, or names a file
             that is missing, too large, or elsewhere; the message starts with file:line.
     """
     root = parse_xml(path)
     _include(root, path.parent, set())
     omitted = _omit(root)
     if root.tag != "mujoco":
-        _refuse(root, f"<{root.tag}> is no MJCF; expected <mujoco>")
+        _refuse(root, f"<{root.tag}> is not MJCF; expected <mujoco>")
     for parent in root.iter():
         for child in parent:
             _check_child(parent, child)
         _check_values(parent)
     _check_counts(root)
     _check_joined(root)
-    _resolve_files(root, path.parent)
+    files = _resolve_files(root, path.parent)
     text, places = write_xml(root)
-    return Mjcf(path, root, text, omitted, places)
+    mjcf = Mjcf(path, root, text, omitted, places)
+    if files or root.find("asset/texture") is not None:
+        stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
+        if error := _compile_error_of(text, stamps, str(path)):
+            raise InvalidInputError(mjcf.explain(ValueError(error)))
+    return mjcf
+
+
+def file_inside(folder: Path, name: str, where: str, what: str = "file") -> Path:
+    """Return the file that a name stands for, an absolute path.
+
+    Args:
+        folder: Folder that the name is relative to.
+        name: Name as it is written in a file, with the folders below `folder`.
+        where: `file:line` or the like of the name, with which messages start.
+        what: Kind of the file, for messages.
+
+    Raises:
+        InvalidInputError: The name leads out of the folder, also by a link, or the file is missing or too large.
+    """
+    plain = name.replace("\\", "/")
+    parts = PurePosixPath(plain).parts
+    if "\0" in name or not parts:
+        raise InvalidInputError(f"{where}: {name!r} is not the name of a file")
+    if PurePosixPath(plain).is_absolute() or PureWindowsPath(name).drive or ":" in parts[0] or ".." in parts:
+        raise InvalidInputError(
+            f"{where}: {what} {name!r} is outside of the folder {folder}; only files in it or below are read: copy "
+            "it there, and write its name relative to the folder"
+        )
+    file = folder.absolute() / plain
+    try:
+        if not file.is_file():
+            raise InvalidInputError(f"{where}: {what} {file} is missing; put it there, or fix the name")
+        if not file.resolve().is_relative_to(folder.resolve()):
+            raise InvalidInputError(
+                f"{where}: {what} {file} is a link to {file.resolve()}, outside of the folder; copy the file itself"
+            )
+    except (OSError, RuntimeError, ValueError) as error:
+        if isinstance(error, InvalidInputError):
+            raise
+        raise InvalidInputError(f"{where}: {what} {name[:80]!r}: {error}") from error
+    check_size(file, where)
+    return file
+
+
+def check_size(file: Path, where: str) -> None:
+    """Check that a file is not empty and not larger than `MAX_FILE_BYTES`.
+
+    Raises:
+        InvalidInputError: It is.
+    """
+    size = file.stat().st_size
+    if not size:
+        raise InvalidInputError(f"{where}: {file} is empty")
+    if size > MAX_FILE_BYTES:
+        raise InvalidInputError(
+            f"{where}: {file} has {size >> 20} MiB; up to {MAX_FILE_BYTES >> 20} MiB are read: simplify it"
+        )
+
+
+def compile_error(text: str) -> str:
+    """Return what MuJoCo finds wrong with an MJCF text and the files that it names: call it with `call_limited`."""
+    try:
+        mujoco.MjSpec.from_string(text).compile()
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+@lru_cache(maxsize=64)
+def _compile_error_of(text: str, stamps: tuple[tuple[Path, int, int], ...], about: str) -> str:
+    """Return `compile_error` of a text once for each state of the files that it names."""
+    return call_limited(compile_error, text, about=about)
 
 
 def _refuse(node: ET.Element, text: str) -> NoReturn:
@@ -218,19 +294,19 @@ def _check_joined(root: ET.Element) -> None:
             _refuse(node, f"<{node.tag}> fixes the object to the world; name two of its own bodies")
 
 
-def _resolve_files(root: ET.Element, folder: Path) -> None:
+def _resolve_files(root: ET.Element, folder: Path) -> list[Path]:
     """Replace the names of files by absolute paths, and remove the settings that say where to search them."""
     settings: dict[str, str] = {}
     for compiler in root.findall("compiler"):
         for key in ("assetdir", "meshdir", "texturedir", "strippath"):
             if key in compiler.attrib:
                 settings[key] = compiler.attrib.pop(key)
-    sizes: Counter[str] = Counter()
     asset_folder = settings.get("assetdir", "")
     folders = {
         "mesh": settings.get("meshdir", asset_folder),
         "texture": settings.get("texturedir", asset_folder),
     }
+    files = []
     for node in root.iter():
         for key in _FILES & set(node.attrib):
             if node.tag not in folders:
@@ -240,14 +316,8 @@ def _resolve_files(root: ET.Element, folder: Path) -> None:
                 name = PurePath(name.replace("\\", "/")).name
             within = f"{folders[node.tag]}/{name}" if folders[node.tag] else name
             file = file_inside(folder, within, place_of(node), node.tag)
-            sizes[node.tag] += (mesh_faces if node.tag == "mesh" else texture_pixels)(file, place_of(node))
+            if node.tag == "mesh" and file.suffix.lower() not in (".obj", ".stl", ".msh"):
+                _refuse(node, f"{file} has an unknown format; valid: .obj, .stl, .msh")
             node.set(key, str(file))
-    for node in root.iterfind("asset/texture[@builtin]"):
-        sides = [float(node.get(key, "1")) for key in ("width", "height", "nchannel")]
-        sizes["texture"] += int(np.prod(sides)) * (6 if node.get("type") in ("cube", "skybox", None) else 1)
-    for tag, largest in (("mesh", MAX_FACES), ("texture", MAX_PIXELS)):
-        if sizes[tag] > 2 * largest:
-            unit = "triangles" if tag == "mesh" else "pixels"
-            _refuse(
-                root, f"its files <{tag}> have {sizes[tag]} {unit} in all; at most {2 * largest} are read"
-            )
+            files.append(file)
+    return files
