@@ -241,14 +241,14 @@ PROTOCOL_ROWS = {
 def protocol_table() -> str:
     """A row for each protocol, with the values in which they differ most."""
     from libero_eval.cli.protocols import shown_values
-    from libero_eval.protocols.files import card_names, load_card
+    from libero_eval.protocols.files import load_protocol, protocol_names
 
     lines = [
         "| protocol |" + "".join(f" {title} |" for title in PROTOCOL_ROWS),
         "|---" * (len(PROTOCOL_ROWS) + 1) + "|",
     ]
-    for name in card_names():
-        values = shown_values(load_card(name))
+    for name in protocol_names():
+        values = shown_values(load_protocol(name))
         cells = []
         for keys in PROTOCOL_ROWS.values():
             told = dict.fromkeys(values[key] for key in keys)

@@ -71,9 +71,10 @@ def validate(
         for path, text in _describe_all(errors, kind, value):
             full = (*prefix, *path)
             line = line_of(full) if line_of else None
-            where = f"{source}:{line}: " if source and line else f"{source}: " if source else ""
+            where = f"{source}:{line}: " if source and line else f"{source}: " if source and line_of else ""
             parts.append(where + _joined(full, text))
-        raise error(_limited(parts)) from None
+        once = f"{source}: " if source and not line_of else ""
+        raise error(once + _limited(parts)) from None
 
 
 def validate_arguments(

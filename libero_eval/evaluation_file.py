@@ -10,18 +10,17 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any, NotRequired
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
-from typing_extensions import TypedDict
 
-from libero_env.storage import atomic_write_text
+from libero_env.storage import read_json, write_json
+from libero_env.text import json_safe
 from libero_env.validation import validate
 from lifelong.errors import EvaluationFileError, ResultsError
-from lifelong.results.subgoals import predicate_of
-from lifelong.results.summary import json_safe
 from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
+from lifelong.results.subgoals import predicate_of
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
@@ -31,36 +30,6 @@ _Name = Annotated[str, Field(min_length=1, max_length=1000)]
 _Id = Annotated[
     str, Field(pattern=r"^[^/\x00]+/[^\x00]+$", max_length=1000)
 ]  # also part of the names of files
-
-
-class _TaskRow(TypedDict):
-    """A task in the file, without what follows from it."""
-
-    task: _Id
-    name: _Name
-    instruction: str
-    init_states: list[_Count]
-    successes: list[bool]
-    lengths: list[_Count]
-    atoms: NotRequired[list[str]]
-    atoms_ever: NotRequired[list[list[bool]]]
-    atoms_at_end: NotRequired[list[list[bool]]]
-    errors: NotRequired[list[str | None]]
-    actions: NotRequired[list[str]]
-    attempts: NotRequired[list[list[_Count]]]
-
-
-class _Content(TypedDict):
-    """The file, without what follows from it."""
-
-    evaluated: dict[str, Any]
-    protocol: dict[str, Any]
-    init_states: list[_Count]
-    versions: dict[str, Any]
-    tasks: list[Any]
-    environment: NotRequired[dict[str, Any]]
-    unit_starts: NotRequired[Annotated[int, Field(ge=1)] | None]
-    times: NotRequired[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -80,29 +49,55 @@ class TaskResult:
         errors: Error of each episode that the protocol counts as a failure, or None; empty if there are none.
         actions: Digest of the actions of each episode, by which episodes can be compared to the bit; empty if they
             were not recorded.
-        attempts: Number of draws that were not valid of each perturbation of the protocol, (episodes, perturbations);
+        attempts: Number of samples that were not valid of each perturbation of the protocol, (episodes, perturbations);
             empty without perturbations.
 
     Raises:
-        EvaluationFileError: The arrays have different lengths, or values of the wrong kind.
+        EvaluationFileError: The arrays have different lengths.
     """
 
-    task: str
-    name: str
+    task: _Id
+    name: _Name
     instruction: str
-    init_states: tuple[int, ...]
+    init_states: tuple[_Count, ...]
     successes: tuple[bool, ...]
-    lengths: tuple[int, ...]
+    lengths: tuple[_Count, ...]
     atoms: tuple[str, ...] = ()
     atoms_ever: tuple[tuple[bool, ...], ...] = ()
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
     errors: tuple[str | None, ...] = ()
     actions: tuple[str, ...] = ()
-    attempts: tuple[tuple[int, ...], ...] = ()
+    attempts: tuple[tuple[_Count, ...], ...] = ()
 
     def __post_init__(self) -> None:
-        for problem in self._problems():
-            raise EvaluationFileError(f"{self.task}: {problem}")
+        count = len(self.init_states)
+        problems = [] if count else ["there are no episodes"]
+        if len(set(self.init_states)) != count:
+            problems.append(f"an initial state is counted twice: {list(self.init_states)}")
+        flags = ("atoms_ever", "atoms_at_end")
+        for name in ("successes", "lengths", "errors", "actions", "attempts", *flags):
+            entries = getattr(self, name)
+            optional = name in ("errors", "actions", "attempts") or (name in flags and not self.atoms)
+            if len(entries) != count and not (optional and not entries):
+                problems.append(f"{name} has {len(entries)} entries, init_states has {count}")
+            if name in flags and {len(row) for row in entries} - {len(self.atoms)}:
+                problems.append(f"{name} needs a column for each of the {len(self.atoms)} atoms")
+        if problems:
+            raise EvaluationFileError(f"{self.task}: {problems[0]}")
+
+    @classmethod
+    def joined(cls, parts: "Sequence[TaskResult]") -> "TaskResult":
+        """Return the results of a task from those of parts of its episodes, in order."""
+        raised = any(part.errors for part in parts)
+        rows: dict[str, tuple] = {
+            f.name: sum((getattr(part, f.name) for part in parts), ())
+            for f in fields(cls)
+            if isinstance(getattr(parts[0], f.name), tuple) and f.name not in ("atoms", "errors")
+        }
+        if raised:
+            rows["errors"] = sum((p.errors or (None,) * len(p.init_states) for p in parts), ())
+        first = parts[0]
+        return cls(first.task, first.name, first.instruction, atoms=first.atoms, **rows)
 
     @property
     def success(self) -> Estimate:
@@ -116,28 +111,6 @@ class TaskResult:
         """Mean length of the successful episodes, [control steps]; NaN if there are none."""
         lengths = [n for n, won in zip(self.lengths, self.successes, strict=True) if won]
         return float(np.mean(lengths)) if lengths else float("nan")
-
-    def _problems(self) -> list[str]:
-        count = len(self.init_states)
-        rows: dict[str, Sequence[Any]] = {"successes": self.successes, "lengths": self.lengths}
-        rows |= {"errors": self.errors} if self.errors else {}
-        rows |= {"actions": self.actions} if self.actions else {}
-        rows |= {"attempts": self.attempts} if self.attempts else {}
-        rows |= {"atoms_ever": self.atoms_ever, "atoms_at_end": self.atoms_at_end} if self.atoms else {}
-        found = [
-            f"{name} has {len(values)} entries, init_states has {count}"
-            for name, values in rows.items()
-            if len(values) != count
-        ]
-        if not count:
-            found.append("there are no episodes")
-        if len(set(self.init_states)) != count:
-            found.append(f"an initial state is counted twice: {list(self.init_states)}")
-        for name in ("atoms_ever", "atoms_at_end"):
-            widths = {len(row) for row in getattr(self, name)}
-            if widths - {len(self.atoms)}:
-                found.append(f"{name} needs a column for each of the {len(self.atoms)} atoms")
-        return found
 
 
 @dataclass(frozen=True)
@@ -155,15 +128,18 @@ class EvaluationResult:
         unit_starts: Number of episodes that were run in one batch; the bits of a policy may depend on it. None: all
             episodes of a task.
         times: When and how long it was run; not part of `outcomes`.
+
+    Raises:
+        EvaluationFileError: There are no tasks, or one is counted twice.
     """
 
     evaluated: Mapping[str, Any]
     protocol: Mapping[str, Any]
-    init_states: tuple[int, ...]
-    versions: Mapping[str, str]
+    init_states: tuple[_Count, ...]
+    versions: Mapping[str, Any]
     tasks: tuple[TaskResult, ...]
     environment: Mapping[str, Any] = field(default_factory=dict)
-    unit_starts: int | None = None
+    unit_starts: Annotated[int, Field(ge=1)] | None = None
     times: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
@@ -210,16 +186,19 @@ class EvaluationResult:
         path = path / FILE_NAME if path.is_dir() else path
         if not path.is_file():
             raise EvaluationFileError(f"{path} does not exist; `libero eval` writes {FILE_NAME}")
-        try:
-            values = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise EvaluationFileError(f"{path} cannot be read: {error}") from error
-        except (ValueError, RecursionError) as error:
-            raise EvaluationFileError(f"{path} is not JSON ({error}): it is broken or incomplete") from error
-        try:
-            return _from_plain(values)
-        except EvaluationFileError as error:
-            raise EvaluationFileError(f"{path}: {error}") from None
+        values = read_json(path, EvaluationFileError)
+        _check_format(values, path)
+        rows = values.get("tasks")
+        if isinstance(rows, list):
+            values["tasks"] = [_of_fields(row, TaskResult) if isinstance(row, dict) else row for row in rows]
+        result: EvaluationResult = validate(
+            cls, _of_fields(values, cls), source=str(path), error=EvaluationFileError
+        )
+        if values.get("outcomes") != result.outcomes:
+            raise EvaluationFileError(
+                f"{path}: the digest `outcomes` is not that of the tasks: the file was edited"
+            )
+        return result
 
     def write(self, path: Path | str) -> Path:
         """Write the result in one step, and return the file; readers never see a part of it.
@@ -232,8 +211,7 @@ class EvaluationResult:
         """
         path = Path(path)
         try:
-            text = json.dumps(self.to_plain(), indent=1, ensure_ascii=False, allow_nan=False)
-            atomic_write_text(path, text + "\n", fsync=True)
+            write_json(path, self.to_plain(), fsync=True)
         except OSError as error:
             raise ResultsError(f"{path}: the result cannot be written ({error})") from error
         return path
@@ -282,66 +260,30 @@ def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
     return {name: float(np.mean(values)) for name, values in rates.items()}
 
 
-def task_result(values: Any, where: str = "a task") -> TaskResult:
-    """Return a task's result from plain data; keys of `to_plain` that follow from the others are ignored.
-
-    Args:
-        values: Mapping with the fields of `TaskResult`; lists instead of tuples.
-        where: What the values are, for the message of an error.
-
-    Raises:
-        EvaluationFileError: A field is missing or of the wrong kind.
-    """
-    if not isinstance(values, Mapping):
-        raise EvaluationFileError(f"{where} is {type(values).__name__}; expected an object")
-    names = [f.name for f in fields(TaskResult)]
-    known = {name: values[name] for name in names if name in values}
-    row = validate(_TaskRow, known, prefix=(where,), error=EvaluationFileError)
-    return TaskResult(**{name: _tuples(value) for name, value in row.items()})
-
-
-def _from_plain(values: Any) -> EvaluationResult:
-    if not isinstance(values, dict):
-        raise EvaluationFileError("this is not the result of an evaluation: expected a JSON object")
-    _check_format(values.get("format"))
-    known = {key: value for key, value in values.items() if key in _Content.__annotations__}
-    content = validate(_Content, known, error=EvaluationFileError)
-    result = EvaluationResult(
-        evaluated=content["evaluated"],
-        protocol=content["protocol"],
-        init_states=tuple(content["init_states"]),
-        versions=content["versions"],
-        tasks=tuple(task_result(row, f"task {i}") for i, row in enumerate(content["tasks"])),
-        environment=content.get("environment", {}),
-        unit_starts=content.get("unit_starts"),
-        times=content.get("times", {}),
-    )
-    if values.get("outcomes") != result.outcomes:
-        raise EvaluationFileError("the digest `outcomes` is not that of the tasks: the file was edited")
-    return result
-
-
 def _measured(result: TaskResult) -> dict[str, Any]:
-    """Return what was measured, as plain data; without perturbations as before there were any."""
-    left_out = {"actions"} if result.attempts else {"actions", "attempts"}
-    return {k: v for k, v in asdict(result).items() if k not in left_out}
+    """Return what was measured, as plain data."""
+    return {k: v for k, v in asdict(result).items() if k != "actions"}
 
 
 def _digest(rows: Any) -> str:
     return "sha256:" + hashlib.sha256(json.dumps(rows, sort_keys=True).encode()).hexdigest()
 
 
-def _check_format(name: Any) -> None:
-    if name == FORMAT:
+def _check_format(values: Any, path: Path) -> None:
+    stated = values.get("format") if isinstance(values, dict) else None
+    if stated == FORMAT:
         return
-    if str(name).partition("/")[0] == FORMAT.partition("/")[0]:
+    if str(stated).partition("/")[0] == FORMAT.partition("/")[0]:
         raise EvaluationFileError(
-            f"the format is {name}; this version reads {FORMAT}: "
-            "update libero-lifelong, or read it with the version that wrote it"
+            f"{path}: the format is {stated}; this version reads {FORMAT}: update libero-lifelong, or read it with "
+            "the version that wrote it"
         )
-    stated = "has no format" if name is None else f"has the format {name!r}"
-    raise EvaluationFileError(f"this is not the result of an evaluation: it {stated}; expected {FORMAT}")
+    what = "has no format" if stated is None else f"has the format {stated!r}"
+    raise EvaluationFileError(
+        f"{path}: this is not the result of an evaluation: it {what}; expected {FORMAT}"
+    )
 
 
-def _tuples(value: Any) -> Any:
-    return tuple(_tuples(v) for v in value) if isinstance(value, list) else value
+def _of_fields(values: Mapping[str, Any], kind: Any) -> dict[str, Any]:
+    """Return the values that are fields of a class; the others in the file follow from them."""
+    return {f.name: values[f.name] for f in fields(kind) if f.name in values}

@@ -1,7 +1,7 @@
 """A result is run again from its file alone: the same policy, protocol, tasks, initial states and seed."""
 
-import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -11,11 +11,9 @@ from typing_extensions import TypedDict
 from libero_env.sim.backend import MUJOCO, Backend
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
-from libero_eval.protocols.files import parse_card
-from libero_eval.protocols.protocol import Card
+from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.requests import EvalRequest
 from lifelong.errors import ConfigError, ResultsError
-
-POLICIES = ("run", "policy", "server")  # keys of `evaluated` that name a policy, one for each kind
 
 
 class _Evaluated(TypedDict, total=False):
@@ -37,83 +35,66 @@ def is_result(text: str) -> bool:
     return path.suffix == ".json" and path.is_file()
 
 
-def repeated(args: argparse.Namespace, result: EvaluationResult) -> argparse.Namespace:
-    """Return the arguments of `libero eval` that repeat a result.
+def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
+    """Return the request that repeats a result.
 
     Args:
-        args: Arguments with the result's file as the policy; processes, folder and device are taken from them.
+        request: Request with the result's file as the policy; processes, folder and device are taken from it.
         result: The result.
 
     Raises:
         ResultsError: The result does not say which policy it is of.
-        ConfigError: It is of a policy in a module that the user has not allowed.
+        ConfigError: It is of a policy in a module that the user has not allowed, or of another backend.
     """
-    evaluated = result.evaluated
-    known = {key: value for key, value in evaluated.items() if key in _Evaluated.__annotations__}
-    validate(_Evaluated, known, source=str(args.policy), prefix=("evaluated",), error=ResultsError)
-    kind = next((name for name in POLICIES if evaluated.get(name)), None)
-    if kind is None:
-        raise ResultsError(f"{args.policy} does not say which policy it is of: {dict(evaluated)}")
-    _check_code(str(evaluated[kind]), args)
-    path = Path(args.policy)
-    folder = path if path.is_dir() else path.parent
-    changes = {
-        "policy": str(evaluated[kind]),
-        "after": evaluated.get("after"),
-        "names": evaluated.get("names"),
-        "seed": int(evaluated.get("seed", 0)),
-        "suite": [task.task for task in result.tasks],
-        "unit_starts": result.unit_starts,
-        "policy_threads": args.policy_threads or _threads(result),
-        "horizon": None,
-        "robot": None,
-        "backend": _same_back_end(args, result),
-        "perturb": None,
-        "size": None,
-        "out": args.out or folder / "again",
-    }
-    return argparse.Namespace(**(vars(args) | changes))
+    path = Path(request.policy_name)
+    stated = {key: value for key, value in result.evaluated.items() if key in _Evaluated.__annotations__}
+    evaluated = validate(_Evaluated, stated, source=str(path), prefix=("evaluated",), error=ResultsError)
+    policy = next((evaluated[key] for key in ("run", "policy", "server") if key in evaluated), None)
+    if policy is None:
+        raise ResultsError(f"{path} does not say which policy it is of: {dict(result.evaluated)}")
+    _check_code(policy, request)
+    _check_backend(request, result)
+    return replace(
+        request,
+        policy=policy,
+        after=evaluated.get("after"),
+        names=evaluated.get("names"),
+        seed=evaluated.get("seed", 0),
+        suite=tuple(task.task for task in result.tasks),
+        unit_starts=result.unit_starts or len(result.init_states),
+        policy_threads=request.policy_threads or _threads(result),
+        horizon=None,
+        robot=None,
+        perturb=None,
+        size=None,
+        out=request.out or (path if path.is_dir() else path.parent) / "again",
+    )
 
 
-def _same_back_end(args: argparse.Namespace, result: EvaluationResult) -> str | None:
-    """Return the back end that a result is repeated with: its own, with the settings that the arguments have.
-
-    Raises:
-        ConfigError: The arguments name another one.
-    """
+def _check_backend(request: EvalRequest, result: EvaluationResult) -> None:
     world = result.protocol.get("world")
-    own = str(world.get("backend", MUJOCO)) if isinstance(world, dict) else MUJOCO
-    if args.backend is not None and (given := Backend.read(args.backend).name) != own:
-        raise ConfigError(f"--backend {given}: the result is of backend={own}, which it is repeated with")
-    return args.backend
+    backend = str(world.get("backend", MUJOCO)) if isinstance(world, dict) else MUJOCO
+    if request.backend is not None and (asked := Backend.read(request.backend).name) != backend:
+        raise ConfigError(f"--backend {asked}: the result is of backend={backend}, which it is repeated with")
 
 
-def _check_code(policy: str, args: argparse.Namespace) -> None:
+def _check_code(policy: str, request: EvalRequest) -> None:
     """Refuse to run code that a result, which may be somebody else's, names: unless the user has allowed it."""
     module, colon, _ = policy.partition(":")
     package = module.partition(".")[0]
     runs_code = bool(colon) and "://" not in policy and not Path(policy).exists()
-    if runs_code and not {module, package} & set(args.allow):
+    if runs_code and not {module, package} & set(request.allow):
         raise ConfigError(
-            f"{args.policy} is of the policy {policy}, whose code would be run; if you know and trust it, "
+            f"{request.policy} is of the policy {policy}, whose code would be run; if you know and trust it, "
             f"allow it with --allow {package}"
         )
-
-
-def repeated_card(result: EvaluationResult, where: str) -> Card:
-    """Return the protocol of a result.
-
-    Raises:
-        ProtocolError: The result was edited.
-    """
-    return parse_card(result.protocol, str(result.protocol.get("name", "result")), where)
 
 
 def check_same(
     result: EvaluationResult,
     *,
     evaluated: Mapping[str, Any],
-    protocol: Card,
+    protocol: EvalProtocol,
     versions: Mapping[str, str],
     despite: Sequence[str],
 ) -> None:
@@ -144,5 +125,5 @@ def check_same(
 
 
 def _threads(result: EvaluationResult) -> int | None:
-    found = result.environment.get("policy_threads") if result.evaluated.get("run") else None
-    return found if isinstance(found, int) and 1 <= found <= 1024 else None
+    threads = result.environment.get("policy_threads") if result.evaluated.get("run") else None
+    return threads if isinstance(threads, int) and 1 <= threads <= 1024 else None

@@ -63,7 +63,7 @@ class EvaluationFileError(ResultsError, ValueError):
     """Raised for the result of an evaluation that is missing, broken, or of another format or version."""
 
 
-class WireError(LifelongError, ValueError):
+class CodecError(LifelongError, ValueError):
     """Raised for bytes or values that are not valid in a policy server's protocol."""
 
 

@@ -20,8 +20,8 @@ from libero_env.cli import main as cli
 from libero_env.errors import DEBUG_VARIABLE, LiberoError, code_of
 from libero_env.parallel import spawn_pool
 from libero_env.tasks import get_task, read_task
-from libero_eval.protocols.packaged import PROTOCOLS
-from libero_eval.work.suite import SuiteEvaluation
+from libero_eval.protocols.files import load_protocol
+from libero_eval.work.evaluation import Evaluation
 from lifelong import launch
 
 ROOT = Path(__file__).parents[1]
@@ -366,7 +366,7 @@ def test_a_new_task_may_have_any_instruction_of_one_line(here, capsys):
 @pytest.mark.parametrize("name", ["libero", "openpi"])  # one horizon, and one for each suite
 def test_the_memory_of_an_evaluation_is_estimated(name, tmp_path):
     task = get_task("libero_goal/0")
-    plan = SuiteEvaluation({}, [task], (0, 1), PROTOCOLS[name], tmp_path, None, None, videos=2, versions={})
+    plan = Evaluation({}, [task], (0, 1), load_protocol(name), tmp_path, None, None, videos=2, versions={})
     assert 6e8 < plan.memory(1) < 2e9 and plan.memory(3) == 3 * plan.memory(1)
 
 

@@ -13,8 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from libero_eval.cli.evaluate import plan_eval, policy_threads
-from libero_eval.cli.main import build_parser
+from libero_eval.evaluate import plan_evaluation, policy_threads
+from libero_eval.requests import EvalRequest
 
 
 def main() -> None:
@@ -42,16 +42,22 @@ def main() -> None:
 def measure(args: argparse.Namespace, size: int) -> tuple[float, float]:
     """Return wall and processor time per episode of 600 steps, [s], without the first unit, which opens the scene."""
     with tempfile.TemporaryDirectory() as folder:
-        words = ["eval", args.policy, "--suite", args.task, "--out", folder, "--unit-starts", str(size)]
-        words += ["--horizon", str(args.horizon), "--threads", str(args.threads)]
-        plan = plan_eval(build_parser().parse_args(words))
+        request = EvalRequest(
+            policy=args.policy,
+            suite=(args.task,),
+            out=Path(folder),
+            unit_starts=size,
+            horizon=args.horizon,
+            threads=args.threads,
+        )
+        plan = plan_evaluation(request)
         with plan.pool() as pool, policy_threads(plan):
             plan.evaluate(plan.units[0], pool)
             wall, processor = time.perf_counter(), time.process_time()
             units = plan.units[-max(1, 10 // size) :]
             for unit in units:
                 plan.evaluate(unit, pool)
-            count = sum(len(unit.starts) for unit in units) * args.horizon / 600
+            count = sum(len(unit.init_states) for unit in units) * args.horizon / 600
             return (time.perf_counter() - wall) / count, (time.process_time() - processor) / count
 
 

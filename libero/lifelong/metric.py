@@ -25,7 +25,7 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.tasks import Task, get_suite, read_task, suite_names
-from lifelong.evaluation.actors import Obs
+from lifelong.evaluation.environments import Obs
 from lifelong.evaluation.rollout import Episode, run_episodes
 from lifelong.seeding import seeded
 

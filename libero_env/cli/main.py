@@ -127,21 +127,42 @@ COMMANDS: dict[str, dict[str, Command]] = {
         ),
     },
     "Evaluation": {
-        name: Command("libero_eval.cli.main:main", text, reads_words=True)
-        for name, text in {
-            "eval": "success of a policy on tasks; resumes where it was stopped",
-            "robustness": "what perturbations do to a policy: success against severity, kind by kind",
-            "compare": "whether evaluated policies differ, start by start, and what chance alone makes",
-            "power": "how many episodes a difference in success needs",
-            "results export": "write a result as another tool's result file",
-            "protocols list": "the protocols of the package",
-            "protocols show": "all values of a protocol, and where they stand",
-            "protocols diff": "the values in which two protocols differ",
-            "serve": "serve a run's policy in openpi's WebSocket protocol",
-            "relearn": "steps until the forgotten tasks of a run are back",
-            "saliency": "images of where a policy looks during a rollout",
-            "check": "whether run directories are intact: checksums, records, what belongs together",
-        }.items()
+        "eval": Command(
+            "libero_eval.cli.evaluate:evaluate",
+            "success of a policy on tasks; resumes where it was stopped",
+        ),
+        "robustness": Command(
+            "libero_eval.cli.robustness:robustness",
+            "what perturbations do to a policy: success against severity, kind by kind",
+        ),
+        "compare": Command(
+            "libero_eval.cli.compare:compare",
+            "whether evaluated policies differ, start by start, and what chance alone makes",
+        ),
+        "power": Command("libero_eval.cli.compare:power", "how many episodes a difference in success needs"),
+        "results export": Command(
+            "libero_eval.cli.compare:export", "write a result as another tool's result file"
+        ),
+        "protocols list": Command("libero_eval.cli.protocols:list_protocols", "the protocols of the package"),
+        "protocols show": Command(
+            "libero_eval.cli.protocols:show", "all values of a protocol, and where they stand"
+        ),
+        "protocols diff": Command(
+            "libero_eval.cli.protocols:diff", "the values in which two protocols differ"
+        ),
+        "serve": Command("libero_eval.cli.runs:serve", "serve a run's policy in openpi's WebSocket protocol"),
+        "relearn": Command(
+            "libero_eval.cli.runs:relearn",
+            "steps until the forgotten tasks of a run are back",
+            "what is measured is kept: the same command goes on with the rest",
+        ),
+        "saliency": Command(
+            "libero_eval.cli.runs:saliency", "images of where a policy looks during a rollout"
+        ),
+        "check": Command(
+            "libero_eval.cli.runs:check",
+            "whether run directories are intact: checksums, records, what belongs together",
+        ),
     },
     "Tools": {
         "doctor": Command(
@@ -222,8 +243,7 @@ def bind(name: str, words: Sequence[str]) -> Callable[[], int | None]:
     command = ALL[name]
     function = load(command)
     if command.reads_words:
-        whole = function.__module__ == "libero_eval.cli.main"
-        return partial(function, [*name.split(), *words] if whole else words)
+        return partial(function, words)
     from libero_env.cli.options import parse
 
     return parse(function, words, f"libero {name}")

@@ -136,8 +136,20 @@ def _capture(target: Callable[..., Any]) -> Callable[..., dict[str, Any]]:
     ]
     captured.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     captured.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": dict[str, Any]}
-    captured.__doc__ = re.sub(r"(?m)^(\s*)Attributes:$", r"\1Args:", inspect.getdoc(target) or "")
+    captured.__doc__ = _documentation(target)
     return captured
+
+
+def _documentation(target: Callable[..., Any]) -> str:
+    """Return a docstring in which the attributes of a dataclass, those of its bases first, are arguments."""
+    text = inspect.getdoc(target) or ""
+    if not inspect.isclass(target):
+        return text
+    texts = [
+        inspect.getdoc(kind) or "" for kind in reversed(target.__mro__) if dataclasses.is_dataclass(kind)
+    ]
+    blocks = [found[1] for one in texts if (found := re.search(r"(?m)^Attributes:\n((?:    .*\n?)+)", one))]
+    return "\n".join([text.partition("Attributes:")[0] + "Args:", *(block.rstrip() for block in blocks)])
 
 
 def _quiet(hint: Any, default: Any) -> Any:

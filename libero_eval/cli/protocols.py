@@ -1,73 +1,60 @@
 """`libero protocols`: the protocols by which policies are evaluated, and how they differ."""
 
-import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from libero_env.cli.arguments import Subparsers
+from libero_env.cli.options import Positional
+from libero_env.text import text_table
 
 if TYPE_CHECKING:
-    from libero_eval.protocols.protocol import Card
-
-CARD_HELP = "a protocol's name, a card of your own (my.yaml), or the result of an evaluation (eval.json)"
+    from libero_eval.protocols.protocol import EvalProtocol
 
 
-def register(subparsers: Subparsers) -> None:
-    """Add the commands `libero protocols list`, `show` and `diff`."""
-    parser = subparsers.add_parser(
-        "protocols", help="how policies are evaluated: LIBERO's paper, openpi, LeRobot, ..."
-    )
-    commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    listing = commands.add_parser("list", help="the protocols of the package")
-    listing.set_defaults(run=run_list)
-    show = commands.add_parser("show", help="all values of a protocol, and where they stand")
-    show.add_argument("protocol", metavar="CARD", help=CARD_HELP)
-    show.set_defaults(run=run_show)
-    diff = commands.add_parser("diff", help="the values in which two protocols differ")
-    for name in ("first", "second"):
-        diff.add_argument(name, metavar="CARD", help=CARD_HELP)
-    diff.set_defaults(run=run_diff)
-
-
-def run_list(args: argparse.Namespace) -> None:
+def list_protocols() -> None:
     """Print name, digest and title of each protocol."""
-    from libero_eval.protocols.files import card_names, load_card
+    from libero_eval.protocols.files import load_protocol, protocol_names
 
-    for name in card_names():
-        card = load_card(name)
-        print(f"{name:<14} {card.digest}  {card.title}")
+    for name in protocol_names():
+        protocol = load_protocol(name)
+        print(f"{name:<14} {protocol.digest}  {protocol.title}")
 
 
-def run_show(args: argparse.Namespace) -> None:
-    """Print a protocol: each value, and the source of its section or of itself."""
-    from libero_eval.protocols.files import load_card
+def show(protocol: Positional[str]) -> None:
+    """Print a protocol: each value, and the source of its section or of itself.
 
-    card = load_card(args.protocol)
-    print(f"{card.name}: {card.title} (digest {card.digest})")
-    section = ""
-    for name, value in shown_values(card).items():
+    Args:
+        protocol: A protocol's name, a file of your own (my.yaml), or the result of an evaluation (eval.json).
+    """
+    from libero_eval.protocols.files import load_protocol
+
+    loaded = load_protocol(protocol)
+    sources, section = loaded.sources, ""
+    print(f"{loaded.name}: {loaded.title} (digest {loaded.digest})")
+    for name, value in shown_values(loaded).items():
         head, _, field = name.partition(".")
         if head != section:
             section = head
-            print(f"\n{section}" + (f"  # {card.sources[section]}" if section in card.sources else ""))
-        source = f"  # {card.sources[name]}" if name in card.sources else ""
+            print(f"\n{section}" + (f"  # {sources[section]}" if section in sources else ""))
+        source = f"  # {sources[name]}" if name in sources else ""
         print(f"  {field:<18} {value}{source}")
 
 
-def run_diff(args: argparse.Namespace) -> int:
-    """Print the values that differ, one a line; return 1 if any does."""
-    from libero_eval.protocols.files import load_card
+def diff(first: Positional[str], second: Positional[str]) -> int:
+    """Print the values in which two protocols differ, one a line; the exit status is 1 if any does.
 
-    first, second = load_card(args.first), load_card(args.second)
-    ours, theirs = shown_values(first), shown_values(second)
-    rows = [(name, value, theirs[name]) for name, value in ours.items() if value != theirs[name]]
+    Args:
+        first: A protocol's name, a file of your own (my.yaml), or the result of an evaluation (eval.json).
+        second: The other one.
+    """
+    from libero_eval.protocols.files import load_protocol
+
+    one, other = load_protocol(first), load_protocol(second)
+    values, others = shown_values(one), shown_values(other)
+    rows = [(name, value, others[name]) for name, value in values.items() if value != others[name]]
     if not rows:
-        print(f"{first.name} and {second.name} are the same protocol ({first.digest})")
+        print(f"{one.name} and {other.name} are the same protocol ({one.digest})")
         return 0
-    table = [("", first.name, second.name), *rows]
-    widths = [max(len(row[k]) for row in table) for k in (0, 1)]
-    for name, one, other in table:
-        print(f"{name:<{widths[0]}}  {one:<{widths[1]}}  {other}")
+    print(text_table([("", one.name, other.name), *rows], left=3))
     return 1
 
 
@@ -81,9 +68,9 @@ _IDLE = {
 }
 
 
-def shown_values(card: "Card") -> dict[str, str]:
-    """Return the values of a card as text, by dotted name; `-` where one means nothing beside the others."""
-    values = {name: value for name, value in card.flat().items() if "." in name}
+def shown_values(protocol: "EvalProtocol") -> dict[str, str]:
+    """Return the values of a protocol as text, by dotted name; `-` where one means nothing beside the others."""
+    values = protocol.flat()
 
     def is_idle(name: str) -> bool:
         other, value = _IDLE.get(name, (name, object()))

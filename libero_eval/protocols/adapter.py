@@ -1,73 +1,96 @@
-"""The adapter of a protocol card: what a policy is given, and what its answers mean."""
+"""What a policy is given under a protocol, and what its answers mean."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from libero_env.tasks import Task
 from libero_eval.protocols.preprocessing import preprocess
-from libero_eval.protocols.protocol import Card
+from libero_eval.protocols.protocol import EvalProtocol
 from lifelong.errors import PolicyError
-from lifelong.evaluation.inputs import Obs, PolicyInput
+from lifelong.evaluation.environments import Obs
 
 ACTION_DIM = 7
 
 
 @dataclass(frozen=True)
-class CardAdapter:
-    """Converts observations of simulations to a card's inputs, and predicted actions to the simulations' own.
+class PolicyInput:
+    """Observation of one simulation, as a protocol defines it.
 
     Attributes:
-        card: The protocol.
+        images: Image of each camera by the original's name, `agentview` or `robot0_eye_in_hand`: (H, W, 3) uint8, after
+            the protocol's turning, resizing and cropping.
+        state: Proprioception in the protocol's order, rotation convention and dtype, (8,) in most protocols.
+        prompt: Instruction, after the protocol's template.
+        extra: Further vectors that a protocol sends by name, such as vla-eval's `controller_states`.
+    """
+
+    images: Mapping[str, np.ndarray]
+    state: np.ndarray
+    prompt: str
+    extra: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ProtocolAdapter:
+    """Converts observations of simulations to a protocol's inputs, and predicted actions to the simulations' own.
+
+    It keeps no state, so that episodes do not depend on each other.
+
+    Attributes:
+        protocol: The protocol.
         task: Task whose instruction is given.
     """
 
-    card: Card
+    protocol: EvalProtocol
     task: Task
 
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """Cameras that the simulations render, in the protocol's order."""
-        return self.card.pixels.cameras
-
-    @property
-    def observations(self) -> tuple[str, ...]:
-        """Names of the observations that `inputs` reads."""
-        return ("rgb", "proprioception", "ee_quat")
-
     def inputs(self, obs: Obs, rows: Sequence[int] | None = None) -> list[PolicyInput]:
-        """Return the inputs of some simulations; see `lifelong.evaluation.inputs.Adapter`."""
+        """Return the inputs of some simulations.
+
+        Args:
+            obs: (B, ...) arrays by name, with images of the protocol's cameras, `ee_pos`, `ee_quat` and
+                `gripper_states`.
+            rows: Indices of the simulations; by default all.
+        """
         rows = range(len(next(iter(obs.values())))) if rows is None else rows
-        prompt = self.card.prompt(self.task)
+        prompt = self.protocol.prompt(self.task)
         return [PolicyInput(self._images(obs, i), self._state(obs, i), prompt) for i in rows]
 
     def actions(self, predicted: np.ndarray) -> np.ndarray:
-        """Return the simulations' actions for predicted ones; see `lifelong.evaluation.inputs.Adapter`."""
+        """Return the simulations' actions, (..., 7) float64; the gripper opens at -1 and closes at +1.
+
+        Args:
+            predicted: (..., 7) actions of a policy in the protocol's convention.
+
+        Raises:
+            PolicyError: The last dimension is not 7, or a value is not finite.
+        """
         actions = np.array(predicted, np.float64)
         if actions.ndim == 0 or actions.shape[-1] != ACTION_DIM:
             raise PolicyError(f"predicted actions have shape {actions.shape}; expected (..., {ACTION_DIM})")
         if not np.isfinite(actions).all():
             raise PolicyError("predicted actions are not finite")
-        gripper = self.card.action.gripper or "as_predicted"
+        gripper = self.protocol.action.gripper or "as_predicted"
         actions[..., -1] = GRIPPERS[gripper](np.asarray(predicted)[..., -1])
         return actions
 
     def _images(self, obs: Obs, i: int) -> dict[str, np.ndarray]:
-        pixels, found = self.card.pixels, dict[str, np.ndarray]()
+        pixels, images = self.protocol.pixels, dict[str, np.ndarray]()
         for camera in pixels.cameras:
-            image = np.asarray(obs[f"{camera.removeprefix('robot0_')}_rgb"][i])
+            image = np.asarray(obs[view_of(camera)][i])
             if pixels.orientation == "bottom_up":
                 image = image[::-1]
             elif pixels.orientation == "rotated":  # the original's rows, bottom first, turned by 180 degrees
                 image = image[:, ::-1]
             crop = 1.0 if pixels.crop is None else pixels.crop
-            found[camera] = preprocess(image, pixels.resize or "none", pixels.resize_size, crop)
-        return found
+            images[camera] = preprocess(image, pixels.resize or "none", pixels.resize_size, crop)
+        return images
 
     def _state(self, obs: Obs, i: int) -> np.ndarray:
-        rules = self.card.proprioception
+        rules = self.protocol.proprioception
         if rules.source != "observation":
             return np.zeros(0)
         quat = np.roll(np.asarray(obs["ee_quat"][i], np.float64), -1)  # wxyz -> xyzw
@@ -77,6 +100,11 @@ class CardAdapter:
             "gripper_qpos": np.asarray(obs["gripper_states"][i], np.float64),
         }
         return np.concatenate([parts[name] for name in rules.order or ()]).astype(rules.dtype or "float64")
+
+
+def view_of(camera: str) -> str:
+    """Return the name of the observed image of a camera."""
+    return f"{camera.removeprefix('robot0_')}_rgb"
 
 
 def axis_angle(quat_xyzw: np.ndarray) -> np.ndarray:

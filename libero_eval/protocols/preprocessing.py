@@ -30,7 +30,7 @@ def preprocess(image: np.ndarray, resize: str, size: Size | None, crop: float) -
         crop: Share of the area that is cut out of the middle and resized back; 1 for all of it.
     """
     if resize != "none":
-        assert size is not None, "cards with a chain have a size"
+        assert size is not None, "protocols with a chain have a size"
         image = RESIZES[resize](image, size)
     return crop_centre(image, crop) if crop < 1 else np.ascontiguousarray(image)
 

@@ -1,25 +1,37 @@
-"""Protocol cards: everything that decides what a policy sees and how its episodes are judged.
+"""Protocols: everything that decides what a policy sees, and how its episodes are run and counted.
 
-A card is a YAML file; `libero_eval.protocols.files` reads it. The dataclasses below are its sections. A value of
-null means that the source of the protocol does not state it: it is never guessed, and a card is run only when all that
-a run needs is stated.
+The dataclasses are the sections of a protocol's file, see `libero_eval.protocols.files`. A value of null means that the
+source of the protocol does not state it: it is never guessed, and a protocol is run only when all that a run needs is
+stated.
 """
 
 import hashlib
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, fields
+from typing import Annotated, Any, Literal
 
+from pydantic import Field
+
+from libero_env.errors import LiberoError
 from libero_env.tasks import Task
-from libero_eval.protocols.checks import contradictions, type_errors
+from libero_env.text import plain, suggest
+from libero_env.validation import validate
 from lifelong.errors import ProtocolError, ProtocolMismatchError
 
-Steps = int | Mapping[str, int]
+SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
+
+# upper bounds are what no protocol means, and no machine does in a life
+_AtLeastOne = Annotated[int, Field(ge=1)]
+_Steps = Annotated[int, Field(ge=1, le=1_000_000)]
+_EnvSeed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+_RenderSide = Annotated[int, Field(ge=1, le=1024)]  # pixels
+_Side = Annotated[int, Field(ge=1, le=4096)]
+_Action = Annotated[tuple[float, ...], Field(min_length=7, max_length=7)]
 
 
 @dataclass(frozen=True)
-class World:
+class Simulation:
     """What is simulated.
 
     Attributes:
@@ -42,9 +54,8 @@ class World:
         controller: Name of the controller, see `libero_env.sim.controller`.
         delta: Whether actions are relative to the present pose.
         predicates: Semantics of the goals, see `libero_env.sim.predicates`.
-        perturb: Perturbations, such as `camera=0.3,light=0.5`, see `libero_env.perturbations`; empty for none. A card
-            without it has none.
-        backend: Back end of the physics and the pictures, see `libero_env.sim.backend`. A card without it has `mujoco`.
+        perturb: Perturbations, such as `camera=0.3,light=0.5`, see `libero_env.perturbations`; empty for none.
+        backend: Backend of the physics and the pictures, see `libero_env.sim.backend`.
     """
 
     models: Literal["original", "builtin", "any"]
@@ -55,11 +66,11 @@ class World:
     init_states: Literal["original", "builtin"]
     environments: Literal["reused", "rebuilt"] | None
     fixture_poses: Literal["drawn", "stored"]
-    env_seed: int | None
+    env_seed: _EnvSeed | None
     seeding: Literal["once", "every_reset"] | None
     seed_per_start: int | None
     seed_per_task: int | None
-    loads: int | None
+    loads: Annotated[int, Field(le=10_000)] | None
     control_freq: int
     controller: Literal["osc_pose"]
     delta: bool
@@ -67,9 +78,22 @@ class World:
     perturb: str = ""
     backend: Literal["mujoco", "warp"] = "mujoco"
 
+    def problems(self) -> Iterator[str]:
+        """Yield which values contradict each other."""
+        if self.perturb:
+            yield from _perturbation_problems(self.perturb)
+        if self.fixture_poses == "stored" and self.env_seed is not None:
+            yield f"world.env_seed is {self.env_seed}, but world.fixture_poses are stored: nothing is drawn"
+        if self.seeding == "once":
+            for name in ("seed_per_start", "seed_per_task"):
+                if value := getattr(self, name):
+                    yield f"world.{name} is {value}, but world.seeding is once"
+        if self.control_freq != 20:
+            yield f"world.control_freq is {self.control_freq}; the benchmark runs at 20 Hz"
+
 
 @dataclass(frozen=True)
-class Rules:
+class Episodes:
     """How an episode runs and ends.
 
     Attributes:
@@ -86,13 +110,33 @@ class Rules:
     """
 
     reset_order: tuple[Literal["seed", "reset", "set_init_state", "settle"], ...]
-    settle_steps: int | None
-    settle_action: tuple[float, ...] | None
+    settle_steps: Annotated[int, Field(ge=0, le=10_000)] | None
+    settle_action: _Action | None
     settle_counted: bool
-    horizon: Steps | None
+    horizon: _Steps | Mapping[str, _Steps] | None
     success: Literal["first_hit", "accumulated", "final"]
     errors: Literal["failure", "stop"] | None
     observed: Literal["substep", "after"]
+
+    def problems(self) -> Iterator[str]:
+        """Yield which values contradict each other."""
+        if self.settle_steps == 0:
+            if self.settle_action is not None:
+                yield f"episode.settle_action is {list(self.settle_action)}, but episode.settle_steps is 0"
+            if self.settle_counted:
+                yield "episode.settle_counted is true, but episode.settle_steps is 0"
+        by_suite = self.horizon if isinstance(self.horizon, Mapping) else {}
+        if by_suite and (missing := [s for s in SUITES if s not in by_suite]):
+            yield f"episode.horizon has no value for {', '.join(missing)}"
+        least = 1 + (self.settle_steps or 0) * self.settle_counted
+        horizons = by_suite.values() if by_suite else [self.horizon or least]
+        if (lowest := min(horizons)) < least:
+            yield f"episode.horizon is {lowest}; it must be at least {least}"
+        order = self.reset_order
+        if "set_init_state" not in order or len(set(order)) != len(order):
+            yield f"episode.reset_order is {list(order)}; it must have set_init_state, and each call once"
+        elif "reset" in order and order.index("reset") > order.index("set_init_state"):
+            yield "episode.reset_order has reset after set_init_state, which would undo it"
 
 
 @dataclass(frozen=True)
@@ -109,12 +153,26 @@ class Pixels:
         crop: Share of the area that is cut out of the middle and resized back; 1 for all of it.
     """
 
-    cameras: tuple[Literal["agentview", "robot0_eye_in_hand"], ...]
-    render_size: tuple[int, int] | None
+    cameras: Annotated[tuple[Literal["agentview", "robot0_eye_in_hand"], ...], Field(min_length=1)]
+    render_size: tuple[_RenderSide, _RenderSide] | None
     orientation: Literal["upright", "bottom_up", "rotated"] | None
     resize: Literal["none", "pil_bilinear_pad", "jpeg_lanczos3", "torch_bilinear"] | None
-    resize_size: tuple[int, int] | None
-    crop: float | None
+    resize_size: tuple[_Side, _Side] | None
+    crop: Annotated[float, Field(gt=0, le=1)] | None
+
+    def problems(self) -> Iterator[str]:
+        """Yield which values contradict each other."""
+        size = self.resize_size
+        if len(set(self.cameras)) != len(self.cameras):
+            yield f"pixels.cameras is {list(self.cameras)}; expected each camera once"
+        if self.resize == "none" and size is not None:
+            yield f"pixels.resize_size is {list(size)}, but pixels.resize is none"
+        if self.resize not in (None, "none") and size is None:
+            yield f"pixels.resize is {self.resize}, but pixels.resize_size is null"
+        if self.crop is not None and self.crop < 1 and self.resize in (None, "none"):
+            yield (
+                f"pixels.crop is {self.crop}, but pixels.resize is {self.resize or 'null'}: nothing says to which size"
+            )
 
 
 @dataclass(frozen=True)
@@ -135,6 +193,15 @@ class Proprioception:
     rotation: Literal["axis_angle", "axis_angle_float32", "axis_angle_positive", "quat_xyzw"] | None
     dtype: Literal["float32", "float64"] | None
 
+    def problems(self) -> Iterator[str]:
+        """Yield which values contradict each other."""
+        if self.source == "none" and self.order:
+            yield f"proprioception.order is {list(self.order)}, but proprioception.source is none"
+        if self.source == "observation":
+            for name in ("order", "rotation", "dtype"):
+                if not getattr(self, name):
+                    yield f"proprioception.source is observation, but proprioception.{name} is not stated"
+
 
 @dataclass(frozen=True)
 class Language:
@@ -147,6 +214,11 @@ class Language:
 
     source: Literal["file_name", "bddl"]
     template: str
+
+    def problems(self) -> Iterator[str]:
+        """Yield what is wrong with the template."""
+        if "{instruction}" not in self.template:
+            yield f"language.template is {self.template!r}; it must have {{instruction}}"
 
 
 @dataclass(frozen=True)
@@ -171,9 +243,16 @@ class Actions:
     unnorm_mask: str | None
     unnorm_clip: bool | None
     gripper: Literal["as_predicted", "sign", "open_sign", "open_cut"] | None
-    chunk: int | None
-    replan: int | None
+    chunk: _AtLeastOne | None
+    replan: _AtLeastOne | None
     ensembling: str | None
+
+    def problems(self) -> Iterator[str]:
+        """Yield which values contradict each other."""
+        if self.chunk is not None and self.replan is not None and self.replan > self.chunk:
+            yield (
+                f"action.replan is {self.replan}, but action.chunk is {self.chunk}: there are not as many actions"
+            )
 
 
 @dataclass(frozen=True)
@@ -189,10 +268,10 @@ class Sampling:
     """
 
     seed: int | None
-    denoising_steps: int | None
+    denoising_steps: _AtLeastOne | None
     temperature: float | None
     precision: str | None
-    batch: int | None
+    batch: _AtLeastOne | None
 
 
 @dataclass(frozen=True)
@@ -207,28 +286,29 @@ class Counting:
         dataset: Revision of the data they were trained on.
     """
 
-    tasks: int | None
-    trials: int | None
+    tasks: _AtLeastOne | None
+    trials: _Steps | None
     interval: str | None
     checkpoint: str | None
     dataset: str | None
 
 
-# What a run cannot do without
-NEEDED = (
-    "episode.settle_steps",
-    "episode.horizon",
-    "pixels.render_size",
-    "pixels.orientation",
-    "pixels.resize",
-    "proprioception.source",
-    "action.gripper",
-)
+SECTIONS: dict[str, Any] = {
+    "world": Simulation,
+    "episode": Episodes,
+    "pixels": Pixels,
+    "proprioception": Proprioception,
+    "language": Language,
+    "action": Actions,
+    "sampling": Sampling,
+    "counting": Counting,
+}
+FIELDS = tuple(f"{section}.{field.name}" for section, kind in SECTIONS.items() for field in fields(kind))
 
 
 @dataclass(frozen=True)
-class Card:
-    """A protocol.
+class EvalProtocol:
+    """A protocol; `EvalProtocol.read` checks the values.
 
     Attributes:
         name: Name, that of its file.
@@ -242,15 +322,12 @@ class Card:
         sampling: Chance and arithmetic of the policy.
         counting: What the reported number is a mean of.
         sources: Section or field, such as `world.env_seed` -> where its values stand.
-
-    Raises:
-        ProtocolError: A value has the wrong type, or two contradict each other.
     """
 
     name: str
     title: str
-    world: World
-    episode: Rules
+    world: Simulation
+    episode: Episodes
     pixels: Pixels
     proprioception: Proprioception
     language: Language
@@ -260,112 +337,133 @@ class Card:
     sources: Mapping[str, str]
 
     def __post_init__(self) -> None:
-        problems = type_errors(self) or contradictions(self.flat())
+        sections = (self.episode, self.pixels, self.action, self.proprioception, self.world, self.language)
+        problems = [text for section in sections for text in section.problems()]
+        if self.world.fixture_poses == "drawn" and "reset" not in self.episode.reset_order:
+            problems.append(
+                "world.fixture_poses are drawn, but episode.reset_order has no reset, which draws them"
+            )
+        valid = (*SECTIONS, *FIELDS)
+        problems += [
+            f"sources.{key} is not a key of a protocol.{suggest(key, valid)}"
+            for key in self.sources
+            if key not in valid
+        ]
         if problems:
-            raise ProtocolError(f"protocol {self.name}: " + "; ".join(problems))
+            raise ProtocolError("; ".join(problems))
+
+    @classmethod
+    def read(cls, values: Mapping[str, Any], where: str) -> "EvalProtocol":
+        """Return the protocol of plain data, as of a file, or of `resolved`.
+
+        Args:
+            values: Section -> field -> value, with `name`, `title` and `sources`.
+            where: File that messages name.
+
+        Raises:
+            ProtocolError: A field is missing or unknown, a value has the wrong type, or two contradict each other.
+        """
+        content = {"sources": {}} | {k: v for k, v in values.items() if k not in ("digest", "extends")}
+        return validate(cls, content, source=where, error=ProtocolError)
 
     def flat(self) -> dict[str, Any]:
-        """Return all values by dotted name, such as `world.env_seed`."""
-        return dict(_flat(self))
+        """Return the values of all sections by dotted name, such as `world.env_seed`."""
+        return {
+            name: getattr(getattr(self, name.partition(".")[0]), name.partition(".")[2]) for name in FIELDS
+        }
 
     def resolved(self) -> dict[str, Any]:
-        """Return the card as plain data, with a digest of everything that decides a result."""
+        """Return the protocol as plain data, with a digest of everything that decides a result."""
         return {**asdict(self), "digest": self.digest}
 
     @property
     def digest(self) -> str:
-        """Digest of all values, 16 hex digits; names and sources are not part of it."""
-        values = {k: v for k, v in self.flat().items() if "." in k and not k.startswith("sources")}
-        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
+        """Digest of all values, 16 hex digits; name, title and sources are not part of it."""
+        return hashlib.sha256(json.dumps(self.flat(), sort_keys=True).encode()).hexdigest()[:16]
 
     def steps(self, task: Task) -> int:
         """Return the maximum number of the policy's steps on a task.
 
         Raises:
-            ProtocolError: The card states none for the task's suite.
+            ProtocolError: None is stated for the task's suite.
         """
         horizon = self.episode.horizon
-        found = horizon.get(task.origin.suite) if isinstance(horizon, Mapping) else horizon
-        if found is None and isinstance(horizon, Mapping) and not task.suite.startswith("libero_"):
-            found = max(horizon.values())  # a user's own suite
-        if found is None:
+        if isinstance(horizon, Mapping):
+            own_suite = None if task.suite.startswith("libero_") else max(horizon.values())
+            horizon = horizon.get(task.origin.suite, own_suite)
+        if horizon is None:
             raise ProtocolError(f"protocol {self.name} states no episode.horizon for {task.suite}")
-        return found - self.settle_steps * self.episode.settle_counted
+        return horizon - self.settle_steps * self.episode.settle_counted
 
     @property
     def settle_steps(self) -> int:
         """Number of steps before the policy acts."""
         return self.episode.settle_steps or 0
 
-    @property
-    def settle_action(self) -> tuple[float, ...] | None:
-        """Action of these steps."""
-        return self.episode.settle_action
-
     def prompt(self, task: Task) -> str:
         """Return the instruction of a task that a policy receives."""
         text = task.problem.language if self.language.source == "bddl" else task.language
         return self.language.template.replace("{instruction}", text)
 
-    def env_seed(self, task: Task, start: int) -> int | None:
+    def env_seed(self, task: Task, init_state: int) -> int | None:
         """Return the seed that the environment gets for an initial state; None where the poses are stored."""
         world = self.world
-        if world.fixture_poses == "stored" or world.env_seed is None:
-            return None
-        if world.seeding == "once":
-            return world.env_seed
-        return world.env_seed + (world.seed_per_start or 0) * start + (world.seed_per_task or 0) * task.index
+        if world.fixture_poses == "stored" or world.env_seed is None or world.seeding == "once":
+            return None if world.fixture_poses == "stored" else world.env_seed
+        return (
+            world.env_seed
+            + (world.seed_per_start or 0) * init_state
+            + (world.seed_per_task or 0) * task.index
+        )
 
     def require(self) -> None:
-        """Check that the card states all that a run needs.
+        """Check that the protocol states all that a run needs.
 
         Raises:
             ProtocolError: It does not, or states what no run offers; the message names the fields.
         """
         if self.episode.success == "final":
             raise ProtocolError(f"protocol {self.name} cannot be run: episodes end at success, not `final`")
+        needed = ["episode.settle_steps", "episode.horizon", "pixels.render_size", "pixels.orientation"]
+        needed += ["pixels.resize", "proprioception.source", "action.gripper"]
+        needed += ["episode.settle_action"] if self.episode.settle_steps else []
+        needed += ["world.env_seed", "world.seeding"] if self.world.fixture_poses == "drawn" else []
         values = self.flat()
-        needed = list(NEEDED)
-        if self.pixels.resize not in (None, "none"):
-            needed.append("pixels.resize_size")
-        if self.episode.settle_steps:
-            needed.append("episode.settle_action")
-        if self.world.fixture_poses == "drawn":
-            needed += ["world.env_seed", "world.seeding"]
         if missing := [name for name in needed if values[name] is None]:
             raise ProtocolError(
-                f"protocol {self.name} cannot be run: its source does not state {', '.join(missing)}. Write a card "
+                f"protocol {self.name} cannot be run: its source does not state {', '.join(missing)}. Write a file "
                 f"with `extends: {self.name}` that does, and give its path to --protocol"
             )
 
-    def changed(self, values: Mapping[str, Any]) -> "Card":
-        """Return a card with other values of some fields, by dotted name such as `episode.horizon`.
+    def changed(self, values: Mapping[str, Any]) -> "EvalProtocol":
+        """Return a protocol with other values of some fields, by dotted name such as `episode.horizon`.
 
         Raises:
             ProtocolError: A value has the wrong type, or contradicts another.
         """
-        parts: dict[str, dict[str, Any]] = {}
+        content = asdict(self)
         for name, value in values.items():
             section, _, field = name.partition(".")
-            parts.setdefault(section, {})[field] = value
-        return replace(self, **{k: replace(getattr(self, k), **v) for k, v in parts.items()})
+            content[section][field] = value
+        return self.read(content, f"protocol {self.name}")
 
     def check(self, announced: Mapping[str, Any]) -> None:
-        """Compare the card with what a policy announces of itself.
+        """Compare the protocol with what a policy announces of itself.
 
         Args:
-            announced: Dotted name of a field, such as `action.chunk`, or a section with its fields -> value. Names that
-                no card has are ignored, as are fields that the card does not state.
+            announced: Dotted name of a field, such as `action.chunk`, or a section with its fields -> value. Other
+                names are ignored, as are fields that the protocol does not state.
 
         Raises:
             ProtocolMismatchError: Values differ; the message names both of each.
         """
-        own = {k: v for k, v in self.flat().items() if "." in k}
-        given = {k: v for k, v in _flat(announced) if k in own}
+        expected = {name: value for name, value in self.flat().items() if value is not None}
+        by_section = {k: v for k, v in announced.items() if k in SECTIONS and isinstance(v, Mapping)}
+        stated = announced | {f"{s}.{name}": v for s, part in by_section.items() for name, v in part.items()}
         wrong = [
-            f"{name}: protocol {self.name} has {own[name]!r}, the policy {value!r}"
-            for name, value in given.items()
-            if value is not None and own[name] is not None and _plain(value) != _plain(own[name])
+            f"{name}: protocol {self.name} has {value!r}, the policy {stated[name]!r}"
+            for name, value in expected.items()
+            if stated.get(name) is not None and plain(stated[name]) != plain(value)
         ]
         if wrong:
             raise ProtocolMismatchError(
@@ -373,33 +471,11 @@ class Card:
             )
 
 
-SECTIONS: dict[str, type] = {
-    "world": World,
-    "episode": Rules,
-    "pixels": Pixels,
-    "proprioception": Proprioception,
-    "language": Language,
-    "action": Actions,
-    "sampling": Sampling,
-    "counting": Counting,
-}
+def _perturbation_problems(text: str) -> Iterator[str]:
+    from libero_env.perturbations.value import format_perturbations, parse_perturbations  # slow to import
 
-
-def _flat(values: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield dotted names and values of sections; mappings inside of a section are values."""
-    if is_dataclass(values):
-        pairs = [(f.name, getattr(values, f.name)) for f in fields(values)]
-    else:
-        pairs = list(values.items())
-    for name, value in pairs:
-        if not prefix and (is_dataclass(value) or (name in SECTIONS and isinstance(value, Mapping))):
-            yield from _flat(value, f"{name}.")
-        else:
-            yield prefix + name, value
-
-
-def _plain(value: Any) -> Any:
-    """Return a value with lists for all sequences, numbers as they compare."""
-    if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in value.items()}
-    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+    try:
+        if text != (ordered := format_perturbations(parse_perturbations(text))):
+            yield f"world.perturb is {text!r}; in the order of application it is {ordered!r}"
+    except LiberoError as error:
+        yield f"world.perturb: {error}"

@@ -1,74 +1,36 @@
-"""A self-contained page about the robustness of policies, and the same as text and JSON."""
+"""A self-contained page about the robustness of policies with its figures, and the same as text and JSON."""
 
-import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from libero_env.storage import atomic_write_text
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from libero_env.perturbations import KINDS
+from libero_env.storage import atomic_write_text, write_json
+from libero_env.text import text_table
 from libero_eval.judging.text import interval_text, p_text
-from libero_eval.robustness.figures import curves_figure, radar_figure
-from libero_eval.robustness.results import Axis, Interaction, Outcomes, name_of
+from libero_eval.robustness.results import Axis, Robustness, name_of
 from lifelong.errors import ResultsError
-from lifelong.report.figures import as_svg
+from lifelong.report.figures import (
+    INK,
+    LINE_COLOURS,
+    LINE_MARKERS,
+    STYLE,
+    as_svg,
+    hide_spines,
+    legend_below,
+    shorten,
+)
 from lifelong.report.templates import page_template
-from lifelong.results.summary import json_safe
-from lifelong.stats.intervals import Estimate, holm
+from lifelong.stats.intervals import Estimate
 
 ALPHA = 0.05  # of the kinds together
-
-
-@dataclass(frozen=True)
-class Robustness:
-    """What perturbations do to one policy.
-
-    Attributes:
-        label: Name of the policy.
-        outcomes: Outcomes of all conditions.
-        paths: Folders of the results.
-        redrawn: Number of draws that were given up, by condition.
-    """
-
-    label: str
-    outcomes: Outcomes
-    paths: tuple[str, ...] = ()
-    redrawn: Mapping[str, int] = field(default_factory=dict)
-
-    @property
-    def base(self) -> Estimate:
-        """Success without perturbation."""
-        return self.outcomes.success(())
-
-    @cached_property
-    def axes(self) -> tuple[Axis, ...]:
-        """Every kind that was run by itself, the most harmful first."""
-        return self.outcomes.axes()
-
-    @cached_property
-    def interactions(self) -> tuple[Interaction, ...]:
-        """Every pair of which each was also run by itself."""
-        return self.outcomes.interactions()
-
-    @cached_property
-    def adjusted(self) -> dict[str, float]:
-        """P-value of each kind, adjusted by Holm over all of them."""
-        return dict(
-            zip((axis.kind for axis in self.axes), holm([axis.p_value for axis in self.axes]), strict=True)
-        )
-
-    @property
-    def severities(self) -> tuple[float, ...]:
-        """All severities of any kind, ascending, from 0."""
-        return tuple(sorted({s for axis in self.axes for s in axis.severities}))
-
-    @staticmethod
-    def at(axis: Axis, severity: float) -> Estimate | None:
-        """Return the success of a kind at a severity; None if it was not measured."""
-        found = dict(zip(axis.severities, axis.success, strict=True))
-        return found.get(severity)
+COLUMNS = 4
 
 
 def verdict(found: Robustness) -> str:
@@ -90,44 +52,40 @@ def verdict(found: Robustness) -> str:
 def render(found: Robustness) -> str:
     """Return the tables as plain text for a terminal."""
     severities = found.severities
-    width = max([4, *(len(axis.kind) for axis in found.axes)])
-    heads = "".join(f"{s:>6g}" for s in severities)
-    lines = [
-        f"{found.label}: success in percent by severity, 0 is without perturbation",
-        f"{'kind':<{width}}{heads}{'area':>7}{'95 %':>15}{'kept':>7}{'half at':>9}{'Holm':>9}",
+    rows: list[list[object]] = [
+        ["kind", *(f"{s:g}" for s in severities), "area", "95 %", "kept", "half at", "Holm"]
     ]
     for axis in found.axes:
-        row = [found.at(axis, s) for s in severities]
-        cells = "".join(f"{'–':>6}" if e is None else f"{100 * e.value:>6.0f}" for e in row)
-        lines.append(
-            f"{axis.kind:<{width}}{cells}{100 * axis.area.value:>7.0f}{interval_text(axis.area):>15}"
-            f"{100 * axis.kept.value:>7.0f}{severity_text(axis.half.value):>9}"
-            f"{p_text(found.adjusted[axis.kind]):>9}"
+        successes = [found.at(axis, s) for s in severities]
+        rows.append(
+            [
+                axis.kind,
+                *("–" if e is None else f"{100 * e.value:.0f}" for e in successes),
+                f"{100 * axis.area.value:.0f}",
+                interval_text(axis.area),
+                f"{100 * axis.kept.value:.0f}",
+                severity_text(axis.half.value),
+                p_text(found.adjusted[axis.kind]),
+            ]
         )
-    for pair in found.interactions:
-        lines.append(
+    lines = [
+        f"{found.label}: success in percent by severity, 0 is without perturbation",
+        text_table(rows),
+        *(
             f"{name_of(pair.condition)}: {100 * pair.success.value:.0f}, expected {100 * pair.expected:.0f}, "
             f"excess {100 * pair.excess.value:+.0f} {interval_text(pair.excess)}".replace("+-", "-")
-        )
+            for pair in found.interactions
+        ),
+    ]
     return "\n".join([*lines, "", verdict(found)])
 
 
-def write_robustness(
-    policies: Sequence[Robustness],
-    folder: Path,
-    *,
-    units: Mapping[str, str],
-    facts: Sequence[tuple[str, str]] = (),
-    notes: Sequence[str] = (),
-) -> Path:
+def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
     """Write `robustness.html`, which needs no other file, and `robustness.json` with all numbers and outcomes.
 
     Args:
         policies: The policies; the page is about the first, and the others are drawn beside it.
         folder: Folder of the two files.
-        units: What severity 1 is, by kind.
-        facts: What was run, as pairs of name and value.
-        notes: What a reader has to know.
 
     Returns:
         The page.
@@ -136,32 +94,38 @@ def write_robustness(
         ResultsError: The files cannot be written.
     """
     first, axes = policies[0], {policy.label: policy.axes for policy in policies}
+    units = {name: f"{kind.at_one:g} {kind.unit}" for name, kind in KINDS.items()}
+    outcomes = first.outcomes
+    suites = ", ".join(dict.fromkeys(task.partition("/")[0] for task in outcomes.tasks))
+    episodes = len(outcomes.tasks) * len(outcomes.starts)
     page = page_template("page.html", "libero_eval.robustness").render(
         title=f"Robustness of {first.label}",
-        facts=facts,
-        notes=notes,
+        facts=[
+            ("tasks", f"{len(outcomes.tasks)} of {suites}"),
+            ("starts", f"{len(outcomes.starts)} a task"),
+            ("conditions", str(len(outcomes.conditions))),
+            ("episodes", str(outcomes.successes.size)),
+        ],
         verdict=verdict(first),
         policies=policies,
         units=units,
         curves=as_svg(curves_figure(axes, units)),
         radar=as_svg(radar_figure(axes)),
         interactions=[
-            {"label": policy.label, "name": name_of(found.condition), "found": found}
+            {"label": policy.label, "name": name_of(pair.condition), "found": pair}
             for policy in policies
-            for found in policy.interactions
+            for pair in policy.interactions
         ],
-        redrawn=_redrawn(first),
+        redrawn=[(name, count, episodes) for name, count in first.redrawn.items() if count],
         paths=[path for policy in policies for path in policy.paths],
         interval=interval_text,
         p_text=p_text,
         severity=severity_text,
         severities=_severities_text,
     )
-    content = json.dumps(json_safe({"policies": [_plain(policy) for policy in policies]}), indent=1)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         atomic_write_text(folder / "robustness.html", page)
-        atomic_write_text(folder / "robustness.json", content + "\n")
+        write_json(folder / "robustness.json", {"policies": [_content(policy) for policy in policies]})
     except OSError as error:
         raise ResultsError(f"{folder}: the page cannot be written ({error})") from error
     return folder / "robustness.html"
@@ -178,16 +142,11 @@ def _severities_text(e: Estimate) -> str:
     return f"[{e.low:.2f}, {severity_text(e.high)}]"
 
 
-def _redrawn(found: Robustness) -> list[tuple[str, int, int]]:
-    episodes = len(found.outcomes.tasks) * len(found.outcomes.starts)
-    return [(name, count, episodes) for name, count in found.redrawn.items() if count]
-
-
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:-1]) + (" and " if len(names) > 1 else "") + names[-1]
 
 
-def _plain(found: Robustness) -> dict[str, Any]:
+def _content(found: Robustness) -> dict[str, Any]:
     outcomes = found.outcomes
     return {
         "label": found.label,
@@ -204,3 +163,105 @@ def _plain(found: Robustness) -> dict[str, Any]:
             for condition, rows in zip(outcomes.conditions, outcomes.successes, strict=True)
         },
     }
+
+
+def curves_figure(policies: Mapping[str, Sequence[Axis]], units: Mapping[str, str]) -> Figure:
+    """Draw success against severity with intervals, one panel for each kind, in the order of the first policy.
+
+    Args:
+        policies: Label of each policy and its axes.
+        units: What severity 1 is, by kind; a second line of the panel's title.
+    """
+    first = next(iter(policies.values()))
+    columns, rows = min(COLUMNS, len(first)), math.ceil(len(first) / COLUMNS)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(2.15 * columns + 0.4, 1.95 * rows + 0.3), layout="constrained")
+        grid = figure.subplots(rows, columns, squeeze=False, sharey=True)
+        for axes in grid.flat[len(first) :]:
+            axes.set_axis_off()
+        named = set[str]()  # policies that are in the legend
+        for place, kind in enumerate(axis.kind for axis in first):
+            axes = grid.flat[place]
+            for number, (label, found) in enumerate(policies.items()):
+                axis = next((a for a in found if a.kind == kind), None)
+                if axis is not None:
+                    _draw_axis(axes, axis, number, "" if label in named else shorten(label, 60))
+                    named.add(label)
+            axes.set_title(f"{kind}\n{shorten(units.get(kind, ''), 34)}".strip(), loc="left", fontsize=8)
+            axes.set_xlim(-0.03, 1.03)
+            axes.set_ylim(0, 102)
+            axes.set_xticks((0, 0.5, 1), ("0", "½", "1"))
+            axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
+            hide_spines(axes)
+            if place % columns == 0:
+                axes.set_ylabel("success (%)")
+            if place + columns >= len(first):
+                axes.set_xlabel("severity")
+        legend_below(figure)
+    return figure
+
+
+def radar_figure(policies: Mapping[str, Sequence[Axis]]) -> Figure:
+    """Draw the success that is to be expected along each kind, its area, as a radar picture.
+
+    Args:
+        policies: Label of each policy and its axes; kinds are in the order of the first, by name.
+    """
+    kinds = sorted(axis.kind for axis in next(iter(policies.values())))
+    angles = np.linspace(0, 2 * np.pi, len(kinds), endpoint=False)
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(4.4, 4.2), layout="constrained")
+        axes = figure.add_subplot(projection="polar")
+        axes.set_theta_offset(np.pi / 2)  # type: ignore[attr-defined]  # of polar axes
+        axes.set_theta_direction(-1)  # type: ignore[attr-defined]
+        for number, (label, found) in enumerate(policies.items()):
+            areas = {axis.kind: 100 * axis.area.value for axis in found}
+            values = [areas.get(kind, np.nan) for kind in kinds]
+            colour = LINE_COLOURS[number % len(LINE_COLOURS)]
+            closed = [*values, values[0]], [*angles, angles[0]]
+            style = "-" if number == 0 else "--"
+            marker = LINE_MARKERS[number % len(LINE_MARKERS)]  # shows a kind without neighbours
+            axes.plot(
+                closed[1],
+                closed[0],
+                color=colour,
+                lw=1.5,
+                ls=style,
+                marker=marker,
+                ms=2.5,
+                label=shorten(label, 60),
+            )
+            if number == 0:
+                axes.fill(closed[1], closed[0], color=colour, alpha=0.15, lw=0)
+        axes.set_ylim(0, 100)
+        axes.set_yticks((25, 50, 75, 100), ("25", "50", "75", "100 %"), fontsize=6.5)
+        axes.set_xticks(angles, kinds)
+        axes.tick_params(axis="x", pad=2)
+        for text, angle in zip(axes.get_xticklabels(), angles, strict=True):
+            side = round(np.sin(angle), 3)  # labels grow away from the circle
+            text.set_horizontalalignment("left" if side > 0 else "right" if side < 0 else "center")
+        axes.set_rlabel_position(180 / len(kinds))  # type: ignore[attr-defined]  # between two kinds
+        axes.grid(lw=0.4, alpha=0.4, color=INK)
+        axes.spines["polar"].set_linewidth(0.5)
+        legend_below(figure)
+    return figure
+
+
+def _draw_axis(axes: matplotlib.axes.Axes, axis: Axis, number: int, label: str) -> None:
+    colour, marker = LINE_COLOURS[number % len(LINE_COLOURS)], LINE_MARKERS[number % len(LINE_MARKERS)]
+    low, mean, high = (
+        100 * np.array([getattr(e, name) for e in axis.success]) for name in ("low", "value", "high")
+    )
+    style = "-" if number == 0 else "--"
+    axes.fill_between(axis.severities, low, high, color=colour, alpha=0.16 if number == 0 else 0.08, lw=0)
+    axes.plot(
+        axis.severities,
+        mean,
+        color=colour,
+        lw=1.4,
+        ls=style,
+        marker=marker,
+        ms=3,
+        label=label or None,
+        clip_on=False,
+    )

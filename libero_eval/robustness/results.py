@@ -7,7 +7,7 @@ have Wilson's intervals instead, and to other variances that of one start is add
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from libero_eval.evaluation_file import EvaluationResult
 from lifelong.errors import ResultsError
-from lifelong.stats.intervals import Estimate, Floats, combine_intervals, wilson_interval
+from lifelong.stats.intervals import Estimate, Floats, combine_intervals, holm, wilson_interval
 
 DRAWS, SEED, CONFIDENCE = 2000, 2023, 0.95
 ONE_EPISODE = 0.96  # z²/4 at 95 %: the variance that Wilson's interval adds, in units of one episode
@@ -178,6 +178,56 @@ class Outcomes:
             float(rates[0] - expected(rates)), draws[:, 0] - expected(draws), self._least, -np.inf, np.inf
         )
         return Interaction(condition, self.success(condition), float(expected(rates)), excess)
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """What perturbations do to one policy.
+
+    Attributes:
+        label: Name of the policy.
+        outcomes: Outcomes of all conditions.
+        paths: Folders of the results.
+        redrawn: Number of draws that were given up, by condition.
+    """
+
+    label: str
+    outcomes: Outcomes
+    paths: tuple[str, ...] = ()
+    redrawn: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def base(self) -> Estimate:
+        """Success without perturbation."""
+        return self.outcomes.success(())
+
+    @cached_property
+    def axes(self) -> tuple[Axis, ...]:
+        """Every kind that was run by itself, the most harmful first."""
+        return self.outcomes.axes()
+
+    @cached_property
+    def interactions(self) -> tuple[Interaction, ...]:
+        """Every pair of which each was also run by itself."""
+        return self.outcomes.interactions()
+
+    @cached_property
+    def adjusted(self) -> dict[str, float]:
+        """P-value of each kind, adjusted by Holm over all of them."""
+        return dict(
+            zip((axis.kind for axis in self.axes), holm([axis.p_value for axis in self.axes]), strict=True)
+        )
+
+    @property
+    def severities(self) -> tuple[float, ...]:
+        """All severities of any kind, ascending, from 0."""
+        return tuple(sorted({s for axis in self.axes for s in axis.severities}))
+
+    @staticmethod
+    def at(axis: Axis, severity: float) -> Estimate | None:
+        """Return the success of a kind at a severity; None if it was not measured."""
+        found = dict(zip(axis.severities, axis.success, strict=True))
+        return found.get(severity)
 
 
 def name_of(condition: Condition) -> str:

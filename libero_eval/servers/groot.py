@@ -4,20 +4,17 @@ Sources: Isaac-GR00T `gr00t/policy/server_client.py` (messages), `gr00t/policy/g
 `Gr00tSimPolicyWrapper`), `gr00t/eval/sim/LIBERO/libero_env.py` (LIBERO's keys).
 """
 
+import io
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from libero_eval.servers.codecs import GROOT
-from libero_eval.servers.connections import API_KEY, Limits
-from libero_eval.servers.packages import need
-from libero_eval.servers.wires import EpisodeStart, camera_image
-from lifelong.errors import ServerError, WireError
-from lifelong.evaluation.inputs import PolicyInput
+from libero_eval.protocols.adapter import PolicyInput
+from libero_eval.servers.transport import API_KEY, Codec, EpisodeStart, Limits, PolicyClient, need, refuse
+from lifelong.errors import CodecError, ServerError
 
 VIDEO = {"image": "agentview", "wrist_image": "robot0_eye_in_hand"}  # key -> camera
 STATE = {
@@ -34,25 +31,45 @@ PROMPT = "annotation.human.action.task_description"
 _KEYS = {"video": tuple(VIDEO), "state": tuple(STATE), "action": ACTION, "language": (PROMPT,)}
 
 
-@dataclass
-class GrootWire:
-    """A GR00T server; see `libero_eval.servers.wires.Wire`.
+def _encode(value: np.ndarray | np.generic) -> Any:
+    refuse(value.dtype, "VO")
+    if isinstance(value, np.generic):
+        return value.item()
+    file = io.BytesIO()
+    np.save(file, value, allow_pickle=False)
+    return {"__ndarray_class__": True, "as_npy": file.getvalue()}
+
+
+def _decode(values: Mapping) -> Any:
+    if "__ndarray_class__" in values:
+        return np.load(io.BytesIO(values["as_npy"]), allow_pickle=False)
+    if "__ModalityConfig_class__" in values:
+        return values["as_json"]
+    return values
+
+
+GROOT = Codec("GR00T", _encode, _decode)
+
+
+class GrootClient(PolicyClient):
+    """A GR00T server; its modality configuration is what it announces.
 
     It must have been started with `--use-sim-policy-wrapper`, as GR00T's own evaluation on LIBERO does. One request
     has the observations of at most `limits.in_flight` simulations; the server computes them together. The environment
     variable `LIBERO_API_KEY` is sent as `api_token`.
 
-    Attributes:
+    Args:
         address: URL of the server, `tcp://host:port`.
         limits: How long the server is waited for.
-        announced: Modality configuration of the policy, by modality.
+
+    Raises:
+        ServerError: The server is not there, or serves a policy of another embodiment.
     """
 
-    address: str
-    limits: Limits = Limits()
-    announced: Mapping[str, Any] = field(init=False)
+    codec = GROOT
 
-    def __post_init__(self) -> None:
+    def __init__(self, address: str, limits: Limits = Limits()):  # noqa: B008 - frozen
+        self.address, self.limits = address, limits
         self._zmq = need("zmq")
         self._context = self._zmq.Context()
         self._socket: Any = None
@@ -63,24 +80,30 @@ class GrootWire:
             self.close()
             raise
 
+    @staticmethod
+    def stated(announced: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the number of actions of a chunk."""
+        steps = announced["action"].get("delta_indices")
+        return {"action.chunk": len(steps)} if steps else {}
+
     def open(self, episodes: Sequence[EpisodeStart]) -> None:
-        """Reset the policy; see `Wire`. The server knows no single episodes."""
+        """Reset the policy; see `PolicyClient`. The server knows no single episodes."""
         self._call("reset", {"options": None})
 
     def ask(self, inputs: Mapping[int, PolicyInput]) -> dict[int, Any]:
-        """Return the predicted actions, unchecked; see `Wire`."""
-        found: dict[int, Any] = {}
+        """Return the predicted actions, unchecked; see `PolicyClient`."""
+        actions: dict[int, Any] = {}
         order = sorted(inputs)
         size = self.limits.in_flight or len(order) or 1
         for start in range(0, len(order), size):
             rows = order[start : start + size]
-            observation = observe([inputs[i] for i in rows], self.announced)
+            observation = self._observation([inputs[i] for i in rows])
             answer = self._call("get_action", {"observation": observation, "options": None})
-            found |= dict(zip(rows, self._actions(answer, len(rows)), strict=True))
-        return found
+            actions |= dict(zip(rows, self._actions(answer, len(rows)), strict=True))
+        return actions
 
     def finish(self, simulation: int, success: bool) -> None:
-        """Do nothing: the protocol has no message for it; see `Wire`."""
+        """Do nothing: the protocol has no message for it; see `PolicyClient`."""
 
     def close(self) -> None:
         """Close the socket."""
@@ -105,22 +128,35 @@ class GrootWire:
                 ) from error
 
     def _modalities(self) -> dict[str, Any]:
-        found = self._call("get_modality_config")
-        if not isinstance(found, Mapping):
-            raise ServerError(f"{self.address} sent a {type(found).__name__} as its modality configuration")
-        for modality, known in _KEYS.items():
-            config = found.get(modality)
+        modalities = self._call("get_modality_config")
+        if not isinstance(modalities, Mapping):
+            raise ServerError(
+                f"{self.address} sent a {type(modalities).__name__} as its modality configuration"
+            )
+        for modality, valid in _KEYS.items():
+            config = modalities.get(modality)
             config = config if isinstance(config, Mapping) else {}
             keys = config.get("modality_keys")
-            if not keys or not set(keys) <= set(known):
+            if not keys or not set(keys) <= set(valid):
                 raise ServerError(
-                    f"{self.address} has {modality} keys {keys}; LIBERO's are {', '.join(known)}: "
+                    f"{self.address} has {modality} keys {keys}; LIBERO's are {', '.join(valid)}: "
                     "serve a policy of the embodiment libero_sim"
                 )
             steps = config.get("delta_indices")
             if modality in ("video", "state") and (steps is None or list(steps) != [0]):
                 raise ServerError(f"{self.address} wants {modality} of the steps {steps}; valid: [0]")
-        return dict(found)
+        return dict(modalities)
+
+    def _observation(self, inputs: Sequence[PolicyInput]) -> dict[str, Any]:
+        """Return GR00T's observation: images (B, 1, H, W, 3), parts of the state (B, 1, D), instructions."""
+        keys = {modality: self.announced[modality]["modality_keys"] for modality in _KEYS}
+        observation: dict[str, Any] = {
+            f"video.{key}": np.stack([self.image(given, VIDEO[key]) for given in inputs])[:, None]
+            for key in keys["video"]
+        }
+        states = np.stack([given.state for given in inputs]).astype(np.float32)[:, None]
+        observation |= {f"state.{key}": states[..., STATE[key]] for key in keys["state"]}
+        return observation | {key: [given.prompt for given in inputs] for key in keys["language"]}
 
     def _actions(self, answer: Any, count: int) -> np.ndarray:
         """Return the actions (B, H, 7) of an answer, which is a list of actions by key and of further data."""
@@ -161,7 +197,7 @@ class GrootWire:
             raise ServerError(
                 f"{self.address} sent nothing within {seconds:g} s ({endpoint}); --timeout sets the limit"
             ) from error
-        except WireError as error:
+        except CodecError as error:
             raise ServerError(f"{self.address} sent {error} ({endpoint})") from error
         except BaseException:
             self._drop()
@@ -184,22 +220,3 @@ class GrootWire:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
-
-
-def observe(inputs: Sequence[PolicyInput], announced: Mapping[str, Any]) -> dict[str, Any]:
-    """Return GR00T's observation of simulations: images (B, 1, H, W, 3), parts of the state (B, 1, D), instructions.
-
-    Args:
-        inputs: Input of each simulation.
-        announced: Modality configuration of the policy.
-    """
-    keys = {modality: announced[modality]["modality_keys"] for modality in _KEYS}
-    found: dict[str, Any] = {
-        f"video.{key}": np.stack([camera_image(given, VIDEO[key], "GR00T's server") for given in inputs])[
-            :, None
-        ]
-        for key in keys["video"]
-    }
-    states = np.stack([given.state for given in inputs]).astype(np.float32)[:, None]
-    found |= {f"state.{key}": states[..., STATE[key]] for key in keys["state"]}
-    return found | {key: [given.prompt for given in inputs] for key in keys["language"]}

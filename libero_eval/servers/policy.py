@@ -1,47 +1,36 @@
 """A policy on a server, as `libero eval` evaluates it."""
 
-import argparse
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Task, get_task
-from libero_eval.candidates import PolicyUnderTest
-from libero_eval.protocols.adapter import CardAdapter
-from libero_eval.protocols.environment import make_env, run_protocol
-from libero_eval.protocols.packaged import SELECTION
-from libero_eval.protocols.protocol import Card
-from libero_eval.servers.actor import RemoteActor
-from libero_eval.servers.announcements import groot_fields, openpi_fields, vla_eval_fields
-from libero_eval.servers.connections import Limits
-from libero_eval.servers.groot import GrootWire
-from libero_eval.servers.native import ServedActor
-from libero_eval.servers.sessions import FORMAT, PREFIX, SERVER
-from libero_eval.servers.wires import (
-    EpisodeStart,
-    OpenpiDialect,
-    VlaEvalDialect,
-    WebSocketWire,
-    Wire,
-    plain,
-    same,
-    summary,
-)
+from libero_env.text import plain
+from libero_eval.policies import PolicyUnderTest
+from libero_eval.protocols.adapter import ProtocolAdapter, view_of
+from libero_eval.protocols.environment import run_protocol
+from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.requests import Request
+from libero_eval.servers.actors import RemoteActor, ServedActor
+from libero_eval.servers.groot import GrootClient
+from libero_eval.servers.openpi import OpenpiClient
+from libero_eval.servers.serving import FORMAT, PREFIX, SERVER
+from libero_eval.servers.transport import EpisodeStart, Limits, PolicyClient
+from libero_eval.servers.vla_eval import VlaEvalClient
 from lifelong.data.settings import CAMERAS
 from lifelong.errors import ProtocolError, ServerError
 from lifelong.evaluation.actors import Actor
-from lifelong.evaluation.environments import VectorEnv
-from lifelong.seeding import EVALUATION
 
-# scheme of an address -> scheme of the transport, and what the server's announcement says about the protocol
-SCHEMES = {
-    "ws": ("ws", openpi_fields),
-    "wss": ("wss", openpi_fields),
-    "vla-eval": ("ws", vla_eval_fields),
-    "gr00t": ("tcp", groot_fields),
+# scheme of an address -> kind of server, scheme of its transport
+CLIENTS: dict[str, tuple[Any, str]] = {
+    "ws": (OpenpiClient, "ws"),
+    "wss": (OpenpiClient, "wss"),
+    "vla-eval": (VlaEvalClient, "ws"),
+    "gr00t": (GrootClient, "tcp"),
 }
 
 
@@ -63,7 +52,7 @@ def checked_address(url: str, given: str) -> str:
         valid = False
     if not valid:
         scheme = given.partition("://")[0]
-        raise ServerError(f"{given} is no address; write {scheme}://host:port, the port from 1 to 65535")
+        raise ServerError(f"{given} is not an address; write {scheme}://host:port, the port from 1 to 65535")
     return url
 
 
@@ -72,118 +61,82 @@ class ServerPolicy(PolicyUnderTest):
 
     What the server announces is part of the policy's identity, and is compared with the protocol before anything runs.
 
-    Args:
-        args: Arguments of `libero eval`; `policy` is the address.
-
     Raises:
+        UnknownNameError: The address is of no kind of server.
         ServerError: The server is not there, or is of another kind.
     """
 
-    def __init__(self, args: argparse.Namespace):
-        self.args = args
-        self.limits = Limits(answer=args.timeout, in_flight=args.in_flight)
-        wire = self._wire()
-        self.announced = wire.announced
-        wire.close()
-        self.own = self.announced.get("server") == SERVER  # a policy of this package
-        if self.own and self.announced.get("format") != FORMAT:
+    def __init__(self, request: Request):
+        super().__init__(request)
+        self.given = given = request.policy_name
+        with self._client() as client:
+            self.announced, self._kind = client.announced, type(client)
+        about = self.announced
+        self.is_run = about.get("server") == SERVER  # a policy of this package
+        if self.is_run and about.get("format") != FORMAT:
             raise ServerError(
-                f"{args.policy} is of format {self.announced.get('format')!r}; this version knows {FORMAT}: "
+                f"{given} is of format {about.get('format')!r}; this version reads {FORMAT}: "
                 "serve the run with the version that evaluates it"
             )
-        self.identity = {"server": args.policy, "announced": plain(self.announced)}
-        self.out = Path("eval") / re.sub(r"\W+", "_", args.policy).strip("_")
-        self.selection = tuple(self.announced["selection"]) if self.own else SELECTION
-        self.tasks = tuple(self._tasks())
+        self.identity = {"server": given, "announced": plain(about)}
+        self.out = Path("eval") / re.sub(r"\W+", "_", given).strip("_")
+        if self.is_run:
+            self.selection = tuple(about["selection"])
+            self.tasks = tuple(get_task(name) for name in about["tasks"] if not name.startswith("file/"))
+            names = [key.removeprefix(PREFIX) for key in about["observation"]]
+            self._views = [name for name in names if name in CAMERAS]
+            self.cameras = tuple(CAMERAS[view] for view in self._views)
 
-    def protocol(self, base: Card) -> Card:
+    def protocol(self, base: EvalProtocol) -> EvalProtocol:
         """Return the protocol; see `PolicyUnderTest`. Of a served run it is the one that the run has in process.
 
         Raises:
             ProtocolMismatchError: The server announces something else; the message names both values.
             ProtocolError: The protocol does not state how many actions are executed, and the server needs it.
         """
-        if self.own:
-            about = self.announced
-            own = (about["horizon"], about["settle_steps"], about["robot"])
-            drawing, assets = about.get("drawing"), self.args.assets
-            return run_protocol(base, self._image_size(), *own, drawing=drawing, assets=assets)
-        base.check(SCHEMES[self._scheme][1](self.announced))
-        if base.action.replan is None and self._scheme != "vla-eval":
+        about = self.announced
+        if self.is_run:
+            return run_protocol(
+                base,
+                tuple(about["observation"][PREFIX + self._views[0]]["shape"][:2]),
+                about["horizon"],
+                about["settle_steps"],
+                about["robot"],
+                drawing=about.get("drawing"),
+                assets=self.request.assets,
+            )
+        base.check(self._kind.stated(about))
+        if base.action.replan is None and self._kind is not VlaEvalClient:
             raise ProtocolError(
                 f"protocol {base.name} does not state action.replan, the number of actions that are executed of each "
-                f"answer: write a card with `extends: {base.name}` that does, and give its path to --protocol"
+                f"answer: write a file with `extends: {base.name}` that does, and give its path to --protocol"
             )
         return base
 
-    def env(self, task: Task, count: int, protocol: Card) -> VectorEnv:
-        """Build the environment of a task; see `PolicyUnderTest`."""
-        if self.own:
-            cameras = tuple(CAMERAS[view] for view in self._views())
-            return make_env(task, count, protocol, cameras=cameras, **self.simulated)
-        adapter = CardAdapter(protocol, task)
-        return make_env(
-            task,
-            count,
-            protocol,
-            cameras=adapter.cameras,
-            observations=adapter.observations,
-            **self.simulated,
-        )
-
     @contextmanager
-    def actor(self, task: Task, states: Sequence[int], protocol: Card) -> Iterator[Actor]:
+    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
         """Yield the actor of episodes, with connections of its own; see `PolicyUnderTest`.
 
         Raises:
             ServerError: The server is not there any more, or announces something else than at first.
         """
         episodes = [EpisodeStart(task, state) for state in states]
-        if self.own:
-            seeds = [(self.args.seed, EVALUATION, task.index, state) for state in states]
-            served = ServedActor(self.args.policy, self.announced, episodes, seeds, self.limits)
-            try:
-                yield served
-            finally:
-                served.close()
-            return
-        wire = self._wire()
-        try:
-            if not same(wire.announced, self.announced):
-                raise ServerError(
-                    f"{self.args.policy} announces {summary(wire.announced)}, but at first "
-                    f"{summary(self.announced)}: another policy is served there now; evaluate it by itself"
-                )
-            adapter = CardAdapter(protocol, task)
-            views = tuple(f"{camera.removeprefix('robot0_')}_rgb" for camera in adapter.cameras)
-            yield RemoteActor(wire, adapter, episodes, views=views, replan=protocol.action.replan)
-        finally:
-            wire.close()
+        with self._client() as client:
+            client.check_same(client.announced, self.announced)
+            if self.is_run:
+                assert isinstance(client, OpenpiClient)
+                yield ServedActor(client, self.announced, episodes, self.seeds(task, states))
+            else:
+                views = tuple(map(view_of, protocol.pixels.cameras))
+                adapter, replan = ProtocolAdapter(protocol, task), protocol.action.replan
+                yield RemoteActor(client, adapter, episodes, views=views, replan=replan)
 
-    @property
-    def _scheme(self) -> str:
-        return self.args.policy.partition("://")[0]
-
-    def _wire(self) -> Wire:
-        scheme, found, rest = self.args.policy.partition("://")
-        if not found or scheme not in SCHEMES:
-            raise UnknownNameError("kind of server", scheme, SCHEMES)
-        address = checked_address(f"{SCHEMES[scheme][0]}://{rest}", self.args.policy)
-        if scheme == "gr00t":
-            return GrootWire(address, self.limits)
-        dialect = VlaEvalDialect() if scheme == "vla-eval" else OpenpiDialect()
-        return WebSocketWire(address, dialect, self.limits)
-
-    def _views(self) -> list[str]:
-        names = [key.removeprefix(PREFIX) for key in self.announced["observation"]]
-        return [name for name in names if name in CAMERAS]
-
-    def _image_size(self) -> tuple[int, int]:
-        height, width, _ = self.announced["observation"][PREFIX + self._views()[0]]["shape"]
-        return height, width
-
-    def _tasks(self) -> Iterator[Task]:
-        """Yield the tasks of a served run that are tasks of the benchmark."""
-        for name in self.announced["tasks"] if self.own else ():
-            if not name.startswith("file/"):
-                yield get_task(name)
+    @contextmanager
+    def _client(self) -> Iterator[PolicyClient]:
+        scheme, separator, rest = self.given.partition("://")
+        if not separator or scheme not in CLIENTS:
+            raise UnknownNameError("kind of server", scheme, CLIENTS)
+        kind, transport = CLIENTS[scheme]
+        limits = Limits(answer=self.request.timeout, in_flight=self.request.in_flight)
+        with closing(kind(checked_address(f"{transport}://{rest}", self.given), limits)) as client:
+            yield client

@@ -1,34 +1,291 @@
-"""A WebSocket server of policies in openpi's protocol.
+"""A run's policy for clients in openpi's protocol: the server, what it announces, and the episodes of a client.
 
 The metadata are sent first; each observation is answered by a map with `actions` and `server_timing`. An error is sent
 as text, its traceback, and ends the connection with code 1011. `GET /healthz` answers `OK`. Source: openpi
 `src/openpi/serving/websocket_policy_server.py`.
+
+An episode begins with the first request on a connection, with another `prompt` or `task`, and with a request that has
+`reset: true`; nothing else. Each client has a history and, for stochastic policies, generators of its own.
 """
 
 import asyncio
+import copy
 import hmac
 import os
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from http import HTTPStatus
-from typing import Any, Protocol
+from itertools import count
+from typing import Any
 
-from libero_eval.servers.codecs import OPENPI
-from libero_eval.servers.connections import API_KEY
-from libero_eval.servers.packages import need
+import numpy as np
+
+from libero_env.tasks import Task, get_suite, suite_names
+from libero_eval.servers.openpi import OPENPI
+from libero_eval.servers.transport import API_KEY, need
+from lifelong.algorithms.base import Algorithm
+from lifelong.errors import PolicyError
+from lifelong.evaluation.actors import PolicyActor
+from lifelong.evaluation.restore import LoadedRun
+from lifelong.results.provenance import installed_versions
+from lifelong.seeding import generator
+
+SERVER, FORMAT = "libero-lifelong", 1  # the first entries of what is announced
+PREFIX = "observation/"
+_SERVED = 5  # first word of the seeds of episodes whose client sends none
+# names of openpi's LIBERO observations, and what of a policy's inputs follows from them
+_OPENPI_IMAGES = {"agentview_rgb": "image", "eye_in_hand_rgb": "wrist_image"}
+_OPENPI_STATE = {"ee_pos": slice(0, 3), "gripper_states": slice(6, 8)}
 
 
-class Answering(Protocol):
-    """One client's episodes."""
+@dataclass(frozen=True)
+class Request:
+    """A client's observation.
+
+    Attributes:
+        obs: (B, ...) arrays under the names of `libero_env.envs.batch.BatchEnv`.
+        rows: Whether the client sent a leading axis B; otherwise B is 1.
+        task: Task that is acted on.
+        reset: Whether an episode begins with this request.
+        seeds: Words from which the generator of each row is made, if the client sent them.
+    """
+
+    obs: Mapping[str, np.ndarray]
+    rows: bool
+    task: Task
+    reset: bool
+    seeds: Sequence[Sequence[int]] | None
+
+
+class ServedPolicy:
+    """A run's policy, for any number of clients.
+
+    Args:
+        run: The run.
+        seed: Seed of the generators of episodes whose client sends none.
+    """
+
+    def __init__(self, run: LoadedRun, *, seed: int = 0):
+        self.run, self.seed = run, seed
+        self._sessions = count()
+
+    @cached_property
+    def metadata(self) -> dict[str, Any]:
+        """What is announced to every client, plain data."""
+        run, spec = self.run, self.run.policy.spec
+        images: dict[str, Any] = {
+            view: {"dtype": "uint8", "shape": [*spec.image_size, 3]} for view in spec.views
+        }
+        readings = {name: {"dtype": "float64", "shape": [size]} for name, size in spec.proprio.items()}
+        return {
+            "server": SERVER,
+            "format": FORMAT,
+            "versions": installed_versions(),
+            "run": run.path.name,
+            "after": run.learned,
+            "weights": run.weights_digest,
+            "protocol": "libero",
+            "horizon": run.eval.horizon,
+            "settle_steps": run.eval.settle_steps,
+            "drawing": run.drawing,
+            "robot": run.robot,
+            "selection": list(run.eval.init_states("curve")),
+            "observation": {PREFIX + name: about for name, about in (images | readings).items()},
+            "images": "upright: first row on top, not mirrored",
+            "actions": {"dtype": "float64", "shape": [1, spec.action_dim], "chunk": 1, "replan": 1},
+            "gripper": "opens at -1, closes at +1",
+            "openpi_names": not self._lacking(),
+            "tasks": {task.id: task.language for task in run.tasks},
+            "reset": "an episode begins with a connection, another prompt or task, or reset: true",
+        }
+
+    def session(self) -> "Session":
+        """Return the episodes of a new client."""
+        return Session(self, next(self._sessions))
+
+    def own_copy(self) -> LoadedRun:
+        """Return the run with a policy that acts by itself; weights are shared where the algorithm changes none."""
+        policy, algorithm = self.run.policy, self.run.algorithm
+        shared: dict[int, Any] = {}
+        if type(algorithm).policy_for is Algorithm.policy_for:
+            shared = {id(t): t for t in (*policy.parameters(), *policy.buffers())}
+        policy, algorithm = copy.deepcopy((policy, algorithm), shared)
+        return replace(self.run, policy=policy, algorithm=algorithm)
+
+    def read(self, message: Any, before: Task | None) -> Request:
+        """Return a client's message as a request.
+
+        Args:
+            message: The message.
+            before: Task of the client's last request.
+
+        Raises:
+            PolicyError: A key is missing, or a value has the wrong type, dtype or shape.
+        """
+        if not isinstance(message, Mapping):
+            raise PolicyError(f"a request is a map of names and values, not a {type(message).__name__}")
+        if PREFIX + "image" in message and PREFIX + self.run.policy.spec.views[0] not in message:
+            message = self._from_openpi(message)
+        spec = self.run.policy.spec
+        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(spec.views, (*spec.image_size, 3))
+        shapes |= {name: (size,) for name, size in spec.proprio.items()}
+        first = np.ndim(message.get(PREFIX + spec.views[0], 0))
+        rows = first == 4
+        obs = {name: _checked(message, name, shape, rows) for name, shape in shapes.items()}
+        if len({len(value) for value in obs.values()}) > 1:
+            raise PolicyError(
+                f"numbers of rows differ: { {name: len(value) for name, value in obs.items()} }"
+            )
+        task = self._task(message, before)
+        seeds = message.get("seed")
+        if seeds is not None:
+            seeds = _seeds(seeds, len(next(iter(obs.values()))), rows)
+        return Request(obs, rows, task, bool(message.get("reset", False)), seeds)
+
+    def _task(self, message: Mapping[str, Any], before: Task | None) -> Task:
+        """Return the task that a request names by `task`, `suite/index`, or by its instruction, `prompt`.
+
+        `instruction` is what the policy is told instead of the task's own words.
+        """
+        prompt, name = message.get("prompt"), message.get("task")
+        if prompt is None and name is None and before is not None:
+            return before
+        known = {task.id: task for task in self.run.tasks}
+        if isinstance(name, str):
+            found = [known[name]] if name in known else [t for t in _tasks() if t.id == name]
+        else:
+            found = [t for t in self.run.tasks if t.language == prompt]
+            found = found or [t for t in _tasks() if t.language == prompt]
+        if len(found) == 1 and prompt in (None, found[0].language):
+            told = message.get("instruction")
+            return replace(found[0], language=told) if isinstance(told, str) else found[0]
+        if len(found) > 1:
+            ids = ", ".join(t.id for t in found)
+            raise PolicyError(
+                f"several tasks have the instruction {prompt!r}; send one of them as `task`: {ids}"
+            )
+        valid = "; ".join(f"{t.id}: {t.language}" for t in self.run.tasks)
+        raise PolicyError(f"no task with prompt {prompt!r} and task {name!r}. The run's tasks: {valid}")
+
+    def _lacking(self) -> list[str]:
+        """Return the policy's inputs that do not follow from openpi's observations of LIBERO."""
+        spec = self.run.policy.spec
+        return [n for n in spec.views if n not in _OPENPI_IMAGES] + [
+            n for n in spec.proprio if n not in _OPENPI_STATE
+        ]
+
+    def _from_openpi(self, message: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a request under openpi's names for LIBERO under the policy's own names.
+
+        openpi turns images by 180 degrees from the simulator's bottom-up rows: they are upright, and mirrored.
+        """
+        spec = self.run.policy.spec
+        if lacking := self._lacking():
+            names = ", ".join(PREFIX + name for name in (*spec.views, *spec.proprio))
+            raise PolicyError(
+                f"this policy needs {', '.join(lacking)}, which observation/image, observation/wrist_image and "
+                f"observation/state do not hold; send {names}"
+            )
+        found = {k: v for k, v in message.items() if not str(k).startswith(PREFIX)}
+        for view in spec.views:
+            image = _checked(message, _OPENPI_IMAGES[view], (*spec.image_size, 3), False)[0]
+            found[PREFIX + view] = image[:, ::-1]
+        if spec.proprio:
+            state = _checked(message, "state", (8,), False)[0]
+            found |= {PREFIX + name: state[_OPENPI_STATE[name]] for name in spec.proprio}
+        return found
+
+
+class Session:
+    """The episodes of one client: a policy with its own history.
+
+    Args:
+        served: The policy that is served.
+        number: Number of the client, from 0.
+    """
+
+    def __init__(self, served: ServedPolicy, number: int):
+        self._served, self._number = served, number
+        self._run: LoadedRun | None = None
+        self._stack, self._episodes = ExitStack(), 0
+        self._actor: PolicyActor | None = None
+        self._task: Task | None = None
+        self._rows = 0
 
     def infer(self, message: Any) -> dict[str, Any]:
-        """Return the answer to a request."""
+        """Return the answer to a request: `actions` (1, 7) float64, or (B, 1, 7) for B rows.
+
+        Raises:
+            PolicyError: The request is not valid.
+        """
+        request = self._served.read(message, self._task)
+        rows = len(next(iter(request.obs.values())))
+        if self._actor is None or request.reset or self._task != request.task:
+            self._begin(request, rows)
+        elif rows != self._rows:
+            raise PolicyError(
+                f"{rows} rows in an episode that began with {self._rows}; begin another with reset: true"
+            )
+        assert self._actor is not None
+        actions = self._actor.act(request.obs)[:, None]
+        return {"actions": actions if request.rows else actions[0]}
 
     def close(self) -> None:
         """Forget the client."""
+        self._stack.close()
+        self._actor = self._run = None
+
+    def _begin(self, request: Request, rows: int) -> None:
+        self._stack.close()
+        self._run = run = self._run or self._served.own_copy()
+        seeds = request.seeds
+        if seeds is None:
+            words = (self._served.seed, _SERVED, self._number, self._episodes)
+            seeds = [(*words, row) for row in range(rows)]
+        policy = self._stack.enter_context(run.acting(request.task))
+        draws = [generator(*words) for words in seeds]
+        actor = PolicyActor(policy, run.embed(request.task), run.device, run.eval.precision, draws)
+        actor.reset(rows)
+        self._actor, self._task, self._rows = actor, request.task, rows
+        self._episodes += 1
+
+
+def _tasks() -> list[Task]:
+    return [task for name in suite_names() for task in get_suite(name).tasks]
+
+
+def _checked(message: Mapping[str, Any], name: str, shape: tuple[int, ...], rows: bool) -> np.ndarray:
+    """Return an array of a request with a leading axis, (B, *shape)."""
+    key, image = PREFIX + name, len(shape) == 3
+    if key not in message:
+        names = ", ".join(sorted(str(k) for k in message)) or "nothing"
+        raise PolicyError(f"the request lacks {key}; it has {names}")
+    value = np.asarray(message[key])
+    expected = f"({'B, ' if rows else ''}{', '.join(map(str, shape))})"
+    wanted = "u" if image else "fiu"
+    found = value if rows else value[None]
+    if value.dtype.kind not in wanted or (image and value.dtype != np.uint8):
+        raise PolicyError(f"{key} has dtype {value.dtype}; valid: {'uint8' if image else 'floats'}")
+    if found.shape[1:] != shape or not len(found):
+        raise PolicyError(f"{key} has shape {value.shape}; this policy's is {expected}")
+    if not image and not np.isfinite(found).all():
+        raise PolicyError(f"{key} has values that are not finite")
+    return found
+
+
+def _seeds(seeds: Any, count: int, rows: bool) -> list[tuple[int, ...]]:
+    """Return the words of each row's seed: a list of integers, or one such list for each row."""
+    found = np.asarray(seeds if rows else [seeds])
+    if found.ndim != 2 or found.dtype.kind not in "iu" or len(found) != count or (found < 0).any():
+        raise PolicyError(
+            f"seed is {seeds!r}; valid: integers from 0, as a list, or a list for each of {count} rows"
+        )
+    return [tuple(map(int, words)) for words in found]
 
 
 class PolicyServer:
@@ -47,7 +304,7 @@ class PolicyServer:
     def __init__(
         self,
         metadata: dict[str, Any],
-        session: Callable[[], Answering],
+        session: Callable[[], Session],
         *,
         host: str = "127.0.0.1",
         port: int = 8000,
@@ -91,7 +348,7 @@ class PolicyServer:
         finally:
             await self._in_worker(session.close)
 
-    def _answer(self, session: Answering, data: bytes | str, last: float | None) -> bytes:
+    def _answer(self, session: Session, data: bytes | str, last: float | None) -> bytes:
         if isinstance(data, str):
             data = data.encode()
         request = OPENPI.unpack(data)

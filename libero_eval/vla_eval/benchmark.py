@@ -1,4 +1,4 @@
-"""A benchmark of vla-eval that is simulated here, under one of our protocol cards.
+"""A benchmark of vla-eval that is simulated here, under one of our protocols.
 
 `vla-eval run` takes it by its import string, `libero_eval.vla_eval:LiberoBenchmark`, with `docker` off. Its
 observations have the keys of vla-eval's own `LIBEROBenchmark` (0.8.0, vla_eval/benchmarks/libero/benchmark.py), so that
@@ -11,37 +11,58 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.tasks import Task, get_suite
-from libero_eval.protocols.adapter import CardAdapter
-from libero_eval.protocols.environment import ProtocolEnv, make_env, resolve_world, run_protocol
-from libero_eval.protocols.files import load_card
-from libero_eval.protocols.protocol import Card
-from libero_eval.vla_eval.harness import StepBenchmark, StepResult, require
+from libero_eval.protocols.adapter import ProtocolAdapter
+from libero_eval.protocols.environment import OBSERVATIONS, ProtocolEnv, resolve_world, run_protocol
+from libero_eval.protocols.files import load_protocol
+from libero_eval.protocols.protocol import EvalProtocol
 from lifelong.errors import PolicyError
-from lifelong.evaluation.inputs import Obs
+from lifelong.evaluation.environments import Obs
 from lifelong.results.provenance import installed_versions
 
-ADJUSTABLE = ("vla-eval", "libero")  # cards that leave some fields to what a policy asks for
+try:
+    from vla_eval.benchmarks.base import StepBenchmark, StepResult
+
+    INSTALLED = True
+except ImportError:  # the classes can be imported but not made
+    INSTALLED = False
+    StepBenchmark: Any = object  # type: ignore[no-redef]
+    StepResult: Any = object  # type: ignore[no-redef]
+
+VERSION = "0.8.0"  # of vla-eval that the tests run
+ADJUSTABLE = ("vla-eval", "libero")  # protocols that leave some fields to what a policy asks for
 IMAGES = {"agentview": "agentview", "robot0_eye_in_hand": "wrist"}  # camera -> key
 PREFIX = "observation/"
 logger = logging.getLogger(__name__)
 
 
+def require() -> None:
+    """Check that vla-eval is installed.
+
+    Raises:
+        MissingPackageError: It is not.
+    """
+    if not INSTALLED:
+        raise MissingPackageError(
+            "this class is one of vla-eval's, which is not installed", f"pip install vla-eval=={VERSION}"
+        )
+
+
 class LiberoBenchmark(StepBenchmark):
-    """Tasks of one suite under a protocol card; the same episodes as `libero eval --protocol`.
+    """Tasks of one suite under a protocol; the same episodes as `libero eval --protocol`.
 
     Episode i of a task starts in initial state i. Observations are `images` (`agentview`, and `wrist`), `states` and
-    `task_description`, after the whole of the card's processing; with `observations`, they are instead our own arrays
-    under the names that `libero serve` takes, `observation/agentview_rgb`.
+    `task_description`, after the whole of the protocol's processing; with `observations`, they are instead our own
+    arrays under the names that `libero serve` takes, `observation/agentview_rgb`.
 
-    A card fixes what a policy sees. What the model server announces (its parameters reach this constructor) must agree
-    with it, or the run is refused. The cards `vla-eval` and `libero` take the values of `seed`, `env_seed`,
+    A protocol fixes what a policy sees. What the model server announces (its parameters reach this constructor) must
+    agree with it, or the run is refused. The protocols `vla-eval` and `libero` take the values of `seed`, `env_seed`,
     `num_steps_wait`, `max_steps`, `quat_no_antipodal` and `absolute_action` instead, as vla-eval's own benchmark does.
 
     Args:
         suite: Name of the suite.
-        card: Name of a protocol card, or path of one.
+        card: Name of a protocol, or path of its file.
         task_ids: Indices of the tasks; None for all.
         send_wrist_image: Whether observations have the image of the wrist's camera.
         send_state: Whether they have the state.
@@ -57,9 +78,9 @@ class LiberoBenchmark(StepBenchmark):
 
     Raises:
         MissingPackageError: vla-eval is not installed.
-        UnknownNameError: The suite or the card does not exist.
-        ProtocolMismatchError: The server or the configuration asks for something else than the card; both values are
-            named.
+        UnknownNameError: The suite or the protocol does not exist.
+        ProtocolMismatchError: The server or the configuration asks for something else than the protocol; both values
+            are named.
         LiberoError: A task does not exist.
     """
 
@@ -104,18 +125,18 @@ class LiberoBenchmark(StepBenchmark):
             "proprioception.rotation": _rotation(quat_no_antipodal),
         }
         self.tasks = _tasks(suite, task_ids)
-        chosen = load_card(card)
+        chosen = load_protocol(card)
         if self.observations is None:
             chosen = _agreed(chosen, {k: v for k, v in asked.items() if v is not None})
         else:
             height, width = camera_size or chosen.pixels.render_size or (128, 128)
             settling = chosen.settle_steps if num_steps_wait is None else num_steps_wait
             chosen = run_protocol(chosen, (height, width), max_steps or 600, settling)
-        self.card, notes = resolve_world(chosen, self.tasks, assets)
-        self.card.require()
+        self.protocol, notes = resolve_world(chosen, self.tasks, assets)
+        self.protocol.require()
         for note in notes:
             logger.warning(note)
-        self._adapter: CardAdapter | None = None
+        self._adapter: ProtocolAdapter | None = None
         self._task: Task | None = None
         self._env: ProtocolEnv | None = None
         self._ever = False
@@ -124,12 +145,12 @@ class LiberoBenchmark(StepBenchmark):
         """Return the tasks; each has what identifies the simulation, which vla-eval stores with every episode."""
         versions = installed_versions(self.assets)
         about = {
-            "protocol": self.card.name,
-            "protocol_digest": self.card.digest,
+            "protocol": self.protocol.name,
+            "protocol_digest": self.protocol.digest,
             "models": versions["models"],
             "models_digest": versions["models_digest"],
-            "drawing": self.card.world.drawing,
-            "robot": self.card.world.robot,
+            "drawing": self.protocol.world.drawing,
+            "robot": self.protocol.world.robot,
             "mujoco": versions["mujoco"],
             "libero_lifelong": versions.get("libero-lifelong", "source"),
         }
@@ -140,7 +161,7 @@ class LiberoBenchmark(StepBenchmark):
                 "name": t.language if languages.count(t.language) == 1 else f"{t.language} ({t.id})",
                 "suite": self.suite,
                 "task_id": t.index,
-                "prompt": self.card.prompt(t),
+                "prompt": self.protocol.prompt(t),
                 **about,
             }
             for t in self.tasks
@@ -150,8 +171,8 @@ class LiberoBenchmark(StepBenchmark):
         """Start an episode in the initial state `episode_idx` of a task, and let the objects settle."""
         env = self._open(next(t for t in self.tasks if t.index == task["task_id"]))
         obs, _ = env.reset(options={"init_state": np.array([task.get("episode_idx", 0)])})
-        settling = np.zeros(7) if self.card.settle_action is None else np.asarray(self.card.settle_action)
-        for _ in range(self.card.settle_steps):
+        settling = np.asarray(self.protocol.episode.settle_action or np.zeros(7))
+        for _ in range(self.protocol.settle_steps):
             obs, *_ = env.step(settling[None])
         self._ever = False
         self._recorder.record_video(self._frame(obs))
@@ -181,20 +202,20 @@ class LiberoBenchmark(StepBenchmark):
         """Return what the server receives for an observation of the simulation."""
         assert self._adapter is not None and self._task is not None, "reset was called"
         if self.observations is not None:
-            own = {PREFIX + name: raw_obs[name][0] for name in self.observations}
-            told = self._task if self._env is None else self._env.task
-            return {"task_description": told.language, "task": told.id, **own}
+            arrays = {PREFIX + name: raw_obs[name][0] for name in self.observations}
+            acted = self._task if self._env is None else self._env.task
+            return {"task_description": acted.language, "task": acted.id, **arrays}
         (given,) = self._adapter.inputs(raw_obs)
         cameras = [c for c in given.images if c == "agentview" or self.send_wrist_image]
-        found: dict[str, Any] = {
+        observation: dict[str, Any] = {
             "images": {IMAGES[camera]: given.images[camera] for camera in cameras},
             "task_description": given.prompt,
         }
         if self.send_state:
-            found |= {"states": given.state, **given.extra}
-            if self.card.name == "vla-eval":
-                found["controller_states"] = self._controller_state(raw_obs)
-        return found
+            observation |= {"states": given.state, **given.extra}
+            if self.protocol.name == "vla-eval":
+                observation["controller_states"] = self._controller_state(raw_obs)
+        return observation
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
         """Return the outcome of an episode."""
@@ -203,10 +224,10 @@ class LiberoBenchmark(StepBenchmark):
     def get_metadata(self) -> dict[str, Any]:
         """Return the length of episodes, their number, and everything that identifies protocol and simulation."""
         return {
-            "max_steps": max(self.card.steps(task) for task in self.tasks),
+            "max_steps": max(self.protocol.steps(task) for task in self.tasks),
             "max_episodes_per_task": 50,
             "suite": self.suite,
-            "card": self.card.resolved(),
+            "card": self.protocol.resolved(),
             "versions": installed_versions(self.assets),
         }
 
@@ -220,9 +241,9 @@ class LiberoBenchmark(StepBenchmark):
             ROTATION_AA,
         )
 
-        opens = (self.card.action.gripper or "").startswith("open")
+        opens = (self.protocol.action.gripper or "").startswith("open")
         gripper = GRIPPER_01 if opens else GRIPPER_CLOSE_POS
-        position = POSITION_DELTA if self.card.world.delta else POSITION_ABSOLUTE
+        position = POSITION_DELTA if self.protocol.world.delta else POSITION_ABSOLUTE
         return {"position": position, "rotation": ROTATION_AA, "gripper": gripper}
 
     def get_observation_spec(self) -> dict[str, Any]:
@@ -246,24 +267,25 @@ class LiberoBenchmark(StepBenchmark):
 
     def render(self) -> np.ndarray | None:
         """Return the present image of the agent's camera, (H, W, 3) uint8."""
-        return None if self._env is None else self._env.env.observer.render(0, "agentview")
+        return None if self._env is None else self._env.observer.render(0, "agentview")
 
     def _open(self, task: Task) -> ProtocolEnv:
         """Return the simulation of a task; it is kept for all of the task's episodes."""
         if self._env is None or self._task is not task:
             self.cleanup()
-            self._task, self._adapter = task, CardAdapter(self.card, task)
-            native = self.observations
-            self._env = make_env(
+            self._task, native = task, self.observations
+            self._env = ProtocolEnv(
+                self.protocol,
                 task,
                 1,
-                self.card,
-                cameras=_cameras(native) if native else self._adapter.cameras,
-                observations=_entries(native) if native else self._adapter.observations,
+                cameras=_cameras(native) if native else None,
+                observations=_entries(native) if native else OBSERVATIONS,
                 assets=self.assets,
                 drawing=None if native else "protocol",
             )
-            self._adapter = CardAdapter(self.card, self._env.task)  # as the card's perturbations change it
+            self._adapter = ProtocolAdapter(
+                self.protocol, self._env.task
+            )  # as the protocol's perturbations change it
         return self._env
 
     def _controller_state(self, obs: Obs) -> np.ndarray:
@@ -297,22 +319,22 @@ def _tasks(suite: str, ids: Sequence[int] | None) -> tuple[Task, ...]:
 
 
 def _rotation(quat_no_antipodal: bool | None) -> str | None:
-    """Return a card's name of the convention of rotation vectors, None if none is asked for."""
+    """Return a protocol's name of the convention of rotation vectors, None if none is asked for."""
     if quat_no_antipodal is None:
         return None
     return "axis_angle" if quat_no_antipodal else "axis_angle_positive"
 
 
-def _agreed(card: Card, asked: dict[str, Any]) -> Card:
-    """Return the card with what is asked for, if it leaves that open; otherwise check that it is the same."""
-    if card.name not in ADJUSTABLE:
-        card.check(asked)
-        return card
-    if card.world.fixture_poses == "stored":
+def _agreed(protocol: EvalProtocol, asked: dict[str, Any]) -> EvalProtocol:
+    """Return the protocol with what is asked for, if it leaves that open; otherwise check that it is the same."""
+    if protocol.name not in ADJUSTABLE:
+        protocol.check(asked)
+        return protocol
+    if protocol.world.fixture_poses == "stored":
         asked.pop("world.env_seed", None)  # nothing is drawn
     if asked.get("episode.settle_steps") == 0:
         asked["episode.settle_action"] = None
-    return card.changed(asked)
+    return protocol.changed(asked)
 
 
 def _cameras(names: Sequence[str]) -> tuple[str, ...]:

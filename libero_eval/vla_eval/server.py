@@ -12,11 +12,16 @@ from pathlib import Path
 from typing import Any
 
 from libero_env.tasks import Task, get_suite
-from libero_eval.servers.sessions import PREFIX, ServedPolicy, Session
-from libero_eval.vla_eval.harness import PredictModelServer, require
+from libero_eval.servers.serving import PREFIX, ServedPolicy, Session
+from libero_eval.vla_eval.benchmark import require
 from lifelong.errors import PolicyError
 from lifelong.evaluation.restore import restore
 from lifelong.seeding import EVALUATION
+
+try:
+    from vla_eval.model_servers.predict import PredictModelServer
+except ImportError:  # the class can be imported but not made
+    PredictModelServer: Any = object  # type: ignore[no-redef]
 
 
 class RunServer(PredictModelServer):

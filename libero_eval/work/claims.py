@@ -5,7 +5,7 @@ while it works. A claim is abandoned when it has not been touched for the length
 holder ran on this machine and is gone. Times are those of the file server, so that clocks may differ.
 
 Claims save work, they do not guard results: two processes may both believe they hold a unit, for instance after one was
-suspended. Whoever publishes a unit's result first wins (see `libero_eval.work.folder`).
+suspended. Whoever publishes a unit's result first wins (see `libero_eval.work.store`).
 """
 
 import json

@@ -1,12 +1,14 @@
-"""Progress of an evaluation that several processes share, and its results as lines of a table."""
+"""How far an evaluation is that several processes share, and its results as lines of a table."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from libero_env.tasks.published import parse_plus_id
-from libero_eval.evaluation_file import TaskResult, overall
-from libero_eval.work.folder import UnitResult
+from libero_env.text import duration
+from libero_eval.evaluation_file import FILE_NAME, TaskResult, overall
+from libero_eval.work.store import UnitResult, WorkStore, read_plan, read_unit
 from lifelong.stats.intervals import Estimate
 
 PLUS = "libero_plus_"  # beginning of the names of suites of LIBERO-Plus
@@ -48,7 +50,7 @@ class Progress:
         ]
         if math.isfinite(self.per_hour):
             parts += [f"{self.per_hour:,.0f} an hour"]
-            parts += [f"{show_time(self.seconds_left)} left"] if self.done < self.units else []
+            parts += [f"{duration(self.seconds_left)} left"] if self.done < self.units else []
         parts += [f"{self.running} running"] if self.running else []
         parts += [f"{self.failed} with errors"] if self.failed else []
         return ", ".join(parts)
@@ -65,9 +67,9 @@ def measure_progress(
         running: Number of units that processes work on.
         failed: Number of units with errors.
     """
-    recent = sorted(done.values(), key=lambda found: found.finished)[-RECENT:]
-    busy = busy_seconds((found.started, found.finished) for found in recent)
-    count = sum(len(found.result.init_states) for found in recent)
+    recent = sorted(done.values(), key=lambda unit: unit.finished)[-RECENT:]
+    busy = busy_seconds((unit.started, unit.finished) for unit in recent)
+    count = sum(len(unit.result.init_states) for unit in recent)
     return Progress(
         units=len(units),
         done=sum(name in done for name in units),
@@ -88,13 +90,34 @@ def busy_seconds(spans: Iterable[tuple[float, float]]) -> float:
     return total
 
 
-def show_time(seconds: float) -> str:
-    """Return a duration as text, such as `40 s`, `12 min` or `3.4 h`."""
-    if not math.isfinite(seconds):
-        return "unknown time"
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+def describe_status(path: Path) -> str:
+    """Return how far an evaluation is, who works on which unit, and what went wrong, as text.
+
+    Args:
+        path: Folder of the evaluation.
+
+    Raises:
+        LifelongError: The folder holds no evaluation, or a broken file.
+    """
+    plan = read_plan(path)
+    store = WorkStore(path, plan)
+    files = {name: path / "units" / f"{name}.json" for name in plan["units"]}
+    done = {name: read_unit(file)[0] for name, file in files.items() if file.is_file()}
+    held, errors = store.claims.held(), store.errors()
+    lines = [
+        f"policy    {', '.join(f'{k} {v}' for k, v in plan['evaluated'].items())}",
+        f"progress  {measure_progress(plan['units'], done, len(held), len(errors))}",
+    ]
+    for name, claim in sorted(held.items()):
+        who = claim.claim.holder if claim.claim else "a process that is starting"
+        lines.append(f"running   {name} by {who}, seen {max(0.0, claim.silent):.0f} s ago")
+    for name, error in errors.items():
+        lines.append(f"error     {name}, {error.attempts} attempts: {error.last}; see {error.path}")
+    if len(done) == len(files):
+        lines.append(f"result    {path / FILE_NAME}")
+    elif not held:
+        lines.append("stopped   no process works on it; the same command goes on")
+    return "\n".join(lines)
 
 
 HEADER = f"{'task':<18} {'successes':>9} {'%':>6} {'95 %':>13} {'steps':>6}  instruction"

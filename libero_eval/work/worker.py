@@ -1,24 +1,29 @@
-"""One process of an evaluation: it takes units from the folder until all are done, and writes the result."""
+"""Processes of an evaluation: each takes units from the folder until all are done, and writes the result."""
 
 import math
+import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from multiprocessing.process import BaseProcess
+from typing import Any
 
 from libero_env.errors import LiberoError
+from libero_env.parallel import end_with_parent
 from libero_env.text import printable
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.work.claims import Claim
-from libero_eval.work.folder import UnitErrors, UnitResult, describe
+from libero_eval.work.evaluation import Evaluation
 from libero_eval.work.progress import Progress, measure_progress
-from libero_eval.work.suite import SuiteEvaluation
-from libero_eval.work.units import Unit
+from libero_eval.work.store import Unit, UnitErrors, UnitResult, describe
 from lifelong.errors import ConnectionLost, EvaluationIncompleteError
 
 POLL = 0.5  # s between two looks at the folder while other processes work on the last units
 SAY_EVERY = 30.0  # s between two lines of progress
 FAILURES_IN_A_ROW = 3  # of units, which end a process
+_MOST_DEATHS = 3  # killed processes that are replaced without a unit being finished in between
+_PATIENCE = 30.0  # s; for processes to end by themselves
 
 
 class Worker:
@@ -34,14 +39,14 @@ class Worker:
 
     def __init__(
         self,
-        evaluation: SuiteEvaluation,
+        evaluation: Evaluation,
         *,
         on_result: Callable[[TaskResult], None] = lambda _: None,
         on_progress: Callable[[Progress], None] = lambda _: None,
         on_error: Callable[[str], None] = lambda text: print(printable(text), file=sys.stderr, flush=True),
         on_wait: Callable[[int], None] = lambda _: None,
     ):
-        self._evaluation, self._folder = evaluation, evaluation.folder
+        self._evaluation, self._store = evaluation, evaluation.store
         self._on_result, self._on_progress = on_result, on_progress
         self._on_error, self._on_wait = on_error, on_wait
         self._attempts_before: dict[str, int] = {}
@@ -56,9 +61,9 @@ class Worker:
             ConfigError: The folder holds another evaluation.
             EvaluationIncompleteError: Units ended with errors, and there is nothing else to do.
         """
-        found = self.work(wait=True)
-        assert found is not None
-        return found
+        result = self.work(wait=True)
+        assert result is not None
+        return result
 
     def work(self, *, wait: bool) -> EvaluationResult | None:
         """Evaluate units; write `eval.json` and return its content if all are done.
@@ -70,24 +75,24 @@ class Worker:
             ConfigError: The folder holds another evaluation.
             EvaluationIncompleteError: Units ended with errors, and there is nothing else to do.
         """
-        evaluation, folder = self._evaluation, self._folder
-        folder.join(evaluation.units)
-        self._attempts_before = {name: found.attempts for name, found in folder.errors().items()}
+        evaluation, store = self._evaluation, self._store
+        store.join(evaluation.units)
+        self._attempts_before = {name: errors.attempts for name, errors in store.errors().items()}
         if done := self._look():  # somebody has begun
             self._say(done)
         with evaluation.pool() as self._pool:
             while len(done := self._look()) < len(evaluation.units):
                 self._on_wait(len(done))
-                errors, held = folder.errors(), set(folder.held())
+                errors, held = store.errors(), set(store.held())
                 choice = self._order(done, errors, held)
-                if taken := folder.take(choice):
+                if taken := store.take(choice):
                     self._work(*taken)
                 elif not wait:
                     return None
                 elif choice or held:
                     self._say(done)
                     time.sleep(POLL)
-                elif len(folder.done(evaluation.units)) == len(done):
+                elif len(store.done(evaluation.units)) == len(done):
                     raise self._incomplete(errors)
         result = evaluation.result(done)
         result.write(evaluation.out / FILE_NAME)
@@ -95,11 +100,11 @@ class Worker:
 
     def _look(self) -> Mapping[str, UnitResult]:
         """Return the units that are done; announce the tasks that are complete."""
-        done = self._folder.done(self._evaluation.units)
+        done = self._store.done(self._evaluation.units)
         for task in self._evaluation.tasks:
-            if task.id not in self._announced and (found := self._evaluation.task_result(task, done)):
+            if task.id not in self._announced and (result := self._evaluation.task_result(task, done)):
                 self._announced.add(task.id)
-                self._on_result(found)
+                self._on_result(result)
         return done
 
     def _order(
@@ -121,37 +126,37 @@ class Worker:
         return sorted(left, key=preference)
 
     def _tries(self, unit: Unit, errors: Mapping[str, UnitErrors]) -> int:
-        found = errors.get(unit.name)
-        return found.attempts - self._attempts_before.get(unit.name, 0) if found else 0
+        attempts = errors[unit.name].attempts if unit.name in errors else 0
+        return max(0, attempts - self._attempts_before.get(unit.name, 0))
 
     def _work(self, unit: Unit, claim: Claim) -> None:
         self._task = unit.task.id
-        with self._folder.claims.keeping(claim, on_beat=self._beat):
+        with self._store.claims.keeping(claim, on_beat=self._beat):
             try:
-                found: UnitResult | None = self._evaluation.evaluate(unit, self._pool, self._label(unit))
+                result: UnitResult | None = self._evaluation.evaluate(unit, self._pool, self._label(unit))
             except Exception as error:  # noqa: BLE001 - policies raise errors of any type
                 self._pool.close()
-                found = self._after_error(unit, error)
-            if found is not None:
-                self._folder.publish(unit, found)
+                result = self._after_error(unit, error)
+            if result is not None:
+                self._store.publish(unit, result)
                 self._succeeded, self._in_a_row = True, 0
-        self._say(self._folder.done(self._evaluation.units))
+        self._say(self._store.done(self._evaluation.units))
 
     def _after_error(self, unit: Unit, error: Exception) -> UnitResult | None:
         """Record an error; return a result if the protocol counts it; raise it if going on makes no sense."""
         if isinstance(error, OSError) and str(self._evaluation.out) in str(error.filename or ""):
             raise error
-        found = self._folder.add_error(unit, error)
-        tries = self._tries(unit, {unit.name: found})
+        errors = self._store.add_error(unit, error)
+        tries = self._tries(unit, {unit.name: errors})
         self._on_error(
-            f"{unit.name}: attempt {tries} ended with {describe(error)}; traceback in {found.path}"
+            f"{unit.name}: attempt {tries} ended with {describe(error)}; traceback in {errors.path}"
         )
         if self._evaluation.errors_are_failures and not isinstance(error, LiberoError):
             if tries <= self._evaluation.retries:
                 return None
-            return self._evaluation.evaluate_apart(unit, self._pool, has_worked=self._folder.has_results)
+            return self._evaluation.evaluate_apart(unit, self._pool, has_worked=self._store.has_results)
         self._in_a_row += 1
-        never_worked = not self._succeeded and not self._folder.has_results
+        never_worked = not self._succeeded and not self._store.has_results
         if isinstance(error, ConnectionLost) and tries <= self._evaluation.retries:
             return None
         if never_worked or self._in_a_row >= FAILURES_IN_A_ROW:
@@ -159,7 +164,7 @@ class Worker:
         return None
 
     def _incomplete(self, errors: Mapping[str, UnitErrors]) -> EvaluationIncompleteError:
-        shown = "; ".join(f"{name}: {found.last}" for name, found in list(errors.items())[:3])
+        shown = "; ".join(f"{name}: {error.last}" for name, error in list(errors.items())[:3])
         more = f"; and {len(errors) - 3} more" if len(errors) > 3 else ""
         return EvaluationIncompleteError(
             f"{len(errors)} of {len(self._evaluation.units)} units ended with errors and are not counted "
@@ -170,7 +175,7 @@ class Worker:
     def _beat(self) -> None:
         if time.monotonic() - self._said > SAY_EVERY:
             with suppress(LiberoError, OSError):  # the loop reports what is wrong
-                self._say(self._folder.done(self._evaluation.units))
+                self._say(self._store.done(self._evaluation.units))
 
     def _say(self, done: Mapping[str, UnitResult]) -> None:
         """Report the progress, but not too often; always when everything is done."""
@@ -180,12 +185,79 @@ class Worker:
             self._on_progress(self._progress(done))
 
     def _progress(self, done: Mapping[str, UnitResult]) -> Progress:
-        running, failed = len(self._folder.held()), len(self._folder.errors())
-        sizes = {unit.name: len(unit.starts) for unit in self._evaluation.units}
+        running, failed = len(self._store.held()), len(self._store.errors())
+        sizes = {unit.name: len(unit.init_states) for unit in self._evaluation.units}
         return measure_progress(sizes, done, running, failed)
 
     def _label(self, unit: Unit) -> str:
         if not self._evaluation.progress:
             return ""
-        done = self._folder.done(self._evaluation.units)
+        done = self._store.done(self._evaluation.units)
         return f"{self._progress(done)} | {unit.task.id}"
+
+
+class Workers:
+    """Processes that call a function of a module; they end with this process. One that is killed is replaced.
+
+    Args:
+        count: Number of processes.
+        function: Function that each of them calls.
+        argument: Argument of the function; it is pickled.
+    """
+
+    def __init__(self, count: int, function: Callable[[Any], None], argument: Any):
+        self._count, self._function, self._argument = count, function, argument
+        self._context = multiprocessing.get_context("spawn")  # an OpenGL context that a fork inherits hangs
+        self._processes: list[BaseProcess] = []
+        self._deaths, self._done = 0, 0
+
+    @property
+    def pids(self) -> list[int]:
+        """Numbers of the processes that run."""
+        return [process.pid for process in self._processes if process.is_alive() and process.pid]
+
+    def supervise(self, done: int) -> None:
+        """Replace processes that were killed.
+
+        Args:
+            done: Number of units that are done. Where it does not grow, the processes are killed by what they run.
+        """
+        if done > self._done:
+            self._deaths, self._done = 0, done
+        for i, process in enumerate(self._processes):
+            if process.exitcode is None or process.exitcode >= 0:
+                continue
+            self._deaths += 1
+            more = self._deaths <= _MOST_DEATHS
+            what = "another is started" if more else "no other is started"
+            print(f"process {process.pid} was killed (signal {-process.exitcode}); {what}", file=sys.stderr)
+            if more:
+                self._processes[i] = self._start()
+            else:
+                del self._processes[i]
+                return
+
+    def __enter__(self) -> "Workers":
+        self._processes = [self._start() for _ in range(self._count)]
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        for process in self._processes:
+            if kind is None:
+                process.join(_PATIENCE)
+            process.terminate()
+        end = time.monotonic() + _PATIENCE
+        for process in self._processes:
+            process.join(max(0.0, end - time.monotonic()))
+            process.kill()
+            process.join(_PATIENCE)
+
+    def _start(self) -> BaseProcess:
+        process = self._context.Process(target=_call, args=(self._function, self._argument))
+        process.start()
+        return process
+
+
+def _call(function: Callable[[Any], None], argument: Any) -> None:
+    end_with_parent()
+    function(argument)

@@ -1,12 +1,12 @@
 """Environments of an evaluation: the interface that rollouts use, and a pool of open environments."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
 
-from lifelong.evaluation.inputs import Obs
+Obs = Mapping[str, np.ndarray]  # name -> (B, ...)
 
 
 class VectorEnv(Protocol):

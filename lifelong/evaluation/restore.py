@@ -1,5 +1,6 @@
 """Loading of a run's policy for acting, from the run's directory or one of its checkpoints."""
 
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -62,6 +63,11 @@ class LoadedRun:
     group_sizes: tuple[int, ...] = ()
     drawing: str | None = None
     perturb: tuple[tuple[Perturbation, ...], ...] = ()
+
+    @property
+    def weights_digest(self) -> str:
+        """Digest of the file of the weights, 16 hex digits."""
+        return hashlib.sha256(self.checkpoint.read_bytes()).hexdigest()[:16]
 
     def learned_task(self, position: int) -> Task:
         """Return a task of the run in the words in which it was learned."""

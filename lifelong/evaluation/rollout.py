@@ -15,8 +15,7 @@ from tqdm import tqdm
 
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, PolicyActor, TakesNote
-from lifelong.evaluation.environments import VectorEnv
-from lifelong.evaluation.inputs import Obs
+from lifelong.evaluation.environments import Obs, VectorEnv
 from lifelong.policies.base import Policy, in_mode
 from lifelong.seeding import generator
 

@@ -1,47 +1,48 @@
 """Results of evaluations and cards of protocols as others may have left them, through everything that reads them."""
 
-import argparse
 import contextlib
 import io
 import json
+from dataclasses import fields
 
 import pytest
 import yaml
 from hypothesis import given
 
+from libero_env.text import json_safe
+from libero_env.validation import validate
 from libero_eval.cli.compare import _single_sides
-from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, task_result
+from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.exports import export_lerobot, export_vla_eval
 from libero_eval.judging.comparison import judge, write_judgement
 from libero_eval.judging.text import render
-from libero_eval.protocols.files import load_card
-from libero_eval.protocols.packaged import PROTOCOLS
-from libero_eval.repeat import repeated, repeated_card
-from lifelong.results.summary import json_safe
+from libero_eval.protocols.files import load_protocol
+from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.repeat import repeated
+from libero_eval.requests import EvalRequest
 from tests.harness.fuzz import examples, survive
 from tests.harness.mutations import changed_text, mutated
 from tests.harness.results import drawn_result
 
 pytestmark = pytest.mark.unit
 
-CARD = json_safe(PROTOCOLS["openpi"].resolved())
+CARD = json_safe(load_protocol("openpi").resolved())
 VALID = [
     drawn_result(0.7, 1, tasks=2, protocol=CARD).to_plain(),
     drawn_result(
         0.4, 2, tasks=1, evaluated={"run": "runs/a", "after": 1, "seed": 3}, unit_starts=10
     ).to_plain(),
-    {
-        k: v for k, v in drawn_result(0.4, 2, tasks=1).to_plain().items() if k != "format"
-    },  # of the first version
 ]
-ARGS = argparse.Namespace(policy="here", out=None, policy_threads=None, allow=[], backend=None)
+REQUEST = EvalRequest(policy="here")
 
 
 def sealed(values: object) -> object:
     """The same with the digest that its tasks have, where they are valid: the digest is no protection."""
     if isinstance(values, dict):
         with contextlib.suppress(Exception):
-            tasks = tuple(task_result(row) for row in values["tasks"])
+            names = [f.name for f in fields(TaskResult)]
+            rows = [{name: row[name] for name in names if name in row} for row in values["tasks"]]
+            tasks = tuple(validate(TaskResult, row) for row in rows)
             values["outcomes"] = EvaluationResult({}, {}, (), {}, tasks).outcomes
     return values
 
@@ -56,7 +57,7 @@ def test_any_result_is_used_or_refused(values, tmp_path_factory):
 
     def use() -> None:
         result = EvaluationResult.read(folder)
-        repeated(ARGS, result)
+        repeated(REQUEST, result)
         export_lerobot(result, folder / "lerobot")
         export_vla_eval(result, folder / "vla-eval")
         found = judge(_single_sides([str(folder), str(folder)]), control=None, allow=[], alpha=0.05)
@@ -65,7 +66,9 @@ def test_any_result_is_used_or_refused(values, tmp_path_factory):
         write_judgement(found, folder / "compare.json")
 
     survive("results of evaluations", use)
-    survive("results of evaluations", lambda: repeated_card(EvaluationResult.read(folder), "here"))
+    survive(
+        "results of evaluations", lambda: EvalProtocol.read(EvaluationResult.read(folder).protocol, "here")
+    )
 
 
 @given(text=changed_text(json.dumps(VALID[0])))
@@ -81,4 +84,4 @@ def test_any_text_of_a_result_is_read_or_refused(text, tmp_path_factory):
 def test_any_card_is_read_or_refused(values, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / "card.yaml"
     path.write_text(yaml.safe_dump(values), encoding="utf-8", errors="replace")
-    survive("cards of protocols", lambda: load_card(str(path)).require())
+    survive("cards of protocols", lambda: load_protocol(str(path)).require())

@@ -12,7 +12,7 @@ from libero_env.objects import folder
 from libero_env.paths import objects_dir
 from libero_env.tasks import bddl, make_task, read_suite
 from libero_env.tasks.problem import differences
-from libero_eval.protocols.files import load_card
+from libero_eval.protocols.files import load_protocol
 from tests.harness.fuzz import examples, survive
 from tests.harness.mutations import changed_text, hostile, mutated
 
@@ -173,7 +173,7 @@ def test_a_changed_object_is_read_or_refused(place, properties):
 @examples(short=60, long=2000)
 def test_a_changed_protocol_is_read_or_refused(place, card):
     path = write(place / "card.yaml", card)
-    survive("protocol cards", lambda: load_card(path))
+    survive("protocol cards", lambda: load_protocol(path))
 
 
 @given(config=mutated([{"assets": "builtin", "objects": "here", "benchmark_root": "x", "robot": "libero"}]))

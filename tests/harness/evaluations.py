@@ -7,13 +7,13 @@ import numpy as np
 
 from libero_env.tasks import get_suite
 from libero_eval.evaluation_file import EvaluationResult
-from libero_eval.protocols.packaged import PROTOCOLS
-from libero_eval.work.suite import SuiteEvaluation
+from libero_eval.protocols.files import load_protocol
+from libero_eval.user_policy import CallableActor
+from libero_eval.work.evaluation import Evaluation
 from libero_eval.work.worker import Worker
-from lifelong.evaluation.actors import CallableActor
 
 TASKS = get_suite("libero_goal").tasks[:2]
-QUICK = PROTOCOLS["libero"].changed(
+QUICK = load_protocol("libero").changed(
     {"episode.horizon": 10, "episode.settle_steps": 0, "episode.settle_action": None}
 )
 
@@ -58,12 +58,12 @@ class Still:
         return np.zeros((len(observations["x"]), 7))
 
 
-def evaluation(out: Path, policy=None, **changes) -> SuiteEvaluation:
+def evaluation(out: Path, policy=None, **changes) -> Evaluation:
     policy = policy or Still()
 
     @contextmanager
     def actor(task, states):
-        yield CallableActor(policy, task.language, views=())
+        yield CallableActor(policy, (), task.language)
 
     arguments = {
         "identity": {"policy": "still"},
@@ -73,7 +73,7 @@ def evaluation(out: Path, policy=None, **changes) -> SuiteEvaluation:
         "env": lambda task, count: Countdown(count),
         "versions": {"mujoco": "3"},
     }
-    return SuiteEvaluation(out=out, actor=actor, **(arguments | changes))
+    return Evaluation(out=out, actor=actor, **(arguments | changes))
 
 
 def evaluate(out: Path, policy=None, **changes) -> EvaluationResult:

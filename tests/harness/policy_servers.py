@@ -11,10 +11,10 @@ import zmq
 from websockets.asyncio.server import serve
 from websockets.exceptions import ConnectionClosed
 
-from libero_eval.servers.codecs import GROOT, OPENPI, VLA_EVAL
-from libero_eval.servers.groot import ACTION
-from libero_eval.servers.serving import PolicyServer
-from libero_eval.servers.sessions import ServedPolicy
+from libero_eval.servers.groot import ACTION, GROOT
+from libero_eval.servers.openpi import OPENPI
+from libero_eval.servers.serving import PolicyServer, ServedPolicy
+from libero_eval.servers.vla_eval import VLA_EVAL
 
 MODALITIES = {
     "video": ["image", "wrist_image"],

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from libero_env.tasks import get_suite
-from libero_eval.servers.actor import RemoteActor
-from libero_eval.servers.codecs import OPENPI, VLA_EVAL
-from libero_eval.servers.connections import Limits
-from libero_eval.servers.wires import EpisodeStart, VlaEvalDialect, WebSocketWire
+from libero_eval.protocols.adapter import PolicyInput
+from libero_eval.servers.actors import RemoteActor
+from libero_eval.servers.openpi import OPENPI
+from libero_eval.servers.transport import EpisodeStart, Limits
+from libero_eval.servers.vla_eval import VLA_EVAL, VlaEvalClient
 from lifelong.errors import ServerError
 from lifelong.evaluation.actors import PolicyActor
-from lifelong.evaluation.inputs import PolicyInput
 from lifelong.evaluation.restore import restore
 from lifelong.seeding import generator
 from tests.harness.counterparts import counterpart
@@ -165,8 +165,6 @@ def test_their_bytes_are_ours(python):
 class Plain:
     """An adapter that sends the number in an observation, with two images."""
 
-    cameras, observations = ("agentview", "robot0_eye_in_hand"), ("rgb",)
-
     def inputs(self, obs, rows=None):
         image = np.full((8, 8, 3), 2, np.uint8)
         images = {"agentview": image, "robot0_eye_in_hand": image // 2}
@@ -179,11 +177,11 @@ class Plain:
 def test_our_client_and_vla_eval_server(python, tmp_path):
     task, port = get_suite("libero_goal").tasks[0], free_port()
     with process(str(python), "-c", MODEL, str(port)):
-        wire = WebSocketWire(f"ws://127.0.0.1:{port}", VlaEvalDialect(), Limits(60, 60))
+        client = VlaEvalClient(f"ws://127.0.0.1:{port}", Limits(60, 60))
         try:
-            assert wire.announced["model_server"] == "Counting"
-            assert wire.announced["action_spec"]["gripper"]["format"] == "binary_close_positive"
-            actor = RemoteActor(wire, Plain(), [EpisodeStart(task, i) for i in range(4)])
+            assert client.announced["model_server"] == "Counting"
+            assert client.announced["action_spec"]["gripper"]["format"] == "binary_close_positive"
+            actor = RemoteActor(client, Plain(), [EpisodeStart(task, i) for i in range(4)])
             actor.reset(4)
             for step in range(4):
                 actions = actor.act({"x": np.arange(4.0)})
@@ -196,4 +194,4 @@ def test_our_client_and_vla_eval_server(python, tmp_path):
             with pytest.raises(ServerError, match="failed: observation_failed: ValueError: thirteen"):
                 actor.act({"x": np.full(4, 13.0)})
         finally:
-            wire.close()
+            client.close()

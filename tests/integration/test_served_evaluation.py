@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from libero_env.cli import main as cli
-from libero_eval.servers.actor import RemoteActor
-from libero_eval.servers.codecs import OPENPI
-from libero_eval.servers.sessions import ServedPolicy
+from libero_eval.servers.actors import RemoteActor
+from libero_eval.servers.openpi import OPENPI
+from libero_eval.servers.serving import ServedPolicy
 from lifelong.evaluation.restore import restore
 from tests.harness import policy_servers
 from tests.harness.runs import make_run

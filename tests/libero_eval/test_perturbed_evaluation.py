@@ -8,8 +8,9 @@ from libero_env.perturbations import KINDS
 from libero_env.tasks import get_task
 from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.judging.comparability import Side, check_comparable, match
-from libero_eval.protocols.environment import ProtocolEnv, make_env
-from libero_eval.protocols.files import load_card, parse_card
+from libero_eval.protocols.environment import ProtocolEnv
+from libero_eval.protocols.files import load_protocol
+from libero_eval.protocols.protocol import EvalProtocol
 from lifelong.errors import ComparisonError, ProtocolError
 
 EVAL = ["eval", "told_policy:make", "--suite", "libero_goal/1", "--episodes", "3", "--horizon", "3"]
@@ -35,12 +36,12 @@ def make():
 """
 
 
-def test_a_card_without_perturbations_is_as_it_was():
-    card = load_card("libero")
-    assert card.world.perturb == "" and "perturb" not in card.resolved()["world"]
+def test_a_protocol_without_perturbations_is_as_it_was():
+    card = load_protocol("libero")
+    assert card.world.perturb == ""
     moved = card.changed({"world.perturb": "camera=0.3"})
     assert moved.digest != card.digest and moved.changed({"world.perturb": ""}).digest == card.digest
-    assert parse_card(moved.resolved(), "libero", "here") == moved
+    assert EvalProtocol.read(moved.resolved(), "here") == moved
     for wrong in ("camra=0.3", "camera=2", "noise=0.1,camera=0.3"):
         with pytest.raises(ProtocolError, match="world.perturb"):
             card.changed({"world.perturb": wrong})
@@ -53,7 +54,7 @@ def test_an_evaluation_records_its_perturbations(tmp_path, monkeypatch, capsys):
     assert main([*EVAL, "--out", "plain", "--perturb", "camera=0"]) == 0
     assert main([*EVAL, "--out", "changed", *perturb]) == 0
     plain, changed = (EvaluationResult.read(tmp_path / name) for name in ("plain", "changed"))
-    assert "perturb" not in plain.protocol["world"] and plain.tasks[0].attempts == ()
+    assert plain.protocol["world"]["perturb"] == "" and plain.tasks[0].attempts == ()
     assert changed.protocol["world"]["perturb"] == "distractors=0.1,instruction=0.5,robot=0.4,noise=0.2"
     assert np.shape(changed.tasks[0].attempts) == (3, 4)
     told = (tmp_path / "told.txt").read_text().splitlines()
@@ -87,17 +88,19 @@ def test_a_units_episodes_do_not_depend_on_the_unit(tmp_path, monkeypatch):
 
 
 def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypatch):
-    monkeypatch.setattr(ProtocolEnv, "_stored", lambda self: self.env.init_states)  # LIBERO's may not be here
-    card = load_card("openpi").changed({"pixels.render_size": (32, 32)})
+    monkeypatch.setattr(
+        ProtocolEnv, "_stored", lambda self: self.init_states
+    )  # LIBERO's may not be here
+    card = load_protocol("openpi").changed({"pixels.render_size": (32, 32)})
     found = []
     for perturb in ("", "layout=0.3,distractors=0.3,robot=0.4"):
-        env = make_env(
-            get_task("libero_goal/3"), 2, card.changed({"world.perturb": perturb}), cameras=(), threads=1
+        env = ProtocolEnv(
+            card.changed({"world.perturb": perturb}), get_task("libero_goal/3"), 2, cameras=(), threads=1
         )
         env.reset(options={"init_state": np.array([3, 7])})
         plate = [view.body_pos("plate_1") for view in env.views]
         found.append((env.simulations.fixtures.copy(), np.array(plate)))
-        assert env.task.language == env.env.base_task.language and len(env.step(np.zeros((2, 7)))) == 5
+        assert env.task.language == env.base_task.language and len(env.step(np.zeros((2, 7)))) == 5
         env.close()
     assert np.array_equal(found[0][0], found[1][0])
     moved = np.linalg.norm(found[1][1] - found[0][1], axis=1)

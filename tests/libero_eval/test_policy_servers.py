@@ -11,14 +11,13 @@ import pytest
 
 from libero_env.errors import MissingPackageError
 from libero_env.tasks import get_suite
-from libero_eval.servers.actor import RemoteActor, checked_actions
-from libero_eval.servers.codecs import GROOT, OPENPI, VLA_EVAL
-from libero_eval.servers.connections import Connection, Limits
-from libero_eval.servers.groot import GrootWire
-from libero_eval.servers.packages import need
-from libero_eval.servers.wires import EpisodeStart, OpenpiDialect, VlaEvalDialect, WebSocketWire
-from lifelong.errors import ConnectionLost, ServerError, WireError
-from lifelong.evaluation.inputs import PolicyInput
+from libero_eval.protocols.adapter import PolicyInput
+from libero_eval.servers.actors import RemoteActor, checked_actions
+from libero_eval.servers.groot import GROOT, GrootClient
+from libero_eval.servers.openpi import OPENPI, OpenpiClient
+from libero_eval.servers.transport import Connection, EpisodeStart, Limits, need
+from libero_eval.servers.vla_eval import VLA_EVAL, VlaEvalClient
+from lifelong.errors import CodecError, ConnectionLost, ServerError
 from lifelong.evaluation.rollout import run_episodes
 from tests.harness import policy_servers
 
@@ -29,8 +28,6 @@ SHORT = Limits(connect=5, answer=5)
 
 class Plain:
     """An adapter that sends the simulation's number and step, and doubles actions."""
-
-    cameras, observations = ("agentview", "robot0_eye_in_hand"), ("rgb",)
 
     def __init__(self):
         self.asked = []
@@ -60,13 +57,13 @@ def chunk(state: np.ndarray, length: int) -> np.ndarray:
 
 
 def ask(address: str, limits: Limits = SHORT, replan: int | None = 2) -> np.ndarray:
-    wire = WebSocketWire(address, OpenpiDialect(), limits)
+    client = OpenpiClient(address, limits)
     try:
-        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 7)], replan=replan)
+        actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, 7)], replan=replan)
         actor.reset(1)
         return actor.act(observations(1, 0))
     finally:
-        wire.close()
+        client.close()
 
 
 def test_arrays_keep_their_bits_in_every_encoding():
@@ -98,13 +95,13 @@ def test_the_maps_that_stand_for_arrays():
 @pytest.mark.parametrize("codec", [OPENPI, VLA_EVAL, GROOT], ids=lambda c: c.name)
 def test_values_and_bytes_that_are_refused(codec):
     for value in (np.array([object()]), np.zeros(1, "f4,f4"), object()):
-        with pytest.raises(WireError, match=codec.name):
+        with pytest.raises(CodecError, match=codec.name):
             codec.pack({"a": value})
     if codec is not GROOT:
-        with pytest.raises(WireError, match="refused"):
+        with pytest.raises(CodecError, match="refused"):
             codec.pack(np.zeros(1, complex))
     for data in (b"", b"\xc1garbage", codec.pack(1) + b"more"):
-        with pytest.raises(WireError, match=f"no {codec.name} message"):
+        with pytest.raises(CodecError, match=f"not a message of {codec.name}"):
             codec.unpack(data)
 
 
@@ -119,7 +116,7 @@ def test_a_missing_package_is_named(monkeypatch):
 def test_an_array_that_does_not_fit_its_bytes_is_refused():
     for changes in ({b"shape": [3]}, {b"dtype": "O"}, {b"shape": [-1, -2]}, {b"data": b""}):
         lie = {b"__ndarray__": True, b"data": bytes(8), b"dtype": "<f4", b"shape": [2]} | changes
-        with pytest.raises(WireError, match="no openpi message"):
+        with pytest.raises(CodecError, match="not a message of openpi"):
             OPENPI.unpack(msgpack.packb(lie))
 
 
@@ -131,10 +128,10 @@ def test_openpi_observations_and_chunks():
         return {"actions": chunk(observation["observation/state"], 5), "server_timing": {"infer_ms": 1.0}}
 
     with policy_servers.openpi(answer, {"name": "mine", "size": 224}) as address:
-        wire = WebSocketWire(address, OpenpiDialect(), SHORT)
-        assert wire.announced == {"name": "mine", "size": 224}
+        client = OpenpiClient(address, SHORT)
+        assert client.announced == {"name": "mine", "size": 224}
         adapter = Plain()
-        actor = RemoteActor(wire, adapter, [EpisodeStart(TASK, i) for i in range(3)], replan=3)
+        actor = RemoteActor(client, adapter, [EpisodeStart(TASK, i) for i in range(3)], replan=3)
         actor.reset(3)
         over = np.zeros(3, bool)
         for step in range(7):
@@ -144,7 +141,7 @@ def test_openpi_observations_and_chunks():
             for i in np.flatnonzero(~over):
                 np.testing.assert_array_equal(actions[i, :3], [2 * i, 2 * (step // 3 * 3), 2 * (step % 3)])
             assert not actions[over].any()
-        wire.close()
+        client.close()
     assert adapter.asked == [[0, 1, 2], [0, 2], [0, 2]], "only running simulations without actions"
     assert set(seen[0]) == {
         "observation/image",
@@ -180,10 +177,10 @@ def test_only_images_that_are_seen_are_drawn(settle, record, drawn):
     env = Drawing()
     env.render_images = True
     with policy_servers.openpi(answer) as address:
-        wire = WebSocketWire(address, OpenpiDialect(), SHORT)
-        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 0)], replan=3, views=("image",))
+        client = OpenpiClient(address, SHORT)
+        actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, 0)], replan=3, views=("image",))
         rollouts = run_episodes(actor, env, [0], horizon=20, settle_steps=settle, record_every=record)
-        wire.close()
+        client.close()
     assert {i for i, seen in enumerate(env.drawn) if seen} - {9} == drawn, "9: it was not known to be over"
     assert rollouts.episodes[0].success and env.render_images
 
@@ -200,11 +197,11 @@ def test_the_order_of_answers_makes_no_difference():
                 await socket.send(OPENPI.pack({"actions": chunk(state, 1)}))
 
         with policy_servers.web_socket(handler) as address:
-            wire = WebSocketWire(address, OpenpiDialect(), SHORT)
-            actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, i) for i in range(3)], replan=1)
+            client = OpenpiClient(address, SHORT)
+            actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, i) for i in range(3)], replan=1)
             actor.reset(3)
             found.append([actor.act(observations(3, step)) for step in range(2)])
-            wire.close()
+            client.close()
     np.testing.assert_array_equal(found[0], found[1])
     np.testing.assert_array_equal(found[0][1][:, 0], [0, 2, 4])
 
@@ -224,11 +221,11 @@ def test_requests_in_flight(in_flight):
             await socket.send(OPENPI.pack({"actions": chunk(OPENPI.unpack(data)["observation/state"], 1)}))
 
     with policy_servers.web_socket(handler) as address:
-        wire = WebSocketWire(address, OpenpiDialect(), Limits(5, 5, in_flight))
-        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, i) for i in range(5)], replan=1)
+        client = OpenpiClient(address, Limits(5, 5, in_flight))
+        actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, i) for i in range(5)], replan=1)
         actor.reset(5)
         actor.act(observations(5, 0))
-        wire.close()
+        client.close()
     assert most == (in_flight or 5)
 
 
@@ -241,12 +238,12 @@ def test_requests_in_flight(in_flight):
         ({"actions": np.zeros((1, 7))}, "1 actions; the protocol executes 2"),
         ({"actions": np.zeros((4, 7), "S1")}, r"dtype \|S1"),
         ({"actions": [["a"] * 7] * 2}, "dtype <U1"),
-        ({"actions": [[1.0], [2.0, 3.0]]}, "no array"),
+        ({"actions": [[1.0], [2.0, 3.0]]}, "not an array"),
         ({"actions": None}, "dtype object"),
         ({"action": np.zeros((4, 7))}, r"\['action'\] and without `actions`"),
         ({}, "with nothing and without"),
-        ([1, 2], "sent a list as answer; expected a map"),
-        (b"\xc1\x00garbage", "9 bytes that are no openpi message"),
+        ([1, 2], "sent a list as actions; expected a map"),
+        (b"\xc1\x00garbage", "9 bytes that are not a message of openpi"),
         ("Traceback ...\nValueError: no such key", "(?s)its traceback:.*no such key"),
     ],
 )
@@ -278,7 +275,7 @@ def test_a_server_that_is_silent():
 
     with (
         policy_servers.web_socket(mute) as address,
-        pytest.raises(ServerError, match="nothing within .* metadata"),
+        pytest.raises(ServerError, match="nothing within .*metadata"),
     ):
         ask(address, Limits(5, 0.2))
 
@@ -304,7 +301,7 @@ def test_a_server_that_takes_no_request_and_one_that_sends_too_much(monkeypatch)
 
     with pytest.raises(ServerError, match=r"ws://it took no request within 0\.1 s; --timeout"):
         asyncio.run(Connection(Full(), "ws://it", OPENPI, Limits(1, 0.1)).send({}))
-    monkeypatch.setattr("libero_eval.servers.connections.MAX_MESSAGE_BYTES", 1000)
+    monkeypatch.setattr("libero_eval.servers.transport.MAX_MESSAGE_BYTES", 1000)
     with (
         policy_servers.openpi(lambda _: {"actions": np.zeros((100, 7))}) as address,
         pytest.raises(ConnectionLost, match="closed with 1009"),
@@ -318,7 +315,7 @@ def test_a_server_that_comes_later_is_waited_for():
     with pytest.raises(ServerError, match=r"no policy server at .* within 0\.3 s"):
         ask(address, Limits(0.3, 1))
     found = []
-    client = threading.Thread(target=lambda: found.append(WebSocketWire(address, OpenpiDialect(), SHORT)))
+    client = threading.Thread(target=lambda: found.append(OpenpiClient(address, SHORT)))
     client.start()
     time.sleep(0.3)
 
@@ -356,14 +353,14 @@ def test_vla_eval_episodes():
     hello["observation_params"]["send_state"] = True
     answer = lambda payload: {"actions": chunk(payload["states"], 1)[0]}  # noqa: E731
     with policy_servers.vla_eval(answer, hello, heard) as address:
-        wire = WebSocketWire(address, VlaEvalDialect(), SHORT)
-        assert wire.announced == hello
-        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 4)], replan=None)
+        client = VlaEvalClient(address, SHORT)
+        assert client.announced == hello
+        actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, 4)], replan=None)
         actor.reset(1)
         for step in range(2):
             np.testing.assert_array_equal(actor.act(observations(1, step))[0, :2], [0, 2 * step])
         actor.note(np.array([True]), np.array([True]))
-        wire.close()
+        client.close()
     assert [m["type"] for m in heard] == [
         "hello",
         "hello",
@@ -390,12 +387,12 @@ def test_vla_eval_errors_and_messages_out_of_order():
     with policy_servers.vla_eval(
         lambda _: {"error": "observation_failed: KeyError"}, {"x": 1}, heard
     ) as address:
-        wire = WebSocketWire(address, VlaEvalDialect(), SHORT)
-        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 4)], replan=None)
+        client = VlaEvalClient(address, SHORT)
+        actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, 4)], replan=None)
         actor.reset(1)
         with pytest.raises(ServerError, match="failed: observation_failed: KeyError"):
             actor.act(observations(1, 0))
-        wire.close()
+        client.close()
 
     async def handler(socket):
         async for data in socket:
@@ -405,12 +402,12 @@ def test_vla_eval_errors_and_messages_out_of_order():
             await socket.send(VLA_EVAL.pack(reply))
 
     with policy_servers.web_socket(handler) as address:
-        wire = WebSocketWire(address, VlaEvalDialect(), SHORT)
-        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 4)])
+        client = VlaEvalClient(address, SHORT)
+        actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, 4)])
         actor.reset(1)
         with pytest.raises(ServerError, match="sent action with seq 1; expected action with 3"):
             actor.act(observations(1, 0))
-        wire.close()
+        client.close()
 
 
 def test_groot_observations_of_many_simulations():
@@ -422,15 +419,15 @@ def test_groot_observations_of_many_simulations():
         return policy_servers.flat(np.stack([chunk(state, 8) for state in states]))
 
     with policy_servers.groot(policy_servers.groot_endpoints(get_action)) as address:
-        wire = GrootWire(address, Limits(5, 5, 2))
-        assert wire.announced["video"]["modality_keys"] == ["image", "wrist_image"]
-        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, i) for i in range(3)], replan=8)
+        client = GrootClient(address, Limits(5, 5, 2))
+        assert client.announced["video"]["modality_keys"] == ["image", "wrist_image"]
+        actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, i) for i in range(3)], replan=8)
         actor.reset(3)
         for step in range(9):
             actions = actor.act(observations(3, step))
             np.testing.assert_array_equal(actions[:, 0], [0, 2, 4])
             assert (actions[:, 1] == 2 * (step // 8 * 8)).all() and (actions[:, 2] == 2 * (step % 8)).all()
-        wire.close()
+        client.close()
     assert [len(o["state.x"]) for o in seen] == [2, 1, 2, 1], "two simulations in a request"
     assert seen[0]["video.image"].shape == (2, 1, 4, 4, 3) and seen[0]["video.image"].dtype == np.uint8
     assert seen[0]["state.gripper"].shape == (2, 1, 2) and seen[0]["state.x"].dtype == np.float32
@@ -448,19 +445,19 @@ def test_groot_observations_of_many_simulations():
         (lambda **_: policy_servers.flat(np.zeros((1, 1, 7))), "1 actions; the protocol executes 2"),
         (lambda **_: [{"x": np.zeros((1, 8, 1))}, {}], r"answered \['x'\].*--use-sim-policy-wrapper"),
         (lambda **_: "what?", "answered str without"),
-        (lambda **_: b"\xc1", "1 bytes that are no GR00T message"),
+        (lambda **_: b"\xc1", "1 bytes that are not a message of GR00T"),
         (lambda observation, options: {}["key"], r"failed \(get_action\): 'key'"),
         (lambda **_: time.sleep(1), r"nothing within 0\.3 s \(get_action\)"),
     ],
 )
 def test_groot_answers_that_are_not_valid_are_named(get_action, message):
     with policy_servers.groot(policy_servers.groot_endpoints(get_action)) as address:
-        wire = GrootWire(address, Limits(5, 0.3))
-        actor = RemoteActor(wire, Plain(), [EpisodeStart(TASK, 0)], replan=2)
+        client = GrootClient(address, Limits(5, 0.3))
+        actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, 0)], replan=2)
         actor.reset(1)
         with pytest.raises(ServerError, match=message):
             actor.act(observations(1, 0))
-        wire.close()
+        client.close()
 
 
 def test_groot_servers_of_other_embodiments_and_none_at_all():
@@ -468,6 +465,6 @@ def test_groot_servers_of_other_embodiments_and_none_at_all():
         policy_servers.groot(policy_servers.groot_endpoints(None, state=["left_arm"])) as address,
         pytest.raises(ServerError, match=r"state keys \['left_arm'\]; LIBERO's are x, y"),
     ):
-        GrootWire(address, SHORT)
+        GrootClient(address, SHORT)
     with pytest.raises(ServerError, match="no GR00T server at .* within 0.3 s"):
-        GrootWire(address, Limits(0.3, 1))
+        GrootClient(address, Limits(0.3, 1))

@@ -7,7 +7,7 @@ from libero_env.init_states.store import load_init_states
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite
 from libero_eval.evaluation_file import EvaluationResult
-from libero_eval.protocols.files import load_card
+from libero_eval.protocols.files import load_protocol
 from tests.harness.published import REWORDED, base_task, write_plus, write_pro
 
 EVAL = ["eval", "told_policy:make", "--horizon", "2", "--threads", "1"]
@@ -80,6 +80,6 @@ def test_tasks_and_variants_are_listed(folder, capsys):
 
 @pytest.mark.sim
 def test_a_protocol_has_the_horizon_of_the_base_task(folder):
-    card = load_card("openpi")
+    card = load_protocol("openpi")
     for name in ("libero_plus_goal", "libero_pro_goal_task"):
         assert card.steps(get_suite(name).tasks[0]) == card.steps(base_task())

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from libero_eval.evaluation_file import EvaluationResult, TaskResult
-from libero_eval.robustness.figures import curves_figure
-from libero_eval.robustness.page import Robustness, render, verdict, write_robustness
-from libero_eval.robustness.results import Condition, Outcomes, half_severity, name_of
+from libero_eval.robustness.page import curves_figure, render, verdict, write_robustness
+from libero_eval.robustness.results import Condition, Outcomes, Robustness, half_severity, name_of
 from lifelong.errors import ResultsError
 
 pytestmark = pytest.mark.unit
@@ -110,11 +109,9 @@ def test_the_page_and_the_text_say_the_same_numbers(tmp_path) -> None:
         {name_of(B): 2, name_of(C): 0},
     )
     expert = Robustness("expert", outcomes({(): 10, A: 10, B: 10, C: 10}))
-    page = write_robustness(
-        [policy, expert], tmp_path, units={"camera": "60 degrees"}, facts=[("suite", "libero_goal")]
-    )
+    page = write_robustness([policy, expert], tmp_path)
     text = page.read_text()
-    assert "Robustness of sequential" in text and "60 degrees" in text and text.count("<svg") == 2
+    assert "Robustness of sequential" in text and text.count("<svg") == 2
     assert "camera=1" in text and ">2</td>" in text, "draws that were given up are told"
     assert "camera=1,light=1" in text, "so are interactions"
     assert verdict(policy) in text.replace("&#39;", "'") and "camera" in verdict(policy)
@@ -137,4 +134,4 @@ def test_the_legend_names_a_policy_that_was_not_measured_along_the_first_kind() 
 def test_a_policy_that_never_succeeds_has_nothing_to_lose(tmp_path) -> None:
     policy = Robustness("none", outcomes({(): 0, A: 0, B: 0}))
     assert "nothing to lose" in verdict(policy)
-    assert write_robustness([policy], tmp_path, units={}).exists() and "none" in render(policy)
+    assert write_robustness([policy], tmp_path).exists() and "none" in render(policy)

@@ -3,6 +3,7 @@
 import re
 import urllib.error
 import urllib.request
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +12,10 @@ from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import connect
 
 from libero_env.tasks import get_suite, get_task
-from libero_eval.servers.codecs import OPENPI
-from libero_eval.servers.connections import Limits
-from libero_eval.servers.native import ServedActor
-from libero_eval.servers.sessions import ServedPolicy
-from libero_eval.servers.wires import EpisodeStart
+from libero_eval.servers.actors import ServedActor
+from libero_eval.servers.openpi import OPENPI, OpenpiClient
+from libero_eval.servers.serving import ServedPolicy
+from libero_eval.servers.transport import EpisodeStart, Limits
 from lifelong.errors import PolicyError, ServerError
 from lifelong.evaluation.actors import PolicyActor
 from lifelong.evaluation.restore import restore
@@ -73,13 +73,11 @@ def test_served_actions_are_those_in_process(folder, algo):
             seeds = [(0, 4, task.index, state) for state in range(3)]
             wanted = in_process(served, task, seen, seeds)
             episodes = [EpisodeStart(task, state) for state in range(3)]
-            actor = ServedActor(address, served.metadata, episodes, seeds, Limits(10, 60))
-            try:
+            with closing(OpenpiClient(address, Limits(10, 60))) as client:
+                actor = ServedActor(client, served.metadata, episodes, seeds)
                 for _ in range(2):  # the second time from the start
                     actor.reset(3)
                     np.testing.assert_array_equal([actor.act(obs) for obs in seen], wanted)
-            finally:
-                actor.close()
 
 
 def test_clients_do_not_touch_each_other(folder):
@@ -212,14 +210,12 @@ def test_health_errors_and_keys_over_the_wire(folder, monkeypatch):
     monkeypatch.setenv("LIBERO_API_KEY", "secret")
     task = served.run.tasks[0]
     with policy_servers.served(served) as address:
-        actor = ServedActor(address, served.metadata, [EpisodeStart(task, 0)], [(0,)], Limits(10, 60))
-        actor.reset(1)
-        assert actor.act(obs).shape == (1, 7)
-        actor.close()
-        monkeypatch.delenv("LIBERO_API_KEY")
-        actor = ServedActor(address, served.metadata, [EpisodeStart(task, 0)], [(0,)], Limits(10, 60))
-        with pytest.raises(ServerError, match="HTTP 401"):
+        with closing(OpenpiClient(address, Limits(10, 60))) as client:
+            actor = ServedActor(client, served.metadata, [EpisodeStart(task, 0)], [(0,)])
             actor.reset(1)
-        actor.close()
+            assert actor.act(obs).shape == (1, 7)
+        monkeypatch.delenv("LIBERO_API_KEY")
+        with pytest.raises(ServerError, match="HTTP 401"):
+            OpenpiClient(address, Limits(10, 60))
         with pytest.raises(urllib.error.HTTPError, match="401"):
             urllib.request.urlopen(address.replace("ws", "http"))

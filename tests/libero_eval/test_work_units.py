@@ -15,11 +15,9 @@ import pytest
 
 from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.work.claims import Claims, this_machine
-from libero_eval.work.progress import busy_seconds, measure_progress
-from libero_eval.work.status import describe_status
-from libero_eval.work.units import Unit, partition
-from libero_eval.work.worker import Worker
-from libero_eval.work.workers import Crew
+from libero_eval.work.progress import busy_seconds, describe_status, measure_progress
+from libero_eval.work.store import Unit, partition
+from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError, EvaluationIncompleteError, LifelongError, ResultsError
 from tests.harness.evaluations import TASKS, Countdown, Still, evaluate, evaluation
 
@@ -50,8 +48,8 @@ class Raising(Still):
 
 def test_every_start_is_in_one_unit_and_units_do_not_depend_on_other_tasks():
     units = partition(TASKS, range(50), 20)
-    assert [len(u.starts) for u in units] == [20, 20, 10] * 2
-    assert [i for u in units[:3] for i in u.starts] == list(range(50))
+    assert [len(u.init_states) for u in units] == [20, 20, 10] * 2
+    assert [i for u in units[:3] for i in u.init_states] == list(range(50))
     assert partition(TASKS[1:], range(50), 20) == units[3:]
     assert units[1].name == "libero_goal_00_starts_20_39"
     for starts, size in (((0, 1), 0), ((), 10), ((1, 1), 10)):
@@ -112,8 +110,8 @@ def test_an_open_environment_is_used_for_all_units_of_its_task(tmp_path):
 
 def test_a_process_begins_with_a_task_that_nobody_works_on(tmp_path):
     plan, begun = evaluation(tmp_path, **TWO), []
-    plan.folder.join(plan.units)
-    plan.folder.claims.take(plan.units[0].name)
+    plan.store.join(plan.units)
+    plan.store.claims.take(plan.units[0].name)
 
     def env(task, count):
         begun.append(task.id)
@@ -122,15 +120,15 @@ def test_a_process_begins_with_a_task_that_nobody_works_on(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         evaluate(tmp_path, env=env, **TWO)
     assert begun == [TASKS[1].id]
-    assert list(plan.folder.held()) == [plan.units[0].name], "the other unit was given back"
+    assert list(plan.store.held()) == [plan.units[0].name], "the other unit was given back"
 
 
 def test_a_process_that_does_not_wait_leaves_what_others_hold(tmp_path):
     plan = evaluation(tmp_path)
-    claim = plan.folder.claims.take(plan.units[0].name)
+    claim = plan.store.claims.take(plan.units[0].name)
     assert Worker(plan).work(wait=False) is None
-    assert set(plan.folder.done(plan.units)) == {unit.name for unit in plan.units[1:]}
-    plan.folder.claims.release(claim)
+    assert set(plan.store.done(plan.units)) == {unit.name for unit in plan.units[1:]}
+    plan.store.claims.release(claim)
     assert Worker(plan).work(wait=False) == evaluate(tmp_path / "other")
 
 
@@ -221,10 +219,10 @@ def test_a_unit_that_two_processes_run_counts_once(tmp_path):
     unit = one.units[0]
     with one.pool() as pool:
         found = one.evaluate(unit, pool)
-    one.folder.publish(unit, found)
-    other.folder.publish(unit, replace(found, result=replace(found.result, lengths=(1, 1))))
-    assert one.folder.done([unit])[unit.name].result == found.result
-    assert other.folder.done([unit])[unit.name].result == found.result, "the first one wins"
+    one.store.publish(unit, found)
+    other.store.publish(unit, replace(found, result=replace(found.result, lengths=(1, 1))))
+    assert one.store.done([unit])[unit.name].result == found.result
+    assert other.store.done([unit])[unit.name].result == found.result, "the first one wins"
 
 
 # --- errors
@@ -309,7 +307,7 @@ def test_a_unit_file_that_is_cut_off_or_from_another_evaluation_is_not_counted(t
     assert again["result"] == values["result"]
 
 
-def test_a_folder_of_something_else_is_refused(tmp_path):
+def test_a_folder_of_another_version_or_of_something_else_is_refused(tmp_path):
     (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/7"}')
     with pytest.raises(ConfigError, match="libero-evaluation-plan/7"):
         evaluate(tmp_path)
@@ -360,7 +358,7 @@ def test_a_full_disk_counts_nothing_and_the_same_command_goes_on(tmp_path, monke
 
 def test_repeating_is_refused_while_others_work(tmp_path):
     evaluate(tmp_path, **TWO)
-    folder = evaluation(tmp_path, **TWO).folder
+    folder = evaluation(tmp_path, **TWO).store
     folder.claims.take("libero_goal_00_starts_03_04")
     with pytest.raises(ConfigError, match="works on libero_goal_00_starts_03_04; end it"):
         folder.clear()
@@ -372,11 +370,11 @@ def test_repeating_is_refused_while_others_work(tmp_path):
 
 def test_the_status_says_who_holds_what_and_what_is_left(tmp_path):
     plan = evaluation(tmp_path, **TWO)
-    plan.folder.join(plan.units)
+    plan.store.join(plan.units)
     with plan.pool() as pool:
-        plan.folder.publish(plan.units[0], plan.evaluate(plan.units[0], pool))
+        plan.store.publish(plan.units[0], plan.evaluate(plan.units[0], pool))
     assert "stopped" in describe_status(tmp_path)
-    plan.folder.claims.take(plan.units[1].name)
+    plan.store.claims.take(plan.units[1].name)
     text = describe_status(tmp_path)
     assert "1 of 4 units, 2 of 8 episodes" in text and "policy    policy still" in text
     assert f"running   {plan.units[1].name} by " in text and f":{os.getpid()}, seen 0 s ago" in text
@@ -384,12 +382,12 @@ def test_the_status_says_who_holds_what_and_what_is_left(tmp_path):
 
 def test_what_processes_measured_differently_is_listed(tmp_path):
     plan = evaluation(tmp_path, **TWO)
-    plan.folder.join(plan.units)
+    plan.store.join(plan.units)
     with plan.pool() as pool:
         for i, unit in enumerate(plan.units):
             found = plan.evaluate(unit, pool)
             changed = {**found.environment, "instruction_set": "AVX2" if i else "AVX512"}
-            plan.folder.publish(unit, replace(found, environment=changed))
+            plan.store.publish(unit, replace(found, environment=changed))
     result = evaluate(tmp_path, **TWO)
     assert result.environment["instruction_set"] == ["AVX512", "AVX2"]
     assert isinstance(result.environment["policy_threads"], int)
@@ -400,23 +398,23 @@ def test_what_processes_measured_differently_is_listed(tmp_path):
 
 @pytest.mark.slow
 def test_a_killed_process_is_replaced_while_there_is_progress(capfd):
-    with pytest.raises(KeyboardInterrupt), Crew(1, time.sleep, 600) as crew:
+    with pytest.raises(KeyboardInterrupt), Workers(1, time.sleep, 600) as workers:
         for deaths in range(1, 5):
-            (pid,) = crew.pids
+            (pid,) = workers.pids
             os.kill(pid, signal.SIGKILL)
-            while crew.pids == [pid]:
+            while workers.pids == [pid]:
                 time.sleep(0.01)
-            crew.tend(done=0)
-            assert len(crew.pids) == (deaths <= 3), "the fourth without progress is not replaced"
+            workers.supervise(done=0)
+            assert len(workers.pids) == (deaths <= 3), "the fourth without progress is not replaced"
         assert capfd.readouterr().err.count("another is started") == 3
         raise KeyboardInterrupt
-    with Crew(1, time.sleep, 0) as crew:
-        while crew.pids:
+    with Workers(1, time.sleep, 0) as workers:
+        while workers.pids:
             time.sleep(0.01)
-        crew.tend(done=0)
-        assert crew.pids == [], "it has ended by itself"
+        workers.supervise(done=0)
+        assert workers.pids == [], "it has ended by itself"
 
 
 def test_units_are_plain_values():
     unit = Unit(TASKS[0], (1, 2))
-    assert asdict(unit)["starts"] == (1, 2) and hash(unit) == hash(Unit(TASKS[0], (1, 2)))
+    assert asdict(unit)["init_states"] == (1, 2) and hash(unit) == hash(Unit(TASKS[0], (1, 2)))

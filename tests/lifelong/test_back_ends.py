@@ -8,7 +8,7 @@ import pytest
 from libero_env.cli.main import main
 from libero_eval.judging.comparability import Side, back_end_of, check_comparable, check_same_back_end
 from libero_eval.judging.comparison import judge
-from libero_eval.protocols.files import load_card
+from libero_eval.protocols.files import load_protocol
 from lifelong.errors import ComparisonError, ConfigError, ProtocolError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.report.comparison import compare
@@ -25,7 +25,7 @@ def result(seed, backend=None):
 
 
 def test_a_card_names_it_and_keeps_its_digest_without():
-    card = load_card("libero")
+    card = load_protocol("libero")
     assert card.world.backend == "mujoco" and "backend" not in card.resolved()["world"]
     warp = card.changed({"world.backend": "warp"})
     assert warp.resolved()["world"]["backend"] == "warp" and warp.digest != card.digest

@@ -1,6 +1,5 @@
 """Loading of a run's policy, and its saliency."""
 
-from argparse import Namespace
 from dataclasses import replace
 
 import numpy as np
@@ -10,10 +9,10 @@ import yaml
 from PIL import Image
 
 from libero_env.tasks import get_task
-from libero_eval.candidates import RunPolicy
-from libero_eval.protocols.files import load_card
-from libero_eval.saliency import SaliencySettings
-from libero_eval.saliency_sheet import draw_saliency
+from libero_eval.policies import RunPolicy
+from libero_eval.protocols.files import load_protocol
+from libero_eval.requests import Request
+from libero_eval.saliency import SaliencySettings, draw_saliency
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.evaluation.restore import restore
 from tests.harness.runs import make_run
@@ -95,18 +94,10 @@ def test_a_run_is_evaluated_with_the_drawing_that_it_was_trained_with(tmp_path, 
     config = yaml.safe_load(file.read_text())
     config["data"]["drawing"] = drawing
     file.write_text(yaml.safe_dump(config))
-    args = Namespace(
-        policy=str(tmp_path / "run"),
-        after=None,
-        device="cpu",
-        threads=1,
-        assets="builtin",
-        backend=None,
-        allow=[],
-    )
-    policy = RunPolicy(args)
-    env = policy.env(policy.run.tasks[0], 1, policy.protocol(load_card("libero")))
+    request = Request(policy=str(tmp_path / "run"), device="cpu", threads=1, assets="builtin")
+    policy = RunPolicy(request)
+    env = policy.env(policy.run.tasks[0], 1, policy.protocol(load_protocol("libero")))
     try:
-        assert env.env.scene.drawing == drawing
+        assert env.scene.drawing == drawing
     finally:
         env.close()

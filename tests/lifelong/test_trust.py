@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import yaml
 
 from libero_env.cli.main import main
 from libero_eval.repeat import repeated
+from libero_eval.requests import EvalRequest
 from lifelong.errors import ConfigError
 from lifelong.evaluation.restore import restore
 from lifelong.settings.targets import GROUPS, find_target
@@ -49,7 +51,7 @@ HOSTILE = [
     *("lifelong.policies.base.Policy.__subclasses__", "lifelong.language.encoder.np.load", "lifelong.nn"),
     *(
         "libero_env.storage.atomic_path",
-        "libero_eval.candidates.load_callable",
+        "libero_eval.user_policy.load_callable",
         "lifelong.data.loading.Path",
     ),
     *("lifelong.tracking.__builtins__", "lifelong.nn.augmentation.ABC", "lifelong.launch.SweepStart"),
@@ -101,7 +103,7 @@ def test_every_target_of_the_configuration_files_may_be_saved():
 @pytest.mark.parametrize(
     "group", sorted({*GROUPS} - {"stream", "train", "augmentation", "wandb", "pretrain"})
 )
-@pytest.mark.parametrize("target", ["posix.mkdir", "libero_eval.candidates.importlib.import_module"])
+@pytest.mark.parametrize("target", ["posix.mkdir", "libero_eval.user_policy.importlib.import_module"])
 def test_a_strangers_run_executes_nothing(group, target, changed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = changed(**{group: {"_target_": target, "path": "made", "name": "made"}})
@@ -166,10 +168,9 @@ def test_code_named_by_a_result_needs_permission(tmp_path, monkeypatch):
     result = argparse.Namespace(
         evaluated={"policy": "evil:make"}, tasks=[], unit_starts=1, environment={}, protocol={}
     )
-    args = argparse.Namespace(policy=str(tmp_path), policy_threads=None, out=None, allow=[], backend=None)
+    request = EvalRequest(policy=str(tmp_path))
     for kind in ("policy", "run", "server"):
         result.evaluated = {kind: "evil.part:make"}
         with pytest.raises(ConfigError, match="allow it with --allow evil"):
-            repeated(args, result)
-    args.allow = ["evil"]
-    assert repeated(args, result).policy == "evil.part:make"
+            repeated(request, result)
+    assert repeated(replace(request, allow=("evil",)), result).policy == "evil.part:make"

@@ -15,20 +15,19 @@ from typing import Any
 
 from libero_env.errors import LiberoError
 from libero_env.tasks import Task
+from libero_env.text import json_safe
 from libero_env.timing import CONTROL_PERIOD
 from libero_eval.evaluation_file import EvaluationResult, TaskResult
-from libero_eval.protocols.protocol import Card
+from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.work.claims import LEASE
-from libero_eval.work.folder import PLAN_FORMAT, UnitResult, WorkFolder, describe, this_process
 from libero_eval.work.progress import busy_seconds
-from libero_eval.work.units import UNIT_STARTS, Unit, partition
+from libero_eval.work.store import PLAN_FORMAT, Unit, UnitResult, WorkStore, describe, partition, this_process
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, WatchesWorld
 from lifelong.evaluation.environment_record import common_environment, describe_environment
 from lifelong.evaluation.environments import EnvPool, VectorEnv
 from lifelong.evaluation.rollout import Episode, Rollouts, run_episodes, save_animation
 from lifelong.results.provenance import installed_versions
-from lifelong.results.summary import json_safe
 
 # Memory, as measured with libero_10/0
 PROCESS_BYTES, SIMULATION_BYTES, IMAGE_COPIES = 600e6, 2e6, 7
@@ -36,7 +35,7 @@ DECISIVE = ("mujoco", "models", "models_digest")  # versions that the results of
 
 
 @dataclass(frozen=True)
-class SuiteEvaluation:
+class Evaluation:
     """An evaluation of a policy on tasks.
 
     Attributes:
@@ -63,11 +62,11 @@ class SuiteEvaluation:
     identity: Mapping[str, Any]
     tasks: Sequence[Task]
     init_states: tuple[int, ...]
-    protocol: Card
+    protocol: EvalProtocol
     out: Path
     env: Callable[[Task, int], VectorEnv]
     actor: Callable[[Task, Sequence[int]], AbstractContextManager[Actor]]
-    unit_starts: int = UNIT_STARTS
+    unit_starts: int = 10
     retries: int = 1
     errors_are_failures: bool = False
     videos: int = 0
@@ -83,7 +82,7 @@ class SuiteEvaluation:
         return partition(self.tasks, self.init_states, self.unit_starts)
 
     @cached_property
-    def folder(self) -> WorkFolder:
+    def store(self) -> WorkStore:
         """The folder of the results, which other processes may share."""
         simulation = {k: v for k, v in self.versions.items() if k in DECISIVE}
         plan = {
@@ -96,7 +95,7 @@ class SuiteEvaluation:
             "policy_threads": self.policy_threads,
             "simulation": simulation,
         }
-        return WorkFolder(self.out, plan, self.lease)
+        return WorkStore(self.out, plan, self.lease)
 
     @property
     def _resolved_protocol(self) -> dict[str, Any]:
@@ -125,7 +124,7 @@ class SuiteEvaluation:
             label: Text before the progress bar.
         """
         started = time.time()
-        env = pool.get((unit.task.id, len(unit.starts)))
+        env = pool.get((unit.task.id, len(unit.init_states)))
         done = self._run(unit, env, label)
         self._save_videos(unit, done)
         return self._unit_result(unit, done, env, started)
@@ -144,7 +143,7 @@ class SuiteEvaluation:
         """
         started, parts = time.time(), []
         errors: list[str | None] = []
-        for start in unit.starts:
+        for start in unit.init_states:
             alone = Unit(unit.task, (start,))
             env = pool.get((unit.task.id, 1))
             try:
@@ -153,7 +152,7 @@ class SuiteEvaluation:
             except LiberoError:
                 raise
             except Exception as error:  # noqa: BLE001 - policies raise errors of any type
-                if not has_worked and len(errors) == len(unit.starts) - 1 and all(errors):
+                if not has_worked and len(errors) == len(unit.init_states) - 1 and all(errors):
                     raise
                 atoms = tuple(getattr(env, "atoms", ()))
                 none = (False,) * len(atoms)
@@ -167,7 +166,7 @@ class SuiteEvaluation:
         names = [unit.name for unit in self.units if unit.task is task]
         if not all(name in done for name in names):
             return None
-        return _joined([done[name].result for name in names])
+        return TaskResult.joined([done[name].result for name in names])
 
     def result(self, done: Mapping[str, UnitResult]) -> EvaluationResult:
         """Return the results of all tasks with all that they depend on; it depends on the units' files only.
@@ -179,32 +178,32 @@ class SuiteEvaluation:
             ConfigError: A unit is missing.
         """
         tasks = [self.task_result(task, done) for task in self.tasks]
-        found = [done[unit.name] for unit in self.units if unit.name in done]
-        if len(found) != len(self.units):
-            raise ConfigError(f"{len(found)} of {len(self.units)} units are done: there is no result yet")
+        units = [done[unit.name] for unit in self.units if unit.name in done]
+        if len(units) != len(self.units):
+            raise ConfigError(f"{len(units)} of {len(self.units)} units are done: there is no result yet")
         return EvaluationResult(
             evaluated=self.identity,
             protocol=self._resolved_protocol,
             init_states=self.init_states,
-            versions=common_environment([one.versions for one in found]),
-            environment=common_environment([one.environment for one in found]),
+            versions=common_environment([one.versions for one in units]),
+            environment=common_environment([one.environment for one in units]),
             unit_starts=self.unit_starts,
             tasks=tuple(task for task in tasks if task is not None),
             times=self._times(done),
         )
 
     def _run(self, unit: Unit, env: VectorEnv, label: str = "") -> Rollouts:
-        filmed = [i for i, start in enumerate(unit.starts) if start in self.init_states[: self.videos]]
-        with self.actor(_acted_task(env, unit), unit.starts) as actor:
+        filmed = [i for i, start in enumerate(unit.init_states) if start in self.init_states[: self.videos]]
+        with self.actor(_acted_task(env, unit), unit.init_states) as actor:
             if isinstance(actor, WatchesWorld):
                 actor.watch(env)  # type: ignore[arg-type]  # of every environment of this package
             return run_episodes(
                 actor,
                 env,
-                unit.starts,
+                unit.init_states,
                 horizon=self.protocol.steps(unit.task),
                 settle_steps=self.protocol.settle_steps,
-                settle_action=self.protocol.settle_action,
+                settle_action=self.protocol.episode.settle_action,
                 record_every=self.record_every if filmed else 0,
                 recorded=filmed,
                 label=label or unit.task.id,
@@ -219,6 +218,7 @@ class SuiteEvaluation:
         started: float,
         errors: tuple[str | None, ...] = (),
     ) -> UnitResult:
+        attempts = tuple(e.attempts for e in done.episodes)
         result = TaskResult(
             task=unit.task.id,
             name=unit.task.name,
@@ -231,28 +231,23 @@ class SuiteEvaluation:
             atoms_at_end=tuple(e.at_end for e in done.episodes),
             errors=errors if any(errors) else (),
             actions=tuple(e.actions for e in done.episodes),
-            attempts=tuple(e.attempts for e in done.episodes)
-            if any(e.attempts for e in done.episodes)
-            else (),
+            attempts=attempts if any(attempts) else (),
         )
         environment = describe_environment(env)
         return UnitResult(result, environment, self.versions, this_process(), started, time.time())
 
     def _times(self, done: Mapping[str, UnitResult]) -> dict[str, Any]:
         spans = {unit: done[unit.name] for unit in self.units}
-        started, finished = (
-            min(s.started for s in spans.values()),
-            max(s.finished for s in spans.values()),
-        )
+        results = spans.values()
         return {
-            "started": _iso(started),
-            "finished": _iso(finished),
-            "busy_seconds": round(busy_seconds((s.started, s.finished) for s in spans.values()), 2),
+            "started": _iso(min(r.started for r in results)),
+            "finished": _iso(max(r.finished for r in results)),
+            "busy_seconds": round(busy_seconds((r.started, r.finished) for r in results), 2),
             "seconds": {
-                task.id: round(sum(s.finished - s.started for u, s in spans.items() if u.task is task), 2)
+                task.id: round(sum(r.finished - r.started for u, r in spans.items() if u.task is task), 2)
                 for task in self.tasks
             },
-            "processes": len({s.process for s in spans.values()}),
+            "processes": len({r.process for r in results}),
         }
 
     def _save_videos(self, unit: Unit, done: Rollouts) -> None:
@@ -271,26 +266,6 @@ def _acted_task(env: VectorEnv, unit: Unit) -> Task:
     """Return the task that a policy is told: that of the environment, which perturbations may have changed."""
     task = getattr(env, "task", None)
     return task if isinstance(task, Task) else unit.task
-
-
-def _joined(parts: Sequence[TaskResult]) -> TaskResult:
-    """Return the results of a task from those of parts of its episodes, in order."""
-    first = parts[0]
-    raised = any(part.errors for part in parts)
-    return TaskResult(
-        task=first.task,
-        name=first.name,
-        instruction=first.instruction,
-        init_states=tuple(i for part in parts for i in part.init_states),
-        successes=tuple(won for part in parts for won in part.successes),
-        lengths=tuple(n for part in parts for n in part.lengths),
-        atoms=first.atoms,
-        atoms_ever=tuple(row for part in parts for row in part.atoms_ever),
-        atoms_at_end=tuple(row for part in parts for row in part.atoms_at_end),
-        errors=tuple(e for p in parts for e in (p.errors or (None,) * len(p.init_states))) if raised else (),
-        actions=tuple(digest for part in parts for digest in part.actions),
-        attempts=tuple(row for part in parts for row in part.attempts),
-    )
 
 
 def _iso(seconds: float) -> str:

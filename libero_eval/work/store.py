@@ -18,23 +18,66 @@ import socket
 import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from libero_env.storage import atomic_write_text, create_text
-from libero_eval.evaluation_file import FILE_NAME, TaskResult, task_result
+from libero_env.errors import InvalidInputError
+from libero_env.storage import create_text, read_json, write_json
+from libero_env.tasks import Task
+from libero_env.text import flatten, json_safe, shorten, to_json
+from libero_env.validation import validate
+from libero_eval.evaluation_file import FILE_NAME, TaskResult
 from libero_eval.work.claims import LEASE, Claim, Claims, Held
-from libero_eval.work.units import Unit
 from lifelong.errors import ConfigError, LifelongError, ResultsError
 from lifelong.results.provenance import utc_now
-from lifelong.results.summary import json_safe
 
 PLAN_NAME = "evaluation.json"
 PLAN_FORMAT = "libero-evaluation-plan/1"
 UNIT_FORMAT = "libero-evaluation-unit/1"
 AGAIN = "name another folder with --out, or repeat the evaluation with --again"
-OWN_PARTS = (PLAN_NAME, FILE_NAME, "units", "claims", "errors")
+PARTS = (PLAN_NAME, FILE_NAME, "units", "claims", "errors")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A part of an evaluation, a task and a range of its initial states: all its episodes are run in one batch.
+
+    Attributes:
+        task: Task of the benchmark.
+        init_states: Indices of the initial states.
+    """
+
+    task: Task
+    init_states: tuple[int, ...]
+
+    @property
+    def name(self) -> str:
+        """Name of the unit's files, such as `libero_goal_03_starts_10_19`."""
+        first, last = self.init_states[0], self.init_states[-1]
+        return f"{self.task.suite}_{self.task.index:02d}_starts_{first:02d}_{last:02d}"
+
+
+def partition(tasks: Iterable[Task], init_states: Sequence[int], size: int) -> tuple[Unit, ...]:
+    """Return the units of an evaluation, task by task.
+
+    The units of a task do not depend on the other tasks, so that bits of a policy that depend on the composition of
+    its batch do not either.
+
+    Args:
+        tasks: Tasks of the benchmark.
+        init_states: Indices of the initial states of each task.
+        size: Number of initial states of a unit; the last one of a task may have fewer.
+
+    Raises:
+        ConfigError: The size is not positive, there are no initial states, or one is named twice.
+    """
+    if size < 1:
+        raise ConfigError(f"{size} initial states in a unit; a unit needs at least 1")
+    if not init_states or len(set(init_states)) != len(init_states):
+        raise ConfigError(f"initial states {list(init_states)}: name at least one, and each once")
+    parts = [tuple(init_states[i : i + size]) for i in range(0, len(init_states), size)]
+    return tuple(Unit(task, part) for task in tasks for part in parts)
 
 
 @dataclass(frozen=True)
@@ -73,7 +116,7 @@ class UnitErrors:
     path: Path
 
 
-class WorkFolder:
+class WorkStore:
     """The folder of an evaluation.
 
     Args:
@@ -96,15 +139,14 @@ class WorkFolder:
         """
         with _named_errors(self.path, "the folder of the evaluation cannot be written"):
             self.path.mkdir(parents=True, exist_ok=True)
-            sizes = {unit.name: len(unit.starts) for unit in units}
-            known = self._read_plan()
-            if known is None:
-                text = _to_text({**self._plan, "units": sizes, "started": utc_now()})
-                create_text(self.path / PLAN_NAME, text)
-                known = read_plan(self.path)
-            self._check_plan(known)
-            if not sizes.keys() <= known["units"].keys():  # more tasks than so far
-                atomic_write_text(self.path / PLAN_NAME, _to_text(known | {"units": known["units"] | sizes}))
+            sizes = {unit.name: len(unit.init_states) for unit in units}
+            file = self.path / PLAN_NAME
+            if not file.exists():
+                create_text(file, to_json({**self._plan, "units": sizes, "started": utc_now()}))
+            stored = read_plan(self.path)
+            self._check_plan(stored)
+            if not sizes.keys() <= stored["units"].keys():  # more tasks than so far
+                write_json(file, stored | {"units": stored["units"] | sizes})
 
     def clear(self) -> None:
         """Remove the evaluation; videos and files of others stay.
@@ -117,7 +159,7 @@ class WorkFolder:
             raise ConfigError(
                 f"{self.path}: {who} works on {held.unit}; end it before you repeat the evaluation"
             )
-        for name in OWN_PARTS:
+        for name in PARTS:
             path = self.path / name
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         self._results = {}
@@ -136,7 +178,7 @@ class WorkFolder:
                 self._results[unit.name] = self._read_unit(unit)
         return {unit.name: self._results[unit.name] for unit in units if unit.name in self._results}
 
-    def publish(self, unit: Unit, found: UnitResult) -> None:
+    def publish(self, unit: Unit, result: UnitResult) -> None:
         """Write a unit's result. If another process was faster, its result stays.
 
         Raises:
@@ -146,8 +188,8 @@ class WorkFolder:
         with _named_errors(
             self._unit_path(unit), "the result of the unit cannot be written, it is not counted"
         ):
-            create_text(self._unit_path(unit), _to_text(head | asdict(found)))
-        if not found.result.errors:
+            create_text(self._unit_path(unit), to_json(head | asdict(result)))
+        if not result.result.errors:
             (self.path / "errors" / f"{unit.name}.json").unlink(missing_ok=True)
 
     def add_error(self, unit: Unit, error: BaseException) -> UnitErrors:
@@ -160,17 +202,17 @@ class WorkFolder:
             "traceback": "".join(traceback.format_exception(error)),
         }
         with _named_errors(path, "the error of a unit cannot be written"):
-            atomic_write_text(path, _to_text({"unit": unit.name, "errors": [*_read_errors(path), entry]}))
+            write_json(path, {"unit": unit.name, "errors": [*_read_errors(path), entry]})
         return self.errors()[unit.name]
 
     def errors(self) -> dict[str, UnitErrors]:
         """Return the errors of the units that are not done."""
-        found = {}
+        errors = {}
         for name in sorted(_names(self.path / "errors") - _names(self.path / "units")):
             path = self.path / "errors" / f"{name}.json"
             if entries := _read_errors(path):
-                found[name] = UnitErrors(len(entries), str(entries[-1]["error"]), path)
-        return found
+                errors[name] = UnitErrors(len(entries), str(entries[-1]["error"]), path)
+        return errors
 
     def take(self, units: Iterable[Unit]) -> tuple[Unit, Claim] | None:
         """Claim the first of the units that nobody works on; None if there is none.
@@ -199,26 +241,28 @@ class WorkFolder:
     def _unit_path(self, unit: Unit) -> Path:
         return self.path / "units" / f"{unit.name}.json"
 
-    def _read_plan(self) -> dict[str, Any] | None:
-        return read_plan(self.path) if (self.path / PLAN_NAME).exists() else None
-
-    def _check_plan(self, known: Mapping[str, Any]) -> None:
-        different = list(_differences({k: known.get(k) for k in self._plan}, self._plan))
+    def _check_plan(self, stored: Mapping[str, Any]) -> None:
+        there, here = flatten({key: stored.get(key) for key in self._plan}), flatten(self._plan)
+        different = [
+            f"{name} is {_shown(there.get(name))} there and {_shown(here.get(name))} here"
+            for name in sorted(there.keys() | here.keys())
+            if there.get(name) != here.get(name)
+        ]
         if different:
             raise ConfigError(f"{self.path} holds another evaluation: {'; '.join(different)}. Either {AGAIN}")
 
     def _digest(self, unit: Unit) -> str:
-        parts = [self._plan, unit.task.bddl_text, unit.starts]
+        parts = [self._plan, unit.task.bddl_text, unit.init_states]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
     def _read_unit(self, unit: Unit) -> UnitResult:
         path = self._unit_path(unit)
-        found, digest = read_unit(path)
-        if digest != self._digest(unit) or found.result.init_states != unit.starts:
+        result, digest = read_unit(path)
+        if digest != self._digest(unit) or result.result.init_states != unit.init_states:
             raise ConfigError(
                 f"{path} was made by another evaluation or another version of the task: {AGAIN}"
             )
-        return found
+        return result
 
 
 def read_unit(path: Path) -> tuple[UnitResult, str]:
@@ -228,21 +272,15 @@ def read_unit(path: Path) -> tuple[UnitResult, str]:
         LifelongError: The file is broken.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-        if values["format"] != UNIT_FORMAT:
-            raise ValueError(f"the format is {values['format']!r}, not {UNIT_FORMAT}")
-        found = UnitResult(
-            result=task_result(values["result"]),
-            environment=dict(values["environment"]),
-            versions=dict(values["versions"]),
-            process=str(values["process"]),
-            started=float(values["started"]),
-            finished=float(values["finished"]),
-        )
-        return found, str(values["digest"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        values = read_json(path)
+        stated = values.get("format") if isinstance(values, dict) else None
+        if stated != UNIT_FORMAT:
+            raise InvalidInputError(f"the format is {stated!r}, not {UNIT_FORMAT!r}")
+        content = {f.name: values[f.name] for f in fields(UnitResult) if f.name in values}
+        return validate(UnitResult, content), str(values.get("digest"))
+    except InvalidInputError as error:
         raise LifelongError(
-            f"{path} is not a valid result of a unit ({describe(error)}); nothing of it is counted: remove it, and "
+            f"{path} is not a valid result of a unit ({error}); nothing of it is counted: remove it, and "
             "the unit is run again"
         ) from error
 
@@ -254,14 +292,14 @@ def read_plan(path: Path) -> dict[str, Any]:
         LifelongError: There is no evaluation, or the file is broken.
     """
     file = path / PLAN_NAME
+    if not file.exists():
+        raise LifelongError(f"{path} holds no evaluation: {file.name} is missing")
     try:
-        values = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise LifelongError(f"{path} holds no evaluation: {file.name} is missing") from error
-    except (OSError, ValueError) as error:
-        raise LifelongError(f"{file} cannot be read ({error}): {AGAIN}") from error
-    if not isinstance(values, dict) or values.get("format") != PLAN_FORMAT:
-        stated = values.get("format") if isinstance(values, dict) else None
+        values = read_json(file)
+    except InvalidInputError as error:
+        raise LifelongError(f"{error}: {AGAIN}") from error
+    stated = values.get("format") if isinstance(values, dict) else None
+    if stated != PLAN_FORMAT:
         raise ConfigError(f"{file} has the format {stated!r}; this version reads {PLAN_FORMAT}: {AGAIN}")
     if not all(isinstance(values.get(key), dict) for key in ("units", "evaluated")):
         raise LifelongError(f"{file} lacks `units` or `evaluated`: it is broken; {AGAIN}")
@@ -288,10 +326,6 @@ def _named_errors(path: Path, what: str) -> Iterator[None]:
         raise ResultsError(f"{error.filename or path}: {what}: {error.strerror or error}") from error
 
 
-def _to_text(values: Mapping[str, Any]) -> str:
-    return json.dumps(json_safe(values), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
 def _names(folder: Path) -> set[str]:
     """Return the names of the complete files in a folder, without the suffix."""
     try:
@@ -307,15 +341,5 @@ def _read_errors(path: Path) -> list[Mapping[str, Any]]:
         return []
 
 
-def _differences(there: Any, here: Any, name: str = "") -> Iterable[str]:
-    """Yield where plain data differ, such as `protocol.horizon is 600 there and 300 here`."""
-    if isinstance(there, dict) and isinstance(here, dict):
-        for key in sorted({*there, *here}):
-            yield from _differences(there.get(key), here.get(key), f"{name}.{key}" if name else key)
-    elif there != here:
-        yield f"{name} is {_short(there)} there and {_short(here)} here"
-
-
-def _short(value: Any) -> str:
-    text = json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+def _shown(value: Any) -> str:
+    return shorten(json.dumps(value, ensure_ascii=False), 60)

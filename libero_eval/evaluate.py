@@ -1,0 +1,255 @@
+"""From a request to a result: what is to be run, and the processes that run it."""
+
+import io
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from libero_env.cli import ending
+from libero_env.init_states.store import NUM_INIT_STATES
+from libero_env.memory import require_memory
+from libero_env.perturbations import format_perturbations, parse_perturbations
+from libero_env.sim.backend import Backend
+from libero_env.tasks import Task
+from libero_env.tasks.published import require_available
+from libero_eval.evaluation_file import EvaluationResult, TaskResult
+from libero_eval.policies import SELECTION, ExpertPolicy, PolicyUnderTest, RunPolicy
+from libero_eval.protocols.environment import resolve_world
+from libero_eval.protocols.files import load_protocol
+from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.repeat import check_same, is_result, repeated
+from libero_eval.requests import EvalRequest, Request
+from libero_eval.work.evaluation import Evaluation
+from libero_eval.work.progress import Progress
+from libero_eval.work.worker import Worker, Workers
+from lifelong.errors import ConfigError
+from lifelong.results.provenance import installed_versions
+
+
+def evaluate(
+    request: EvalRequest,
+    *,
+    on_task: Callable[[TaskResult], None] = lambda _: None,
+    on_progress: Callable[[Progress], None] = lambda _: None,
+) -> EvaluationResult:
+    """Evaluate a policy; what is done already in the folder is not run again.
+
+    Args:
+        request: Policy, tasks and episodes.
+        on_task: Function called with the result of each task as soon as it is known.
+        on_progress: Function called with the progress of all processes every half minute, and at the end.
+
+    Returns:
+        The result, which is also written to `eval.json` in the folder.
+
+    Raises:
+        LiberoError: The policy, a task, the protocol or the set of initial states does not exist, or the folder holds
+            another evaluation.
+        EvaluationIncompleteError: Episodes ended with errors; the others are kept.
+    """
+    return run(plan_evaluation(request), request, on_task=on_task, on_progress=on_progress)
+
+
+def run(
+    evaluation: Evaluation,
+    request: EvalRequest,
+    *,
+    on_task: Callable[[TaskResult], None] = lambda _: None,
+    on_progress: Callable[[Progress], None] = lambda _: None,
+) -> EvaluationResult:
+    """Run a planned evaluation in as many processes as the request names; see `evaluate`."""
+    count = min(request.workers, len(evaluation.units))
+    remedy = "fewer --workers, --unit-starts or --videos, or a smaller --size"
+    require_memory(evaluation.memory(count), f"an evaluation by {count} processes", remedy)
+    if request.again:
+        evaluation.store.clear()
+    try:
+        with policy_threads(evaluation), Workers(count - 1, _help, replace(request, again=False)) as workers:
+            return Worker(
+                evaluation, on_result=on_task, on_progress=on_progress, on_wait=workers.supervise
+            ).run()
+    except KeyboardInterrupt as error:
+        error.add_note(f"{evaluation.out} keeps what is done; the same command goes on")
+        raise
+
+
+def _help(request: EvalRequest) -> None:
+    """Work on the evaluation of another process, which prints it; errors go to the standard error."""
+
+    def work() -> None:
+        with redirect_stderr(io.StringIO()):  # the other process says the same
+            evaluation = plan_evaluation(request)
+        with policy_threads(evaluation):
+            Worker(evaluation).run()
+
+    work_quietly(work)
+
+
+def work_quietly(work: Callable[[], None]) -> None:
+    """Call a function in a further process; an error ends the process with one line."""
+    with suppress(KeyboardInterrupt), ending.interruptible():
+        try:
+            work()
+        except Exception as error:  # noqa: BLE001 - told by kind
+            sys.exit(ending.report(error, who="a worker ended: "))
+
+
+@contextmanager
+def policy_threads(evaluation: Evaluation) -> Iterator[None]:
+    """Give PyTorch the number of threads that the evaluation names; their number changes the bits of a policy."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(evaluation.policy_threads or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None) -> Evaluation:
+    """Return the evaluation that is asked for.
+
+    Args:
+        request: Policy, tasks and episodes.
+        policy: The policy that it names, where it is loaded already.
+
+    Raises:
+        LiberoError: The policy, a task, the protocol or the set of initial states does not exist.
+    """
+    from libero_env.cli.tasks import find_tasks
+
+    earlier = EvaluationResult.read(request.policy_name) if is_result(request.policy_name) else None
+    if earlier is None:
+        base = load_protocol(request.protocol)
+    else:
+        base = EvalProtocol.read(earlier.protocol, request.policy_name)
+        request = repeated(request, earlier)
+    _check_options(request, earlier)
+    policy = policy or load_policy(request)
+    tasks = find_tasks(request.suite) if request.suite else policy.tasks
+    if not tasks:
+        raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
+    require_available(tasks)
+    protocol = _protocol(request, policy.protocol(base), tasks)
+    identity = {**policy.identity, "seed": request.seed}
+    versions = installed_versions(request.assets)
+    if earlier is None:
+        init_states = choose_init_states(request.starts, _episodes(request, tasks), policy.selection)
+    else:
+        init_states = earlier.init_states
+        check_same(earlier, evaluated=identity, protocol=protocol, versions=versions, despite=request.despite)
+    return Evaluation(
+        identity=identity,
+        tasks=tuple(dict.fromkeys(tasks)),
+        init_states=init_states,
+        protocol=protocol,
+        out=request.out or policy.out,
+        env=lambda task, count: policy.env(task, count, protocol),
+        actor=lambda task, states: policy.actor(task, states, protocol),
+        unit_starts=request.unit_starts,
+        retries=request.retries,
+        errors_are_failures=protocol.episode.errors == "failure",
+        videos=request.videos,
+        progress=sys.stderr.isatty() and request.workers == 1,
+        versions=versions,
+        policy_threads=request.policy_threads or (1 if policy.on_cpu else None),
+    )
+
+
+def load_policy(request: Request) -> PolicyUnderTest:
+    """Return the policy that is asked for: the expert, a server's, a user's own, or a run's."""
+    kind = _kind(request.policy_name)
+    if kind == "server":
+        from libero_eval.servers.policy import ServerPolicy
+
+        return ServerPolicy(request)
+    if kind == "module":
+        from libero_eval.user_policy import UserPolicy
+
+        return UserPolicy(request)
+    return ExpertPolicy(request) if kind == "expert" else RunPolicy(request)
+
+
+def _kind(policy: str) -> str:
+    if "://" in policy:
+        return "server"
+    if Path(policy).exists():
+        return "run"
+    return "expert" if policy == "expert" else "module" if ":" in policy else "run"
+
+
+def choose_init_states(
+    which: str, count: int | None, selection: Sequence[int] = SELECTION
+) -> tuple[int, ...]:
+    """Return the indices of the initial states to evaluate.
+
+    Args:
+        which: `all`; `selection`: those by which a checkpoint may have been chosen; `reporting`: the others.
+        count: Number of them, from the first on; None: all of them.
+        selection: Initial states for selection.
+
+    Raises:
+        ConfigError: There are fewer than `count`.
+    """
+    sets: dict[str, Sequence[int]] = {
+        "all": range(NUM_INIT_STATES),
+        "selection": selection,
+        "reporting": [i for i in range(NUM_INIT_STATES) if i not in selection],
+    }
+    chosen = tuple(sets[which])
+    count = len(chosen) if count is None else count
+    if not 1 <= count <= len(chosen):
+        raise ConfigError(f"{count} episodes of a task; {which} has 1 to {len(chosen)} initial states")
+    return chosen[:count]
+
+
+def _episodes(request: EvalRequest, tasks: Sequence[Task]) -> int | None:
+    """Return the number of episodes of each task; None for all: LIBERO-Plus has one, from the first initial state.
+
+    Raises:
+        ConfigError: A task has fewer initial states.
+    """
+    scarce = [task for task in tasks if task.num_starts == 1]
+    from_plus = all(task.suite.startswith("libero_plus_") for task in tasks)
+    count = request.episodes or (1 if from_plus else None)
+    if scarce and (count != 1 or request.starts == "selection"):
+        raise ConfigError(
+            f"{scarce[0].id} has one initial state, number 0: --episodes 1, without --starts selection"
+        )
+    return count
+
+
+def _protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[Task]) -> EvalProtocol:
+    """Return the protocol on this machine, with what the request changes; what was chosen is printed."""
+    protocol, notes = resolve_world(base, tasks, request.assets)
+    changes: dict[str, object] = {}
+    if request.horizon:
+        changes["episode.horizon"] = request.horizon
+    if request.perturb is not None:
+        perturbations = parse_perturbations(request.perturb, request.perturb_seed)
+        changes["world.perturb"] = format_perturbations(perturbations)
+    if request.robot:
+        changes["world.robot"] = request.robot
+    if request.backend is not None:
+        changes["world.backend"] = Backend.read(request.backend).name
+    protocol = protocol.changed(changes)
+    Backend.read(request.backend or protocol.world.backend).require_installed()
+    protocol.require()
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr, flush=True)
+    return protocol
+
+
+def _check_options(request: EvalRequest, earlier: EvaluationResult | None) -> None:
+    """Check that no option is given that means nothing for this kind of policy.
+
+    Raises:
+        ConfigError: One is; the message says what it is of.
+    """
+    if request.after is not None and _kind(request.policy_name) != "run":
+        raise ConfigError(f"--after is of runs, and {request.policy} is none")
+    if request.despite and earlier is None:
+        raise ConfigError(f"--despite is of results that are run again, and {request.policy} is none")

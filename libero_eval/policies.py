@@ -1,0 +1,178 @@
+"""Policies that can be evaluated: what each sees, and what acts for it. Those of runs, and the scripted expert."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from libero_env.init_states.store import NUM_INIT_STATES
+from libero_env.tasks import Task
+from libero_eval.protocols.adapter import ACTION_DIM, view_of
+from libero_eval.protocols.environment import OBSERVATIONS, ProtocolEnv, run_protocol
+from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.requests import Request
+from lifelong.data.settings import CAMERAS
+from lifelong.evaluation.actors import Actor, PolicyActor
+from lifelong.evaluation.environments import Obs
+from lifelong.evaluation.restore import restore
+from lifelong.seeding import EVALUATION, generator
+
+if TYPE_CHECKING:
+    from libero_env.envs.batch import BatchEnv
+
+# Initial states by which a checkpoint is chosen by default
+SELECTION = range(NUM_INIT_STATES - 20, NUM_INIT_STATES)
+
+
+class PolicyUnderTest(ABC):
+    """A policy to be evaluated.
+
+    Args:
+        request: What is asked for.
+
+    Attributes:
+        identity: Plain data that identify the policy.
+        out: Default folder of the results.
+        tasks: Tasks of its run, if it has one.
+        selection: Initial states by which it may have been chosen.
+        on_cpu: Whether it is a network of this package on the CPU, whose bits depend on its number of threads.
+        cameras: Cameras that are rendered for it; None for the protocol's.
+        observations: Names of its observations, see `libero_env.sim.observations`.
+    """
+
+    identity: Mapping[str, Any]
+    out: Path
+    tasks: Sequence[Task] = ()
+    selection: Sequence[int] = SELECTION
+    on_cpu: bool = False
+    cameras: tuple[str, ...] | None = None
+    observations: tuple[str, ...] = OBSERVATIONS
+
+    def __init__(self, request: Request):
+        self.request = request
+
+    def protocol(self, base: EvalProtocol) -> EvalProtocol:
+        """Return the protocol as it is run with the policy, such as with the image size that it was trained on."""
+        return base
+
+    def env(self, task: Task, count: int, protocol: EvalProtocol) -> ProtocolEnv:
+        """Build the environment of a task with the given number of simulations."""
+        request = self.request
+        return ProtocolEnv(
+            protocol,
+            task,
+            count,
+            cameras=self.cameras,
+            observations=self.observations,
+            threads=request.threads_of_worker,
+            assets=request.assets,
+            backend=request.backend,
+        )
+
+    @abstractmethod
+    def actor(
+        self, task: Task, states: Sequence[int], protocol: EvalProtocol
+    ) -> AbstractContextManager[Actor]:
+        """Return the context manager of the task's actor, which starts in the given initial states."""
+
+    def seeds(self, task: Task, states: Sequence[int]) -> list[tuple[int, ...]]:
+        """Return the words from which the random numbers of each episode are made."""
+        return [(self.request.seed, EVALUATION, task.index, state) for state in states]
+
+
+class RunPolicy(PolicyUnderTest):
+    """The policy of a run, evaluated with the images it was trained on: their size and drawing."""
+
+    def __init__(self, request: Request):
+        super().__init__(request)
+        run = restore(
+            Path(request.policy_name), after=request.after, device=request.device, allow=request.allow
+        )
+        self.run = run
+        self.identity = {"run": str(run.path), "after": run.learned, "weights": run.weights_digest}
+        self.out = run.path / "eval" / f"after_{run.learned:02d}"
+        self.tasks = run.tasks
+        self.selection = tuple(run.eval.init_states("curve"))
+        self.on_cpu = run.device.type == "cpu"
+        self.cameras = tuple(CAMERAS[view] for view in run.policy.spec.views)
+
+    def protocol(self, base: EvalProtocol) -> EvalProtocol:
+        """Return the protocol with the run's images and one prediction for each step; see `PolicyUnderTest`."""
+        run = self.run
+        return run_protocol(
+            base,
+            run.policy.spec.image_size,
+            run.eval.horizon,
+            run.eval.settle_steps,
+            run.robot,
+            drawing=run.drawing,
+            assets=self.request.assets,
+        )
+
+    @contextmanager
+    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
+        """Yield the policy with a generator for each episode; see `PolicyUnderTest`."""
+        run = self.run
+        draws = [generator(*words) for words in self.seeds(task, states)]
+        with run.acting(task) as policy:
+            yield PolicyActor(policy, run.embed(task), run.device, run.eval.precision, draws)
+
+
+class ExpertPolicy(PolicyUnderTest):
+    """The scripted expert, which sees the whole state: how much of a task can be done at all."""
+
+    out = Path("eval/expert")
+
+    def __init__(self, request: Request):
+        from libero_env.demos.config import GENERATOR
+
+        super().__init__(request)
+        self.identity = {"policy": "expert", "generator": GENERATOR}
+        self.cameras = ("agentview",) if request.videos else ()
+        self.observations = ("rgb",) if request.videos else ()
+
+    @contextmanager
+    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
+        """Yield an expert for each episode; see `PolicyUnderTest`."""
+        yield ExpertActor(self.seeds(task, states), tuple(map(view_of, self.cameras or ())))
+
+
+class ExpertActor:
+    """The scripted expert, one for each simulation; what it does depends on its seed and its simulation alone.
+
+    Args:
+        seeds: Seed of the motion style of each expert.
+        views: Names of the images that recorded rollouts show.
+    """
+
+    action_dim, sees_next = ACTION_DIM, False
+
+    def __init__(self, seeds: Sequence[Sequence[int]], views: tuple[str, ...] = ()):
+        self.seeds, self.views = seeds, views
+        self._over = np.zeros(len(seeds), bool)
+
+    def watch(self, env: "BatchEnv") -> None:
+        """Receive the simulations; see `WatchesWorld`."""
+        from libero_env.expert import Expert, Shapes
+
+        self._env, shapes = env, Shapes(env.scene)
+        self._experts = [Expert(env.task, np.random.default_rng(seed), shapes=shapes) for seed in self.seeds]
+
+    def reset(self, num_envs: int) -> None:
+        """Take all episodes as running; see `Actor`."""
+        self._over = np.zeros(num_envs, bool)
+
+    def note(self, over: np.ndarray, success: np.ndarray) -> None:
+        """Take note of which episodes are over; see `TakesNote`."""
+        self._over = over
+
+    def act(self, obs: Obs) -> np.ndarray:
+        """Return the experts' actions; those that are done or have given up hold still. See `Actor`."""
+        actions = np.zeros((len(self._experts), ACTION_DIM))
+        for i, expert in enumerate(self._experts):
+            if not self._over[i] and not expert.failure_reason:
+                actions[i] = expert.act(self._env.views[i])
+        return actions

@@ -1,0 +1,152 @@
+"""What an evaluation is asked for: a policy, the episodes to run it in, and how they are run."""
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Annotated, Literal
+
+from libero_env.cli.options import (
+    Device,
+    Field,
+    FilePath,
+    Horizon,
+    Natural,
+    Positional,
+    Positive,
+    Processes,
+    ProcessesOrAll,
+    Seconds,
+    Seed,
+    Side,
+)
+from libero_env.parallel import cpu_count
+from libero_env.validation import validate_arguments
+from lifelong.errors import ConfigError
+
+KINDS = (
+    *("layout", "distractors", "instruction", "camera", "light", "table", "background"),
+    *("robot", "noise", "occlusion", "latency", "gain"),
+)
+PAIRS = ("camera=0.4,light=0.4", "camera=0.4,robot=0.4", "light=0.4,noise=0.4")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """Episodes of a policy.
+
+    Attributes:
+        policy: A run's directory, one of its checkpoints, module:function that returns an object with predict, the
+            address of a policy server: ws://host:port (openpi, libero serve), vla-eval://..., gr00t://..., or `expert`,
+            the scripted one.
+        suite: Suites or tasks (default: the run's).
+        after: Of a run: the policy after this task, from 0 (default: the last).
+        starts: Initial states: all 50, or those by which a policy was not, or may have been, chosen.
+        episodes: Number of these starts, from the first on (default: all of them).
+        protocol: libero, openpi, ..., see `libero protocols list`; or a file of your own, my.yaml.
+        perturb_seed: Seed of what perturbations draw.
+        horizon: Maximum number of control steps (default: the protocol's).
+        size: Image size in pixels, for a policy that does not define it.
+        names: What a policy of your own receives: this package's observations, the original's, or the protocol's inputs
+            (default: native for upright images, otherwise original).
+        videos: Record this number of episodes of each task.
+        seed: Seed of stochastic policies.
+        assets: `builtin`, `original`, or the folder of the original's models.
+        robot: Arm: libero, or robosuite-1.4.1 (default: the protocol's, or that of the run).
+        backend: Physics and pictures: mujoco, or warp on a GPU, with settings as in warp,device=cuda:1,contacts=256
+            (default: the protocol's, mujoco).
+        unit_starts: Episodes of a task that are run in one batch.
+        policy_threads: Threads of a policy on the CPU (default: 1 for a run's).
+        out: Folder of the results (default: in the run, or eval/POLICY).
+        workers: Processes that share the work.
+        retries: Further attempts after an error.
+        device: auto, cpu, cuda, cuda:1.
+        allow: Packages of others whose classes a run's configuration, or a result that is run again, may name (default:
+            none; their code is executed).
+        threads: Threads of the simulations; 0: all cores, shared by the workers.
+        timeout: Seconds until a policy server must answer.
+        in_flight: Requests that a policy server gets before it has answered (default: one for each episode of a batch).
+        again: Repeat what is done already.
+
+    Raises:
+        ConfigError: A value is of another kind or outside of its range.
+    """
+
+    policy: Positional[str | None] = None
+    suite: tuple[str, ...] = ()
+    after: Natural | None = None
+    starts: Literal["all", "reporting", "selection"] = "all"
+    episodes: Positive | None = None
+    protocol: str = "libero"
+    perturb_seed: Seed = 0
+    horizon: Horizon | None = None
+    size: Side | None = None
+    names: Literal["native", "original", "protocol"] | None = None
+    videos: Natural = 0
+    seed: Seed = 0
+    assets: str | None = None
+    robot: str | None = None
+    backend: str | None = None
+    unit_starts: Positive = 10  # measured by experiments/benchmarks/evaluation_units.py
+    policy_threads: Processes | None = None
+    out: FilePath | None = None
+    workers: Processes = 1
+    retries: Annotated[int, Field(ge=0, le=1000)] = 1
+    device: Device = "auto"
+    allow: tuple[str, ...] = ()
+    threads: ProcessesOrAll = 0
+    timeout: Seconds = 300.0
+    in_flight: Positive | None = None
+    again: bool = False
+
+    def __post_init__(self) -> None:
+        validate_arguments(type(self), vars(self), error=ConfigError)
+
+    @property
+    def threads_of_worker(self) -> int:
+        """Number of threads of the simulations in each process."""
+        return self.threads or max(1, cpu_count() // self.workers)
+
+    @property
+    def policy_name(self) -> str:
+        """Word that names the policy.
+
+        Raises:
+            ConfigError: There is none.
+        """
+        if self.policy is None:
+            raise ConfigError("no policy is named; it comes first: libero eval RUN_DIR --suite libero_goal")
+        return self.policy
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalRequest(Request):
+    """An evaluation of a policy, or of a result, eval.json, which is run again; see `libero_eval.evaluate`.
+
+    Attributes:
+        perturb: Perturbations, such as camera=0.3,light=0.5, see `libero perturb list` (default: the protocol's, none).
+        despite: Of a result that is run again: what may differ from then, such as mujoco (default: nothing).
+    """
+
+    perturb: str | None = None
+    despite: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RobustnessRequest(Request):
+    """Evaluations of a policy under every kind of perturbation at several severities.
+
+    Attributes:
+        episodes: Number of the starts, from the first on.
+        kinds: Kinds of perturbations, see `libero perturb list`.
+        severities: Severities above 0, at most 1.
+        pairs: Two perturbations at once, of kinds and severities that are also run alone.
+    """
+
+    episodes: Positive | None = 10
+    kinds: tuple[str, ...] = KINDS
+    severities: tuple[Annotated[float, Field(ge=0, le=1)], ...] = (0.2, 0.4, 0.6, 0.8, 1.0)
+    pairs: tuple[str, ...] = PAIRS
+
+    def condition(self, perturb: str, out: Path) -> EvalRequest:
+        """Return the evaluation under some perturbations, in a folder of its own."""
+        shared = {f.name: getattr(self, f.name) for f in fields(Request)}
+        return EvalRequest(**{**shared, "perturb": perturb, "out": out})

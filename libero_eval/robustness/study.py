@@ -1,0 +1,149 @@
+"""Evaluations of a policy under many perturbations, each episode from the start of one without: run, and read again."""
+
+import io
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import redirect_stderr
+from dataclasses import replace
+from pathlib import Path
+
+from libero_env.perturbations import format_perturbations, get_kind, parse_perturbations
+from libero_eval.evaluate import load_policy, plan_evaluation, policy_threads, work_quietly
+from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
+from libero_eval.policies import PolicyUnderTest
+from libero_eval.requests import PAIRS, RobustnessRequest
+from libero_eval.robustness.results import Outcomes, Robustness, name_of
+from libero_eval.work.evaluation import Evaluation
+from libero_eval.work.worker import Worker, Workers
+from lifelong.errors import ConfigError
+
+CONDITIONS = "conditions"  # folder of the evaluations
+Told = Callable[[str, EvaluationResult, int, int], None]
+
+
+def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_: None) -> tuple[str, Path]:
+    """Evaluate a policy under all conditions; what is done already is not run again.
+
+    Args:
+        request: Policy, tasks, kinds and severities.
+        on_condition: Function called with each condition, its result, and how many are done of how many.
+
+    Returns:
+        A name of the policy, and the folder of the results.
+    """
+    conditions = conditions_of(request)
+    policy = load_policy(request)
+    request = replace(request, out=request.out or policy.out / "robustness")
+    if request.again:
+        for _, evaluation in _evaluations(request, policy, conditions):
+            evaluation.store.clear()
+        request = replace(request, again=False)
+    try:
+        with Workers(min(request.workers, len(conditions)) - 1, _help, request) as workers:
+            _work(request, policy, conditions, workers, on_condition)
+    except KeyboardInterrupt as error:
+        error.add_note(f"{request.out} keeps what is done; the same command goes on")
+        raise
+    assert request.out is not None
+    return _name(policy), request.out
+
+
+def _help(request: RobustnessRequest) -> None:
+    """Work on the conditions of another process; errors go to the standard error."""
+
+    def work() -> None:
+        with redirect_stderr(io.StringIO()):  # the other process says the same
+            policy = load_policy(request)
+        _work(request, policy, conditions_of(request))
+
+    work_quietly(work)
+
+
+def _work(
+    request: RobustnessRequest,
+    policy: PolicyUnderTest,
+    conditions: Sequence[str],
+    workers: Workers | None = None,
+    on_condition: Told = lambda *_: None,
+) -> None:
+    """Take units of all conditions until none is free; the first process waits for those of others at the end."""
+    units: dict[str, int] = {}  # of the conditions that are done
+    for wait in (False, True) if workers else (False,):
+        for condition, evaluation in _evaluations(request, policy, conditions):
+            if condition in units:
+                continue
+
+            def supervise(done: int, before: int = sum(units.values())) -> None:
+                if workers:
+                    workers.supervise(before + done)
+
+            with policy_threads(evaluation):
+                result = Worker(evaluation, on_wait=supervise).work(wait=wait)
+            if result is not None:
+                units[condition] = len(evaluation.units)
+                on_condition(condition, result, len(units), len(conditions))
+
+
+def _evaluations(
+    request: RobustnessRequest, policy: PolicyUnderTest, conditions: Sequence[str]
+) -> Iterator[tuple[str, Evaluation]]:
+    """Yield the evaluation of each condition."""
+    assert request.out is not None
+    for number, condition in enumerate(conditions):
+        with redirect_stderr(io.StringIO() if number else sys.stderr):  # notes are said once
+            out = request.out / CONDITIONS / (condition or "none")
+            yield condition, plan_evaluation(request.condition(condition, out), policy)
+
+
+def conditions_of(request: RobustnessRequest) -> list[str]:
+    """Return the texts of all conditions, the one without perturbations first.
+
+    Raises:
+        LiberoError: A kind does not exist, or a text is not valid.
+    """
+    seed = request.perturb_seed
+    texts = [
+        f"{get_kind(kind).name}={severity:g}"
+        for kind in request.kinds
+        for severity in sorted(request.severities)
+    ]
+    conditions = [format_perturbations(parse_perturbations(text, seed)) for text in texts]
+    for text in request.pairs:
+        pair = parse_perturbations(text, seed)
+        if len(pair) != 2:
+            raise ConfigError(f"--pairs {text}: expected two perturbations, such as camera=0.4,light=0.4")
+        if all(one.kind in request.kinds and one.severity in request.severities for one in pair):
+            conditions.append(format_perturbations(pair))
+        elif request.pairs != PAIRS:  # those that were named
+            raise ConfigError(
+                f"--pairs {text}: each must also be run alone; name its kind in --kinds and its severity in "
+                "--severities"
+            )
+    return list(dict.fromkeys(("", *conditions)))
+
+
+def read_study(folder: Path, name: str = "") -> Robustness:
+    """Return the outcomes in a folder of this command.
+
+    Raises:
+        ConfigError: It holds no finished conditions.
+    """
+    results, redrawn = {}, {}
+    for path in sorted((folder / CONDITIONS).glob(f"*/{FILE_NAME}")):
+        result = EvaluationResult.read(path)
+        perturbations = parse_perturbations(result.protocol.get("world", {}).get("perturb", ""))
+        condition = tuple((one.kind, one.severity) for one in perturbations)
+        results[condition] = result
+        redrawn[name_of(condition)] = sum(sum(row) for task in result.tasks for row in task.attempts)
+    if not results:
+        raise ConfigError(
+            f"{folder} holds no finished conditions; `libero robustness POLICY --out {folder}` makes them"
+        )
+    return Robustness(name or folder.name, Outcomes.of(results), (str(folder),), redrawn)
+
+
+def _name(policy: PolicyUnderTest) -> str:
+    identity = policy.identity
+    if "run" in identity:
+        return "/".join(Path(str(identity["run"])).parts[-3:])
+    return str(identity.get("policy", identity.get("server", "policy")))

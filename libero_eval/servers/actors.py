@@ -1,0 +1,181 @@
+"""Actors whose actions come from a policy server: in chunks under a protocol, or as of a run in process."""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from libero_env.tasks import get_task
+from libero_eval.protocols.adapter import ACTION_DIM, ProtocolAdapter
+from libero_eval.servers.openpi import OpenpiClient
+from libero_eval.servers.serving import PREFIX
+from libero_eval.servers.transport import EpisodeStart, PolicyClient
+from lifelong.errors import ServerError
+from lifelong.evaluation.environments import Obs
+
+
+class RemoteActor:
+    """Actions from a policy server, a chunk of which each simulation executes before it asks for the next.
+
+    Only simulations whose chunk is used up and whose episode is not over are asked for. A simulation's actions depend
+    on its own answers, not on the order in which answers come.
+
+    Args:
+        client: The server.
+        adapter: Conversion of observations and actions under a protocol.
+        episodes: Episode of each simulation.
+        views: Names of the observed images that recorded rollouts show.
+        replan: Number of actions of a chunk that are executed; None for a server that answers single actions.
+    """
+
+    action_dim = ACTION_DIM
+
+    def __init__(
+        self,
+        client: PolicyClient,
+        adapter: ProtocolAdapter,
+        episodes: Sequence[EpisodeStart],
+        *,
+        views: tuple[str, ...] = (),
+        replan: int | None = None,
+    ):
+        self.views = views
+        self._client, self._adapter, self._episodes, self._replan = client, adapter, tuple(episodes), replan
+        self._chunks: list[deque[np.ndarray]] = []
+        self._over = np.zeros(len(episodes), bool)
+
+    @property
+    def sees_next(self) -> bool:
+        """Whether the next observation is sent to the server; the others need no images."""
+        return any(not chunk for chunk, over in zip(self._chunks, self._over, strict=True) if not over)
+
+    def reset(self, num_envs: int) -> None:
+        """Begin the episodes on the server; see `lifelong.evaluation.actors.Actor`."""
+        assert num_envs == len(self._episodes), "one simulation for each episode"
+        self._chunks = [deque() for _ in self._episodes]
+        self._over = np.zeros(num_envs, bool)
+        self._client.open(self._episodes)
+
+    def note(self, over: np.ndarray, success: np.ndarray) -> None:
+        """Take note of which episodes are over, (B,) bool, and which of them succeeded, (B,) bool."""
+        for i in np.flatnonzero(over & ~self._over):
+            self._client.finish(int(i), bool(success[i]))
+        self._over = over.copy()
+
+    def act(self, obs: Obs) -> np.ndarray:
+        """Return (B, 7) float64 actions; those of finished episodes are zero.
+
+        Raises:
+            ServerError: The server fails, is too late, or its actions are not valid.
+            ConnectionLost: A connection breaks.
+        """
+        running = np.flatnonzero(~self._over).tolist()
+        if rows := [i for i in running if not self._chunks[i]]:
+            inputs = dict(zip(rows, self._adapter.inputs(obs, rows), strict=True))
+            answers = self._client.ask(inputs)
+            for i in rows:
+                predicted = checked_actions(answers[i], self._replan, self._describe(i))
+                self._chunks[i].extend(self._adapter.actions(predicted))
+        actions = np.zeros((len(self._chunks), self.action_dim))
+        for i in running:
+            actions[i] = self._chunks[i].popleft()
+        return actions
+
+    def _describe(self, i: int) -> str:
+        episode = self._episodes[i]
+        return f"{self._client.address} ({episode.task.id}, initial state {episode.init_state})"
+
+
+def checked_actions(answer: Any, replan: int | None, where: str) -> np.ndarray:
+    """Return the actions to be executed from a server's answer, (replan, 7) float64.
+
+    Args:
+        answer: What the server sent as actions: (H, 7) numbers with H at least `replan`, or (7,) where one is executed.
+        replan: Number of actions to be executed; None for a server that answers single actions.
+        where: The server and the episode, for error messages.
+
+    Raises:
+        ServerError: The answer has another type, dtype or shape, too few actions, or values that are not finite.
+    """
+    wanted = f"({'H' if replan else 1}, {ACTION_DIM}) numbers" + (f" with H >= {replan}" if replan else "")
+    try:
+        actions = np.asarray(answer)
+    except ValueError as error:
+        raise ServerError(
+            f"{where} sent actions that are not an array ({error}); expected {wanted}"
+        ) from error
+    if actions.dtype.kind not in "fiu":
+        raise ServerError(f"{where} sent actions of dtype {actions.dtype}; expected {wanted}")
+    chunk = actions[None] if actions.ndim == 1 else actions
+    if chunk.ndim != 2 or chunk.shape[1] != ACTION_DIM:
+        raise ServerError(f"{where} sent actions of shape {actions.shape}; expected {wanted}")
+    if replan is None and len(chunk) != 1:
+        raise ServerError(
+            f"{where} sent actions of shape {actions.shape}; expected {wanted}: the protocol asks for each action "
+            "by itself, so let the server hand out its chunks one by one (vla-eval: chunk_size)"
+        )
+    if len(chunk) < (replan or 1):
+        raise ServerError(f"{where} sent {len(chunk)} actions; the protocol executes {replan} of each answer")
+    used = chunk[: replan or 1].astype(np.float64)
+    if not np.isfinite(used).all():
+        bad = used[~np.isfinite(used)][0]
+        raise ServerError(f"{where} sent actions that are not finite ({bad}); expected {wanted}")
+    return used
+
+
+class ServedActor:
+    """Actions of a run that `libero serve` serves: it is sent what the policy would see in process, to the bit.
+
+    All simulations of a task are one request, so that they are computed as in process.
+
+    Args:
+        client: The server.
+        announced: Its metadata.
+        episodes: Episode of each simulation; all of one task.
+        seeds: Words from which the generator of each episode is made, for stochastic policies.
+    """
+
+    def __init__(
+        self,
+        client: OpenpiClient,
+        announced: Mapping[str, Any],
+        episodes: Sequence[EpisodeStart],
+        seeds: Sequence[Sequence[int]],
+    ):
+        self._client, self._episodes = client, episodes
+        self._names = [key.removeprefix(PREFIX) for key in announced["observation"]]
+        self.views = tuple(name for name in self._names if name.endswith("_rgb"))
+        self.action_dim = int(announced["actions"]["shape"][-1])
+        task = episodes[0].task
+        self._first = {"reset": True, "seed": [list(words) for words in seeds]}
+        if task.suite != "file":  # the server does not have those
+            self._first["task"] = task.id
+        reworded = task.suite != "file" and task.language != get_task(task.id).language
+        self._first["instruction" if reworded else "prompt"] = task.language
+        self._begun = self._connected = False
+
+    def reset(self, num_envs: int) -> None:
+        """Let the next request begin the episodes; see `lifelong.evaluation.actors.Actor`."""
+        if not self._connected:
+            self._client.open(self._episodes[:1])
+        self._connected, self._begun = True, False
+
+    def act(self, obs: Obs) -> np.ndarray:
+        """Return (B, 7) float64 actions.
+
+        Raises:
+            ServerError: The server fails, is too late, or its actions are not valid.
+            ConnectionLost: The connection breaks.
+        """
+        request: dict[str, Any] = {PREFIX + name: np.asarray(obs[name]) for name in self._names}
+        actions = self._client.request(request if self._begun else request | self._first).get("actions")
+        self._begun = True
+        expected = (len(next(iter(obs.values()))), 1, self.action_dim)
+        address = self._client.address
+        if not isinstance(actions, np.ndarray) or actions.dtype.kind != "f" or actions.shape != expected:
+            came = f"{actions.dtype} {actions.shape}" if isinstance(actions, np.ndarray) else repr(actions)
+            raise ServerError(f"{address} sent as actions {came}; expected floats of shape {expected}")
+        if not np.isfinite(actions).all():
+            raise ServerError(f"{address} sent actions that are not finite")
+        return actions[:, 0].astype(np.float64)

@@ -1,0 +1,308 @@
+"""A policy of the user's own: an object with `predict`, from `module:function`."""
+
+import hashlib
+import importlib
+import os
+import sys
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from libero_env.errors import code_of
+from libero_env.tasks import Task
+from libero_env.validation import validate
+from libero_eval.policies import PolicyUnderTest
+from libero_eval.protocols.adapter import ACTION_DIM, ProtocolAdapter, view_of
+from libero_eval.protocols.environment import OBSERVATIONS
+from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.requests import Request
+from lifelong.errors import LifelongError, MissingObservationError, PolicyError
+from lifelong.evaluation.actors import Actor
+from lifelong.evaluation.environments import Obs
+
+_WRITE = "write module:function, such as my_policy:make"
+_Side = Annotated[int, Field(ge=1, le=4096)]  # pixels
+ORIGINAL_NAMES = {
+    "agentview_rgb": "agentview_image",
+    "eye_in_hand_rgb": "robot0_eye_in_hand_image",
+    "joint_states": "robot0_joint_pos",
+    "joint_velocities": "robot0_joint_vel",
+    "gripper_states": "robot0_gripper_qpos",
+    "gripper_velocities": "robot0_gripper_qvel",
+    "ee_pos": "robot0_eef_pos",
+    "ee_quat": "robot0_eef_quat",
+}
+
+
+class UserPolicy(PolicyUnderTest):
+    """A user-defined policy; see `CallableActor` for its interface.
+
+    Its module's source is part of its identity, and so is what it names in an attribute `identity`, plain data such as
+    the digest of its weights: results of different ones are not mixed.
+    """
+
+    def __init__(self, request: Request):
+        super().__init__(request)
+        name = request.policy_name
+        self.policy = load_callable(name)
+        self.cameras = self._attribute("cameras", tuple[str, ...], ("agentview", "robot0_eye_in_hand"))
+        self.observations = self._attribute("observations", tuple[str, ...], OBSERVATIONS)
+        self.identity = {
+            "policy": name,
+            "source": source_digest(name),
+            **self._attribute("identity", dict[str, Any], {}),
+            **({} if request.names is None else {"names": request.names}),
+        }
+        self.out = Path("eval") / name.replace(":", ".")
+
+    def protocol(self, base: EvalProtocol) -> EvalProtocol:
+        """Return the protocol with the policy's own image size, if it has one; see `PolicyUnderTest`."""
+        size = self._attribute("camera_size", tuple[_Side, _Side] | None, None)
+        if self.request.size:
+            size = (self.request.size, self.request.size)
+        return base if size is None else base.changed({"pixels.render_size": size})
+
+    @contextmanager
+    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
+        """Yield the actor that gives the policy its observations under the names it takes."""
+        views = tuple(map(view_of, self.cameras or ()))
+        names = self.request.names or ("native" if protocol.pixels.orientation == "upright" else "original")
+        if names == "protocol":
+            yield ProtocolActor(self.policy, views, ProtocolAdapter(protocol, task), protocol.action.replan)
+        else:
+            yield CallableActor(self.policy, views, protocol.prompt(task), names == "original")
+
+    def _attribute(self, name: str, kind: Any, default: Any) -> Any:
+        """Return an attribute of the policy, or the default where it has none.
+
+        Raises:
+            PolicyError: It is of another kind.
+        """
+        value = getattr(self.policy, name, default)
+        return validate(kind, value, prefix=(f"the policy's {name}",), error=PolicyError)
+
+
+class Observations(dict[str, Any]):
+    """Observations by name; a name that is not among them is an error that says which there are."""
+
+    def __missing__(self, name: str) -> Any:
+        hint = "protocols with the original's names have no others; --names native gives this package's"
+        if name in ORIGINAL_NAMES.values():
+            hint = "--names original gives the original's names"
+        raise MissingObservationError(f"there is no observation {name!r}, but {', '.join(self)}; {hint}")
+
+
+def as_original(obs: Obs) -> dict[str, np.ndarray]:
+    """Return observations as LIBERO's own environments name them, with flipped images and xyzw quaternions."""
+    renamed = {}
+    for name, value in obs.items():
+        if name.endswith("_rgb"):
+            value = value[:, ::-1]
+        elif name == "ee_quat":
+            value = np.roll(value, -1, axis=-1)
+        renamed[ORIGINAL_NAMES.get(name, name)] = value
+    return renamed
+
+
+@dataclass
+class _UserActor:
+    """Calls the user's object; errors in its code name it.
+
+    Attributes:
+        policy: The object.
+        views: Names of the observed images that recorded rollouts show.
+    """
+
+    policy: Any
+    views: tuple[str, ...]
+    action_dim = ACTION_DIM
+
+    def _name(self, method: str) -> str:
+        return f"{type(self.policy).__name__}.{method}"
+
+    def _reset(self, instruction: str, num_envs: int) -> None:
+        if hasattr(self.policy, "reset"):
+            with code_of(f"the policy's {self._name('reset')}"):
+                self.policy.reset(instruction, num_envs)
+
+    def _predict(self, observations: Observations) -> np.ndarray:
+        """Return what the object predicts as an array of any shape.
+
+        Raises:
+            PolicyError: It is not an array of numbers.
+        """
+        name = self._name("predict")
+        with code_of(f"the policy's {name}"):
+            answer = self.policy.predict(observations)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("error", np.exceptions.ComplexWarning)
+                tensor = hasattr(answer, "detach")  # of PyTorch
+                return np.asarray(answer.detach().cpu() if tensor else answer, np.float64)
+        except (TypeError, ValueError, np.exceptions.ComplexWarning) as error:
+            raise PolicyError(
+                f"{name} returned a {type(answer).__name__} that is not an array of numbers ({error})"
+            ) from None
+
+
+@dataclass
+class CallableActor(_UserActor):
+    """A user-defined object with `predict(observations) -> actions`.
+
+    `predict` receives the observations of `libero_env.envs.batch.BatchEnv`, (B, ...) arrays by name, with upright
+    images, and the instruction as text under "instruction". Finished episodes keep their rows; actions for them are
+    ignored. It returns (B, 7) actions; the gripper opens at -1 and closes at +1. An optional
+    `reset(instruction, num_envs)` is called before each task's episodes.
+
+    Attributes:
+        instruction: Instruction that the object receives.
+        original: Whether observations are those of LIBERO's own environments, see `as_original`.
+    """
+
+    instruction: str
+    original: bool = False
+
+    def reset(self, num_envs: int) -> None:
+        """Call the object's `reset`, if it has one; see `Actor`."""
+        self._reset(self.instruction, num_envs)
+
+    def act(self, obs: Obs) -> np.ndarray:
+        """Return the object's actions; see `Actor`.
+
+        Raises:
+            PolicyError: The actions have the wrong shape, or are not finite.
+        """
+        observations = as_original(obs) if self.original else obs
+        actions = self._predict(Observations(observations, instruction=self.instruction))
+        expected = (len(next(iter(obs.values()))), self.action_dim)
+        if actions.shape != expected:
+            raise PolicyError(
+                f"{self._name('predict')} returned actions of shape {actions.shape}; expected {expected}"
+            )
+        if not np.isfinite(actions).all():
+            raise PolicyError(f"{self._name('predict')} returned actions that are not finite")
+        return actions
+
+
+@dataclass
+class ProtocolActor(_UserActor):
+    """A user-defined object that is given a protocol's inputs, and answers in the protocol's convention.
+
+    Its `predict` receives for all simulations: an array (B, H, W, 3) by name of each camera, `state` (B, 8), and
+    `instruction`. It returns (B, 7) actions, or chunks (B, H, 7), of which the protocol executes as many as it says
+    before it asks again.
+
+    Attributes:
+        adapter: Conversion of observations and actions under the protocol.
+        replan: Number of actions of a chunk that are executed; None for all.
+    """
+
+    adapter: ProtocolAdapter
+    replan: int | None
+
+    def reset(self, num_envs: int) -> None:
+        """Forget what was predicted; the object's `reset` is called with the first instruction. See `Actor`."""
+        self._waiting: list[np.ndarray] = []
+        self._num_envs: int | None = num_envs
+
+    @property
+    def sees_next(self) -> bool:
+        """Whether the next observation is given to the object."""
+        return not self._waiting
+
+    def act(self, obs: Obs) -> np.ndarray:
+        """Return the object's actions; see `Actor`.
+
+        Raises:
+            PolicyError: The actions have the wrong shape, are too few, or are not finite.
+        """
+        if not self._waiting:
+            self._waiting = self._next_actions(obs)
+        return self._waiting.pop(0)
+
+    def _next_actions(self, obs: Obs) -> list[np.ndarray]:
+        """Return the actions (B, A) of the next steps."""
+        inputs = self.adapter.inputs(obs)
+        if self._num_envs is not None:
+            self._reset(inputs[0].prompt, self._num_envs)
+            self._num_envs = None
+        images = {name: np.stack([one.images[name] for one in inputs]) for name in inputs[0].images}
+        states = np.stack([one.state for one in inputs])
+        answer = self._predict(Observations(images, state=states, instruction=inputs[0].prompt))
+        chunks = answer[:, None] if answer.ndim == 2 else answer
+        if chunks.ndim != 3 or chunks.shape[::2] != (len(inputs), self.action_dim):
+            raise PolicyError(
+                f"{self._name('predict')} returned actions of shape {answer.shape}; expected "
+                f"({len(inputs)}, {self.action_dim}), or chunks ({len(inputs)}, H, {self.action_dim})"
+            )
+        count = chunks.shape[1] if self.replan is None or answer.ndim == 2 else self.replan
+        if chunks.shape[1] < count:
+            raise PolicyError(
+                f"{self._name('predict')} returned {chunks.shape[1]} actions; the protocol executes {count} of them"
+            )
+        return list(self.adapter.actions(chunks[:, :count]).swapaxes(0, 1))
+
+
+def load_callable(text: str) -> Any:
+    """Return the result of `module:function`, an object with `predict`. The working directory is searched too.
+
+    Raises:
+        LifelongError: The module or function does not exist, or its result has no `predict`.
+    """
+    module, _, name = text.partition(":")
+    folder = os.getcwd()
+    added = folder not in sys.path
+    if added:
+        sys.path.insert(0, folder)
+    try:
+        with code_of(f"the module {module}"):
+            make = getattr(_imported(module, text), name, None)
+        if not callable(make):
+            what = "has no function" if make is None else f"has a {type(make).__name__}, not a function,"
+            raise LifelongError(f"{text}: module {module} {what} {name}; {_WRITE}")
+        with code_of(f"{text}()"):
+            policy = make()
+    finally:
+        if added:
+            sys.path.remove(folder)
+    if not callable(getattr(policy, "predict", None)):
+        raise LifelongError(
+            f"{text}() returns a {type(policy).__name__} without predict(observations) -> (B, 7) actions"
+        )
+    return policy
+
+
+def _imported(module: str, text: str) -> ModuleType:
+    """Return a module; one that it imports itself and that does not exist is an error of its own."""
+    parts = module.split(".")
+    if module.endswith(".py"):
+        function = text.removeprefix(module)
+        raise LifelongError(
+            f"{text}: a module is named without .py: write {Path(module).stem}{function}, in the folder of the file"
+        )
+    if not all(part.isidentifier() for part in parts):
+        raise LifelongError(f"{text}: {module!r} is not a name of a module; {_WRITE}")
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name not in {".".join(parts[: i + 1]) for i in range(len(parts))}:
+            raise
+        raise LifelongError(
+            f"{text}: there is no module {error.name}, neither in the current folder ({Path.cwd()}) nor installed; "
+            f"type the command in the folder of {error.name}.py"
+        ) from error
+
+
+def source_digest(text: str) -> str | None:
+    """Return the digest of the source of the module in `module:function`; None if it has no file of its own."""
+    source = getattr(sys.modules[text.partition(":")[0]], "__file__", None)
+    if source is None or not Path(source).is_file():
+        return None
+    return hashlib.sha256(Path(source).read_bytes()).hexdigest()[:16]
