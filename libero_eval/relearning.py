@@ -79,7 +79,7 @@ class RelearnSettings:
 
 
 @dataclass(frozen=True)
-class Lesson:
+class Trial:
     """One task to be relearned.
 
     Attributes:
@@ -181,13 +181,11 @@ def relearn(
         with _opened(run, task, held_out, settings.episodes) as measure:
             with before.acting(run.tasks[task]) as then:
                 learned = measure(then)
-            lesson = Lesson(
-                task, training, measure, back_limit(learned, settings.tolerance, settings.episodes)
-            )
+            trial = Trial(task, training, measure, back_limit(learned, settings.tolerance, settings.episodes))
             for start in starts:
                 acting = run.acting(run.tasks[task]) if start == "final" else nullcontext(initial)
                 with acting as policy:
-                    log.append(_relearned(run, policy, start, lesson, learned, settings, config))
+                    log.append(_relearned(run, policy, start, trial, learned, settings, config))
     return log.path
 
 
@@ -195,7 +193,7 @@ def _relearned(
     run: LoadedRun,
     policy: Policy,
     start: Start,
-    lesson: Lesson,
+    trial: Trial,
     learned: float,
     settings: RelearnSettings,
     config: Configuration,
@@ -205,14 +203,14 @@ def _relearned(
     began = time.perf_counter()
     steps, errors = steps_until(
         copy.deepcopy(policy).to(run.device),
-        lesson,
+        trial,
         settings=settings,
         fit_settings=fit_settings,
-        seed=(run.seed, RELEARN, lesson.task),
+        seed=(run.seed, RELEARN, trial.task),
         augment=config.build("augmentation") if "augmentation" in config.values else None,
     )
     return RelearnRecord(
-        task=lesson.task,
+        task=trial.task,
         start=start,
         learned_error=learned,
         tolerance=settings.tolerance,
@@ -227,7 +225,7 @@ def _relearned(
 
 def steps_until(
     policy: Policy,
-    lesson: Lesson,
+    trial: Trial,
     *,
     settings: RelearnSettings,
     fit_settings: FitSettings,
@@ -238,7 +236,7 @@ def steps_until(
 
     Args:
         policy: Policy to be trained, all weights of it.
-        lesson: The task.
+        trial: The task.
         settings: Settings of the measurement.
         fit_settings: Batch size and optimiser; the rate stays what it is after the warm-up.
         seed: Integers that all draws derive from.
@@ -250,10 +248,10 @@ def steps_until(
     steps: list[int] = []
     errors: list[float] = []
 
-    def look(end: EpochEnd) -> None:
+    def measure(end: EpochEnd) -> None:
         steps.append(end.epoch * settings.every)
-        errors.append(lesson.measure(policy))
-        if errors[-1] <= lesson.limit:
+        errors.append(trial.measure(policy))
+        if errors[-1] <= trial.limit:
             raise _Back
 
     epochs = -(-settings.steps // settings.every)
@@ -263,14 +261,14 @@ def steps_until(
     with suppress(_Back):
         fit(
             policy,
-            lesson.training,
+            trial.training,
             Algorithm(),
             settings=constant,
             seed=seed,
             device=device_of(policy),
             augment=augment,
-            on_epoch=look,
-            label=f"task {lesson.task + 1}",
+            on_epoch=measure,
+            label=f"task {trial.task + 1}",
         )
     return steps, errors
 

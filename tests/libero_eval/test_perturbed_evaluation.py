@@ -88,9 +88,7 @@ def test_a_units_episodes_do_not_depend_on_the_unit(tmp_path, monkeypatch):
 
 
 def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypatch):
-    monkeypatch.setattr(
-        ProtocolEnv, "_stored", lambda self: self.init_states
-    )  # LIBERO's may not be here
+    monkeypatch.setattr(ProtocolEnv, "_stored", lambda self: self.init_states)  # LIBERO's may not be here
     card = load_protocol("openpi").changed({"pixels.render_size": (32, 32)})
     found = []
     for perturb in ("", "layout=0.3,distractors=0.3,robot=0.4"):

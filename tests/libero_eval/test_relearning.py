@@ -1,8 +1,9 @@
 """Steps until a forgotten task is back: the measurement, its records, and what reports say."""
 
 import copy
+import inspect
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,12 +11,12 @@ import pytest
 import torch
 
 from libero_eval import relearning
-from libero_eval.cli.main import build_parser
+from libero_eval.cli import runs
 from libero_eval.relearning import (
     FailureShare,
     HeldOutError,
-    Lesson,
     RelearnSettings,
+    Trial,
     error_on,
     relearn,
     steps_until,
@@ -52,16 +53,16 @@ def learned(found: Linear, task: int, steps: int = 120) -> Linear:
     return found
 
 
-def lesson(error: float, task: int = 0) -> Lesson:
+def lesson(error: float, task: int = 0) -> Trial:
     """A task that counts as back at an error of at most 1.05 times the given one."""
-    return Lesson(task, Windows(task), HeldOutError(held_out(task)), 1.05 * error)
+    return Trial(task, Windows(task), HeldOutError(held_out(task)), 1.05 * error)
 
 
 def held_out(task: int = 0) -> Batch:
     return Windows(task).batch(torch.arange(20))
 
 
-def again(found: Linear, goal: Lesson, settings: RelearnSettings = SETTINGS):
+def again(found: Linear, goal: Trial, settings: RelearnSettings = SETTINGS):
     return steps_until(found, goal, settings=settings, fit_settings=FIT, seed=(1, 5, 0))
 
 
@@ -288,15 +289,11 @@ def test_tasks_that_do_not_exist_and_settings_that_make_no_sense_are_refused(fin
     for change in ({"every": 0}, {"steps": 0}, {"tolerance": -0.1}, {"held_out": 0}, {"episodes": 51}):
         with pytest.raises(ConfigError, match=f"relearn.{next(iter(change))} is"):
             RelearnSettings(**change)
-    assert build_parser().parse_args(["relearn", str(folder), "--tasks", "0", "2"]).tasks == [0, 2]
 
 
 def test_the_options_of_the_command_default_to_the_settings() -> None:
-    args = build_parser().parse_args(["relearn", "run"])
-    assert (
-        RelearnSettings(args.steps, args.every, args.tolerance, args.held_out, args.episodes)
-        == RelearnSettings()
-    )
+    options = inspect.signature(runs.relearn).parameters
+    assert all(options[f.name].default == f.default for f in fields(RelearnSettings))
 
 
 def test_a_run_that_is_not_finished_is_refused(finished, monkeypatch) -> None:

@@ -1,6 +1,5 @@
 """`libero robustness` and the scripted expert as a policy."""
 
-import argparse
 import json
 import pickle
 
@@ -8,8 +7,9 @@ import numpy as np
 import pytest
 
 from libero_env.cli.main import main
-from libero_eval.cli import robustness
 from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.requests import RobustnessRequest
+from libero_eval.robustness.study import conditions_of
 
 pytestmark = pytest.mark.sim
 
@@ -58,9 +58,9 @@ def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> N
     assert record["label"] == "still_policy:make" and len(record["axes"]) == 2
     assert [pair["condition"] for pair in record["interactions"]] == ["robot=0.5,noise=0.5"]
     assert "robot" in (still / "found" / "robustness.html").read_text()
-    for folder, perturb in (("none", None), ("robot=1", "robot=1")):
+    for folder, perturb in (("none", ""), ("robot=1", "robot=1")):
         result = EvaluationResult.read(still / "found" / "conditions" / folder)
-        assert result.protocol["world"].get("perturb") == perturb and len(result.tasks[0].successes) == 2
+        assert result.protocol["world"]["perturb"] == perturb and len(result.tasks[0].successes) == 2
 
     before = {path: path.stat().st_mtime_ns for path in still.glob("found/conditions/*/units/*")}
     assert main(["robustness", *WORDS, *KINDS, "--out", "found"]) == 0, "what is done is not run again"
@@ -96,18 +96,19 @@ def test_default_kinds_and_pairs_exist() -> None:
     from libero_env.perturbations import KINDS as ALL
     from libero_env.perturbations import parse_perturbations
 
-    assert set(robustness.KINDS) <= set(ALL) and len(robustness.KINDS) == 12
-    for text in robustness.PAIRS:
+    request = RobustnessRequest()
+    assert set(request.kinds) <= set(ALL) and len(request.kinds) == 12
+    for text in request.pairs:
         pair = parse_perturbations(text)
-        assert {one.kind for one in pair} <= set(robustness.KINDS)
-        assert {one.severity for one in pair} <= set(robustness.SEVERITIES)
+        assert {one.kind for one in pair} <= set(request.kinds)
+        assert {one.severity for one in pair} <= set(request.severities)
 
 
 def test_worker_processes_find_the_same_conditions() -> None:
-    """Arguments are pickled on their way to them; the default pairs of kinds that are not run are left out."""
-    args = argparse.Namespace(kinds=["noise"], severities=[0.4], pairs=robustness.PAIRS, perturb_seed=0)
-    found = robustness._conditions(args)
-    assert found == ["", "noise=0.4"] == robustness._conditions(pickle.loads(pickle.dumps(args)))
+    """Requests are pickled on their way to them; the default pairs of kinds that are not run are left out."""
+    request = RobustnessRequest(kinds=("noise",), severities=(0.4,))
+    conditions = conditions_of(request)
+    assert conditions == ["", "noise=0.4"] == conditions_of(pickle.loads(pickle.dumps(request)))
 
 
 def test_the_expert_is_a_policy_that_can_be_evaluated(tmp_path, monkeypatch, capsys) -> None:
