@@ -19,8 +19,8 @@ from libero_env.storage import read_json, write_json
 from libero_env.text import json_safe
 from libero_env.validation import validate
 from lifelong.errors import EvaluationFileError, ResultsError
-from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
 from lifelong.results.subgoals import predicate_of
+from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"

@@ -176,7 +176,10 @@ def test_every_command_and_argument_is_in_the_reference():
         if not command.reads_words:
             section = page.split(f"## libero {name}\n")[1].split("\n## ")[0]
             for option in inspect.signature(options_of(load(command))).parameters:
-                assert option.replace("_", "-") in section.replace("--as SET", "--published").lower(), (
+                assert (
+                    option.replace("_", "-")
+                    in section.replace("--as SET", "--published").replace("--as {", "--format {").lower()
+                ), (
                     name,
                     option,
                 )
