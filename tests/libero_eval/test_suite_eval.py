@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lifelong.stats.intervals import wilson_interval
 
 from libero_env import memory
 from libero_env.cli import main as cli
@@ -19,6 +18,7 @@ from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
 from libero_eval.user_policy import ORIGINAL_NAMES, CallableActor, UserPolicy, as_original, load_callable
 from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
+from lifelong.stats.intervals import wilson_interval
 from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate
 
 pytestmark = pytest.mark.unit
