@@ -78,7 +78,6 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
     """
     plain = _with_drawing(plain_data(config))
     checked = Configuration(plain)
-    checked.check()
     settings = checked.settings()
     path = Path(settings.runs_dir) / _run_name(names, settings)
     _check_writable(path)

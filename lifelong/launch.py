@@ -13,7 +13,6 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -21,18 +20,9 @@ from omegaconf.errors import OmegaConfBaseException
 from libero_env.cli import ending
 from libero_env.errors import LiberoError
 from libero_env.parallel import end_with_parent
-from libero_env.text import printable
+from libero_env.text import printable, suggest
 from lifelong import experiment
-from lifelong.composition import (
-    check_choices,
-    check_overrides,
-    config_folder,
-    existing_folder,
-    in_order,
-    read_options,
-    swept,
-    with_suggestion,
-)
+from lifelong.composition import REFUSALS, compose_first, config_folders, explained, swept
 from lifelong.errors import ConfigError
 from lifelong.report.page import write_report
 from lifelong.results.run_directory import config_digest
@@ -50,22 +40,22 @@ from lifelong.sweeps import (
 )
 from lifelong.training.distributed import Ranks, process_group, rank
 
-# of the process that was started: its ranks, folders of configuration files, and sweep
-_process: dict[str, Any] = {}
-
-
-class SweepStart(Callback):
-    """Hydra callback that notes what a sweep (`-m`) is asked for, in the process that starts it."""
-
-    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write the sweep's file."""
-        folder = Path(config.hydra.sweep.dir).resolve()
-        words, ranks = list(config.hydra.overrides.task), _process.get("ranks") or Ranks()
-        planned = math.prod(len(values) for values in swept(words, _process.get("folders", ())).values())
-        own = "BasicSweeper" in str(config.hydra.sweeper._target_)  # another one chooses its jobs as it goes
-        if ranks.first:
-            begin_sweep(folder, words, planned if own else None)
-        _process.update(sweep=folder, words=words)
+# of Hydra's options: those without a value, and those with one, of which some have a choice
+FLAGS = ("--multirun", "--resolve", "--help", "--hydra-help", "--version")
+VALUED = {
+    "--config-dir": None,
+    "--cfg": ("job", "hydra", "all"),
+    "--info": ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"),
+    "--package": None,
+}
+_SHORT = {
+    "--multirun": "-m",
+    "--config-dir": "-cd",
+    "--cfg": "-c",
+    "--info": "-i",
+    "--package": "-p",
+    "--help": "-h",
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -80,17 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     with ending.debugging(sys.argv[1:] if argv is None else argv) as words:
         try:
             with ending.interruptible(), process_group() as ranks:
-                options = read_options(words)
-                own = [] if options.config_dir is None else [existing_folder(Path(options.config_dir))]
-                folders = [config_folder(), *own]
-                check_overrides(options.overrides, folders)
-                check_choices(options.overrides, folders)
-                try:
-                    return _compose_and_run(options, folders, ranks)
-                except (HydraException, OmegaConfBaseException) as error:  # it cannot be composed
-                    if told := with_suggestion(error, options.overrides, folders):
-                        raise told from error
-                    raise
+                return _launch(read_options(words), ranks)
         except KeyboardInterrupt as error:
             error.add_note("the same command resumes the run")
             return _report(error)
@@ -98,86 +78,133 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _report(error)
 
 
-def _compose_and_run(options: argparse.Namespace, folders: Sequence[Path], ranks: Ranks) -> int:
-    """Run the jobs of the command line, several after `-m`; return the worst exit status."""
-    sys.argv[1:] = in_order(options, _sweep_folder(options))  # where Hydra reads them
-    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach the caller, which prints a line
-    _process.clear()
-    _process.update(ranks=ranks, folders=folders, status=0)
+def read_options(words: Sequence[str]) -> argparse.Namespace:
+    """Return Hydra's options among the words, which may stand anywhere, and `overrides`, the other words.
+
+    Raises:
+        ConfigError: A word is not an option.
+    """
+    parser = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
+    for name in (*FLAGS, *VALUED):
+        names = [name, _SHORT[name]] if name in _SHORT else [name]
+        if name in FLAGS:
+            parser.add_argument(*names, action="store_true")
+        else:
+            parser.add_argument(*names, choices=VALUED[name])
+    parser.add_argument("overrides", nargs="*")
     try:
-        hydra.main(version_base="1.3", config_path=str(folders[0]), config_name="config")(_job)()
-    except (AssertionError, AttributeError, OSError, TypeError, ValueError) as error:
-        if "began" in _process or isinstance(error, LiberoError):
-            raise
-        # raised by Hydra for overrides that it cannot apply, or a folder of its own that cannot be made
-        said = " ".join(str(error).split())
-        raise ConfigError(f"the configuration cannot be composed: {said}") from error
-    except Exception:
-        if "sweep" not in _process:
-            raise
-        _end_sweep(ranks)  # a launcher lost a job, such as one that its cluster has killed
+        options, unknown = parser.parse_known_intermixed_args(list(words))
+    except argparse.ArgumentError as error:
+        raise ConfigError(f"{error}") from error
+    if unknown:
+        valid = [*FLAGS, *VALUED]
+        raise ConfigError(
+            f"{unknown[0]} is not an option.{suggest(unknown[0], valid)} Valid: {', '.join(valid)}; "
+            "an override has no dashes, as in algo=ewc"
+        )
+    return options
+
+
+def _launch(options: argparse.Namespace, ranks: Ranks) -> int:
+    """Run the jobs of the command line, several after `-m`; return the worst exit status."""
+    folders = config_folders(None if options.config_dir is None else Path(options.config_dir))
+    words, sweep = list(options.overrides), None
+    config = compose_first(words, folders)
+    job = Job(ranks, [word for word in words if not word.startswith("hydra")])
+    if options.multirun:
+        if not any(word.startswith("hydra.sweep.dir=") for word in words):
+            # a folder of its own, by which the same command finds it again
+            words.append(
+                f"hydra.sweep.dir='{config.runs_dir}/{FOLDER}/{sweep_name(sorted(words), list(swept(words)))}'"
+            )
+        sweep = Path(compose_first(words, folders).hydra.sweep.dir).resolve()
+        jobs = math.prod(len(values) for values in swept(words, folders).values())
+        chooses = (
+            "BasicSweeper" not in config.hydra.sweeper._target_
+        )  # as it goes, so their number is not known
+        if ranks.first and not (options.cfg or options.info):
+            begin_sweep(sweep, job.words, None if chooses else jobs)
+    with_value = [
+        f"{name}={value}" for name in VALUED if (value := getattr(options, name[2:].replace("-", "_")))
+    ]
+    flags = [name for name in FLAGS if getattr(options, name[2:].replace("-", "_"))]
+    sys.argv[1:] = [*flags, *with_value, *words]  # where Hydra reads them; overrides stand at the end
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach the caller, which prints a line
+    try:
+        hydra.main(version_base="1.3", config_path=str(folders[0]), config_name="config")(job)()
+    except LiberoError:
         raise
-    return _end_sweep(ranks) if "sweep" in _process else _process["status"]
+    except REFUSALS as error:  # of Hydra: jobs keep theirs
+        raise explained(error, words, folders) from error
+    except Exception:
+        if sweep is not None:
+            _end_sweep(sweep, ranks)  # a launcher lost a job, such as one that its cluster has killed
+        raise
+    return job.status if sweep is None else _end_sweep(sweep, ranks)
 
 
-def _job(config: DictConfig) -> Path | None:
-    """Run one job, in whatever process Hydra's launcher calls it."""
-    hydra_config = HydraConfig.get()
-    ranks = _process.get("ranks")
-    if ranks is None:  # a process of a launcher, which knows the configuration alone
+class Job:
+    """What Hydra calls for each job, with its configuration: in this process, or a copy in one of a launcher's.
+
+    Args:
+        ranks: Ranks of this process.
+        words: Overrides of the whole command.
+    """
+
+    def __init__(self, ranks: Ranks, words: list[str]):
+        self.ranks: Ranks | None = ranks
+        self.words, self.status = words, 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "ranks": None}  # a launcher's process joins those it trains with by itself
+
+    def __call__(self, config: DictConfig) -> Path | None:
+        """Run the job; return the run's directory, None after an error."""
+        if self.ranks is not None:
+            return self._run(config, self.ranks)
         end_with_parent()
-        with ending.interruptible(), process_group() as own:
-            _process.update(ranks=own, status=0)
-            return _job(config)
-    _process["began"] = True
-    if hydra_config.mode == RunMode.MULTIRUN:
-        config = _named_in_sweep(config, hydra_config)
-    learn = partial(experiment.run, config, hydra_config.runtime.choices, ranks)
-    if hydra_config.mode != RunMode.MULTIRUN or not ranks.first:
-        try:
-            return learn()
-        except Exception as error:  # noqa: BLE001 - told by kind
-            _process["status"] = _report(error)
-            if ranks.size > 1:  # the others may be waiting: torchrun ends them when this process ends
-                raise SystemExit(_process["status"]) from error
-            return None
-    file = Path(hydra_config.runtime.output_dir) / JOB_FILE
-    key = config_digest(plain_data(config))
-    job = JobRecord(int(hydra_config.job.num), key, tuple(hydra_config.overrides.task), "running")
-    done = run_job(file, job, learn, _report_line, again=ranks.size > 1)
-    if done.exit_status and ranks.size > 1:
-        raise SystemExit(done.exit_status)
-    return Path(done.run) if done.run else None
+        with ending.interruptible(), process_group() as ranks:
+            return self._run(config, ranks)
 
+    def _run(self, config: DictConfig, ranks: Ranks) -> Path | None:
+        hydra_config = HydraConfig.get()
+        is_sweep = hydra_config.mode == RunMode.MULTIRUN
+        if is_sweep:
+            config = self._named(config, hydra_config.overrides.task)
+        learn = partial(experiment.run, config, hydra_config.runtime.choices, ranks)
+        if not is_sweep or not ranks.first:
+            try:
+                return learn()
+            except Exception as error:  # noqa: BLE001 - told by kind
+                self.status = _report(error)
+                if ranks.size > 1:  # the others may be waiting: torchrun ends them when this process ends
+                    raise SystemExit(self.status) from error
+                return None
+        file = Path(hydra_config.runtime.output_dir) / JOB_FILE
+        key = config_digest(plain_data(config))
+        record = JobRecord(int(hydra_config.job.num), key, tuple(hydra_config.overrides.task), "running")
+        done = run_job(file, record, learn, _report_line, again=ranks.size > 1)
+        if done.exit_status and ranks.size > 1:
+            raise SystemExit(done.exit_status)
+        return Path(done.run) if done.run else None
 
-def _sweep_folder(options: argparse.Namespace) -> list[str]:
-    """Return the override that gives a sweep a folder of its own, by which the same command finds it again."""
-    words = options.overrides
-    if not options.multirun or any(word.startswith("hydra.sweep.dir=") for word in words):
-        return []
-    overrides = [word for word in words if "=" in word]
-    name = sweep_name(sorted(overrides), list(swept(overrides)))
-    return [f"hydra.sweep.dir='${{runs_dir}}/{FOLDER}/{name}'"]
-
-
-def _named_in_sweep(config: DictConfig, hydra_config: Any) -> DictConfig:
-    """Return a job's configuration with a `run_id` that tells its run from those of the sweep's other jobs."""
-    words = _process.get("words") or read_sweep(Path(hydra_config.sweep.dir)).words
-    several, named = swept(words), {word.partition("=")[0] for word in words}
-    own = {key: value for key, _, value in (word.partition("=") for word in hydra_config.overrides.task)}
-    name = job_suffix({key: value for key, value in own.items() if key in several or key not in named})
-    if not name:
+    def _named(self, config: DictConfig, overrides: Sequence[str]) -> DictConfig:
+        """Return a job's configuration with a `run_id` that tells its run from those of the sweep's other jobs."""
+        several, named = swept(self.words), {word.partition("=")[0] for word in self.words}
+        values = {key: value for key, _, value in (word.partition("=") for word in overrides)}
+        name = job_suffix({k: value for k, value in values.items() if k in several or k not in named})
+        if not name:
+            return config
+        config = copy(config)
+        config.run_id = name if config.run_id is None else f"{config.run_id}_{name}"
         return config
-    config = copy(config)
-    config.run_id = name if config.run_id is None else f"{config.run_id}_{name}"
-    return config
 
 
-def _end_sweep(ranks: Ranks) -> int:
+def _end_sweep(folder: Path, ranks: Ranks) -> int:
     """Say what became of the jobs, compare the runs that are finished, and return the exit status."""
-    if not ranks.first:
+    if not ranks.first or not folder.is_dir():
         return 0
-    sweep = read_sweep(_process["sweep"])
+    sweep = read_sweep(folder)
     if len(sweep.runs) > 1:
         page = write_report(sweep.runs, sweep.folder / "report.html")
         print(f"{len(sweep.runs)} runs compared: {page}")

@@ -13,7 +13,7 @@ import torch
 from pydantic import Field
 
 from libero_env.perturbations import Perturbation
-from libero_env.validation import validate_arguments
+from libero_env.validation import checked
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.data.windows import StageWindows, TaskWindows, WindowSubset
@@ -25,7 +25,7 @@ Stages = tuple[tuple[int, ...], ...]
 _SEVERITY_DIGITS = 4  # so that the text of a perturbation, by which files and records name it, is exact
 
 
-@dataclass(frozen=True)
+@checked
 class StreamSettings:
     """Settings of the order in which data arrive; by default all windows of one task at a time.
 
@@ -59,7 +59,6 @@ class StreamSettings:
     perturb_seed: Natural = 0
 
     def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("stream",), error=ConfigError)
         self._largest_perturbations()
 
     def perturbations(self, sizes: Sequence[int]) -> tuple[tuple[Perturbation, ...], ...]:

@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from libero_env.validation import validate_arguments
-from lifelong.errors import ConfigError, LifelongError
+from lifelong.errors import LifelongError
 
 
 class Tracker:
@@ -15,9 +14,6 @@ class Tracker:
             it later. `online` uploads at once.
         project: Name of the W&B project.
         entity: W&B user or team; None for the default of the login.
-
-    Raises:
-        ConfigError: The mode is unknown.
     """
 
     def __init__(
@@ -27,12 +23,6 @@ class Tracker:
         project: str = "libero-lifelong",
         entity: str | None = None,
     ):
-        validate_arguments(
-            Tracker,
-            {"mode": mode, "project": project, "entity": entity},
-            prefix=("wandb",),
-            error=ConfigError,
-        )
         self.mode, self.project, self.entity = mode, project, entity
         self._run: Any = None
 

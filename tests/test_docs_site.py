@@ -2,6 +2,7 @@
 
 import importlib.util
 import inspect
+import itertools
 import os
 import re
 import shlex
@@ -15,7 +16,6 @@ from types import ModuleType
 
 import pytest
 import yaml
-from hydra import compose, initialize_config_dir
 
 from libero._adapters.lifelong.config import load_config
 from libero_env.cli.main import ALL, bind, find, load, main
@@ -24,7 +24,7 @@ from libero_env.objects import catalog
 from libero_env.objects.builtin import builtin_names
 from libero_env.tasks import get_suite, suite_names
 from lifelong.algorithms import Algorithm
-from lifelong.composition import check_choices, swept
+from lifelong.composition import compose_run, swept
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -103,8 +103,10 @@ def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
 
 @cache
 def composes(*overrides: str) -> None:
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        compose("config", list(overrides))
+    for values in itertools.product(*swept(overrides).values()):  # of a sweep, each job
+        chosen = dict(zip(swept(overrides), values, strict=True))
+        single = [word for word in overrides if word.split("=")[0] not in chosen]
+        compose_run([*single, *(f"{key}={value}" for key, value in chosen.items())])
 
 
 def check_line(line: str) -> None:
@@ -120,11 +122,6 @@ def check_line(line: str) -> None:
         words[0] = "python"
     if words[:2] in (["python", "train.py"], ["libero", "train"]):
         overrides = [w for w in words[2:] if w not in ("-m", "--cfg", "job")]
-        check_choices(overrides, [CONFIGS])
-        if "-m" in words:  # Hydra takes sweeps apart before it composes: the first value of each
-            values = swept(overrides, [CONFIGS])
-            single = [w for w in overrides if w.split("=")[0] not in values]
-            overrides = [*single, *(f"{key}={several[0]}" for key, several in values.items())]
         composes(*overrides)
     elif words[0].endswith("libero"):
         name = find(words[1:])

@@ -1,5 +1,6 @@
 """Learn a sequence of tasks: `python libero/lifelong/main.py benchmark_name=LIBERO_SPATIAL lifelong=er seed=100`."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -11,34 +12,35 @@ def main() -> int:
         The exit status, see `libero_env.cli.ending`.
     """
     import hydra
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
 
     from libero._adapters.lifelong.config import CONFIGS
     from libero.lifelong.run import run
     from libero_env.cli import ending
-    from lifelong.composition import check_choices
+    from libero_env.errors import LiberoError
+    from lifelong.composition import REFUSALS, explained
 
-    status, mistakes = 0, (HydraException, OmegaConfBaseException)
+    status = 0
 
     def job(config: object) -> None:
         nonlocal status
         try:
             run(config)
         except Exception as error:  # noqa: BLE001 - told by kind
-            status = max(status, ending.report(error, mistakes=mistakes))
+            status = max(status, ending.report(error))
 
     with ending.debugging(sys.argv[1:]) as words:
         sys.argv[1:] = words  # where Hydra reads them
+        os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors are printed below, in one line
         try:
             with ending.interruptible():
-                check_choices(words, [CONFIGS])
                 hydra.main(version_base="1.3", config_path=str(CONFIGS), config_name="config")(job)()
         except KeyboardInterrupt as error:
             error.add_note("train.resume=true resumes after the last finished task")
             return ending.report(error)
-        except Exception as error:  # noqa: BLE001 - told by kind
-            return ending.report(error, mistakes=mistakes)
+        except LiberoError as error:
+            return ending.report(error)
+        except REFUSALS as error:  # of Hydra: the job keeps its own
+            return ending.report(explained(error, words, [CONFIGS]))
     return status
 
 

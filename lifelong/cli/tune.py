@@ -105,7 +105,6 @@ def tune(request: TuneRequest) -> None:
     config, choices = compose_run(plain_words, request.config_dir)
     plain = plain_data(config)
     checked = Configuration(plain)
-    checked.check()
     if threads := checked.settings().threads:
         torch.set_num_threads(threads)
     beside = [other(algo) for algo in request.beside if algo != choices["algo"]]
@@ -167,7 +166,8 @@ def _candidate(
     from lifelong.tuning.sweep import Candidate
 
     config = plain_data(compose_run(words, config_dir)[0])
-    Configuration(config).check()
+    for group in ("algo", "data", "train"):  # before anything is recorded or learned
+        Configuration(config).build(group)
     return Candidate(label, {key: _value_at(config, key.lstrip("+")) for key in values}, config)
 
 

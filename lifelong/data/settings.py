@@ -1,7 +1,6 @@
 """Settings of the demonstrations that a policy learns from."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -9,7 +8,7 @@ from pydantic import Field
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.demos.contents import LOW_DIM_KEYS
 from libero_env.perturbations import Perturbation
-from libero_env.validation import OneOf, validate_arguments
+from libero_env.validation import OneOf, checked
 from lifelong.data.loading import BACKENDS, MEMORY
 from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
@@ -21,7 +20,7 @@ CAMERAS = {
 }  # view -> camera in the model
 
 
-@dataclass(frozen=True)
+@checked
 class DataSettings:
     """Settings of the demonstrations that a policy learns from; see configs/data.
 
@@ -62,7 +61,6 @@ class DataSettings:
     perturb_seed: Natural = 0
 
     def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("data",), error=ConfigError)
         for key in ("views", "proprio"):
             names = list(getattr(self, key))
             if len(set(names)) < len(names):

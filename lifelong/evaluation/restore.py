@@ -234,11 +234,7 @@ def read_config(file: Path, allow: Sequence[str]) -> Configuration:
     language = values.get("language")
     if isinstance(language, dict):  # nothing is written into a folder that the file names
         values["language"] = {key: value for key, value in language.items() if key != "cache_dir"}
-    config = Configuration(values, source=str(file), allowed=tuple(allow))
-    config.check_some(("benchmark", "data", "language", "policy", "algo", "eval"), ("seed",))
-    if "pretrain" in values:
-        config.check_some(("pretrain",))
-    return config
+    return Configuration(values, source=str(file), allowed=tuple(allow))
 
 
 class _NoWindows(Mapping[int, TaskWindows]):

@@ -1,14 +1,13 @@
 """Settings of the measurement of success."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 from libero_env.errors import LiberoError
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.perturbations import Perturbation
 from libero_env.sim.backend import MUJOCO, Backend
-from libero_env.validation import validate_arguments
+from libero_env.validation import checked
 from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
 from lifelong.results.coverage import MatrixCells, measured_tasks
@@ -16,7 +15,7 @@ from lifelong.stats.metrics import Transfer
 from lifelong.types import Count, Natural
 
 
-@dataclass(frozen=True)
+@checked
 class EvalSettings:
     """Settings of the measurement of success; the defaults are those of LIBERO's paper, except `selection`.
 
@@ -69,7 +68,6 @@ class EvalSettings:
     shift: PerturbSetting | None = None
 
     def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("eval",), error=ConfigError)
         try:
             self.back_end.require_installed()
         except LiberoError as error:

@@ -1,17 +1,18 @@
-"""Settings of a run, and the gate through which every configuration passes before anything is built from it."""
+"""Settings of a run, and what is built from its configuration."""
 
 from lifelong.data.settings import CAMERAS, DataSettings
-from lifelong.settings.configuration import Configuration
-from lifelong.settings.nodes import build, plain_data
+from lifelong.settings.configuration import GROUPS, Configuration, build, find_target, plain_data
 from lifelong.settings.run import BenchmarkSettings, PretrainSettings, RunSettings
 
 __all__ = [
     "CAMERAS",
+    "GROUPS",
     "BenchmarkSettings",
     "Configuration",
     "DataSettings",
     "PretrainSettings",
     "RunSettings",
     "build",
+    "find_target",
     "plain_data",
 ]

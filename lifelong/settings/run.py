@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import AfterValidator, Field
@@ -10,7 +9,7 @@ from pydantic import AfterValidator, Field
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Suite, Task, get_suite, suite_names
 from libero_env.tasks.suites import OWN, read_suite
-from libero_env.validation import validate_arguments
+from libero_env.validation import checked
 from lifelong.errors import ConfigError
 from lifelong.types import Count, Natural, PathText
 
@@ -18,7 +17,7 @@ from lifelong.types import Count, Natural, PathText
 def _check_name(name: int | float | str) -> int | float | str:
     if not re.fullmatch(r"[^\W.][^/\\\0\n]*", str(name)) or len(str(name)) > 100:
         raise ValueError(
-            f"{name!r} is no name; expected up to 100 characters, a letter or digit first, no / and no \\"
+            f"{name!r} is not a name; expected up to 100 characters, a letter or digit first, no / and no \\"
         )
     return name
 
@@ -26,7 +25,7 @@ def _check_name(name: int | float | str) -> int | float | str:
 Name = Annotated[int | float | str, AfterValidator(_check_name)]  # of a directory
 
 
-@dataclass(frozen=True)
+@checked
 class RunSettings:
     """Keys at the top of the configuration; see configs/config.yaml."""
 
@@ -41,7 +40,7 @@ class RunSettings:
     init_from: PathText | None
 
 
-@dataclass(frozen=True)
+@checked
 class BenchmarkSettings:
     """The task sequence.
 
@@ -63,9 +62,6 @@ class BenchmarkSettings:
     horizon: Count = 600
     group_size: Count = 1
     files: Annotated[Sequence[PathText], Field(min_length=1)] | None = None
-
-    def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("benchmark",), error=ConfigError)
 
     def sequence(self) -> tuple[Task, ...]:
         """Return the tasks in learning order.
@@ -102,7 +98,7 @@ class BenchmarkSettings:
         return read_suite(self.files, self.suite)
 
 
-@dataclass(frozen=True)
+@checked
 class PretrainSettings:
     """Tasks that a policy learns jointly before the sequence.
 
@@ -117,9 +113,6 @@ class PretrainSettings:
     tasks: Count | Annotated[Sequence[Natural | str], Field(min_length=1)] | None = None
     demos: Annotated[int, Field(ge=1, le=100_000)] | None = None
     epochs: Count | None = None
-
-    def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("pretrain",), error=ConfigError)
 
     def sequence(self) -> tuple[Task, ...]:
         """Return the tasks; none without pretraining.

@@ -1,13 +1,11 @@
 """Settings of the training of a task."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from libero_env.validation import validate_arguments
-from lifelong.errors import ConfigError
+from libero_env.validation import checked
 from lifelong.types import Count, Natural, NonNegative
 
 
@@ -18,7 +16,7 @@ def _read_off(value: Any) -> Any:
 Rate = Annotated[float, Field(ge=0, lt=1)]
 
 
-@dataclass(frozen=True)
+@checked
 class FitSettings:
     """Settings of the training of a task; the defaults are those of LIBERO's paper (appendix B) and code.
 
@@ -62,7 +60,3 @@ class FitSettings:
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     accumulate: Count = 1
     compile: Annotated[Literal["off", "default", "reduce-overhead"], BeforeValidator(_read_off)] = "off"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "compile", _read_off(self.compile))
-        validate_arguments(type(self), vars(self), prefix=("train",), error=ConfigError)

@@ -10,7 +10,7 @@ import yaml
 from libero_env.errors import UnknownNameError
 from lifelong import checkpoints
 from lifelong.algorithms.importance import BatchFisher
-from lifelong.composition import check_choices
+from lifelong.composition import compose_run
 from lifelong.seeding import generator
 from lifelong.settings import build
 from lifelong.training.fit import fit
@@ -206,7 +206,7 @@ def test_packnet_forgets_as_the_original_only(compat):
 
 def test_another_choice_is_refused():
     with pytest.raises(UnknownNameError, match="Valid: libero, none"):
-        check_choices(["algo=er", "compat=robomimic"], [CONFIGS])
+        compose_run(["algo=er", "compat=robomimic"])
 
 
 def test_the_sequence_sets_the_augmentation_of_its_algorithm(tmp_path):
