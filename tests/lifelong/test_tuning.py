@@ -204,7 +204,7 @@ def test_lists_of_values_are_found_and_others_are_left() -> None:
     ("words", "told"),
     [
         (["algo=dmpel"], "suggests no values"),
-        (["algo=ewc", "algo.strenght=1,2"], "Did you mean algo.strength"),
+        (["algo=ewc", "algo.strenght=1,2"], "Did you mean 'algo.strength'"),
         (["algo=ewcc"], "Did you mean 'ewc'"),
         (["algo=ewc", "algo.strength=-1,2"], "algo.strength"),
         (["algo=ewc", "--stream", "61"], "one task"),
