@@ -12,8 +12,8 @@ from hydra.utils import get_object
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 import lifelong
-from lifelong.composition import compose_run
 from libero_env.errors import InvalidInputError
+from lifelong.composition import compose_run
 from lifelong.errors import ConfigError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.settings import GROUPS, RunSettings
