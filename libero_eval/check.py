@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 from libero_env.errors import LiberoError
+from libero_env.text import json_safe
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
 from lifelong.errors import CheckpointError, LifelongError
-from lifelong.results.checkpoint_folder import BROKEN_SUFFIX, CheckpointFolder
-from lifelong.results.coverage import measured_tasks
 from lifelong.results.log import ResultLog
-from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
+from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord, measured_tasks
 from lifelong.results.results import Results
-from lifelong.results.run_directory import RunDirectory, read_saved_config
-from lifelong.results.summary import json_safe, summarize
+from lifelong.results.run_directory import BROKEN_SUFFIX, CheckpointFolder, RunDirectory, read_saved_config
+from lifelong.results.summary import summarize
 
 _COMPARED = (
     *("finished", "tasks_learned", "success_matrix", "curves", "losses", "best_epochs"),

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from libero_env.storage import atomic_write_text
+from libero_env.text import json_safe
 from libero_eval.evaluation_file import EvaluationResult, TaskResult
 from lifelong.errors import ResultsError
-from lifelong.results.summary import json_safe
 
 
 def export_vla_eval(result: EvaluationResult, folder: Path) -> list[Path]:

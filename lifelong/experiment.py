@@ -38,14 +38,15 @@ from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
 from lifelong.pretraining import policy_at_start, pretraining_context, pretraining_directory
 from lifelong.report.page import write_report
-from lifelong.results.conditions import (
+from lifelong.results.log import ResultLog
+from lifelong.results.provenance import (
     changed_conditions,
     changed_demonstrations,
     present_conditions,
     recorded_threads,
+    start_record,
+    utc_now,
 )
-from lifelong.results.log import ResultLog
-from lifelong.results.provenance import start_record, utc_now
 from lifelong.results.records import DemonstrationsRecord, PhaseRecord, RunEndRecord, RunRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary

@@ -25,7 +25,7 @@ from lifelong import experiment
 from lifelong.composition import REFUSALS, compose_first, config_folders, explained, swept
 from lifelong.errors import ConfigError
 from lifelong.report.page import write_report
-from lifelong.results.run_directory import config_digest
+from lifelong.results.provenance import config_digest
 from lifelong.settings import plain_data
 from lifelong.sweeps import (
     FOLDER,

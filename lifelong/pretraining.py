@@ -15,7 +15,8 @@ from lifelong.errors import CheckpointError, ConfigError
 from lifelong.evaluation.restore import read_config, restore
 from lifelong.policies.base import Policy
 from lifelong.results.log import ResultLog
-from lifelong.results.run_directory import RunDirectory, config_digest
+from lifelong.results.provenance import config_digest
+from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import INIT, seeded
 from lifelong.settings import Configuration, PretrainSettings
 from lifelong.streams import StreamSettings

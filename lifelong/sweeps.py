@@ -25,10 +25,10 @@ from pydantic import Field
 
 from libero_env.parallel import is_running, process_start, this_machine
 from libero_env.storage import atomic_write_text
+from libero_env.text import json_safe
 from libero_env.validation import validate
 from lifelong.errors import ResultsError, RunLockedError
 from lifelong.results.provenance import utc_now
-from lifelong.results.summary import json_safe
 
 SWEEP_FILE, JOB_FILE, FOLDER = "sweep.json", "job.json", "sweep"
 Status = Literal["running", "done", "failed", "interrupted"]

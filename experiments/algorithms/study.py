@@ -36,12 +36,13 @@ from lifelong.composition import config_folder
 from lifelong.data.demonstrations import find_demos
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
-from lifelong.results.run_directory import result_relevant
+from lifelong.results.provenance import result_relevant
 from lifelong.settings import Configuration, plain_data
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 RECORDS = HERE / "records"
+REFERENCES = ("er", "sequential", "single_task")  # that each other algorithm is compared with
 SETTINGS = ("eval.episodes=20", "threads=1", "eval.sim_threads=1", "progress=false")
 # the rate is constant, so that neither comes nearer in a few hundred steps
 RELEARN = {
@@ -282,7 +283,11 @@ def report(runs: Sequence[Planned]) -> None:
         if not found:
             continue
         with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # runs are named by relative paths
-            page = write_report([run.unpack(Path()) for run in found], HERE / study.name / "report.html")
+            page = write_report(
+                [run.unpack(Path()) for run in found],
+                HERE / study.name / "report.html",
+                references=[name for name in REFERENCES if name in study.algorithms],
+            )
         print(f"{len(found)} runs: {page}")
 
 

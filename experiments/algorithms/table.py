@@ -12,7 +12,7 @@ from pathlib import Path
 
 from study import Planned, planned
 
-from lifelong.report.tables import duration, quantity
+from libero_env.text import duration, quantity
 from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
 from lifelong.results.relearning import Savings, by_measure, read_relearning, savings

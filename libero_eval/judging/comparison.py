@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.storage import atomic_write_text
+from libero_env.text import json_safe
 from libero_eval.judging.comparability import (
     Matched,
     Side,
@@ -23,7 +24,6 @@ from libero_eval.judging.comparability import (
 from libero_eval.judging.group_scores import GroupScores, group_scores
 from lifelong.errors import ConfigError, ResultsError
 from lifelong.report.comparison import MUJOCO
-from lifelong.results.summary import json_safe
 from lifelong.stats.episodes import (
     ALPHA,
     Difference,

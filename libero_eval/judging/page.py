@@ -9,7 +9,7 @@ from libero_eval.judging.comparison import Comparison, Judgement
 from libero_eval.judging.figures import forest_figure, profile_figure, sequential_figure
 from lifelong.errors import ResultsError
 from lifelong.report.figures import as_svg
-from lifelong.report.templates import page_template
+from lifelong.report.tables import page_template
 
 
 def write_page(found: Judgement, path: Path) -> Path:

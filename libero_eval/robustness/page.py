@@ -26,7 +26,7 @@ from lifelong.report.figures import (
     legend_below,
     shorten,
 )
-from lifelong.report.templates import page_template
+from lifelong.report.tables import page_template
 from lifelong.stats.intervals import Estimate
 
 ALPHA = 0.05  # of the kinds together

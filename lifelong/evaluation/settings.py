@@ -10,7 +10,7 @@ from libero_env.sim.backend import MUJOCO, Backend
 from libero_env.validation import checked
 from lifelong.data.perturbations import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
-from lifelong.results.coverage import MatrixCells, measured_tasks
+from lifelong.results.records import MatrixCells, measured_tasks
 from lifelong.stats.metrics import Transfer
 from lifelong.types import Count, Natural
 

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from libero_env.storage import atomic_write_text
+from libero_env.text import json_safe
 from lifelong.errors import ComparisonError
 from lifelong.report.runs import Group, Run, other_demonstrations
-from lifelong.results.summary import json_safe
 from lifelong.stats.intervals import mean_and_standard_error
 from lifelong.stats.methods import MARGIN, MethodRun, statistics
 from lifelong.stats.metrics import METRIC_NAMES, metric_values

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.storage import atomic_write_text
+from libero_env.text import duration
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import MUJOCO, Plan, compare, findings, write_comparison
 from lifelong.report.figures import (
@@ -21,22 +22,22 @@ from lifelong.report.figures import (
     learning_figure,
     save,
 )
-from lifelong.report.heat_table import mean_heatmap, run_heatmap
 from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
 from lifelong.report.tables import (
     atom_rows,
     cost_table,
-    duration,
-    episodes_text,
+    mean_heatmap,
     most_forgotten,
+    page_template,
+    percent,
+    run_heatmap,
     shift_table,
     task_costs,
 )
-from lifelong.report.templates import page_template, percent
-from lifelong.results.episode_table import write_episodes
 from lifelong.results.records import RunRecord
 from lifelong.results.relearning import by_measure, read_relearning, savings_heads, savings_rows
 from lifelong.results.shifts import shift_scores
+from lifelong.results.summary import write_episodes
 from lifelong.stats.methods import MARGIN
 from lifelong.stats.metrics import METRIC_NAMES, Metrics, average_success, metric_values
 
@@ -161,7 +162,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "tasks": _task_rows(run, rates),
         "times": [(name, duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
         "total_time": duration(sum(times.values())),
-        "episodes": episodes_text(*run.results.episodes()),
+        "episodes": run.results.episodes(),
         "relearning": [
             (savings_heads(part), savings_rows(part)) for part in by_measure(read_relearning(run.path))
         ],

@@ -10,8 +10,8 @@ from typing import Any
 import yaml
 
 from lifelong.errors import LifelongError, ResultsError
-from lifelong.results.conditions import few_of, resume_notes
 from lifelong.results.log import ResultLog
+from lifelong.results.provenance import few_of, resume_notes
 from lifelong.results.records import RunRecord
 from lifelong.results.results import Results
 from lifelong.stats.metrics import Metrics, lifelong_metrics

@@ -1,102 +1,92 @@
-"""Rows of a report's tables of costs and subgoals."""
+"""Tables of pages, and the templates that show them: self-contained HTML in one style."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
+import jinja2
 import numpy as np
 
+from libero_env.text import duration, quantity
 from lifelong.report.comparison import costs_of
+from lifelong.report.figures import cell_colours
 from lifelong.report.runs import Run
+from lifelong.results.results import Results
 from lifelong.results.shifts import ShiftScore
 from lifelong.results.subgoals import AtomRates, Subgoals
+from lifelong.stats.intervals import mean_and_standard_error, wilson_interval
+
+# costs by their names in `lifelong.training.costs`: head of the column, its tooltip, and how a value is shown
+COST_COLUMNS: dict[str, tuple[str, str, Callable[[float], str]]] = {
+    "training_seconds": ("Training", "wall time of training on a task", duration),
+    "evaluation_seconds": ("Evaluation", "wall time of rollouts while and after learning a task", duration),
+    "end_task_seconds": ("Between tasks", "wall time of what the algorithm does after a task", duration),
+    "flops_per_step": (
+        "A step",
+        "operations of a training step, replay and penalties included",
+        lambda value: quantity(value, "FLOP"),
+    ),
+    "flops_per_action": (
+        "An action",
+        "operations of one action with a full history",
+        lambda value: quantity(value, "FLOP"),
+    ),
+    "parameters": ("Parameters", "of the policy and of what the algorithm trains beside it", quantity),
+    "parameters_trained": ("Trained", "parameters that the optimiser moves", quantity),
+    "stored_bytes": (
+        "Stored",
+        "kept from task to task: state, and frames to replay",
+        lambda value: quantity(value, "B"),
+    ),
+    "peak_gpu_bytes": ("GPU memory", "largest while learning a task", lambda value: quantity(value, "B")),
+    "peak_memory_bytes": ("Memory", "largest of the process so far", lambda value: quantity(value, "B")),
+}
 
 
-def episodes_text(run: int, copied: int) -> str:
-    """Return a sentence about the episodes of a run, with a blank before it; nothing without any."""
-    if not run + copied:
-        return ""
-    rest = f"; {copied} more would have repeated these to the bit and were copied" if copied else ""
-    return f" {run} episodes were run{rest}."
+def page_template(name: str, package: str = "lifelong.report") -> jinja2.Template:
+    """Return a template of a package, with the filter `percent`; an undefined name is an error.
 
-
-def duration(seconds: float) -> str:
-    """Format seconds for readers: 0.4 s, 42 s, 3 min 20 s, 2 h 05 min."""
-    if seconds < 1:
-        return f"{seconds:.1g} s" if seconds else "0 s"
-    seconds = round(seconds)
-    if seconds < 60:
-        return f"{seconds} s"
-    if seconds < 3600:
-        return f"{seconds // 60} min {seconds % 60:02d} s"
-    return f"{seconds // 3600} h {seconds % 3600 // 60:02d} min"
-
-
-def quantity(value: float, unit: str = "") -> str:
-    """Format a number with three digits and its SI prefix: 5.38 M, 1.20 TFLOP, 512 B."""
-    for power, prefix in ((12, "T"), (9, "G"), (6, "M"), (3, "k")):
-        if value >= 10**power:
-            digits = f"{value / 10**power:#.3g}".rstrip(".")
-            return f"{digits} {prefix}{unit}".rstrip()
-    return f"{value:.0f} {unit}".rstrip()
-
-
-@dataclass(frozen=True)
-class Column:
-    """A column of the table of costs.
-
-    Attributes:
-        name: Name of the cost, as in `lifelong.training.costs`.
-        head: Head of the column.
-        title: Tooltip of the head.
-        text: Function that formats a value.
+    Args:
+        name: File of the template; it may include those of `lifelong.report`.
+        package: Package whose folder holds it.
     """
-
-    name: str
-    head: str
-    title: str
-    text: Callable[[float], str]
-
-
-def _flops(value: float) -> str:
-    return quantity(value, "FLOP")
-
-
-def _bytes(value: float) -> str:
-    return quantity(value, "B")
+    environment = jinja2.Environment(
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(p, ".") for p in (package, "lifelong.report")]),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["percent"] = percent
+    return environment.get_template(name)
 
 
-COST_COLUMNS = (
-    Column("training_seconds", "Training", "wall time of training on a task", duration),
-    Column(
-        "evaluation_seconds", "Evaluation", "wall time of rollouts while and after learning a task", duration
-    ),
-    Column(
-        "end_task_seconds", "Between tasks", "wall time of what the algorithm does after a task", duration
-    ),
-    Column(
-        "flops_per_step", "A step", "operations of a training step, replay and penalties included", _flops
-    ),
-    Column("flops_per_action", "An action", "operations of one action with a full history", _flops),
-    Column("parameters", "Parameters", "of the policy and of what the algorithm trains beside it", quantity),
-    Column("parameters_trained", "Trained", "parameters that the optimiser moves", quantity),
-    Column("stored_bytes", "Stored", "kept from task to task: state, and frames to replay", _bytes),
-    Column("peak_gpu_bytes", "GPU memory", "largest while learning a task", _bytes),
-    Column("peak_memory_bytes", "Memory", "largest of the process so far", _bytes),
-)
+def percent(value: float | None, digits: int = 1) -> str:
+    """Format a share as percent with a typographic minus sign; a dash where it is undefined."""
+    if value is None or np.isnan(value):
+        return "–"
+    text = f"{100 * value:.{digits}f}"
+    return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
 
 
 def cost_table(rows: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, Any] | None:
     """Return labelled rows of costs, with the columns that any row has; None if there are none."""
-    columns = [c for c in COST_COLUMNS if any(c.name in costs for _, costs in rows)]
+    columns = {
+        name: column for name, column in COST_COLUMNS.items() if any(name in costs for _, costs in rows)
+    }
     if not columns:
         return None
     texts = [
-        (label, [c.text(costs[c.name]) if np.isfinite(costs.get(c.name, np.nan)) else "–" for c in columns])
+        (
+            label,
+            [
+                show(costs[name]) if np.isfinite(costs.get(name, np.nan)) else "–"
+                for name, (_, _, show) in columns.items()
+            ],
+        )
         for label, costs in rows
         if costs
     ]
-    return {"columns": columns, "rows": texts}
+    return {"columns": [(head, title) for head, title, _ in columns.values()], "rows": texts}
 
 
 def task_costs(run: Run, labels: Sequence[str]) -> dict[str, Any] | None:
@@ -151,3 +141,58 @@ def shift_table(score: ShiftScore, labels: Sequence[str]) -> dict[str, Any]:
     ]
     means = [*map(score.success, names), *(score.forgetting(shifted=shifted) for shifted in (False, True))]
     return {"name": score.shift, "rows": rows, "means": means}
+
+
+def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:
+    """Return the cells of one run's matrix: percent, colours, and Wilson's interval as the tooltip."""
+    rates, episodes = results.success_matrix()
+    low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
+    spread = "{} of {} episodes; 95 % interval {} to {} %"
+
+    def hint(i: int, j: int) -> str:
+        ends = (f"{100 * end[i, j]:.0f}" for end in (low, high))
+        return spread.format(round(rates[i, j] * episodes[i, j]), episodes[i, j], *ends)
+
+    def detail(i: int, j: int) -> str:
+        return f"{100 * low[i, j]:.0f}–{100 * high[i, j]:.0f}"
+
+    return _grid(rates, labels, hint, detail)
+
+
+def mean_heatmap(matrices: np.ndarray, mean: np.ndarray, labels: Sequence[str]) -> dict[str, Any]:
+    """Return the cells of the mean over seeds, with its standard error as the tooltip."""
+
+    def spread(i: int, j: int) -> tuple[float, int]:
+        values = matrices[:, i, j][~np.isnan(matrices[:, i, j])]
+        return 100 * mean_and_standard_error(values)[1], len(values)
+
+    def hint(i: int, j: int) -> str:
+        error, count = spread(i, j)
+        return f"mean of {count} seeds, standard error {error:.1f}" if count > 1 else "one seed"
+
+    return _grid(mean, labels, hint, lambda i, j: "")
+
+
+def _grid(
+    rates: np.ndarray,
+    labels: Sequence[str],
+    hint: Callable[[int, int], str],
+    detail: Callable[[int, int], str],
+) -> dict[str, Any]:
+    """Return the rows of the table; cells without an evaluation are None."""
+
+    def cell(i: int, j: int) -> dict[str, str] | None:
+        if np.isnan(rates[i, j]):
+            return None
+        back, ink = cell_colours(float(rates[i, j]))
+        text = f"{100 * rates[i, j]:.0f}"
+        where = f"after task {i + 1} ({labels[i]}), on task {j + 1} ({labels[j]}): {text} %"
+        tooltip = f"{where}\n{hint(i, j)}"
+        return {"text": text, "detail": detail(i, j), "hint": tooltip, "back": back, "ink": ink}
+
+    size, rows = len(rates), []
+    for i in range(size):
+        known = rates[i, : i + 1]
+        average = f"{100 * known.mean():.0f}" if not np.isnan(known).any() else ""
+        rows.append({"label": labels[i], "cells": [cell(i, j) for j in range(size)], "average": average})
+    return {"rows": rows, "size": size, "title": ""}

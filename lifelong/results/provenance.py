@@ -1,19 +1,46 @@
-"""Where results come from: when a run started, from which source, with which versions."""
+"""Where results come from: the configuration, source and versions of a run, and all else that decides its bits.
 
+Floating-point sums depend on how they are divided: on the number of threads, the instruction set and processor for
+which kernels are chosen, the libraries, the renderer. The same command gives the same bits where all of these are the
+same.
+"""
+
+import hashlib
+import json
 import os
+import platform
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from lifelong.results.coverage import MatrixCells
-from lifelong.results.records import RunRecord
-from lifelong.results.run_directory import config_digest
-from lifelong.stats.metrics import Transfer
+import numpy as np
 
+from libero_env.text import flatten
+from lifelong.results.records import DemonstrationsRecord, RunRecord
+from lifelong.results.results import Results
+
+if TYPE_CHECKING:
+    import torch
+
+# Keys that may differ between the start of a run and its resumption, because they change no result.
+VOLATILE = (
+    "device",
+    "progress",
+    "resume",
+    "run_id",
+    "runs_dir",
+    "threads",
+    "wandb",
+    "data.memory",
+    "data.backend",
+    "eval.transfer",  # how records are read, not what they hold
+    "eval.shift",  # evaluations besides all others
+)
 VERSIONED_PACKAGES = (
     "libero-lifelong",
     "mujoco",
@@ -24,66 +51,62 @@ VERSIONED_PACKAGES = (
     "h5py",
     "transformers",
 )
+_PACKAGES = (
+    "libero_env",
+    "lifelong",
+    "libero_eval",
+)  # whose files decide results; the facade only calls them
+_ENDINGS = (".py", ".yaml", ".npz", ".json")
+_VARIABLES = (
+    "MKL_CBWR",
+    "MKL_ENABLE_INSTRUCTIONS",
+    "ONEDNN_MAX_CPU_ISA",
+    "ATEN_CPU_CAPABILITY",
+    "NVIDIA_TF32_OVERRIDE",
+)
+_DECISIVE_VERSIONS = (
+    "python",
+    "mujoco",
+    "torch",
+    "numpy",
+    "robosuite",
+    "transformers",
+    "models",
+    "models_digest",
+)
+_ROOT = Path(__file__).parents[2]
 
-_SOURCE = Path(__file__).parents[2]
+
+def result_relevant(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a configuration that affect results, by dotted key."""
+    volatile = tuple(f"{key}." for key in VOLATILE)
+    return {k: v for k, v in flatten(config).items() if not f"{k}.".startswith(volatile)}
 
 
-def start_record(
-    *,
-    algo: str,
-    benchmark: str,
-    policy: str,
-    seed: int,
-    preset: str,
-    tasks: Sequence[str],
-    instructions: Sequence[str],
-    config: Mapping[str, Any],
-    group_sizes: Sequence[int] = (),
-    conditions: Mapping[str, str] | None = None,
-    cells: MatrixCells = "all",
-    transfer: Transfer = "cross_fitted",
-    perturbed: Sequence[str] = (),
-    backend: str = "mujoco",
-) -> RunRecord:
+def config_digest(config: Mapping[str, Any]) -> str:
+    """Return 16 hex digits that change with whatever affects the results of a configuration."""
+    text = json.dumps(result_relevant(config), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def start_record(*, config: Mapping[str, Any], group_sizes: Sequence[int] = (), **facts: Any) -> RunRecord:
     """Return the record of a run that starts now, on this machine.
 
     Args:
-        algo: Name of the algorithm's configuration.
-        benchmark: Name of the benchmark's configuration.
-        policy: Name of the policy's configuration.
-        seed: Seed of the run.
-        preset: Name of the preset.
-        tasks: Names of the tasks in learning order.
-        instructions: Instructions of the tasks, in the same order.
         config: Resolved configuration as plain data, whose digest is recorded.
         group_sizes: Number of tasks in each group that is one step of the sequence; () for one at a time.
-        conditions: What decides the bits of its results, see `lifelong.results.conditions`.
-        cells: Cells of the success matrix that are measured.
-        transfer: Estimate of forward transfer, see `lifelong.stats.metrics`.
-        perturbed: Perturbations under which each task is learned and evaluated, as text; () for none at all.
-        backend: Name of the back end of rollouts.
+        facts: Other fields of `RunRecord`; lists become tuples.
     """
-    equal = len(set(group_sizes)) < 2  # written as earlier versions did
+    equal = len(set(group_sizes)) < 2
     return RunRecord(
-        algo=algo,
-        benchmark=benchmark,
-        policy=policy,
-        seed=seed,
-        preset=preset,
-        tasks=tuple(tasks),
-        instructions=tuple(instructions),
         config_digest=config_digest(config),
         versions=installed_versions(),
         commit=source_commit(),
         cpu_count=os.cpu_count() or 1,
         started=utc_now(),
         group_size=group_sizes[0] if group_sizes and equal else 1,
-        conditions=conditions or {},
-        cells=cells,
-        backend=backend,
         group_sizes=() if equal else tuple(group_sizes),
-        transfer=transfer,
-        perturbed=tuple(perturbed),
+        **{name: tuple(value) if isinstance(value, list) else value for name, value in facts.items()},
     )
 
 
@@ -114,7 +137,7 @@ def installed_versions(assets: str | None = None) -> dict[str, str]:
 
 def source_commit() -> str | None:
     """Return the git commit of this source tree, with "+changes" if it was edited; None outside a checkout."""
-    if not (_SOURCE / ".git").exists():
+    if not (_ROOT / ".git").exists():
         return None
     try:
         commit, changes = (_git("rev-parse", "HEAD"), _git("status", "--porcelain", "--untracked-files=no"))
@@ -125,6 +148,130 @@ def source_commit() -> str | None:
 
 def _git(*args: str) -> str:
     done = subprocess.run(
-        ["git", "-C", str(_SOURCE), *args], capture_output=True, text=True, timeout=10, check=True
+        ["git", "-C", str(_ROOT), *args], capture_output=True, text=True, timeout=10, check=True
     )
     return done.stdout.strip()
+
+
+def present_conditions(
+    device: "torch.device", *, processes: int = 1, renderer: str | None = None
+) -> dict[str, str]:
+    """Return the conditions of this process, by name.
+
+    Args:
+        device: Device of the policy.
+        processes: Number of processes that train together.
+        renderer: Name of the OpenGL renderer, whose images depend on it; None where nothing is drawn.
+    """
+    import torch
+
+    found = {
+        "threads": str(torch.get_num_threads()),
+        "processes": str(processes),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else device.type,
+        "processor": _processor(),
+        "instruction_set": torch.backends.cpu.get_cpu_capability(),
+        "blas": _blas(),
+        "source": source_digest(),
+    }
+    if device.type == "cuda":
+        found |= {"cuda": str(torch.version.cuda), "cudnn": str(torch.backends.cudnn.version())}
+    if renderer is not None:
+        found["renderer"] = renderer
+    return found | {name: os.environ[name] for name in _VARIABLES if name in os.environ}
+
+
+def recorded_threads(results: Results) -> int | None:
+    """Return the number of PyTorch's threads that a run was started with; None where it is not recorded."""
+    starts = results.of(RunRecord)
+    threads = starts[0].conditions.get("threads", "") if starts else ""
+    return int(threads) if threads.isdecimal() and 0 < int(threads) < 4096 else None
+
+
+def changed_conditions(first: RunRecord, later: RunRecord) -> list[str]:
+    """Return what differs between two starts of a run that decides its bits, such as `torch 2.12.0 -> 2.13.0`."""
+    was, now = all_conditions(first), all_conditions(later)
+    return [
+        f"{name.replace('_', ' ')} {was.get(name, 'none')} -> {now.get(name, 'none')}"
+        for name in {**was, **now}
+        if was.get(name) != now.get(name)
+    ]
+
+
+def resume_notes(results: Results) -> list[str]:
+    """Return a sentence for each resume of a run under other conditions, or with other demonstrations, than before."""
+    starts, notes = results.of(RunRecord), []
+    for before, after in zip(starts, starts[1:], strict=False):
+        if changes := changed_conditions(before, after):
+            notes.append(
+                f"Resumed {after.started.replace('T', ' ').replace('+00:00', ' UTC')} under other conditions "
+                f"({', '.join(changes)}): from there on, bits differ from those of an uninterrupted run."
+            )
+    found = results.of(DemonstrationsRecord)
+    for earlier, later in zip(found, found[1:], strict=False):
+        if other := changed_demonstrations(earlier, later, results.run.tasks):
+            notes.append(f"Resumed {other}.")
+    return notes
+
+
+def changed_demonstrations(
+    earlier: DemonstrationsRecord, later: DemonstrationsRecord, tasks: Sequence[str]
+) -> str:
+    """Return what a resume with other demonstrations says, without a full stop; "" where they are the same ones.
+
+    Args:
+        earlier: Demonstrations before.
+        later: Demonstrations after.
+        tasks: Names of the tasks.
+    """
+    pairs = zip(tasks, earlier.counts, later.counts, earlier.digests, later.digests, strict=True)
+    names = [name for name, *values in pairs if values[0] != values[1] or values[2] != values[3]]
+    if not names:
+        return ""
+    return (
+        f"with other demonstrations than before of {few_of(names)}: what was learned before the resume was learned "
+        "from the earlier ones"
+    )
+
+
+def few_of(names: Sequence[str], most: int = 3) -> str:
+    """Return names as a list, and of more than `most` how many there are and the first ones."""
+    listed = ", ".join(names[:most])
+    return listed if len(names) <= most else f"{len(names)} tasks ({listed}, …)"
+
+
+@cache
+def source_digest() -> str:
+    """Return 12 hex digits that change with the source and data of the packages, whether committed or not."""
+    digest, root = hashlib.sha256(), _ROOT
+    for package in _PACKAGES:
+        for file in sorted((root / package).rglob("*")):
+            if file.suffix in _ENDINGS and file.is_file():
+                digest.update(f"{file.relative_to(root).as_posix()}\0".encode())
+                digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()[:12]
+
+
+def all_conditions(record: RunRecord) -> dict[str, str]:
+    """Return everything besides the configuration that decides the bits of what a process does, by name."""
+    versions = {name: record.versions[name] for name in _DECISIVE_VERSIONS if name in record.versions}
+    return {**record.conditions, **versions}
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, "") or platform.processor() or platform.machine()
+
+
+def _blas() -> str:
+    """Return the libraries of matrix products of PyTorch and NumPy."""
+    import torch
+
+    torch_blas = "mkl" if torch.backends.mkl.is_available() else "openblas or other"
+    config = np.show_config(mode="dicts") or {}
+    found = config.get("Build Dependencies", {}).get("blas", {})
+    return f"torch {torch_blas}, numpy {found.get('name', 'unknown')} {found.get('version', '')}".strip()

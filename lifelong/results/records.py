@@ -3,30 +3,45 @@
 import json
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import accumulate
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import Field, WrapValidator
 
 from libero_env.errors import InvalidInputError
+from libero_env.text import json_safe
 from libero_env.validation import validate
-from lifelong.results.coverage import MatrixCells
 from lifelong.stats.metrics import Transfer
 
 _CHECKSUM = "crc32"
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
+MatrixCells = Literal["all", "diagonal", "last_row", "diagonal_and_last_row"]
 Phase = Literal["curve", "matrix", "shift"]
 Number = Annotated[float, WrapValidator(lambda value, parse: math.nan if value is None else parse(value))]
 
 
-@dataclass(frozen=True)
+def measured_tasks(cells: MatrixCells, stage: Sequence[int], tasks: int) -> range:
+    """Return the tasks that are measured after a stage: its row of the success matrix.
+
+    Args:
+        cells: Cells that the run measures.
+        stage: Positions of the tasks that were learned together last, ascending and without gaps.
+        tasks: Number of tasks of the run.
+    """
+    final = stage[-1] == tasks - 1
+    if cells == "all" or (final and cells != "diagonal"):
+        return range(stage[-1] + 1)
+    return range(0) if cells == "last_row" else range(stage[0], stage[-1] + 1)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RunRecord:
     """One start of the process; a resumed run has several. The first names the run."""
 
-    kind: Literal["run"] = field(default="run", init=False)
+    kind: Literal["run"] = "run"
     algo: str
     benchmark: str
     policy: str
@@ -40,7 +55,7 @@ class RunRecord:
     cpu_count: Count
     started: str  # ISO 8601, UTC
     group_size: Annotated[int, Field(ge=1, le=1000)] = 1  # tasks learned together as one step of the sequence
-    conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.conditions`
+    conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.provenance`
     cells: MatrixCells = "all"  # of the success matrix, which are measured
     # of each group, where they are not all of group_size
     group_sizes: tuple[Annotated[int, Field(ge=1)], ...] = ()
@@ -76,72 +91,99 @@ class RunRecord:
         return next(group for group in self.groups if task in group)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LossRecord:
     """The mean training loss of one epoch (epochs count from 1) and its wall time."""
 
-    kind: Literal["loss"] = field(default="loss", init=False)
+    kind: Literal["loss"] = "loss"
     task: Count
     epoch: Count
     loss: Number
     seconds: Number
 
 
-@dataclass(frozen=True)
-class EvalRecord:
-    """Rollouts on one task: `phase` "curve" while learning it, "matrix" after learning task `learned`.
+@dataclass(frozen=True, kw_only=True)
+class Episodes:
+    """Outcomes of episodes on one task.
 
-    Rollouts under a held-out shift (`eval.shift`) after learning task `learned` have the phase "shift" and the
-    perturbations as text; all others are under the perturbations of the run's task, see `RunRecord.perturbed`.
-
-    The epoch is the number of epochs trained on task `learned` when the policy was frozen (0: zero-shot). For each
-    episode the record states which atoms of the goal held before the policy acted, at any time from then on, and at
-    the end; older records do not.
-
-    Rollouts that would repeat earlier ones to the bit are not run: their record is a copy, with the key of the one it
-    is a copy of, and takes 0 seconds.
+    Attributes:
+        init_states: Initial state of each episode.
+        successes: Whether each reached the goal.
+        lengths: Number of control steps of each.
+        atoms: Atoms of the goal, such as `(On plate_1 stove_1)`; empty if they were not measured.
+        atoms_ever: Whether each atom held at any time after the policy began to act, (episodes, atoms).
+        atoms_at_end: Whether each atom held at the end, (episodes, atoms).
     """
 
-    kind: Literal["eval"] = field(default="eval", init=False)
-    phase: Phase
-    learned: Count
-    epoch: Count
-    task: Count
-    successes: tuple[bool, ...]  # one per episode
-    lengths: tuple[Count, ...]  # [control steps]
     init_states: tuple[Count, ...]
-    seconds: Number
-    atoms: tuple[str, ...] = ()  # of the goal, such as (On plate_1 stove_1)
-    atoms_at_start: tuple[tuple[bool, ...], ...] = ()  # (episodes, atoms)
+    successes: tuple[bool, ...]
+    lengths: tuple[Count, ...]
+    atoms: tuple[str, ...] = ()
     atoms_ever: tuple[tuple[bool, ...], ...] = ()
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
-    # digest of all that the rollouts depend on; empty where they also depend on random draws
-    decided_by: str = ""
-    # phase, learned, epoch of the original
-    same_as: tuple[Phase, Count, Count] | None = None
-    shift: str = ""
 
-    def __post_init__(self) -> None:
-        if self.phase not in get_args(Phase):
-            raise ValueError(f"phase of an evaluation is 'curve', 'matrix' or 'shift', not {self.phase!r}")
-        if (self.phase == "shift") != bool(self.shift):
-            raise ValueError(f"an evaluation of phase {self.phase!r} has the shift {self.shift!r}")
-        if not len(self.successes) == len(self.lengths) == len(self.init_states) > 0:
-            raise ValueError(
-                "an evaluation needs equal numbers of successes, lengths and initial states, at least one; got "
-                f"{len(self.successes)}, {len(self.lengths)} and {len(self.init_states)}"
-            )
-        for name in ("atoms_at_start", "atoms_ever", "atoms_at_end"):
-            shape = [len(row) for row in getattr(self, name)]
-            if self.atoms and shape != [len(self.atoms)] * len(self.successes):
-                raise ValueError(
-                    f"{name} of an evaluation needs a row for each episode and a column for each atom"
-                )
+    OPTIONAL: ClassVar[tuple[str, ...]] = ()  # further columns, with an entry for each episode or none at all
+    OF_ATOMS: ClassVar[tuple[str, ...]] = ("atoms_ever", "atoms_at_end")
+
+    def shape_errors(self) -> list[str]:
+        """Return what is wrong with the sizes of the columns."""
+        count, errors = len(self.init_states), []
+        if not count:
+            errors.append("there are no episodes")
+        for name in ("successes", "lengths", *self.OPTIONAL, *self.OF_ATOMS):
+            entries = getattr(self, name)
+            optional = name in self.OPTIONAL or (name in self.OF_ATOMS and not self.atoms)
+            if len(entries) != count and (entries or not optional):
+                errors.append(f"{name} has {len(entries)} entries, init_states has {count}")
+            if name in self.OF_ATOMS and {len(row) for row in entries} - {len(self.atoms)}:
+                errors.append(f"{name} needs a column for each of the {len(self.atoms)} atoms")
+        return errors
 
     @property
     def rate(self) -> float:
         """Success rate of the episodes."""
         return sum(self.successes) / len(self.successes)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvalRecord(Episodes):
+    """Rollouts on one task: `phase` "curve" while learning it, "matrix" after learning task `learned`.
+
+    Rollouts under a held-out shift (`eval.shift`) after learning task `learned` have the phase "shift"; all others are
+    under the perturbations of the run's task, see `RunRecord.perturbed`.
+
+    Rollouts that would repeat earlier ones to the bit are not run: their record is a copy, with the key of the one it
+    is a copy of, and takes 0 seconds.
+
+    Attributes:
+        epoch: Number of epochs trained on task `learned` when the policy was frozen (0: zero-shot).
+        atoms_at_start: Whether each atom held before the policy acted, (episodes, atoms).
+        decided_by: Digest of all that the rollouts depend on; empty where they also depend on random draws.
+        same_as: Phase, learned and epoch of the original, if it is a copy.
+        shift: Perturbations of the shift, as text.
+    """
+
+    kind: Literal["eval"] = "eval"
+    phase: Phase
+    learned: Count
+    epoch: Count
+    task: Count
+    seconds: Number
+    atoms_at_start: tuple[tuple[bool, ...], ...] = ()
+    decided_by: str = ""
+    same_as: tuple[Phase, Count, Count] | None = None
+    shift: str = ""
+
+    OF_ATOMS: ClassVar[tuple[str, ...]] = ("atoms_at_start", "atoms_ever", "atoms_at_end")
+
+    def __post_init__(self) -> None:
+        errors = self.shape_errors()
+        if self.phase not in get_args(Phase):
+            errors.append(f"phase of an evaluation is 'curve', 'matrix' or 'shift', not {self.phase!r}")
+        if (self.phase == "shift") != bool(self.shift):
+            errors.append(f"an evaluation of phase {self.phase!r} has the shift {self.shift!r}")
+        if errors:
+            raise ValueError(errors[0])
 
     @property
     def outcome(self) -> tuple[Any, ...]:
@@ -150,16 +192,16 @@ class EvalRecord:
         return (self.successes, self.lengths, self.init_states, *atoms)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PhaseRecord:
     """Wall time of something that is neither a training epoch nor an evaluation, such as "demos"."""
 
-    kind: Literal["phase"] = field(default="phase", init=False)
+    kind: Literal["phase"] = "phase"
     phase: str
     seconds: Number
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DemonstrationsRecord:
     """The demonstrations that the process which started last learns from, by task.
 
@@ -169,7 +211,7 @@ class DemonstrationsRecord:
         digests: Digest of their states and actions, see `libero_env.demos.DemoOrigin`.
     """
 
-    kind: Literal["demonstrations"] = field(default="demonstrations", init=False)
+    kind: Literal["demonstrations"] = "demonstrations"
     counts: tuple[Count, ...]
     generators: tuple[str, ...]
     digests: tuple[str, ...]
@@ -181,29 +223,29 @@ class DemonstrationsRecord:
             )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class CostRecord:
     """Costs of learning a task besides the time of its epochs and evaluations, named as in `lifelong.training.costs`.
 
     A task may have several such records, each with some of the costs.
     """
 
-    kind: Literal["cost"] = field(default="cost", init=False)
+    kind: Literal["cost"] = "cost"
     task: Count
     costs: Mapping[str, Number]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TaskEndRecord:
     """The end of a task: it is learned, and its row of the success matrix is complete."""
 
-    kind: Literal["task_end"] = field(default="task_end", init=False)
+    kind: Literal["task_end"] = "task_end"
     task: Count
     best_epoch: Count
     seconds: Number
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RelearnRecord:
     """Fine-tuning on a task of a finished run, from one start, in a file of its own beside the run's records.
 
@@ -222,7 +264,7 @@ class RelearnRecord:
         episodes: Number of rollouts; 0 where the error was measured.
     """
 
-    kind: Literal["relearn"] = field(default="relearn", init=False)
+    kind: Literal["relearn"] = "relearn"
     task: Count
     start: Literal["final", "initial"]
     learned_error: Number
@@ -260,11 +302,11 @@ def back_limit(learned: float, tolerance: float, episodes: int) -> float:
     ) / episodes  # whole rollouts, free of rounding
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunEndRecord:
     """The end of the run: the whole sequence is learned."""
 
-    kind: Literal["run_end"] = field(default="run_end", init=False)
+    kind: Literal["run_end"] = "run_end"
     seconds: Number
     finished: str
 
@@ -280,27 +322,17 @@ Record = (
     | RelearnRecord
     | RunEndRecord
 )
-RECORD_TYPES: Mapping[str, type[Record]] = {
-    "run": RunRecord,
-    "loss": LossRecord,
-    "eval": EvalRecord,
-    "phase": PhaseRecord,
-    "demonstrations": DemonstrationsRecord,
-    "cost": CostRecord,
-    "task_end": TaskEndRecord,
-    "relearn": RelearnRecord,
-    "run_end": RunEndRecord,
-}
+_KINDS: Mapping[str, type[Record]] = {record.kind: record for record in get_args(Record)}
 
 
 def to_line(record: Record) -> bytes:
     """Return a record as one line of strict JSON, with a checksum; numbers that are not finite become null."""
-    text = _text(_without_nan(asdict(record)))
+    text = _text(json_safe(asdict(record)))
     return f'{text[:-1]}, "{_CHECKSUM}": "{_checksum(text)}"}}\n'.encode()
 
 
 def from_line(line: bytes) -> Record:
-    """Parse a line of the file. Earlier versions wrote no checksum.
+    """Parse a line of the file.
 
     Raises:
         ValueError: The line is not a record, or not as it was written; the message names the wrong key.
@@ -310,16 +342,16 @@ def from_line(line: bytes) -> Record:
     except (ValueError, RecursionError) as error:
         raise ValueError(f"not JSON ({error})") from error
     kind = values.get("kind") if isinstance(values, dict) else None
-    if not isinstance(kind, str) or kind not in RECORD_TYPES:
-        raise ValueError(f"unknown kind of record {str(kind)[:40]!r}; valid: {', '.join(RECORD_TYPES)}")
+    if not isinstance(kind, str) or kind not in _KINDS:
+        raise ValueError(f"unknown kind of record {str(kind)[:40]!r}; valid: {', '.join(_KINDS)}")
     stated = values.pop(_CHECKSUM, None)
     if stated is not None and stated != _checksum(_text(values)):
         raise ValueError(f"a {kind!r} record that was changed: it does not have its checksum")
-    del values["kind"]
     try:
-        return validate(RECORD_TYPES[kind], values)
+        record: Record = validate(_KINDS[kind], values)
     except InvalidInputError as error:
         raise ValueError(f"a {kind!r} record: {error}") from error
+    return record
 
 
 def _text(values: Mapping[str, Any]) -> str:
@@ -328,9 +360,3 @@ def _text(values: Mapping[str, Any]) -> str:
 
 def _checksum(text: str) -> str:
     return f"{zlib.crc32(text.encode()):08x}"
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(part) for key, part in value.items()}
-    return None if isinstance(value, float) and not math.isfinite(value) else value

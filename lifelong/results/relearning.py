@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from libero_env.text import text_table
 from lifelong.results.log import ResultLog
 from lifelong.results.records import RelearnRecord
 
@@ -102,12 +103,9 @@ def savings_rows(records: Sequence[RelearnRecord]) -> list[tuple[str, ...]]:
 
 def savings_tables(records: Sequence[RelearnRecord]) -> str:
     """Return what was measured as tables in plain text, one for each measure."""
-    return "\n\n".join(_table([savings_heads(part), *savings_rows(part)]) for part in by_measure(records))
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return "\n".join("  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in rows)
+    return "\n\n".join(
+        text_table([savings_heads(part), *savings_rows(part)], left=0) for part in by_measure(records)
+    )
 
 
 def _percent(failed: float) -> str:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong.errors import ResultsError
-from lifelong.results.coverage import measured_tasks
 from lifelong.results.records import (
     CostRecord,
     DemonstrationsRecord,
@@ -23,6 +22,7 @@ from lifelong.results.records import (
     RunEndRecord,
     RunRecord,
     TaskEndRecord,
+    measured_tasks,
 )
 from lifelong.results.subgoals import Subgoals, subgoals
 from lifelong.stats.metrics import Curve, Metrics, Scores, Transfer, lifelong_metrics, mean_curve

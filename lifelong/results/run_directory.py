@@ -2,41 +2,130 @@
 
 config.yaml      resolved configuration
 results.jsonl    records, append-only
-checkpoints/     see `lifelong.results.checkpoint_folder`
+checkpoints/     task_<k>.safetensors           after task k
+                 progress.safetensors           while a task is learned; progress.previous.safetensors before it
+                 best.safetensors               best weights so far of the task being learned
+                 *.broken                       damaged, set aside
 videos/          recorded rollouts
 """
 
-import fcntl
-import hashlib
-import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
+from filelock import FileLock, Timeout
+from torch import Tensor
 
 from libero_env.errors import InvalidInputError
 from libero_env.storage import PART_SUFFIX, atomic_write_text, read_yaml_file
-from lifelong.errors import ConfigError, RunLockedError
-from lifelong.results.checkpoint_folder import CheckpointFolder
+from lifelong import checkpoints
+from lifelong.errors import CheckpointError, ConfigError, RunLockedError
 from lifelong.results.log import ResultLog
+from lifelong.results.provenance import config_digest, result_relevant
 
-# Keys that may differ between the start of a run and its resumption, because they change no result.
-VOLATILE = (
-    "device",
-    "progress",
-    "resume",
-    "run_id",
-    "runs_dir",
-    "threads",
-    "wandb",
-    "data.memory",
-    "data.backend",
-    "eval.transfer",  # how records are read, not what they hold
-    "eval.shift",  # evaluations besides all others
-)
+BROKEN_SUFFIX = ".broken"
+
+_RUN = (None, str)
+_TASK = {"run": _RUN, "task": int, "policy": dict, "algorithm": dict}
+_FIT = {"epoch": int, "loss": float, "penalty": float, "policy": dict, "optimizer": dict}
+_PROGRESS = {**_TASK, "policy": (None, dict), "phase": int, "fit": (None, _FIT)}
+_BEST = {"run": _RUN, "task": int, "epoch": int, "policy": dict, "own": [Tensor]}
+
+
+class CheckpointFolder:
+    """The folder `checkpoints` of a run.
+
+    Args:
+        path: The folder.
+        run: Function that returns the digest by which the run's checkpoints are known; None where it has none.
+    """
+
+    def __init__(self, path: Path, run: Callable[[], str | None] = lambda: None):
+        self.path, self._run = path, run
+        self.progress_path = path / "progress.safetensors"
+        self.previous_path = path / "progress.previous.safetensors"
+        self.best_path = path / "best.safetensors"
+
+    def task_path(self, task: int) -> Path:
+        """Return the path of the checkpoint written after a task."""
+        return self.path / f"task_{task}.safetensors"
+
+    def tasks(self) -> list[int]:
+        """Return the positions of the tasks that have a checkpoint, in ascending order."""
+        names = (file.stem.removeprefix("task_") for file in self.path.glob("task_*.safetensors"))
+        return sorted(int(name) for name in names if name.isascii() and name.isdecimal())
+
+    def save_task(self, task: int, policy: Mapping[str, Tensor], algorithm: Mapping[str, Any]) -> None:
+        """Write the checkpoint after a task."""
+        state = {"run": self._run(), "task": task, "policy": dict(policy), "algorithm": dict(algorithm)}
+        checkpoints.save(self.task_path(task), state)
+        self.previous_path.unlink(missing_ok=True)  # the task is safe without it
+
+    def save_progress(self, state: Mapping[str, Any]) -> None:
+        """Write the progress on a task, and keep the one before it.
+
+        Args:
+            state: The keys `task`, `phase`, `fit`, `policy` and `algorithm`, see `lifelong.sequence`.
+        """
+        checkpoints.save(self.progress_path, {"run": self._run(), **state}, previous=self.previous_path)
+
+    def save_best(self, task: int, epoch: int, policy: Mapping[str, Tensor], own: list[Tensor]) -> None:
+        """Write the best weights so far of a task, with the algorithm's own parameters."""
+        state = {"run": self._run(), "task": task, "epoch": epoch, "policy": dict(policy), "own": own}
+        checkpoints.save(self.best_path, state)
+
+    def load_task(self, path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+        """Return the state after a task.
+
+        Args:
+            path: File that `save_task` wrote, of any name but that of another task.
+            device: Device of the tensors.
+
+        Raises:
+            DamagedCheckpointError: The file is damaged, or no checkpoint.
+            CheckpointError: The file is missing, or belongs to another task or run.
+        """
+        state = self._checked(checkpoints.load(path, device), _TASK, path)
+        if path.stem.startswith("task_") and path.name != self.task_path(state["task"]).name:
+            raise CheckpointError(
+                f"{path} was written after task {state['task']}: checkpoints were exchanged or renamed. Put the "
+                "right one there, or move this one away: the task is then learned again"
+            )
+        return state
+
+    def load_progress(self, path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
+        """Return the state in `progress_path` or `previous_path`; errors are those of `load_task`."""
+        return self._checked(checkpoints.load(path, device), _PROGRESS, path)
+
+    def load_best(self, device: torch.device | str = "cpu") -> dict[str, Any]:
+        """Return the state in `best_path`; errors are those of `load_task`."""
+        state = checkpoints.load(self.best_path, device)
+        return self._checked(state, _BEST, self.best_path)
+
+    def set_aside(self, path: Path) -> Path:
+        """Give a damaged checkpoint a name under which nothing reads it, and return that."""
+        target = path.with_name(path.name + BROKEN_SUFFIX)
+        os.replace(path, target)
+        return target
+
+    def clear_unfinished(self) -> None:
+        """Remove what processes left that were killed while they wrote a checkpoint."""
+        for file in self.path.glob(f".*{PART_SUFFIX}"):
+            file.unlink(missing_ok=True)
+
+    def _checked(self, state: dict[str, Any], form: Any, path: Path) -> dict[str, Any]:
+        checkpoints.check(state, form, path)
+        known = self._run()
+        if None not in (known, state["run"]) and state["run"] != known:
+            raise CheckpointError(
+                f"{path} belongs to a run of another configuration than {self.path.with_name('config.yaml')}. "
+                "Put the right one there, or move this one away: what it holds is then learned again"
+            )
+        return state
 
 
 class RunDirectory:
@@ -117,35 +206,26 @@ def read_saved_config(path: str | Path) -> dict[str, Any]:
     return config
 
 
-def result_relevant(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a configuration that affect results, by dotted key."""
-    volatile = tuple(f"{key}." for key in VOLATILE)
-    return {k: v for k, v in _flat(dict(config)).items() if not f"{k}.".startswith(volatile)}
-
-
-def config_digest(config: Mapping[str, Any]) -> str:
-    """Return 16 hex digits that change with whatever affects the results of a configuration."""
-    text = json.dumps(result_relevant(config), sort_keys=True, default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Hold a file lock within the context; the system releases it whenever the process ends."""
-    with open(path, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise RunLockedError(
-                f"another process is writing to {path.parent / path.name[1:-5]}; wait for it, or give this "
-                "run another name with run_id=NAME"
-            ) from error
-        except OSError as error:  # such as ENOLCK of a network file system
-            raise ConfigError(
-                f"runs_dir: {path.parent} is on a file system that cannot lock files ({error.strerror}); mount it "
-                "with locks, or set runs_dir to another folder"
-            ) from error
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        raise RunLockedError(
+            f"another process is writing to {path.parent / path.name[1:-5]}; wait for it, or give this "
+            "run another name with run_id=NAME"
+        ) from error
+    except (OSError, NotImplementedError) as error:  # such as ENOLCK of a network file system
+        raise ConfigError(
+            f"runs_dir: {path.parent} is on a file system that cannot lock files "
+            f"({getattr(error, 'strerror', error)}); mount it with locks, or set runs_dir to another folder"
+        ) from error
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def _free_name(path: Path) -> Path:
@@ -153,10 +233,3 @@ def _free_name(path: Path) -> Path:
     while (candidate := path.with_name(f"{path.name}.old{number}")).exists():
         number += 1
     return candidate
-
-
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    if not isinstance(value, dict):
-        return {prefix: value}
-    parts = (_flat(v, f"{prefix}.{k}" if prefix else str(k)) for k, v in value.items())
-    return {k: v for part in parts for k, v in part.items()}

@@ -1,26 +1,38 @@
-"""`results.json`: the success matrix, learning curves, metrics and times of a run."""
+"""What a run leaves for others: `results.json`, and every episode of one or several runs as a table, and back.
 
-import json
-import math
+results.json     the success matrix, learning curves, metrics and times of a run
+episodes.csv.gz  one row an episode: the method's label, seed and order of the run, `transfer` (how its forward transfer
+                 is estimated), `together` (numbers of tasks learned together), the evaluation (`phase` curve or matrix,
+                 `row`: position of the task learned last, `epoch` trained on it), the task (`position` in the sequence,
+                 and its name), `start` (initial state), `success` (0 or 1), `length` [control steps]
+"""
+
+import csv
+import gzip
+import io
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from libero_env.storage import atomic_write_text
+from libero_env.storage import atomic_path, atomic_write_text
+from libero_env.text import json_safe, to_json
+from libero_env.validation import validate
 from lifelong.errors import ResultsError
-from lifelong.results.conditions import resume_notes
-from lifelong.results.records import DemonstrationsRecord, RunRecord, TaskEndRecord
+from lifelong.results.provenance import resume_notes
+from lifelong.results.records import DemonstrationsRecord, EvalRecord, Record, RunRecord, TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_summary
 from lifelong.stats.intervals import wilson_interval
-from lifelong.stats.metrics import METRIC_NAMES, Metrics, Scores, lifelong_metrics
+from lifelong.stats.metrics import METRIC_NAMES, Metrics, lifelong_metrics
 
-# Grows when the same records give other metrics. 2: intervals of clusters, forward transfer without a held maximum.
-STATISTICS = 2
+COLUMNS = (
+    *("method", "seed", "order", "transfer", "together", "phase", "row", "epoch", "position", "task"),
+    *("start", "success", "length"),
+)
 _OF_EPISODES = ("phase", "learned", "epoch", "task", "init_states", "successes", "lengths")
 
 
@@ -40,7 +52,7 @@ def write_summary(path: Path | str, results: Results, config: Mapping[str, Any])
     summary = json_safe(summarize(results) | {"config": dict(config)})
     path = Path(path)
     try:
-        atomic_write_text(path, compact_json(summary), fsync=True)
+        atomic_write_text(path, _compact(to_json(summary)), fsync=True)
     except OSError as error:
         raise ResultsError(
             f"{path}: the summary cannot be written ({error}); results.jsonl is intact"
@@ -62,13 +74,14 @@ def summarize(results: Results) -> dict[str, Any]:
         "finished": results.finished,
         "tasks_learned": size,
         "statistics": {
-            "version": STATISTICS,
             "interval": "Wilson's over the episodes, 95 %; none for FWT, NBT and AUC",
             "transfer": results.transfer,
         },
-        "metrics": _metrics(results.scores()) if size else None,
-        "metrics_after_base_stage": _metrics_after_base_stage(results),
-        "metrics_diagonal_from_curve": _metrics(results.scores("curve", "published")) if size else None,
+        "metrics": _as_data(lifelong_metrics(results.scores())) if size else None,
+        "metrics_after_base_stage": _as_data(results.after_base_stage()),
+        "metrics_diagonal_from_curve": (
+            _as_data(lifelong_metrics(results.scores("curve", "published"))) if size else None
+        ),
         "success_matrix": {
             "rates": rates.tolist(),
             "episodes": episodes.tolist(),
@@ -106,31 +119,117 @@ def _without_kind(record: RunRecord | DemonstrationsRecord | None) -> dict[str, 
     return None if record is None else {k: v for k, v in asdict(record).items() if k != "kind"}
 
 
-def _metrics(scores: Scores) -> dict[str, Any]:
-    return _as_data(lifelong_metrics(scores))
+def _as_data(metrics: Metrics | None) -> dict[str, Any] | None:
+    if metrics is None:
+        return None
+    by_task = {name: getattr(metrics, f"{name}_by_task").tolist() for name in ("fwt", "nbt", "auc")}
+    return {name: asdict(getattr(metrics, name)) for name in METRIC_NAMES} | {"by_task": by_task}
 
 
-def _metrics_after_base_stage(results: Results) -> dict[str, Any] | None:
-    """Return the metrics over the later tasks alone; None without a base stage, or before one of them is learned."""
-    found = results.after_base_stage()
-    return None if found is None else _as_data(found)
-
-
-def _as_data(found: Metrics) -> dict[str, Any]:
-    by_task = {name: getattr(found, f"{name}_by_task").tolist() for name in ("fwt", "nbt", "auc")}
-    return {name: asdict(getattr(found, name)) for name in METRIC_NAMES} | {"by_task": by_task}
-
-
-def compact_json(value: Any) -> str:
+def _compact(text: str) -> str:
     """Return indented JSON with lists of numbers in one line each."""
-    text = json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False)
     return re.sub(r"\[\n\s*([^\[\]{}\"]*?)\n\s*\]", lambda m: f"[{' '.join(m[1].split())}]", text)
 
 
-def json_safe(value: Any) -> Any:
-    """Return the same data with None for numbers that are not finite, as JSON has no NaN."""
-    if isinstance(value, Mapping):
-        return {str(k): json_safe(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [json_safe(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def write_episodes(path: Path, runs: Iterable[tuple[str, Results]]) -> Path:
+    """Write all episodes of runs as CSV, compressed if the name ends in .gz; equal runs give equal bytes.
+
+    Args:
+        path: File to write.
+        runs: Label of the method and results of each run.
+
+    Raises:
+        ResultsError: The file cannot be written.
+    """
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    orders: dict[tuple[str, ...], int] = {}
+    for method, results in runs:
+        order = orders.setdefault(results.run.tasks, len(orders))
+        writer.writerows(_rows(method, order, results))
+    content = text.getvalue().encode()
+    try:
+        with atomic_path(path) as part:
+            part.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
+    except OSError as error:
+        raise ResultsError(f"{path}: the episodes cannot be written ({error})") from error
+    return path
+
+
+def _rows(method: str, order: int, results: Results) -> Iterator[tuple[Any, ...]]:
+    run = results.run
+    together = " ".join(str(len(group)) for group in run.groups)
+    for record in results.evaluations():
+        task = run.tasks[record.task] if record.task < len(run.tasks) else ""
+        key = (method, run.seed, order, results.transfer, together, record.phase, record.learned)
+        for start, won, length in zip(record.init_states, record.successes, record.lengths, strict=True):
+            yield (*key, record.epoch, record.task, task, start, int(won), length)
+
+
+def read_episodes(path: Path) -> list[tuple[str, Results]]:
+    """Return the runs of a table as (label, results), enough for all metrics, intervals and tests.
+
+    Raises:
+        ResultsError: The file is missing or is no such table.
+    """
+    try:
+        content = path.read_bytes()
+        text = (gzip.decompress(content) if path.suffix == ".gz" else content).decode()
+        reader = csv.DictReader(io.StringIO(text))
+        if tuple(reader.fieldnames or ()) != COLUMNS:
+            raise ResultsError(f"{path} is no table of episodes; expected the columns {', '.join(COLUMNS)}")
+        runs: dict[tuple[str, ...], list[dict[str, str]]] = {}
+        for row in reader:
+            runs.setdefault(tuple(row[c] for c in COLUMNS[:3]), []).append(row)
+        return [(key[0], _results(rows)) for key, rows in runs.items()]
+    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
+        raise ResultsError(f"{path}: the episodes cannot be read ({error})") from error
+
+
+def _results(rows: list[dict[str, str]]) -> Results:
+    names = {int(row["position"]): row["task"] for row in rows}
+    tasks = [names[place] for place in range(max(names) + 1)]
+    first = rows[0]
+    records: list[Record] = [_run(first, tasks)]
+    cells: dict[tuple[str, ...], list[dict[str, str]]] = {}
+    for row in rows:
+        cells.setdefault(tuple(row[c] for c in ("phase", "row", "epoch", "position")), []).append(row)
+    kept: dict[int, int] = {}
+    for episodes in cells.values():
+        record = _evaluation(episodes)
+        records.append(record)
+        if record.phase == "matrix":
+            kept[record.learned] = record.epoch
+    records += [TaskEndRecord(task=task, best_epoch=epoch, seconds=0.0) for task, epoch in kept.items()]
+    return Results(tuple(records))
+
+
+def _run(row: Mapping[str, str], tasks: list[str]) -> RunRecord:
+    values: dict[str, Any] = {
+        **dict.fromkeys(("benchmark", "policy", "preset", "config_digest", "started"), ""),
+        "algo": row["method"],
+        "seed": int(row["seed"]),
+        "tasks": tasks,
+        "instructions": [name.replace("_", " ") for name in tasks],
+        "versions": {},
+        "commit": None,
+        "cpu_count": 0,
+        "group_sizes": [int(size) for size in row["together"].split()],
+        "transfer": row["transfer"],
+    }
+    return validate(RunRecord, values)
+
+
+def _evaluation(rows: list[dict[str, str]]) -> EvalRecord:
+    values: dict[str, Any] = {
+        "phase": rows[0]["phase"],
+        "learned": int(rows[0]["row"]),
+        "epoch": int(rows[0]["epoch"]),
+        "task": int(rows[0]["position"]),
+        "successes": [bool(int(row["success"])) for row in rows],
+        "lengths": [int(row["length"]) for row in rows],
+        "init_states": [int(row["start"]) for row in rows],
+        "seconds": 0.0,
+    }
+    return validate(EvalRecord, values)

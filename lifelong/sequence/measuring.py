@@ -19,7 +19,7 @@ from libero_env.timing import CONTROL_PERIOD
 from lifelong.context import RunContext
 from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
 from lifelong.policies.base import Policy
-from lifelong.results.conditions import all_conditions
+from lifelong.results.provenance import all_conditions
 from lifelong.results.records import EvalRecord, Phase, RunRecord
 from lifelong.seeding import ROLLOUT
 

@@ -19,7 +19,7 @@ from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
-from lifelong.results.conditions import source_digest
+from lifelong.results.provenance import source_digest
 from lifelong.seeding import END_TASK, FIT, INIT, generator, seeded
 from lifelong.settings import Configuration
 from lifelong.training.fit import fit

@@ -12,7 +12,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from lifelong import checkpoints
-from lifelong.results.checkpoint_folder import CheckpointFolder
+from lifelong.results.run_directory import CheckpointFolder
 from tests.harness.checkpoints import write_forged
 from tests.harness.fuzz import examples, survive
 from tests.harness.sequences import assert_same

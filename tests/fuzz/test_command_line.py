@@ -14,7 +14,7 @@ from libero_env.cli.main import ALL, load, main
 from libero_env.cli.options import options_of
 from lifelong.errors import ConfigError
 from lifelong.report.figures import Line, Panel, as_svg, forgetting_figure, heatmap_figure
-from lifelong.report.templates import page_template
+from lifelong.report.tables import page_template
 from tests.harness.fuzz import examples, survive
 
 pytestmark = pytest.mark.unit

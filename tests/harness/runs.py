@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 from lifelong import checkpoints
 from lifelong.data import SequenceVLDataset, fake_batch
 from lifelong.data.fake import fake_observation
-from lifelong.results.checkpoint_folder import CheckpointFolder
+from lifelong.results.run_directory import CheckpointFolder
 from lifelong.seeding import generator, seeded
 from lifelong.settings import build
 from lifelong.types import PolicySpec

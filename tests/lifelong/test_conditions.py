@@ -7,16 +7,16 @@ import torch
 
 from lifelong import experiment
 from lifelong.report.runs import load_run
-from lifelong.results import conditions
-from lifelong.results.conditions import (
+from lifelong.results import provenance
+from lifelong.results.log import ResultLog
+from lifelong.results.provenance import (
     changed_conditions,
     present_conditions,
     recorded_threads,
     resume_notes,
     source_digest,
+    start_record,
 )
-from lifelong.results.log import ResultLog
-from lifelong.results.provenance import start_record
 from lifelong.results.records import DemonstrationsRecord, from_line, to_line
 from lifelong.settings import RunSettings
 
@@ -70,11 +70,6 @@ def test_the_conditions_name_what_decides_sums():
     assert found["instruction_set"] == torch.backends.cpu.get_cpu_capability()
     assert found["processor"] and found["blas"] and found["renderer"] == "llvmpipe"
     assert from_line(to_line(START).rstrip()) == START
-
-
-def test_records_of_before_have_no_conditions_and_say_nothing():
-    old = replace(START, conditions={})
-    assert changed_conditions(old, START) == []
 
 
 def test_a_resume_under_other_conditions_is_told(tmp_path):
@@ -132,7 +127,7 @@ def test_the_digest_of_the_source_changes_with_any_constant(tmp_path, monkeypatc
         (tmp_path / package).mkdir()
     constant = tmp_path / "libero_env" / "timing.py"
     digests = set()
-    monkeypatch.setattr(conditions, "__file__", str(tmp_path / "lifelong" / "results" / "conditions.py"))
+    monkeypatch.setattr(provenance, "_ROOT", tmp_path)
     for text in ("TIMESTEP = 0.002\n", "TIMESTEP = 0.004\n"):
         constant.write_text(text)
         source_digest.cache_clear()

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from libero_env.text import json_safe
 from lifelong.report.comparison import findings
-from lifelong.results.summary import json_safe
 from lifelong.stats.intervals import holm, wilson_interval
 from lifelong.stats.methods import (
     MethodRun,

@@ -15,11 +15,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from libero_env.tasks import get_suite
+from libero_env.text import json_safe
 from lifelong.errors import LifelongError
 from lifelong.report.figures import Line, Panel, forgetting_figure, heatmap_figure
 from lifelong.report.page import comparison_text, write_report
 from lifelong.report.runs import group_runs, load_run, short_labels
-from lifelong.results.episode_table import read_episodes
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record
 from lifelong.results.records import (
@@ -31,7 +31,7 @@ from lifelong.results.records import (
     RunEndRecord,
     TaskEndRecord,
 )
-from lifelong.results.summary import json_safe, summarize
+from lifelong.results.summary import read_episodes, summarize
 from lifelong.stats.methods import MethodRun, statistics
 from lifelong.stats.metrics import METRIC_NAMES
 

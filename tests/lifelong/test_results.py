@@ -11,7 +11,6 @@ from lifelong.errors import ResultsError
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record
 from lifelong.results.records import (
-    RECORD_TYPES,
     CostRecord,
     DemonstrationsRecord,
     EvalRecord,
@@ -92,7 +91,6 @@ def test_every_kind_of_record_survives_the_round_trip():
     )
     learned_from = DemonstrationsRecord(counts=(50, 10), generators=("expert", ""), digests=("aa", "bb"))
     records = [*RUN, relearned, learned_from]
-    assert {r.kind for r in records} == set(RECORD_TYPES)
     for record in records:
         line = to_line(record)
         assert line.count(b"\n") == 1 and from_line(line) == record
@@ -153,14 +151,6 @@ def test_what_no_record_is_as_long_as_is_kept_and_named(log: ResultLog):
     log.append(START)
     assert list(log.read().records) == [*RUN, START] and "longer than 4 MiB" in log.read().problems[0]
     assert log.path.stat().st_size > 9 << 20
-
-
-def test_lines_of_earlier_versions_have_no_checksum(log: ResultLog):
-    lines = [json.loads(line) for line in log.path.read_text().splitlines()]
-    log.path.write_text(
-        "".join(json.dumps({k: v for k, v in r.items() if k != "crc32"}) + "\n" for r in lines)
-    )
-    assert log.read() == Results(tuple(RUN))
 
 
 def test_any_flipped_digit_is_found():
@@ -309,7 +299,7 @@ def test_the_summary_is_strict_json_and_complete(log: ResultLog, tmp_path: Path)
 
 
 def test_evaluations_without_episodes_are_refused():
-    with pytest.raises(ValueError, match="at least one"):
+    with pytest.raises(ValueError, match="no episodes"):
         evaluation("curve", 0, 0, 0, 0, episodes=0)
     with pytest.raises(ValueError, match="'curve', 'matrix' or 'shift'"):
         evaluation("test", 0, 0, 0, 0)

@@ -8,8 +8,9 @@ import pytest
 
 from lifelong import checkpoints
 from lifelong.errors import CheckpointError
+from lifelong.results.provenance import config_digest
 from lifelong.results.records import EvalRecord, LossRecord, from_line
-from lifelong.results.run_directory import RunDirectory, config_digest
+from lifelong.results.run_directory import RunDirectory
 from lifelong.sequence import TaskSequence, is_measured
 from tests.harness import sequences
 from tests.harness.sequences import ALGORITHMS, Killed, Killer, assert_same, outcome, run_context, sequence

@@ -22,7 +22,7 @@ from lifelong import checkpoints
 from lifelong.data.fake import fake_observation
 from lifelong.evaluation.restore import restore
 from lifelong.report.page import write_report
-from lifelong.results.run_directory import result_relevant
+from lifelong.results.provenance import result_relevant
 from lifelong.types import Observation
 from tests.harness.configs import composed
 
