@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from pydantic import Field
@@ -19,13 +19,13 @@ from libero_env.storage import read_json, write_json
 from libero_env.text import json_safe
 from libero_env.validation import validate
 from lifelong.errors import EvaluationFileError, ResultsError
+from lifelong.results.records import Count, Episodes
 from lifelong.results.subgoals import predicate_of
 from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
 
-_Count = Annotated[int, Field(ge=0, le=2**31)]
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
 _Id = Annotated[
     str, Field(pattern=r"^[^/\x00]+/[^\x00]+$", max_length=1000)
@@ -33,19 +33,13 @@ _Id = Annotated[
 
 
 @dataclass(frozen=True)
-class TaskResult:
+class TaskResult(Episodes):
     """Results of a policy on a task, with one entry per episode.
 
     Attributes:
         task: Id of the task, such as `libero_goal/3`.
         name: Name of the task.
         instruction: Instruction that the policy received.
-        init_states: Index of the initial state of each episode.
-        successes: Whether each episode reached the goal.
-        lengths: Number of control steps of the policy in each episode.
-        atoms: Atoms of the goal, such as `(On plate_1 stove_1)`; empty if they were not measured.
-        atoms_ever: Whether each atom held at any time, (episodes, atoms).
-        atoms_at_end: Whether each atom held at the end, (episodes, atoms).
         errors: Error of each episode that the protocol counts as a failure, or None; empty if there are none.
         actions: Digest of the actions of each episode, by which episodes can be compared to the bit; empty if they
             were not recorded.
@@ -53,37 +47,24 @@ class TaskResult:
             empty without perturbations.
 
     Raises:
-        EvaluationFileError: The arrays have different lengths.
+        EvaluationFileError: The columns have different lengths.
     """
 
     task: _Id
     name: _Name
     instruction: str
-    init_states: tuple[_Count, ...]
-    successes: tuple[bool, ...]
-    lengths: tuple[_Count, ...]
-    atoms: tuple[str, ...] = ()
-    atoms_ever: tuple[tuple[bool, ...], ...] = ()
-    atoms_at_end: tuple[tuple[bool, ...], ...] = ()
     errors: tuple[str | None, ...] = ()
     actions: tuple[str, ...] = ()
-    attempts: tuple[tuple[_Count, ...], ...] = ()
+    attempts: tuple[tuple[Count, ...], ...] = ()
+
+    OPTIONAL: ClassVar[tuple[str, ...]] = ("errors", "actions", "attempts")
 
     def __post_init__(self) -> None:
-        count = len(self.init_states)
-        problems = [] if count else ["there are no episodes"]
-        if len(set(self.init_states)) != count:
-            problems.append(f"an initial state is counted twice: {list(self.init_states)}")
-        flags = ("atoms_ever", "atoms_at_end")
-        for name in ("successes", "lengths", "errors", "actions", "attempts", *flags):
-            entries = getattr(self, name)
-            optional = name in ("errors", "actions", "attempts") or (name in flags and not self.atoms)
-            if len(entries) != count and not (optional and not entries):
-                problems.append(f"{name} has {len(entries)} entries, init_states has {count}")
-            if name in flags and {len(row) for row in entries} - {len(self.atoms)}:
-                problems.append(f"{name} needs a column for each of the {len(self.atoms)} atoms")
-        if problems:
-            raise EvaluationFileError(f"{self.task}: {problems[0]}")
+        errors = self.shape_errors()
+        if len(set(self.init_states)) != len(self.init_states):
+            errors.append(f"an initial state is counted twice: {list(self.init_states)}")
+        if errors:
+            raise EvaluationFileError(f"{self.task}: {errors[0]}")
 
     @classmethod
     def joined(cls, parts: "Sequence[TaskResult]") -> "TaskResult":
@@ -135,7 +116,7 @@ class EvaluationResult:
 
     evaluated: Mapping[str, Any]
     protocol: Mapping[str, Any]
-    init_states: tuple[_Count, ...]
+    init_states: tuple[Count, ...]
     versions: Mapping[str, Any]
     tasks: tuple[TaskResult, ...]
     environment: Mapping[str, Any] = field(default_factory=dict)

@@ -26,7 +26,14 @@ def outcomes(rates: dict[Condition, int], starts: int = 10) -> Outcomes:
 
 def result(wins: int, starts: tuple[int, ...] = STARTS) -> EvaluationResult:
     tasks = tuple(
-        TaskResult(name, name, "do it", starts, tuple(s < wins for s in starts), (5,) * len(starts))
+        TaskResult(
+            name,
+            name,
+            "do it",
+            init_states=starts,
+            successes=tuple(s < wins for s in starts),
+            lengths=(5,) * len(starts),
+        )
         for name in TASKS
     )
     return EvaluationResult({"run": "r"}, {}, starts, {}, tasks)
