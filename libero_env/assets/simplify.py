@@ -258,12 +258,11 @@ def _patches(triangles: np.ndarray, texcoords: np.ndarray) -> np.ndarray:
 
     Two triangles are on one patch if they share a vertex that has the same texture coordinate in both.
     """
+    from scipy.sparse import coo_array  # only needed the first time on a machine
+    from scipy.sparse.csgraph import connected_components
+
     corners = np.concatenate([triangles.reshape(-1, 1), texcoords.reshape(-1, 2).round(6)], axis=1)
     shared = np.unique(corners, axis=0, return_inverse=True)[1].reshape(-1, 3)
-    label = np.arange(shared.max() + 1)
-    while True:
-        before = label.copy()
-        np.minimum.at(label, shared.reshape(-1), np.repeat(label[shared].min(axis=1), 3))
-        label = label[label]
-        if (label == before).all():
-            return label[shared[:, 0]]
+    starts, ends, number = np.repeat(shared[:, 0], 2), shared[:, 1:].reshape(-1), shared.max() + 1
+    edges = coo_array((np.ones(len(starts)), (starts, ends)), shape=(number, number))
+    return connected_components(edges, directed=False)[1][shared[:, 0]]

@@ -3,30 +3,31 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache
+from dataclasses import fields, replace
+from functools import cached_property
 from importlib import metadata
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
-from pydantic import Field
+from pydantic import Field, PlainValidator
 
 from libero_env.assets.pack import select_pack
-from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS, robosuite_version
+from libero_env.assets.robot import DEFAULT_ROBOT, robosuite_version
 from libero_env.demos.contents import Pairing
 from libero_env.demos.write import make_header
+from libero_env.envs.config import Drawing, Names, Robot, Size
 from libero_env.errors import InvalidInputError
 from libero_env.perturbations.catalog import KINDS
 from libero_env.perturbations.episodes import checked_perturbations
 from libero_env.perturbations.value import Perturbation, format_perturbations
-from libero_env.sim.backend import MUJOCO, Backend
+from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
-from libero_env.sim.scene import DRAWINGS, FAST, build_scene, default_drawing
+from libero_env.sim.scene import FAST, build_scene, default_drawing
 from libero_env.tasks import Task, get_task, read_task
 from libero_env.timing import CONTROL_HZ
-from libero_env.validation import OneOf, validate_arguments
+from libero_env.validation import checked
 
 GENERATOR = "scripted-expert-14"  # change it when the same seed yields different demonstrations
 PERTURBED_HEADER = ("perturb", "perturb_draws")  # attributes of a file that was rendered under perturbations
@@ -34,91 +35,11 @@ PERTURB_DRAWS = 1  # change it when the same perturbation of the same demonstrat
 
 _IN_PATH = ("source", "camera_size", "seed")  # options that the path of a file names anyhow
 
-Pixels = Annotated[int, Field(ge=1)]
-Drawing = Annotated[str, OneOf(DRAWINGS)]
-Robot = Annotated[str, OneOf(ROBOTS)]
 
-
-class _Settings:
-    """Base of dataclasses whose values are checked against the annotations of their fields."""
-
-    _unchecked: tuple[str, ...] = ()  # fields that check themselves
-
-    def __post_init__(self) -> None:
-        values = {name: value for name, value in vars(self).items() if name not in self._unchecked}
-        validate_arguments(type(self), values)
-
-    def changes(self) -> dict[str, Any]:
-        """Return the values that are not the defaults."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
-        return {name: value for name, value in values.items() if value != getattr(type(self), name, None)}
-
-
-@dataclass(frozen=True)
-class Variation(_Settings):
-    """How the demonstrations of a task differ from each other.
-
-    Attributes:
-        style: Whether the motion style is sampled for each demonstration; if not, all have the same.
-        noise: Standard deviation of the smooth noise on the executed actions, in units of the action.
-        push_rate: Pushes started per control step.
-        reserved: Whether demonstration k starts from stored state k (modulo 50), which evaluation uses, instead of
-            from a newly sampled one.
-    """
-
-    style: bool = True
-    noise: Annotated[float, Field(ge=0, le=10)] = 0.12
-    push_rate: Annotated[float, Field(ge=0, le=1)] = 0.02
-    reserved: bool = False
-
-
-@dataclass(frozen=True)
-class RenderConfig(_Settings):
-    """What is rendered of each state.
-
-    Attributes:
-        cameras: Names of the cameras in the model.
-        size: (height, width) of the images, pixels.
-        modalities: Kinds of image: `rgb`, `depth`, and at most one of `segmentation_instance`, `segmentation_class`
-            and `segmentation_element`.
-        drawing: How images are drawn, one of `DRAWINGS`; None for the default of the models.
-        perturb: Perturbations, as for `EnvConfig`, of kinds that change what is seen or said, and no physics.
-
-    Raises:
-        UnknownNameError: A kind of perturbation does not exist.
-        InvalidInputError: A value is not valid, or a perturbation changes what happens.
-    """
-
-    cameras: tuple[str, ...] = DEFAULT_CAMERAS
-    size: tuple[Pixels, Pixels] = (128, 128)
-    modalities: tuple[str, ...] = ("rgb",)
-    drawing: Drawing | None = None
-    perturb: str | Sequence[Perturbation] = ()
-
-    _unchecked = ("perturb",)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        object.__setattr__(self, "perturb", rendered_perturbations(self.perturb))
-
-    @property
-    def perturbations(self) -> tuple[Perturbation, ...]:
-        """Perturbations, in the order in which they are applied."""
-        return cast(tuple[Perturbation, ...], self.perturb)
-
-    def header(self) -> dict[str, Any]:
-        """Return the attributes of a file; the default cameras and modalities, and `fast`, are left out."""
-        attributes: dict[str, Any] = {"camera_size": list(self.size)}
-        if self.cameras != DEFAULT_CAMERAS:
-            attributes["cameras"] = list(self.cameras)
-        if self.modalities != ("rgb",):
-            attributes["pictures"] = list(self.modalities)
-        if self.drawing not in (None, FAST):
-            attributes["drawing"] = self.drawing
-        if self.perturb:
-            text = format_perturbations(self.perturbations)
-            attributes |= zip(PERTURBED_HEADER, (text, PERTURB_DRAWS), strict=True)
-        return attributes
+def changed_options(config: Any) -> dict[str, Any]:
+    """Return the values of a configuration that are not the defaults, by the name of their field."""
+    values = {field.name: (getattr(config, field.name), field.default) for field in fields(config)}
+    return {name: value for name, (value, default) in values.items() if value != default}
 
 
 def rendered_perturbations(perturb: str | Sequence[Perturbation]) -> tuple[Perturbation, ...]:
@@ -139,8 +60,64 @@ def rendered_perturbations(perturb: str | Sequence[Perturbation]) -> tuple[Pertu
     return tuple(rendered)
 
 
-@dataclass(frozen=True)
-class DemoConfig(_Settings):
+@checked
+class Variation:
+    """How the demonstrations of a task differ from each other.
+
+    Attributes:
+        style: Whether the motion style is sampled for each demonstration; if not, all have the same.
+        noise: Standard deviation of the smooth noise on the executed actions, in units of the action.
+        push_rate: Pushes started per control step.
+        reserved: Whether demonstration k starts from stored state k (modulo 50), which evaluation uses, instead of
+            from a newly sampled one.
+    """
+
+    style: bool = True
+    noise: Annotated[float, Field(ge=0, le=10)] = 0.12
+    push_rate: Annotated[float, Field(ge=0, le=1)] = 0.02
+    reserved: bool = False
+
+
+@checked
+class RenderConfig:
+    """What is rendered of each state.
+
+    Attributes:
+        cameras: Names of the cameras in the model.
+        size: (height, width) of the images, pixels.
+        modalities: Kinds of image: `rgb`, `depth`, and at most one of `segmentation_instance`, `segmentation_class`
+            and `segmentation_element`.
+        drawing: How images are drawn, one of `DRAWINGS`; None for the default of the models.
+        perturb: Perturbations, as for `EnvConfig`, of kinds that change what is seen or said, and no physics.
+
+    Raises:
+        UnknownNameError: A kind of perturbation does not exist.
+        InvalidInputError: A value is not valid, or a perturbation changes what happens.
+    """
+
+    cameras: Names = DEFAULT_CAMERAS
+    size: Size = (128, 128)
+    modalities: Names = ("rgb",)
+    drawing: Drawing | None = None
+    perturb: Annotated[tuple[Perturbation, ...], PlainValidator(rendered_perturbations)] = ()
+
+    def header(self) -> dict[str, Any]:
+        """Return the attributes of a file; the default cameras and modalities, and `fast`, are left out."""
+        attributes: dict[str, Any] = {"camera_size": list(self.size)}
+        if self.cameras != DEFAULT_CAMERAS:
+            attributes["cameras"] = list(self.cameras)
+        if self.modalities != ("rgb",):
+            attributes["pictures"] = list(self.modalities)
+        if self.drawing not in (None, FAST):
+            attributes["drawing"] = self.drawing
+        if self.perturb:
+            text = format_perturbations(self.perturb)
+            attributes |= zip(PERTURBED_HEADER, (text, PERTURB_DRAWS), strict=True)
+        return attributes
+
+
+@checked
+class DemoConfig:
     """What the demonstrations of a task depend on.
 
     Attributes:
@@ -159,22 +136,19 @@ class DemoConfig(_Settings):
     """
 
     source: Task | str
-    camera_size: tuple[Pixels, Pixels] = (128, 128)
+    camera_size: Size = (128, 128)
     seed: Annotated[int, Field(ge=0)] = 0
     pairing: Pairing = "aligned"
     disturb: bool = True
     variation: Variation = Variation()
-    cameras: tuple[str, ...] = DEFAULT_CAMERAS
-    modalities: tuple[str, ...] = ("rgb",)
+    cameras: Names = DEFAULT_CAMERAS
+    modalities: Names = ("rgb",)
     drawing: Drawing | None = None
     robot: Robot = DEFAULT_ROBOT
-    backend: str = MUJOCO
-
-    _unchecked = ("source", "variation")
+    backend: Annotated[Backend, PlainValidator(Backend.read)] = Backend()
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        self.back_end.require_installed()
+        self.backend.require_installed()
 
     @cached_property
     def drawn(self) -> str:
@@ -182,14 +156,9 @@ class DemoConfig(_Settings):
         return self.drawing or default_drawing(select_pack())
 
     @property
-    def back_end(self) -> Backend:
-        """Back end of the physics."""
-        return Backend.read(self.backend)
-
-    @property
     def batch(self) -> int:
         """Number of demonstrations that are simulated together, and written before the next ones."""
-        return 50 if self.back_end.is_warp else 5
+        return 50 if self.backend.is_warp else 5
 
     @cached_property
     def task(self) -> Task:
@@ -206,9 +175,11 @@ class DemoConfig(_Settings):
     def options(self) -> dict[str, Any]:
         """Return the options that are not the defaults, beside task, size and seed, as plain data."""
         drawing = None if self.drawn == FAST else self.drawn
-        options = replace(self, drawing=drawing, backend=self.back_end.name).changes()
+        options = changed_options(replace(self, drawing=drawing, backend=Backend(self.backend.name)))
         if "variation" in options:
-            options["variation"] = self.variation.changes()
+            options["variation"] = changed_options(self.variation)
+        if "backend" in options:
+            options["backend"] = self.backend.name
         return {name: value for name, value in options.items() if name not in _IN_PATH}
 
     def header(self) -> dict[str, Any]:
@@ -216,10 +187,10 @@ class DemoConfig(_Settings):
         task, pack = self.task, select_pack()
         versions = {name: metadata.version(name) for name in ("mujoco", "h5py")}
         extra = self.render_config.header()
-        if variation := self.variation.changes():
+        if variation := changed_options(self.variation):
             extra["variation"] = json.dumps(variation)
-        if self.back_end.is_warp:  # files without it are of MuJoCo
-            extra["backend"] = self.back_end.name
+        if self.backend.is_warp:  # files without it are of MuJoCo
+            extra["backend"] = self.backend.name
         return make_header(
             problem_name=task.problem.name,
             language=task.language,
@@ -231,15 +202,14 @@ class DemoConfig(_Settings):
             generator=GENERATOR,
             disturbed=self.disturb,
             robot=self.robot,
-            model_digest=model_digest(task, self.drawn, self.robot),
+            model_digest=_model_digest(task, self.drawn, self.robot),
             models=json.dumps({"pack": pack.name, "digest": pack.digest}),
             versions=json.dumps({**versions, "robosuite": robosuite_version()}),
             **extra,
         )
 
 
-@lru_cache(maxsize=16)
-def model_digest(task: Task, drawing: str | None = None, robot: str = DEFAULT_ROBOT) -> str:
+def _model_digest(task: Task, drawing: str, robot: str) -> str:
     """Return 16 hex digits that change with anything in the task's compiled scene, its appearance included."""
     model = build_scene(task.problem, drawing=drawing, robot=robot).model
     buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)

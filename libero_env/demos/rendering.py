@@ -51,7 +51,7 @@ class RenderJob(DemoJob):
     def __post_init__(self) -> None:
         drawing = self.config.drawing or default_drawing(select_pack())
         object.__setattr__(self, "config", replace(self.config, drawing=drawing))
-        text, (height, width) = format_perturbations(self.config.perturbations), self.config.size
+        text, (height, width) = format_perturbations(self.config.perturb), self.config.size
         if len(text) > _LONGEST:
             text = f"{text[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
         folder = self.file.parent / f"under-{text}-{height}x{width}-{drawing}"
@@ -200,7 +200,7 @@ def rendered_header(file: Path, config: RenderConfig, task: Task) -> dict[str, A
     header = {k: v for k, v in before.items() if k not in replaced}
     header |= {**config.header(), "pairing": "aligned"}
     if "instruction" in f"{before.get('perturb', '')} {header.get('perturb', '')}":
-        instruction = reword_task(task, config.perturbations).language
+        instruction = reword_task(task, config.perturb).language
         info = json_attribute(before, "problem_info", file)
         header["problem_info"] = json.dumps({**info, "language_instruction": instruction})
     return header

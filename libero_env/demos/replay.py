@@ -13,10 +13,11 @@ again they may be a step short, so the expert's last action is repeated a few ti
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import mujoco
 import numpy as np
+from pydantic import Field
 
 from libero_env.assets.pack import Pack, facade_assets, pack_of, select_pack
 from libero_env.demos.config import RenderConfig
@@ -24,11 +25,14 @@ from libero_env.demos.contents import EXPORTED_STATE, demo_number, read_header
 from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import PUBLISHED_NOOP_NORM, Episode, Labels, published_noop_steps, read_episodes
 from libero_env.demos.write import DemoWriter
+from libero_env.envs.config import Assets, Drawing, Size
 from libero_env.errors import DemoError
 from libero_env.parallel import progress_bar
 from libero_env.sim.observations import image_name
 from libero_env.sim.scene import Scene
+from libero_env.validation import checked
 
+Steps = Annotated[int, Field(ge=0)]
 REPLAY_MODES = ("state", "action")
 _WAIT = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0]])  # the action of the waiting steps
 
@@ -160,7 +164,7 @@ def rerun_actions(file: Path, target: Path) -> Path:
     return writer.finish()
 
 
-@dataclass(frozen=True)
+@checked
 class Regeneration:
     """How demonstrations are run again.
 
@@ -174,12 +178,12 @@ class Regeneration:
         drawing: How images are drawn, `faithful` or `fast`.
     """
 
-    size: tuple[int, int] = (256, 256)
-    settle_steps: int = 10
-    extra_steps: int = 10
+    size: Size = (256, 256)
+    settle_steps: Steps = 10
+    extra_steps: Steps = 10
     labels: Labels = "expert"
-    assets: Pack | str | Path | None = None
-    drawing: str = "faithful"
+    assets: Assets = None
+    drawing: Drawing = "faithful"
 
     def pack(self) -> Pack:
         """Return the pack of the models."""

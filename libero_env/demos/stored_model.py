@@ -15,25 +15,27 @@ from libero_env.objects.xml_file import Node, parse_xml_text
 from libero_env.sim.scene import Scene, scene_spec
 from libero_env.tasks.problem import Problem
 
-_TEXTURE_FIELDS = (
-    *(
-        "type",
-        "builtin",
-        "mark",
-        "rgb1",
-        "rgb2",
-        "markrgb",
-        "random",
-        "width",
-        "height",
-        "nchannel",
-        "data",
-        "file",
-    ),
-    *("cubefiles", "content_type", "gridlayout", "gridsize", "hflip", "vflip", "colorspace"),
-)
-
-
+_TEXTURE_FIELDS = [
+    "type",
+    "builtin",
+    "mark",
+    "rgb1",
+    "rgb2",
+    "markrgb",
+    "random",
+    "width",
+    "height",
+    "nchannel",
+    "data",
+    "file",
+    "cubefiles",
+    "content_type",
+    "gridlayout",
+    "gridsize",
+    "hflip",
+    "vflip",
+    "colorspace",
+]
 _GROWING = {"include", "replicate", "composite", "flexcomp", "attach", "model", "extension", "plugin"}
 _MAX_ELEMENTS = 20_000  # of a model; a kitchen has 3,000
 _MAX_COUNT = 10_000  # of key frames and the like, for which <size> reserves memory
@@ -75,20 +77,20 @@ def compile_stored(xml: str, spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def _add_textures(stored: mujoco.MjSpec, spec: mujoco.MjSpec) -> None:
-    known = {texture.name: texture for texture in spec.textures}
-    own = {texture.name for texture in stored.textures}
-    ours = {material.name: list(material.textures) for material in spec.materials}
+    available = {texture.name: texture for texture in spec.textures}
+    present = {texture.name for texture in stored.textures}
+    textures_of = {material.name: list(material.textures) for material in spec.materials}
     for material in stored.materials:
-        textures = ours.get(material.name, [])
+        textures = textures_of.get(material.name, [])
         if any(material.textures) or not any(textures):
             continue
         material.textures = textures
         for name in filter(None, textures):
-            if name not in own:
-                own.add(name)
-                _copy_texture(stored, known[name])
-    for name, texture in known.items():  # no material names the sky
-        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX and not own.intersection({name}):
+            if name not in present:
+                present.add(name)
+                _copy_texture(stored, available[name])
+    for name, texture in available.items():  # no material names the sky
+        if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX and name not in present:
             _copy_texture(stored, texture)
 
 

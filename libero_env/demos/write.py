@@ -33,7 +33,7 @@ from libero_env.storage import atomic_path
 TAG = "libero-v1"
 FRAMES_PER_CHUNK = 8
 # Attributes in which all demonstrations of a file agree.
-_CONFIG_KEYS = (
+_CONFIG_KEYS = [
     "bddl_file_name",
     "bddl_file_content",
     "seed",
@@ -49,7 +49,7 @@ _CONFIG_KEYS = (
     "filter",
     "perturb",
     "perturb_draws",
-)
+]
 
 
 class OtherRecordingError(DemoError):

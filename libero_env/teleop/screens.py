@@ -6,7 +6,7 @@ import select
 import shutil
 import sys
 import time
-from typing import Any, Protocol
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -27,17 +27,9 @@ _MAX_GEOMS = 2000  # geoms that the window can show
 _STEPS_PER_IMAGE = 4  # [control steps] between two images in a terminal
 
 
-class ClosableScreen(Screen, Protocol):
-    """A `Screen` that can be closed."""
-
-    def close(self) -> None:
-        """Close the screen and restore what it changed."""
-        ...
-
-
 def open_screen(
     kind: str, keyboard: Keyboard, camera: str = "agentview", reader: "MouseReader | None" = None
-) -> ClosableScreen:
+) -> Screen:
     """Open a window, or use the terminal if no window can be opened.
 
     Args:

@@ -58,6 +58,10 @@ class Screen(Protocol):
         """Show the state, and wait until the control step has lasted 50 ms."""
         ...
 
+    def close(self) -> None:
+        """Close the screen and restore what it changed."""
+        ...
+
 
 class Teleop:
     """Episodes of a task that a user drives.
