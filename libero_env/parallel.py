@@ -9,7 +9,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
 from contextlib import suppress
 from functools import lru_cache
@@ -94,6 +94,35 @@ def as_finished(futures: Iterable[Future[T]], silence: float = LONGEST_SILENCE) 
                 "finished is kept. The same command goes on; fewer workers need less memory and time"
             )
         yield from done
+
+
+def run_each(
+    function: Callable[..., T],
+    arguments: Sequence[tuple[Any, ...]],
+    workers: int,
+    is_needed: Callable[[int], bool] = lambda _: True,
+) -> Generator[tuple[int, T], None, None]:
+    """Call a function with each of several arguments, in this process or in a pool; yield position and result.
+
+    Args:
+        function: Function of a module.
+        arguments: Arguments of each call.
+        workers: Number of processes; 1 calls it in this process.
+        is_needed: Whether the call of a position shall still begin; asked after each result.
+    """
+    if workers < 2:
+        for i, one in enumerate(arguments):
+            if is_needed(i):
+                yield i, function(*one)
+        return
+    with spawn_pool(workers) as pool:
+        futures: dict[Future[T], int] = {pool.submit(function, *one): i for i, one in enumerate(arguments)}
+        for future in as_finished(futures):
+            if not future.cancelled():
+                yield futures[future], future.result()
+                for other, i in futures.items():
+                    if not is_needed(i):
+                        other.cancel()
 
 
 def _start_worker(initializer: Callable[[], None] | None) -> None:

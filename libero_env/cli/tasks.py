@@ -131,8 +131,7 @@ def certify_tasks(
         disturb: Add noise to the actions, as demonstrations do.
         again: Run again what is in the folder.
     """
-    from libero_env.design.certify import certify
-    from libero_env.design.certify_figure import write_results
+    from libero_env.design.certify import certify, write_results
 
     certificates = certify(
         find_tasks(tasks),

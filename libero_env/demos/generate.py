@@ -7,8 +7,7 @@ recorded before, or on how often the recording was interrupted.
 import json
 import sys
 import zlib
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import Future
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +23,7 @@ from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.record import RecordingReport, record_chunk, recorders
 from libero_env.demos.write import DemoWriter, OtherRecordingError
 from libero_env.errors import DemoError, InvalidInputError
-from libero_env.parallel import as_finished, check_main_guard, cpu_count, progress_bar, spawn_pool
+from libero_env.parallel import check_main_guard, cpu_count, progress_bar, run_each
 from libero_env.paths import demos_dir
 from libero_env.tasks import Task, get_suite
 
@@ -109,35 +108,6 @@ def claim_incomplete(jobs: Iterable[tuple[J, int]]) -> Iterator[list[tuple[J, in
             locks.enter_context(_recording_lock(folder))
         # another process may have finished some before the folders were locked
         yield [(job, n) for job, n in incomplete if not job.is_complete(n)]
-
-
-def run_each(
-    function: Callable[..., T],
-    arguments: Sequence[tuple[Any, ...]],
-    workers: int,
-    is_needed: Callable[[int], bool] = lambda _: True,
-) -> Generator[tuple[int, T], None, None]:
-    """Call a function with each of several arguments, in this process or in a pool; yield position and result.
-
-    Args:
-        function: Function of a module.
-        arguments: Arguments of each call.
-        workers: Number of processes; 1 calls it in this process.
-        is_needed: Whether the call of a position shall still begin; asked after each result.
-    """
-    if workers < 2:
-        for i, one in enumerate(arguments):
-            if is_needed(i):
-                yield i, function(*one)
-        return
-    with spawn_pool(workers) as pool:
-        futures: dict[Future[T], int] = {pool.submit(function, *one): i for i, one in enumerate(arguments)}
-        for future in as_finished(futures):
-            if not future.cancelled():
-                yield futures[future], future.result()
-                for other, i in futures.items():
-                    if not is_needed(i):
-                        other.cancel()
 
 
 def number_of_processes(workers: int) -> int:

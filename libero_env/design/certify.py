@@ -7,8 +7,7 @@ resumes. The result from an initial state depends on the task and its number alo
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -23,13 +22,15 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.errors import LiberoError, MissingPackageError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.rollout import run_experts
-from libero_env.parallel import as_finished, progress_bar, spawn_pool
+from libero_env.parallel import progress_bar, run_each
 from libero_env.sim.scene import build_scene
 from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
 from libero_env.tasks.builder import FILE
 
 BATCH = 16  # initial states simulated together
+_COLOURS = ("#f4f6ec", "#8fcfc3", "#2379ab", "#14265e")  # from few steps to many; distinct in greyscale too
+_FAILED = "#b03024"
 NO_HORIZON = 1_000_000  # [steps] `run_experts` ends the attempts
 
 
@@ -142,7 +143,9 @@ def certify(
     with progress_bar(
         total=total, initial=total - left, desc="certify", unit="start", progress=progress
     ) as bar:
-        for k, outcomes in _run(chunks, tasks, jobs, pack, disturb):
+        arguments = [(tasks[k], numbers, pack, disturb) for k, numbers in chunks]
+        for index, outcomes in run_each(attempt, arguments, jobs):
+            k = chunks[index][0]
             merged = {o.state: o for o in (*found[k].outcomes, *outcomes)}
             found[k] = replace(found[k], outcomes=tuple(merged[i] for i in sorted(merged)))
             if path := paths[k]:
@@ -184,27 +187,71 @@ def markdown_table(certificates: Sequence[Certificate]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def write_results(
+    certificates: Sequence[Certificate], out: Path, *, assets: str | None = None, disturb: bool = False
+) -> None:
+    """Write `results.json`, `results.md` and, where matplotlib is installed, a figure of each suite; print their paths.
+
+    Args:
+        certificates: Results of the tasks.
+        out: Folder to write to.
+        assets: Models that were used, as for `select_pack`.
+        disturb: Whether the actions had noise; the names of the files state it.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    ending = "-disturbed" if disturb else ""
+    written = [out / f"results{ending}.json", out / f"results{ending}.md"]
+    written[0].write_text(json.dumps(results(certificates, assets=assets, disturb=disturb), indent=1) + "\n")
+    written[1].write_text(markdown_table(certificates))
+    suites: dict[str, list[Certificate]] = {}
+    for certificate in certificates:
+        suites.setdefault(certificate.task.partition("/")[0], []).append(certificate)
+    for suite, own in suites.items():
+        path = out / f"{suite}{ending}.png"
+        try:
+            draw_figure(own, path, f"{suite}: steps of the expert from each start")
+        except ModuleNotFoundError as error:
+            print(f"no figure of {suite}: {error.name} is not installed (it is in the extra `train`)")
+        else:
+            written.append(path)
+    print("\n".join(map(str, written)))
+
+
+def draw_figure(certificates: Sequence[Certificate], path: Path, title: str) -> None:
+    """Draw the figure of a suite: a row per task, a column per initial state, coloured by length; failures red.
+
+    Raises:
+        ModuleNotFoundError: matplotlib is not installed.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.figure import Figure
+
+    states = max(len(c.outcomes) for c in certificates)
+    steps = np.full((len(certificates), states), np.nan)
+    for row, certificate in zip(steps, certificates, strict=True):
+        row[: len(certificate.outcomes)] = [o.steps if o.success else np.nan for o in certificate.outcomes]
+    figure = Figure(figsize=(8.5, 1.2 + 0.2 * len(certificates)), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.add_subplot()
+    colours = LinearSegmentedColormap.from_list("steps", _COLOURS).with_extremes(bad=_FAILED)
+    image = axes.imshow(
+        np.ma.masked_invalid(steps), cmap=colours, aspect="auto", interpolation="nearest", vmin=0
+    )
+    labels = [f"{_label(c)}  {100 * c.rate:.0f} %" for c in certificates]
+    axes.set_yticks(range(len(labels)), labels, fontsize=6, parse_math=False)  # names are texts of users
+    axes.set_xlabel("initial state; red where the goal was not reached", fontsize=7)
+    axes.tick_params(axis="x", labelsize=6)
+    axes.set_title(title, fontsize=8, parse_math=False)
+    figure.colorbar(image, ax=axes, shrink=min(1.0, 20 / len(certificates))).ax.tick_params(labelsize=6)
+    figure.savefig(path)
+
+
 def _missing(certificate: Certificate, states: int) -> Iterator[list[int]]:
     done = {o.state for o in certificate.outcomes}
     missing = [i for i in range(states) if i not in done]
     for i in range(0, len(missing), BATCH):
         yield missing[i : i + BATCH]
-
-
-def _run(
-    chunks: Iterable[tuple[int, list[int]]], tasks: Sequence[Task], jobs: int, pack: Pack, disturb: bool
-) -> Iterator[tuple[int, list[Outcome]]]:
-    """Yield the index of a task and the outcomes of a chunk, as each is done."""
-    if jobs <= 1:
-        for k, states in chunks:
-            yield k, attempt(tasks[k], states, pack, disturb)
-        return
-    with spawn_pool(jobs) as pool:
-        futures: dict[Future[list[Outcome]], int] = {
-            pool.submit(attempt, tasks[k], states, pack, disturb): k for k, states in chunks
-        }
-        for future in as_finished(futures):
-            yield futures[future], future.result()
 
 
 def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> list[Outcome]:
@@ -267,3 +314,8 @@ def _stored(path: Path, empty: Certificate) -> Certificate:
 
 def _store(path: Path, certificate: Certificate) -> None:
     atomic_write_text(path, json.dumps(asdict(certificate), indent=1) + "\n")
+
+
+def _label(certificate: Certificate) -> str:
+    words = certificate.name.replace("_", " ")
+    return f"{certificate.task.rpartition('/')[2]}  {words if len(words) <= 64 else words[:63] + '…'}"

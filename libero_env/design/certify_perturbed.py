@@ -6,7 +6,7 @@ Results are on disk after each task and perturbation, so that a stopped run resu
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -19,7 +19,7 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, LiberoError, PlacementError
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.rollout import run_experts
-from libero_env.parallel import as_finished, progress_bar, spawn_pool
+from libero_env.parallel import progress_bar, run_each
 from libero_env.perturbations.draws import draw_name, trying
 from libero_env.perturbations.value import Perturbation
 from libero_env.storage import atomic_write_text
@@ -94,7 +94,7 @@ def certify_perturbed(
         A certificate for each task and perturbation, in order.
 
     Raises:
-        LiberoError: A file in `out` is no certificate.
+        LiberoError: A file in `out` is not a certificate.
     """
     units = [(task, one) for task in tasks for one in perturbations]
     found: dict[int, PerturbedCertificate] = {}
@@ -103,24 +103,13 @@ def certify_perturbed(
             found[k] = stored
     left = [k for k in range(len(units)) if k not in found]
     with progress_bar(total=len(units), initial=len(found), desc="certify", unit="variant") as bar:
-        for k, certificate in _run(units, left, starts, redraws, jobs):
+        arguments = [(*units[k], range(starts), redraws) for k in left]
+        for index, certificate in run_each(attempt_perturbed, arguments, jobs):
+            k = left[index]
             found[k] = certificate
             atomic_write_text(_path(out, *units[k]), json.dumps(asdict(certificate), indent=1) + "\n")
             bar.update()
     return [found[k] for k in range(len(units))]
-
-
-def _run(
-    units: Sequence[tuple[Task, Perturbation]], left: Sequence[int], starts: int, redraws: int, jobs: int
-) -> Iterator[tuple[int, PerturbedCertificate]]:
-    if jobs <= 1:
-        for k in left:
-            yield k, attempt_perturbed(*units[k], range(starts), redraws)
-        return
-    with spawn_pool(jobs) as pool:
-        futures = {pool.submit(attempt_perturbed, *units[k], range(starts), redraws): k for k in left}
-        for future in as_finished(futures):
-            yield futures[future], future.result()
 
 
 def attempt_perturbed(
