@@ -188,14 +188,14 @@ def test_truths_are_those_of_the_predicates(pair):
     atoms += [
         Atom(p, (a, b)) for p in ("On", "Stack", "Incontact") for a in scene.objects for b in names if a != b
     ]
-    atoms += [Atom("Up", (name,)) for name in scene.objects] + [Atom("True", ())]
+    atoms += [Atom("Up", (name,)) for name in scene.objects] + [Atom("True", (names[0],))]
     atoms += [Atom(p, (site,)) for p in ("Open", "Close") for site in sites]
     goal = Or(
         (And(tuple(atoms[:3])), Not(ForAll((("b", scene.objects[names[0]].category),), Atom("Up", ("b",)))))
     )
     checkers = [make_goals(goal, atoms, env.views, "original", env.simulations) for env in pair]
     assert isinstance(checkers[0], ViewedGoals)
-    assert checkers[1].on_host == (Atom("True", ()),)
+    assert checkers[1].one_by_one == (Atom("True", (names[0],)),)
     seen = []
     for _ in range(20):  # objects anywhere around the fixtures, joints anywhere
         qpos = np.tile(scene.model.qpos0, (NUM, 1))
@@ -223,11 +223,11 @@ def test_predicates_of_users_and_of_strict_semantics_are_evaluated_on_the_host(p
     atom, reset_ = Atom("Leftof", (a, b)), reset(pair)
     assert reset_
     checker = make_goals(atom, [atom], env.views, "original", env.simulations)
-    assert checker.on_host == (atom,)
+    assert checker.one_by_one == (atom,)
     theirs = ViewedGoals(atom, [atom], pair[0].views, "original").check(range(NUM))[0]
     assert (checker.check(range(NUM))[0] == theirs).all()
     strict = make_goals(env.task.problem.goal, env.goals.atoms, env.views, "strict", env.simulations)
-    assert {one.predicate for one in strict.on_host} == {"In"}
+    assert {one.predicate for one in strict.one_by_one} == {"In"}
 
 
 def test_too_many_contacts_are_an_error_that_says_what_to_set(pair):

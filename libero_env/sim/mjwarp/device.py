@@ -51,26 +51,20 @@ def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray)
         "mass_address": arm.mass_address.astype(np.int32),
         "torque_limit": arm.torque_limit.astype(np.float64),
         "finger_range": arm.finger_range.astype(np.float64),
-        "fixture_bodies": bodies.astype(np.int32),
         "static_geoms": np.flatnonzero(fixed[model.geom_bodyid]).astype(np.int32),
     }
     states = {
         "active": (num, wp.bool),
-        "chosen": (num, wp.bool),
         "grip": (num, wp.float64),
         "goal_pos": ((num, 3), wp.float64),
         "goal_mat": ((num, 9), wp.float64),
         "gripper": ((num, 2), wp.float64),
         "rest": (7, wp.float64),
         "arm": ((num, 7), wp.float64),
-        "new_qpos": ((num, model.nq), float),
-        "new_qvel": ((num, model.nv), float),
         "kept_qpos": ((num, model.nq), float),
         "kept_qvel": ((num, model.nv), float),
         "kept_warm_start": ((num, model.nv), float),
         "kept_time": (num, float),
-        "fixture_pos": ((num, bodies.size), wp.vec3),
-        "fixture_quat": ((num, bodies.size), wp.quat),
     }
     return SimpleNamespace(
         **{name: wp.array(value) for name, value in constants.items()},

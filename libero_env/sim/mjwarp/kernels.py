@@ -1,4 +1,4 @@
-"""Warp kernels of a control step: the controller, and simulations that are started, held or posed.
+"""Warp kernels of a control step: the controller, and simulations that are held or posed.
 
 The controller is that of `libero_env.sim.osc`, whose formulas and constants these are; it computes in double precision
 from MuJoCo Warp's single-precision fields, since inertias in the task space are badly conditioned.
@@ -194,40 +194,6 @@ def sum_arm(
         if active[i]:
             arm[i, j] = arm[i, j] + timestep * wp.float64(qvel[i, j])
         qpos[i, j] = float(arm[i, j])
-
-
-@wp.kernel
-def start(
-    chosen: wp.array[wp.bool],
-    started: float,
-    new_qpos: wp.array2d[float],
-    new_qvel: wp.array2d[float],
-    fixture_bodies: wp.array[int],
-    fixture_pos: wp.array2d[wp.vec3],
-    fixture_quat: wp.array2d[wp.quat],
-    qpos: wp.array2d[float],
-    qvel: wp.array2d[float],
-    warm_start: wp.array2d[float],
-    ctrl: wp.array2d[float],
-    time: wp.array[float],
-    body_pos: wp.array2d[wp.vec3],
-    body_quat: wp.array2d[wp.quat],
-):
-    """Write the states and the poses of the fixtures in which the chosen simulations start."""
-    i = wp.tid()
-    if not chosen[i]:
-        return
-    time[i] = started
-    for j in range(qpos.shape[1]):
-        qpos[i, j] = new_qpos[i, j]
-    for j in range(qvel.shape[1]):
-        qvel[i, j] = new_qvel[i, j]
-        warm_start[i, j] = 0.0
-    for j in range(ctrl.shape[1]):
-        ctrl[i, j] = 0.0
-    for k in range(fixture_bodies.shape[0]):
-        body_pos[i, fixture_bodies[k]] = fixture_pos[i, k]
-        body_quat[i, fixture_bodies[k]] = fixture_quat[i, k]
 
 
 @wp.func

@@ -95,12 +95,13 @@ class WarpSimulations(Simulations):
             )
 
     def contact_geoms(self, i: int) -> np.ndarray:
-        geoms, starts = self._contacts
-        return geoms[starts[i] : starts[i + 1]]
+        geoms, worlds = self.contacts
+        start, end = np.searchsorted(worlds, (i, i + 1))
+        return geoms[start:end]
 
     @property
-    def _contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pairs of geoms of all contacts, by simulation, and where those of each simulation begin."""
+    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the two geoms of all contacts, (n, 2), and the simulation of each, (n,), in ascending order."""
         return self._copies.derived("contacts", self._download_contacts)
 
     def _download_contacts(self) -> tuple[np.ndarray, np.ndarray]:
@@ -108,8 +109,7 @@ class WarpSimulations(Simulations):
         count = int(data.nacon.numpy()[0])
         worlds = data.contact.worldid.numpy()[:count]
         order = np.argsort(worlds, kind="stable")
-        starts = np.searchsorted(worlds[order], np.arange(self.num + 1))
-        return data.contact.geom.numpy()[:count][order], starts
+        return data.contact.geom.numpy()[:count][order], worlds[order]
 
     def time(self, i: int) -> float:
         return float(self.device_data.time.numpy()[i])
@@ -128,31 +128,16 @@ class WarpSimulations(Simulations):
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
         model, data, arrays = self.device_model, self.device_data, self._arrays
         with wp.ScopedDevice(self.device):
-            arrays.chosen.assign(_mask(self.num, ids))
-            arrays.new_qpos.assign(_rows(self.num, ids, qpos))
-            arrays.new_qvel.assign(_rows(self.num, ids, qvel))
-            arm = arrays.arm.numpy().copy()
-            arm[ids] = qpos[:, :7]
-            arrays.arm.assign(arm)
+            _write(data.time, ids, time)
+            _write(data.qpos, ids, qpos)
+            _write(data.qvel, ids, qvel)
+            _write(data.qacc_warmstart, ids, 0.0)
+            _write(data.ctrl, ids, 0.0)
+            _write(arrays.arm, ids, qpos[:, :7])
             if self.fixture_bodies.size:
-                arrays.fixture_pos.assign(self.fixtures[:, :, :3].astype(np.float32))
-                arrays.fixture_quat.assign(self.fixtures[:, :, 3:].astype(np.float32))
-            wp.launch(
-                kernels.start,
-                self.num,
-                inputs=[arrays.chosen, float(time), arrays.new_qpos, arrays.new_qvel, arrays.fixture_bodies],
-                outputs=[
-                    arrays.fixture_pos,
-                    arrays.fixture_quat,
-                    data.qpos,
-                    data.qvel,
-                    data.qacc_warmstart,
-                    data.ctrl,
-                    data.time,
-                    model.body_pos,
-                    model.body_quat,
-                ],
-            )
+                rows = np.ix_(ids, self.fixture_bodies)
+                _write(model.body_pos, rows, self.fixtures[ids, :, :3])
+                _write(model.body_quat, rows, self.fixtures[ids, :, 3:])
             if arrays.static_geoms.size:
                 mjw.kinematics(model, data)
                 wp.launch(
@@ -294,20 +279,18 @@ class WarpSimulations(Simulations):
         for array, value in zip(
             (self.device_data.qacc_warmstart, self.device_data.ctrl), values, strict=True
         ):
-            rows = array.numpy()
-            rows[i] = value
-            array.assign(rows)
+            _write(array, i, value)
         self._copies.forget()
+
+
+def _write(array: Any, where: Any, values: Any) -> None:
+    """Write to a part of an array on the device, by way of the host."""
+    rows = array.numpy()
+    rows[where] = values
+    array.assign(rows)
 
 
 def _mask(num: int, ids: np.ndarray) -> np.ndarray:
     chosen = np.zeros(num, bool)
     chosen[ids] = True
     return chosen
-
-
-def _rows(num: int, ids: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the rows of chosen simulations among those of all, in single precision."""
-    rows = np.zeros((num, values.shape[1]), np.float32)
-    rows[ids] = values
-    return rows
