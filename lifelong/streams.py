@@ -15,7 +15,7 @@ from pydantic import Field
 from libero_env.perturbations import Perturbation
 from libero_env.validation import checked
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.perturbations import PerturbSetting, read_perturbations
+from lifelong.data.settings import PerturbSetting, read_perturbations
 from lifelong.data.windows import StageWindows, TaskWindows, WindowSubset
 from lifelong.errors import ConfigError
 from lifelong.seeding import BLUR, generator

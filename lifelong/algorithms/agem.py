@@ -38,23 +38,23 @@ class AGEM(Rehearsal):
         """
         super().__init__(memory, ratio)
         self.augment_reference = augment_reference
-        self._reference: Batch | None = None  # drawn by `mix`, used by `after_backward`
+        self.reference: Batch | None = None  # drawn by `mix`, used by `after_backward`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch unchanged; the reference windows are drawn here."""
         if len(self.memory):
-            self._reference = self._drawn(batch, generator)
+            self.reference = self._drawn(batch, generator)
             if self.augment_reference and self.augment is not None:
-                self._reference = self.augment(self._reference, generator)
+                self.reference = self.augment(self.reference, generator)
         return batch
 
     def after_backward(self, policy: Policy) -> None:
         """Project the gradient where it disagrees with the reference."""
-        if self._reference is None:
+        if self.reference is None:
             return
         params = [p for p in policy.parameters() if p.requires_grad]
-        loss = policy.loss(self._reference.to(params[0].device))
-        self._reference = None
+        loss = policy.loss(self.reference.to(params[0].device))
+        self.reference = None
         project(params, torch.autograd.grad(loss, params, allow_unused=True))
 
 

@@ -1,50 +1,51 @@
 """Weights to stay near, each with its importance: what EWC, SI and MAS have in common."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
+from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
+from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
 from lifelong.policies.base import Policy
 
 ANCHOR_FORM = {"importance": Weights(), "anchor": Weights()}
 
 
-class Anchor:
-    """Surrogate `sum_i Omega_i (theta_i - anchor_i)^2` of the loss on earlier tasks when weights move.
+class Anchored(Algorithm):
+    """Surrogate `strength * sum_i Omega_i (theta_i - anchor_i)^2` of the loss on earlier tasks when weights move.
+
+    A subclass calls `move_anchor` when a task ends.
 
     Attributes:
+        strength: Weight of the surrogate.
         importance: Omega by parameter name, each of the parameter's shape and never negative.
-        weights: Anchored values by parameter name; empty before the first task ends.
+        anchor: Anchored values by parameter name; empty before the first task ends.
     """
 
-    def __init__(self) -> None:
-        self.importance: dict[str, Tensor] = {}
-        self.weights: dict[str, Tensor] = {}
+    state_form: ClassVar[Any] = ANCHOR_FORM
 
-    def penalty(self, policy: Policy, strength: float) -> Tensor | None:
-        """Return the surrogate times `strength`, a scalar; None before the first task ends."""
-        if not self.weights:
+    def __init__(self, strength: float) -> None:
+        self.strength = strength
+        self.importance: dict[str, Tensor] = {}
+        self.anchor: dict[str, Tensor] = {}
+
+    def penalty(self, policy: Policy) -> Tensor | None:
+        """Return `strength * sum Omega (theta - anchor)^2`, a scalar; None before the first task ends."""
+        if not self.anchor:
             return None
         terms = [
-            (self.importance[name] * (p - self.weights[name]).square()).sum()
+            (self.importance[name] * (p - self.anchor[name]).square()).sum()
             for name, p in policy.named_parameters()
-            if name in self.weights
+            if name in self.anchor
         ]
-        return strength * torch.stack(terms).sum()
+        return self.strength * torch.stack(terms).sum()
 
     @torch.no_grad()
-    def gradient(self, name: str, value: Tensor) -> Tensor:
-        """Return the surrogate's derivative at a parameter's value, of its shape; zero before the first task ends."""
-        if name not in self.weights:
-            return torch.zeros_like(value)
-        return 2 * self.importance[name] * (value - self.weights[name])
-
-    @torch.no_grad()
-    def move(self, policy: Policy, added: Mapping[str, Tensor], decay: float = 1.0) -> None:
+    def move_anchor(self, policy: Policy, added: Mapping[str, Tensor], decay: float = 1.0) -> None:
         """Add a task's importance and anchor the weights at their present values.
 
         Args:
@@ -55,13 +56,13 @@ class Anchor:
         for name, value in added.items():
             old = self.importance.get(name)
             self.importance[name] = value if old is None else old.mul(decay).add_(value)
-        self.weights = {n: p.detach().clone() for n, p in policy.named_parameters() if n in added}
+        self.anchor = {n: p.detach().clone() for n, p in policy.named_parameters() if n in added}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return importance and anchored weights, by parameter name."""
-        return {"importance": dict(self.importance), "anchor": dict(self.weights)}
+        """Return importance and anchor, by parameter name."""
+        return {"importance": dict(self.importance), "anchor": dict(self.anchor)}
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
 
         Raises:
@@ -69,4 +70,4 @@ class Anchor:
         """
         if odd := sorted(state["importance"].keys() ^ state["anchor"].keys()):
             raise CheckpointError(f"{odd[0]} has an importance or an anchor, but not both")
-        self.importance, self.weights = dict(state["importance"]), dict(state["anchor"])
+        self.importance, self.anchor = dict(state["importance"]), dict(state["anchor"])

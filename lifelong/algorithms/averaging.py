@@ -9,7 +9,7 @@ from torch import Tensor
 from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, copy_weights
 from lifelong.types import Natural, Share
 
 
@@ -63,7 +63,7 @@ class Averaging(Algorithm):
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Store the weights that the task begins with, if they are needed at its end."""
         if self.share_of(self.tasks + 1) < 1:
-            self._before = {name: value.detach().clone() for name, value in policy.state_dict().items()}
+            self._before = copy_weights(policy)
 
     @torch.no_grad()
     def end_task(

@@ -101,13 +101,13 @@ class CLARE(RoutedExperts):
             return
         uses = dict.fromkeys(modules, task_index)
         if self._discriminators:
-            compared = self._compare(self._collect(dataset, policy, draws))
+            compared = self.compare(self._collect(dataset, policy, draws))
             uses = {name: compared[name] for name in modules}
         if task_index not in uses.values():
             uses[next(iter(uses))] = task_index
         self._chosen[task_index] = uses
         new = {name: matrix_of(modules[name]) for name, used in uses.items() if used == task_index}
-        self._library.add(task_index, new, self.rank, draws)
+        self.library.add(task_index, new, self.rank, draws)
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
@@ -122,7 +122,7 @@ class CLARE(RoutedExperts):
 
     def _acting(self) -> int | None:
         """Return the present task while it is learned, as it has no autoencoders yet; then each sample chooses."""
-        unfinished = self.task_index in self._library and self.task_index not in self._discriminators
+        unfinished = self.task_index in self.library and self.task_index not in self._discriminators
         return self.task_index if unfinished else None
 
     def route(self, name: str, samples: Tensor) -> Tensor:
@@ -131,7 +131,7 @@ class CLARE(RoutedExperts):
         uses = torch.tensor([self._chosen[t][name] for t, _ in known], device=samples.device)
         return uses[torch.stack([d.errors(samples) for _, d in known]).argmin(0)]
 
-    def _compare(self, samples: Samples) -> dict[str, int]:
+    def compare(self, samples: Samples) -> dict[str, int]:
         """Return for each layer the task whose adapter the present task uses: its own where the samples are new."""
         uses = {}
         for name, x in samples.items():
@@ -176,7 +176,7 @@ class CLARE(RoutedExperts):
         """Return all adapters and autoencoders, and which belong together."""
         known = {task: {n: d.weights for n, d in of.items()} for task, of in self._discriminators.items()}
         chosen = {task: dict(of) for task, of in self._chosen.items()}
-        return {**self._place(), "library": self._library.state(), "discriminators": known, "chosen": chosen}
+        return {**self._place(), "library": self.library.state(), "discriminators": known, "chosen": chosen}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -192,7 +192,7 @@ class CLARE(RoutedExperts):
         self._load_place(state)
         self._chosen = {task: dict(of) for task, of in chosen.items()}
         self._discriminators = {t: {n: Discriminator(w) for n, w in of.items()} for t, of in known.items()}
-        self._library.load(library)
+        self.library.load(library)
 
 
 def _samples(layer: nn.Module, x: Tensor) -> Tensor:

@@ -1,11 +1,8 @@
 """Experience replay from a memory of compressed frames."""
 
-import torch
-
 from lifelong.algorithms.rehearsal import Rehearsal
-from lifelong.data.compressed_memory import COMPRESSED_FORM, CompressedMemory
-from lifelong.data.compressed_windows import Quality
-from lifelong.types import Batch, Count, NonNegative
+from lifelong.data.compressed import COMPRESSED_FORM, CompressedMemory, Quality
+from lifelong.types import Count, NonNegative
 
 
 class CompressedER(Rehearsal):
@@ -37,9 +34,3 @@ class CompressedER(Rehearsal):
                 `CompressedMemory`.
         """
         super().__init__(CompressedMemory(budget, quality, keep_decoded), ratio)
-
-    def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
-        """Return the batch followed by `ratio` times as many windows of earlier tasks."""
-        if not len(self.memory):
-            return batch
-        return batch.join(self._drawn(batch, generator).to(batch.actions.device))

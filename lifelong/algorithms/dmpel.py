@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from lifelong.algorithms.frozen_base import RoutedExperts
 from lifelong.data.windows import TaskWindows, of_episodes
-from lifelong.errors import CheckpointError, ConfigError
+from lifelong.errors import CheckpointError
 from lifelong.nn.experts import ExpertLibrary, adapted_layers, expert_output, weights_of
 from lifelong.nn.routing import SigmoidRouter
 from lifelong.nn.tokens import standardise
@@ -89,20 +89,13 @@ class DMPEL(RoutedExperts):
             replay_size: Number of contexts stored of each task.
             base_tasks: Number of tasks that train the whole policy, which is frozen afterwards; 0 for a pretrained
                 policy.
-
-        Raises:
-            ConfigError: A number below its smallest valid value.
         """
         super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
-        positive = {"experts": experts, "pool": pool, "replay_size": replay_size}
-        for name, value in positive.items():
-            if value < 1:
-                raise ConfigError(f"algo.{name} is {value}; it must be at least 1")
         self.experts, self.top_k, self.hidden, self.pool = experts, top_k, hidden, pool
         self.recall_steps, self.recall_lr, self.replay_size = recall_steps, recall_lr, replay_size
-        self._router: SigmoidRouter | None = None
+        self.router: SigmoidRouter | None = None
         self._memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
-        self._episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
+        self.episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
         self._held: Tensor | None = None  # (B, G, N), coefficients of the present episodes
         # of each group, the tasks (counted in the library) whose experts count in some row of the present pass
         self._counting: list[list[int]] = []
@@ -112,25 +105,25 @@ class DMPEL(RoutedExperts):
         layers = adapted_layers(policy, self.adapted)
         queries, of_window = of_episodes(dataset, lambda batch: self.query(batch.observation))
         queries = queries.to(device_of(policy))
-        self._episodes = {"queries": queries, "of_window": of_window}
+        self.episodes = {"queries": queries, "of_window": of_window}
         draws = self._begin(task_index, policy)
         if draws is None:
             return
-        self._library.add(task_index, weights_of(layers), self.rank, draws, count=self.experts)
-        count, groups = self.experts * len(self._library.pairs), len(_groups(layers))
+        self.library.add(task_index, weights_of(layers), self.rank, draws, count=self.experts)
+        count, groups = self.experts * len(self.library.pairs), len(_groups(layers))
         router = SigmoidRouter.new(queries.shape[1], self.hidden, groups, count, self.top_k, draws)
-        self._router = router.to(queries.device)
+        self.router = router.to(queries.device)
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
         """Return the router's and the task's experts' parameters; everything while the base is learned."""
         learned = super().trained(policy)
-        return learned if self._router is None else [*self._router.parameters(), *learned]
+        return learned if self.router is None else [*self.router.parameters(), *learned]
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch with the query of its episode in each window."""
-        if self._router is None:
+        if self.router is None:
             return batch
-        queries, of_window = (self._episodes[k].to(batch.actions.device) for k in ("queries", "of_window"))
+        queries, of_window = (self.episodes[k].to(batch.actions.device) for k in ("queries", "of_window"))
         queries = queries[of_window[batch.window_ids]]
         proprio = {**batch.observation.proprio, _QUERY: queries[:, None]}
         return replace(batch, observation=replace(batch.observation, proprio=proprio))
@@ -139,23 +132,23 @@ class DMPEL(RoutedExperts):
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Store some of the task's contexts with their coefficients, and let the router recall all stored ones."""
-        queries = self._episodes["queries"]
+        queries = self.episodes["queries"]
         chosen = torch.randperm(len(queries), generator=generator)[: self.replay_size]
         queries = queries[chosen.to(queries.device)]
-        if self._router is None:
+        if self.router is None:
             groups = len(_groups(adapted_layers(policy, self.adapted)))
             coefficients = queries.new_zeros(len(queries), groups, 0)
         else:
-            coefficients = self._router(queries, self.experts).detach()
+            coefficients = self.router(queries, self.experts).detach()
         self._memory[task_index] = {"queries": queries, "coefficients": coefficients}
         self._recall()
-        self._episodes = {}
+        self.episodes = {}
         self._draw_seed(generator)
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
         """Yield the policy with routed experts, the same for every task."""
-        if self._router is None:
+        if self.router is None:
             yield policy
             return
         with self._using(None, policy, *self._hooks(policy)):
@@ -171,10 +164,10 @@ class DMPEL(RoutedExperts):
 
     def coefficients(self, observation: Observation) -> Tensor:
         """Return the coefficient of each expert in each group of layers, (B, G, N)."""
-        assert self._router is not None
+        assert self.router is not None
         given = observation.proprio.get(_QUERY)
-        learning = self.experts if self._episodes else 0
-        return self._router(self.query(observation) if given is None else given[:, 0], learning)
+        learning = self.experts if self.episodes else 0
+        return self.router(self.query(observation) if given is None else given[:, 0], learning)
 
     @contextmanager
     def holding(self, coefficients: Tensor) -> Iterator[None]:
@@ -187,15 +180,15 @@ class DMPEL(RoutedExperts):
 
     def _recall(self) -> None:
         """Let the router give the stored coefficients again, and zeros for experts that came later."""
-        if self._router is None:
+        if self.router is None:
             return
         queries = torch.cat([m["queries"] for m in self._memory.values()])
-        count = self._router.bias.shape[1]
+        count = self.router.bias.shape[1]
         then = torch.cat([_padded(m["coefficients"], count) for m in self._memory.values()])
-        optimizer = torch.optim.AdamW(self._router.parameters(), lr=self.recall_lr)
+        optimizer = torch.optim.AdamW(self.router.parameters(), lr=self.recall_lr)
         for _ in range(self.recall_steps):
             optimizer.zero_grad()
-            (self._router.coefficients(queries) - then).square().mean().backward()
+            (self.router.coefficients(queries) - then).square().mean().backward()
             optimizer.step()
         optimizer.zero_grad()
 
@@ -207,7 +200,7 @@ class DMPEL(RoutedExperts):
         def add(name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
             if self._now is None or not (counting := self._counting[groups[name]]):
                 return None
-            pairs = [of_task[name] for of_task in self._library.pairs.values()]
+            pairs = [of_task[name] for of_task in self.library.pairs.values()]
             rank = pairs[0]["a"].shape[0] // self.experts
             of_tasks = self._now[:, groups[name]].unflatten(1, (-1, self.experts))  # (B, tasks, experts)
             weights = self.scale * of_tasks[:, counting].flatten(1).repeat_interleave(rank, dim=1)
@@ -225,9 +218,9 @@ class DMPEL(RoutedExperts):
 
     def state_dict(self) -> dict[str, Any]:
         """Return experts, router, stored contexts, and those of the present task's windows."""
-        router = {} if self._router is None else {n: p.detach() for n, p in self._router.named_parameters()}
-        kept = {"memory": _copied(self._memory), "episodes": dict(self._episodes)}
-        return {**self._place(), "library": self._library.state(), "router": router, **kept}
+        router = {} if self.router is None else {n: p.detach() for n, p in self.router.named_parameters()}
+        kept = {"memory": _copied(self._memory), "episodes": dict(self.episodes)}
+        return {**self._place(), "library": self.library.state(), "router": router, **kept}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -235,11 +228,11 @@ class DMPEL(RoutedExperts):
         Raises:
             CheckpointError: The shapes of the router, the experts or the stored contexts do not go together.
         """
-        self._router = SigmoidRouter(state["router"], top_k=self.top_k) if state["router"] else None
-        _check_shapes(state, self._router)
+        self.router = SigmoidRouter(state["router"], top_k=self.top_k) if state["router"] else None
+        _check_shapes(state, self.router)
         self._load_place(state)
-        self._memory, self._episodes = _copied(state["memory"]), dict(state["episodes"])
-        self._library.load(state["library"])
+        self._memory, self.episodes = _copied(state["memory"]), dict(state["episodes"])
+        self.library.load(state["library"])
 
 
 def _check_shapes(state: Mapping[str, Any], router: SigmoidRouter | None) -> None:

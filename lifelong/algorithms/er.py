@@ -1,10 +1,8 @@
 """Experience replay."""
 
-import torch
-
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.memory import ReplayMemory
-from lifelong.types import Batch, NonNegative
+from lifelong.types import NonNegative
 
 
 class ER(Rehearsal):
@@ -26,7 +24,3 @@ class ER(Rehearsal):
             ratio: Number of windows replayed for each window of the present task; 1 doubles the batch.
         """
         super().__init__(memory, ratio)
-
-    def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
-        """Return the batch followed by `ratio` times as many windows of earlier tasks."""
-        return batch.join(self._drawn(batch, generator)) if len(self.memory) else batch

@@ -1,20 +1,15 @@
 """Online elastic weight consolidation."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
-from torch import Tensor
 
-from lifelong.algorithms.anchor import ANCHOR_FORM, Anchor
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.anchor import Anchored
 from lifelong.algorithms.importance import ImportanceEstimator, SampleFisher
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import NonNegative
 
 
-class EWC(Algorithm):
+class EWC(Anchored):
     """Pull each weight towards its last anchor, the harder the more it mattered for the tasks so far.
 
     The loss gains `strength * sum_i F_i (theta_i - anchor_i)^2`, and after each task
@@ -26,7 +21,6 @@ class EWC(Algorithm):
     OBJECT .56 / .69 / .16, GOAL .32 / .48 / .06).
     """
 
-    state_form = ANCHOR_FORM
     tuned = {"strength": (150.0, 500.0, 1.5e3, 5e3, 1.5e4), "gamma": (0.5, 0.9, 1.0)}
     plain_start = True
 
@@ -45,25 +39,12 @@ class EWC(Algorithm):
             estimator: Estimator of the Fisher information, `SampleFisher` or `BatchFisher`; None: `SampleFisher()`.
         """
         self.estimator = SampleFisher() if estimator is None else estimator
-        self.strength = self.estimator.strength if strength is None else strength
+        super().__init__(self.estimator.strength if strength is None else strength)
         self.gamma = gamma
-        self.anchor = Anchor()
-
-    def penalty(self, policy: Policy) -> Tensor | None:
-        """Return `strength * sum F (theta - anchor)^2`, a scalar; None before the first task ends."""
-        return self.anchor.penalty(policy, self.strength)
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Add the task's Fisher information and move the anchor to the present weights."""
         fisher = self.estimator.estimate(dataset, policy, generator, self.augment)
-        self.anchor.move(policy, fisher, decay=self.gamma)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return Fisher information and anchor, by parameter name."""
-        return self.anchor.state_dict()
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
-        self.anchor.load_state_dict(state)
+        self.move_anchor(policy, fisher, decay=self.gamma)

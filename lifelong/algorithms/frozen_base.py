@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm, Phase
-from lifelong.errors import ConfigError, PolicyError
+from lifelong.errors import PolicyError
 from lifelong.nn.experts import Attachment, ExpertLibrary, expert_output, freeze_statistics
 from lifelong.policies.base import Policy
 
@@ -23,19 +23,11 @@ class FrozenBase(Algorithm):
     place_form: ClassVar[Mapping[str, Any]] = dict.fromkeys(("task_index", "base_left", "seed"), int)
 
     def __init__(self, *, rank: int, alpha: float, adapted: Sequence[str], base_tasks: int):
-        """Create the algorithm; see the subclasses for the arguments.
-
-        Raises:
-            ConfigError: A rank below 1 or fewer than 0 tasks.
-        """
-        if rank < 1 or base_tasks < 0:
-            raise ConfigError(
-                f"algo.rank is {rank} and algo.base_tasks is {base_tasks}; valid: at least 1, at least 0"
-            )
+        """Create the algorithm; see the subclasses for the arguments."""
         self.rank, self.scale, self.adapted = rank, alpha / rank, tuple(adapted)
         self.task_index, self._base_left = -1, base_tasks
         self._seed = 0  # of the draws at the next task's beginning, drawn when a task ends
-        self._library = ExpertLibrary()
+        self.library = ExpertLibrary()
 
     def _begin(self, task_index: int, policy: Policy) -> torch.Generator | None:
         """Go on to a task and return the generator of its experts' draws; None where it trains the whole policy."""
@@ -53,12 +45,12 @@ class FrozenBase(Algorithm):
     def mode_train(self, policy: Policy) -> None:
         """Set training mode, with running statistics frozen with the base."""
         policy.train()
-        if self._library:
+        if self.library:
             freeze_statistics(policy)
 
     def sizes(self) -> dict[int, int]:
         """Return the number of parameters of each task's experts."""
-        return self._library.sizes()
+        return self.library.sizes()
 
     def _place(self) -> dict[str, int]:
         """Return the place in the sequence of tasks, for `state_dict`."""
@@ -79,9 +71,9 @@ class RoutedExperts(FrozenBase):
 
     relu: ClassVar[bool] = False  # whether a ReLU lies between the A and the B of an expert
 
-    def __init__(self, *, rank: int, alpha: float, adapted: Sequence[str], base_tasks: int):
+    def __init__(self, **settings: Any):
         """Create the algorithm; see `FrozenBase`."""
-        super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
+        super().__init__(**settings)
         self._attachment = Attachment()
         self._learning: int | None = None  # task whose experts all samples use; None: each has its own
         self._now: Tensor | None = None  # what `encode` chose for the rows of the present forward pass
@@ -105,12 +97,12 @@ class RoutedExperts(FrozenBase):
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
         """Return the parameters of the task's experts; everything while the base is learned."""
-        if self.task_index not in self._library:
+        if self.task_index not in self.library:
             return super().trained(policy)
         policy.requires_grad_(False)
         self._learning = self.task_index
         self._attachment.attach(policy, *self._hooks(policy))
-        return self._library.parameters(self.task_index)
+        return self.library.parameters(self.task_index)
 
     def end_phase(self, phase: Phase, policy: Policy) -> None:
         """Remove the experts from the policy's layers."""
@@ -120,7 +112,7 @@ class RoutedExperts(FrozenBase):
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
         """Yield the policy that chooses experts, the same for every task."""
-        if not self._library:
+        if not self.library:
             yield policy
             return
         with self._using(self._acting(), policy, *self._hooks(policy)):
@@ -153,9 +145,9 @@ class RoutedExperts(FrozenBase):
         """
         total: Tensor | None = None
         for task, rows in groups:
-            if task not in self._library:
+            if task not in self.library:
                 continue
-            pairs, own = [self._library[task][name]], x if rows is None else x[rows]
+            pairs, own = [self.library[task][name]], x if rows is None else x[rows]
             part = self.scale * expert_output(layer, own, pairs, relu=self.relu)
             if rows is None:
                 return part

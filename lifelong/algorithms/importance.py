@@ -1,6 +1,5 @@
 """Estimates of how much each weight matters for a task, from gradients on the task's windows."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Literal
 
@@ -8,15 +7,14 @@ import torch
 from torch import Tensor
 
 from lifelong.data.windows import WindowDataset
-from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy, in_mode
 from lifelong.types import Batch, Count, Natural
 
 
-class ImportanceEstimator(ABC):
-    """Mean over windows of a non-negative function of gradients.
+class ImportanceEstimator:
+    """Diagonal Fisher information: mean over windows of the squared gradient of the policy's loss.
 
-    A subclass says of what the gradient is taken (`objective`) and how it counts (`accumulate`).
+    A subclass may say of what the gradient is taken (`objective`) and how it counts (`accumulate`).
 
     Args:
         windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
@@ -26,28 +24,21 @@ class ImportanceEstimator(ABC):
     Attributes:
         training: Whether the policy is in training mode meanwhile.
         strength: Strength of a penalty that goes with the estimate.
-
-    Raises:
-        ConfigError: A negative number of windows, or an empty batch.
     """
 
     training = False
     strength = 1.0
 
     def __init__(self, *, windows: Natural = 512, batch_size: Count = 1, augment: bool = False):
-        if windows < 0 or batch_size < 1:
-            raise ConfigError(
-                f"an estimate from {windows} windows in batches of {batch_size}; valid: 0 (all) or more, at least 1"
-            )
         self.windows, self.batch_size, self.augment = windows, batch_size, augment
 
-    @abstractmethod
-    def objective(self, policy: Policy, batch: Batch) -> Tensor:
-        """Return the scalar whose gradient is taken."""
+    def objective(self, policy: Policy, batch: Batch, draws: torch.Generator) -> Tensor:
+        """Return the scalar whose gradient is taken; `draws` is a CPU generator."""
+        return policy.loss(batch)
 
-    @abstractmethod
     def accumulate(self, total: Tensor, grad: Tensor, weight: float) -> None:
         """Add the importance of a gradient, times a weight, to the total in place."""
+        total.addcmul_(grad, grad, value=weight)
 
     def estimate(
         self,
@@ -61,7 +52,7 @@ class ImportanceEstimator(ABC):
         Args:
             dataset: Windows of the task.
             policy: Policy with the weights after the task; its mode is restored.
-            generator: Generator of the windows' order and of their augmentation.
+            generator: Generator of the windows' order, of their augmentation, and of what the objective draws.
             augment: Augmentation of training, for estimators that augment.
 
         Returns:
@@ -77,7 +68,7 @@ class ImportanceEstimator(ABC):
                 batch = dataset.batch(indices)
                 if self.augment and augment is not None:
                     batch = augment(batch, generator)
-                objective = self.objective(policy, batch.to(device))
+                objective = self.objective(policy, batch.to(device), generator)
                 grads = torch.autograd.grad(objective, list(named.values()), allow_unused=True)
                 for name, grad in zip(named, grads, strict=True):
                     if grad is not None:
@@ -100,14 +91,6 @@ class SampleFisher(ImportanceEstimator):
     def __init__(self, *, windows: Natural = 512, augment: bool = False):
         super().__init__(windows=windows, augment=augment)
 
-    def objective(self, policy: Policy, batch: Batch) -> Tensor:
-        """Return the policy's loss."""
-        return policy.loss(batch)
-
-    def accumulate(self, total: Tensor, grad: Tensor, weight: float) -> None:
-        """Add the squared gradient."""
-        total.addcmul_(grad, grad, value=weight)
-
 
 class BatchFisher(ImportanceEstimator):
     """Mean squared gradient of batches' mean losses, in training mode: the estimate of LIBERO's code.
@@ -126,14 +109,6 @@ class BatchFisher(ImportanceEstimator):
 
     def __init__(self, *, windows: Natural = 512, batch_size: Count = 32, augment: bool = False):
         super().__init__(windows=windows, batch_size=batch_size, augment=augment)
-
-    def objective(self, policy: Policy, batch: Batch) -> Tensor:
-        """Return the policy's loss."""
-        return policy.loss(batch)
-
-    def accumulate(self, total: Tensor, grad: Tensor, weight: float) -> None:
-        """Add the squared gradient."""
-        total.addcmul_(grad, grad, value=weight)
 
 
 class ActionSensitivity(ImportanceEstimator):
@@ -156,28 +131,15 @@ class ActionSensitivity(ImportanceEstimator):
     def __init__(self, *, windows: Natural = 512, of: Literal["projected", "squared"] = "projected"):
         super().__init__(windows=windows)
         self.of = of
-        self._draws: torch.Generator | None = None
 
-    def estimate(
-        self,
-        dataset: WindowDataset,
-        policy: Policy,
-        generator: torch.Generator,
-        augment: Callable[[Batch, torch.Generator], Batch] | None = None,
-    ) -> dict[str, Tensor]:
-        """Estimate the importance; the generator also draws the projections. See `ImportanceEstimator`."""
-        self._draws = generator
-        return super().estimate(dataset, policy, generator, augment)
-
-    def objective(self, policy: Policy, batch: Batch) -> Tensor:
+    def objective(self, policy: Policy, batch: Batch, draws: torch.Generator) -> Tensor:
         """Return a random projection of the actions, or their squared length, mean over steps."""
         actions = policy.predict(batch)
         if self.of == "squared":
             return actions.square().sum(-1).mean()
-        directions = torch.randn(actions.shape, generator=self._draws).to(actions)
-        return (directions * actions).sum() / actions.shape[
-            :-1
-        ].numel() ** 0.5  # (B, T, A), of variance |h|^2
+        directions = torch.randn(actions.shape, generator=draws).to(actions)
+        steps = actions.shape[:-1].numel()
+        return (directions * actions).sum() / steps**0.5  # of variance |h|^2
 
     def accumulate(self, total: Tensor, grad: Tensor, weight: float) -> None:
         """Add the gradient's absolute value."""

@@ -84,14 +84,14 @@ class IsCiL(RoutedExperts):
         states, nearest = self._embed_windows(dataset, policy, draws), None
         if self._prototypes:
             nearest = int(nearest_key(states, self._prototypes).mode().values)
-        self._library.add(task_index, weights_of(layers), self.rank, draws, start=nearest)
+        self.library.add(task_index, weights_of(layers), self.rank, draws, start=nearest)
         self._prototypes[task_index] = cluster_centres(states, self.bases, draws)
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Compute the prototypes of the base, which were not known before it was learned."""
-        if task_index not in self._library:
+        if task_index not in self.library:
             states = self._embed_windows(dataset, policy, generator)
             self._prototypes[task_index] = cluster_centres(states, self.bases, generator)
         self._draw_seed(generator)
@@ -131,7 +131,7 @@ class IsCiL(RoutedExperts):
 
     def state_dict(self) -> dict[str, Any]:
         """Return all adapters and prototypes."""
-        return {**self._place(), "library": self._library.state(), "prototypes": dict(self._prototypes)}
+        return {**self._place(), "library": self.library.state(), "prototypes": dict(self._prototypes)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -147,7 +147,7 @@ class IsCiL(RoutedExperts):
             raise CheckpointError("the adapters and their prototypes do not go together")
         self._load_place(state)
         self._prototypes = dict(prototypes)
-        self._library.load(state["library"])
+        self.library.load(state["library"])
 
 
 def _embedding(features: Tensor) -> Tensor:

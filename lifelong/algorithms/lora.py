@@ -60,27 +60,24 @@ class LoRA(FrozenBase):
             own: Patterns of names of parameters of which every task has its own copy.
             base_tasks: Number of tasks (stages, where tasks are learned together) that train the whole policy,
                 which is frozen afterwards; 0 for a pretrained policy.
-
-        Raises:
-            ConfigError: A rank below 1 or fewer than 0 tasks.
         """
         super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
         self.own, self._base_last = tuple(own), -1
-        self._base: dict[str, Tensor] = {}  # frozen values of all that a task may change
+        self.base: dict[str, Tensor] = {}  # frozen values of all that a task may change
         self._kept: dict[int, dict[str, Tensor]] = {}  # learned task -> its own copies
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Freeze the base once it is learned, and initialise the task's adapter."""
-        names = self._choose(policy) if not self._base else []
+        names = self._choose(policy) if not self.base else []
         draws = self._begin(task_index, policy)
         if draws is None:
             self._base_last = task_index
             return
-        if not self._base:
-            self._base = {n: p.detach().clone() for n, p in policy.named_parameters() if n in names}
-        adapted = {name: base for name, base in self._base.items() if not matches(name, self.own)}
-        self._library.add(task_index, adapted, self.rank, draws)
-        put_weights(policy, self._base)
+        if not self.base:
+            self.base = {n: p.detach().clone() for n, p in policy.named_parameters() if n in names}
+        adapted = {name: base for name, base in self.base.items() if not matches(name, self.own)}
+        self.library.add(task_index, adapted, self.rank, draws)
+        put_weights(policy, self.base)
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
         """Return the task's A and B and its own copies; everything while the base is learned."""
@@ -89,10 +86,10 @@ class LoRA(FrozenBase):
             return super().trained(policy)
         chosen: list[Any] = []
         for name, p in policy.named_parameters():
-            p.requires_grad_(name in self._base)
+            p.requires_grad_(name in self.base)
             if name in pairs:
                 chosen += pairs[name].values()
-            elif name in self._base:
+            elif name in self.base:
                 chosen.append(p)
         return chosen
 
@@ -117,22 +114,22 @@ class LoRA(FrozenBase):
     ) -> None:
         """Store the task's own copies; its A and B are stored already."""
         self._draw_seed(generator)
-        if task_index in self._library:
+        if task_index in self.library:
             params = dict(policy.named_parameters())
-            names = self._base.keys() - self._library[task_index].keys()
+            names = self.base.keys() - self.library[task_index].keys()
             self._kept[task_index] = {n: params[n].detach().clone() for n in sorted(names)}
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
         """Yield the policy with the task's adapter; unchanged for the present task and those not begun."""
         learned = [-1] if task_index <= self._base_last else [t for t in self._kept if t >= task_index]
-        if not self._base or not learned:
+        if not self.base or not learned:
             yield policy
             return
-        present = {n: p.detach().clone() for n, p in policy.named_parameters() if n in self._base}
+        present = {n: p.detach().clone() for n, p in policy.named_parameters() if n in self.base}
         stage = min(learned)  # index of the last task of a stage
-        sums = {name: self._sum(name, pair) for name, pair in self._library.pairs.get(stage, {}).items()}
-        put_weights(policy, self._base | sums | self._kept.get(stage, {}))
+        sums = {name: self._sum(name, pair) for name, pair in self.library.pairs.get(stage, {}).items()}
+        put_weights(policy, self.base | sums | self._kept.get(stage, {}))
         try:
             yield policy
         finally:
@@ -144,12 +141,12 @@ class LoRA(FrozenBase):
 
     def sizes(self) -> dict[int, int]:
         """Return the number of parameters learned by each task with an adapter, its own copies included."""
-        small = sum(p.numel() for n, p in self._base.items() if matches(n, self.own))
+        small = sum(p.numel() for n, p in self.base.items() if matches(n, self.own))
         return {task: small + size for task, size in super().sizes().items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the base, and every task's A, B and own copies."""
-        state = {"base": dict(self._base), "pairs": self._library.state(), "own": dict(self._kept)}
+        state = {"base": dict(self.base), "pairs": self.library.state(), "own": dict(self._kept)}
         return {**self._place(), "base_last": self._base_last, **state}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
@@ -158,16 +155,16 @@ class LoRA(FrozenBase):
         Raises:
             CheckpointError: An adapter does not fit its weight.
         """
-        self._library.load(state["pairs"])
+        self.library.load(state["pairs"])
         for of_task in state["pairs"].values():
             check_pairs(of_task, state["base"])
         self._load_place(state)
         self._base_last = int(state["base_last"])
-        self._base, self._kept = dict(state["base"]), dict(state["own"])
+        self.base, self._kept = dict(state["base"]), dict(state["own"])
 
     def _present(self) -> Mapping[str, Mapping[str, nn.Parameter]]:
         """Return the present task's pairs; none while the base is learned."""
-        return self._library.pairs.get(self.task_index, {})
+        return self.library.pairs.get(self.task_index, {})
 
     def _choose(self, policy: Policy) -> list[str]:
         """Return the names of all parameters that tasks may change."""
@@ -180,7 +177,7 @@ class LoRA(FrozenBase):
     @torch.no_grad()
     def _sum(self, name: str, pair: Pair) -> Tensor:
         """Return W + (alpha / rank) B A."""
-        base = self._base[name]
+        base = self.base[name]
         return base + (self.scale * (pair["b"] @ pair["a"])).view(base.shape)
 
 

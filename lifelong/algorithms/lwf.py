@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,8 +11,33 @@ from torch import Tensor
 from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
-from lifelong.policies.base import Policy, device_of
+from lifelong.policies.base import Policy, copy_weights, device_of
 from lifelong.types import Batch, NonNegative
+
+P = TypeVar("P", bound=Policy)
+
+
+class Teacher:
+    """Frozen copy of a policy, in evaluation mode; it is built when it is first asked.
+
+    Attributes:
+        weights: Its weights and buffers by name; empty before the first task ends.
+    """
+
+    def __init__(self) -> None:
+        self.weights: dict[str, Tensor] = {}
+        self._policy: Any = None
+
+    def become(self, weights: Mapping[str, Tensor]) -> None:
+        """Take over weights."""
+        self.weights, self._policy = dict(weights), None
+
+    def like(self, policy: P) -> P:
+        """Return the teacher, which is a policy of the same form as the given one."""
+        if self._policy is None:
+            self._policy = copy.deepcopy(policy).eval().requires_grad_(False)
+            self._policy.load_state_dict(self.weights)
+        return self._policy  # type: ignore[no-any-return]
 
 
 class LwF(Algorithm):
@@ -41,10 +66,9 @@ class LwF(Algorithm):
                 both alike.
         """
         self.strength = strength
-        self._weights: dict[str, Tensor] = {}  # of the teacher
+        self.teacher = Teacher()
         self._languages: dict[int, Tensor] = {}  # position of each learned task -> (L,)
-        self._teacher: Policy | None = None
-        self._distilled: Batch | None = None  # made by `mix`, used by `penalty`
+        self.distilled: Batch | None = None  # made by `mix`, used by `penalty`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch unchanged; earlier instructions are drawn for a copy of it."""
@@ -52,38 +76,30 @@ class LwF(Algorithm):
             drawn = torch.randint(len(self._languages), (len(batch),), generator=generator)
             languages = torch.stack(list(self._languages.values()))
             language = languages[drawn.to(languages.device)].to(batch.observation.language)
-            self._distilled = replace(batch, observation=replace(batch.observation, language=language))
+            self.distilled = replace(batch, observation=replace(batch.observation, language=language))
         return batch
 
     def penalty(self, policy: Policy) -> Tensor | None:
         """Return `strength * D(h_old, h)`, a scalar; None during the first task."""
-        if self._distilled is None:
+        if self.distilled is None:
             return None
-        batch, self._distilled = self._distilled.to(device_of(policy)), None
+        batch, self.distilled = self.distilled.to(device_of(policy)), None
         with torch.no_grad():
-            teacher = self._build_teacher(policy).answers(batch)
+            teacher = self.teacher.like(policy).answers(batch)
         return self.strength * policy.divergence(batch, teacher).mean()
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Make the present weights the teacher's, and add the task's instruction to the earlier ones."""
-        self._weights = {n: t.detach().clone() for n, t in policy.state_dict().items()}
-        self._teacher = None
+        self.teacher.become(copy_weights(policy))
         self._languages[task_index] = dataset.batch(torch.tensor([0])).observation.language[0].clone()
 
     def state_dict(self) -> dict[str, Any]:
         """Return the teacher's weights and the learned instructions."""
-        return {"weights": dict(self._weights), "languages": dict(self._languages)}
+        return {"weights": dict(self.teacher.weights), "languages": dict(self._languages)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned."""
-        self._weights, self._languages = dict(state["weights"]), dict(state["languages"])
-        self._teacher = None
-
-    def _build_teacher(self, policy: Policy) -> Policy:
-        """Return the teacher, in evaluation mode; it is built at the first call."""
-        if self._teacher is None:
-            self._teacher = copy.deepcopy(policy).eval().requires_grad_(False)
-            self._teacher.load_state_dict(self._weights)
-        return self._teacher
+        self.teacher.become(state["weights"])
+        self._languages = dict(state["languages"])

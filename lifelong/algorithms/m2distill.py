@@ -1,17 +1,17 @@
 """Replay with distillation of every modality's features and of the action distribution."""
 
-import copy
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from lifelong.algorithms.lwf import Teacher
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.checkpoints import Weights
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
-from lifelong.policies.base import Policy, device_of
+from lifelong.policies.base import Policy, copy_weights, device_of
 from lifelong.policies.history import HistoryPolicy, with_features
 from lifelong.types import Batch, Count, NonNegative, Observation
 
@@ -65,16 +65,15 @@ class M2Distill(Rehearsal):
         """
         super().__init__(ReplayMemory(budget), ratio)
         self.image, self.language, self.proprio, self.policy = image, language, proprio, policy
-        self._weights: dict[str, Tensor] = {}  # of the teacher
-        self._teacher: HistoryPolicy | None = None
-        self._distilled: Batch | None = None  # drawn by `mix`, used by `penalty`
+        self.teacher = Teacher()
+        self.distilled: Batch | None = None  # drawn by `mix`, used by `penalty`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch followed by `ratio` times as many earlier windows; others are drawn to distil on."""
         if not len(self.memory):
             return batch
         drawn = self._drawn(batch, generator)
-        self._distilled = drawn if self.augment is None else self.augment(drawn, generator)
+        self.distilled = drawn if self.augment is None else self.augment(drawn, generator)
         return batch.join(self._drawn(batch, generator))
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
@@ -83,12 +82,12 @@ class M2Distill(Rehearsal):
 
     def penalty(self, policy: Policy) -> Tensor | None:
         """Return the weighted sum of `distances` on the drawn windows, a scalar; None during the first task."""
-        if self._distilled is None:
+        if self.distilled is None:
             return None
         student = with_features(policy)
-        observation = self._distilled.to(device_of(student)).observation
-        self._distilled = None
-        found = distances(student, self._build_teacher(student), observation)
+        observation = self.distilled.to(device_of(student)).observation
+        self.distilled = None
+        found = distances(student, self.teacher.like(student), observation)
         return torch.stack([getattr(self, name) * distance for name, distance in found.items()]).sum()
 
     def end_task(
@@ -96,24 +95,16 @@ class M2Distill(Rehearsal):
     ) -> None:
         """Make the present weights the teacher's, and add the task's windows to the memory."""
         super().end_task(task_index, dataset, policy, generator)
-        self._weights = {n: t.detach().clone() for n, t in policy.state_dict().items()}
-        self._teacher = None
+        self.teacher.become(copy_weights(policy))
 
     def state_dict(self) -> dict[str, Any]:
         """Return which windows are kept, and the teacher's weights."""
-        return {**super().state_dict(), "weights": dict(self._weights)}
+        return {**super().state_dict(), "weights": dict(self.teacher.weights)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned; the frames come from the datasets."""
         super().load_state_dict(state, datasets)
-        self._weights, self._teacher = dict(state["weights"]), None
-
-    def _build_teacher(self, policy: HistoryPolicy) -> HistoryPolicy:
-        """Return the teacher, in evaluation mode; it is built at the first call."""
-        if self._teacher is None:
-            self._teacher = copy.deepcopy(policy).eval().requires_grad_(False)
-            self._teacher.load_state_dict(self._weights)
-        return self._teacher
+        self.teacher.become(state["weights"])
 
 
 def distances(student: HistoryPolicy, teacher: HistoryPolicy, observation: Observation) -> dict[str, Tensor]:

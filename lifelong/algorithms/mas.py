@@ -1,20 +1,17 @@
 """Memory aware synapses."""
 
-from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-from torch import Tensor
 
-from lifelong.algorithms.anchor import ANCHOR_FORM, Anchor
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.anchor import Anchored
 from lifelong.algorithms.importance import ActionSensitivity
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import Natural, NonNegative
 
 
-class MAS(Algorithm):
+class MAS(Anchored):
     """Pull each weight towards its last anchor, the harder the more the policy's actions depend on it.
 
     Aljundi et al. 2018, "Memory aware synapses: learning what (not) to forget". After a task
@@ -23,7 +20,6 @@ class MAS(Algorithm):
     actions near zero count for nothing; here it is a random projection of it, see `ActionSensitivity`.
     """
 
-    state_form = {"anchor": ANCHOR_FORM}
     tuned = {"strength": (0.01, 0.03, 0.1, 0.3, 1.0, 10.0)}
     plain_start = True
 
@@ -41,23 +37,11 @@ class MAS(Algorithm):
             windows: Number of windows, drawn without replacement, that the estimate uses, one by one; 0: all.
             of: What a weight matters for: a random projection of the actions, or their squared length as in the paper.
         """
-        self.strength, self.estimator = strength, ActionSensitivity(windows=windows, of=of)
-        self.anchor = Anchor()
-
-    def penalty(self, policy: Policy) -> Tensor | None:
-        """Return `strength * sum Omega (theta - anchor)^2`, a scalar; None during the first task."""
-        return self.anchor.penalty(policy, self.strength)
+        super().__init__(strength)
+        self.estimator = ActionSensitivity(windows=windows, of=of)
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Add the task's importance and move the anchor to the present weights."""
-        self.anchor.move(policy, self.estimator.estimate(dataset, policy, generator))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return importance and anchor, by parameter name."""
-        return {"anchor": self.anchor.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
-        self.anchor.load_state_dict(state["anchor"])
+        self.move_anchor(policy, self.estimator.estimate(dataset, policy, generator))

@@ -82,10 +82,10 @@ class MLR(Algorithm):
         self.ratio = ratio
         self.memory = LatentMemory(budget)
         self._base_left = base_tasks
-        self._frozen: list[str] = []  # parameters that features depend on; empty while the base is learned
+        self.frozen: list[str] = []  # parameters that features depend on; empty while the base is learned
         self._instructions = torch.zeros(0, 0)  # (K, F) directions of the features of all instructions so far
         self._images = torch.zeros(0, 0)  # (K, G) mean directions of the first camera's features
-        self._near = torch.zeros(0, 0)  # (J, F) of earlier instructions that are similar to the present ones
+        self.near = torch.zeros(0, 0)  # (J, F) of earlier instructions that are similar to the present ones
         self._present: Observation | None = None  # set by `mix`, used by `penalty`
         self._replayed: tuple[Tensor, Tensor] | None = (
             None  # latents (B, T, ...), actions (B, T, A), likewise
@@ -97,15 +97,15 @@ class MLR(Algorithm):
         if self._base_left:
             self._base_left -= 1
             return
-        if not self._frozen:
-            self._frozen = feature_parameters(policy, dataset.batch(torch.tensor([0])))
+        if not self.frozen:
+            self.frozen = feature_parameters(policy, dataset.batch(torch.tensor([0])))
         if self.adjustment and len(self._instructions):
-            self._near = self._similar(*describe(policy, dataset))
+            self.near = self._similar(*describe(policy, dataset))
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
         """Return the parameters after the features; all of them while the base is learned."""
         for name, parameter in policy.named_parameters():
-            if name in self._frozen:
+            if name in self.frozen:
                 parameter.requires_grad_(False)
                 parameter.grad = None  # of the base
         return super().trained(policy)
@@ -113,7 +113,7 @@ class MLR(Algorithm):
     def mode_train(self, policy: Policy) -> None:
         """Set training mode, but for modules that are frozen whole: no dropout and no statistics change features."""
         policy.train()
-        frozen = {id(p) for name, p in policy.named_parameters() if name in self._frozen}
+        frozen = {id(p) for name, p in policy.named_parameters() if name in self.frozen}
         for module in policy.modules():
             own = [id(p) for p in module.parameters()]
             if own and frozen.issuperset(own):
@@ -121,9 +121,9 @@ class MLR(Algorithm):
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch unchanged; latents of earlier windows are drawn."""
-        if self._frozen and len(self.memory):
+        if self.frozen and len(self.memory):
             self._replayed = self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
-            self._present = batch.observation if len(self._near) else None
+            self._present = batch.observation if len(self.near) else None
         return batch
 
     def penalty(self, policy: Policy) -> Tensor | None:
@@ -145,7 +145,7 @@ class MLR(Algorithm):
             features = policy.encode(observation)
         z = policy.over_time(features)[:, -1]
         own = _direction(policy.modalities(features)["language"][:, 0].float().flatten(1))
-        return adjust(z, own, self._near.to(own), self.margin)
+        return adjust(z, own, self.near.to(own), self.margin)
 
     def _similar(self, instructions: Tensor, images: Tensor) -> Tensor:
         """Return the directions (J, F) of earlier instructions that are similar to a task's, see `similar_pairs`."""
@@ -169,24 +169,24 @@ class MLR(Algorithm):
         self._instructions, self._images = (
             described if not known else map(torch.cat, zip(known, described, strict=True))
         )
-        self._near = self._near[:0]
+        self.near = self.near[:0]
 
     def state_dict(self) -> dict[str, Any]:
         """Return latents, what is frozen, and directions of the tasks' features."""
         return {
             "base_left": self._base_left,
-            "frozen": list(self._frozen),
+            "frozen": list(self.frozen),
             "memory": self.memory.state_dict(),
             "instructions": self._instructions,
             "images": self._images,
-            "near": self._near,
+            "near": self.near,
         }
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned; no dataset is read."""
         self.memory.load_state_dict(state["memory"])
-        self._base_left, self._frozen = int(state["base_left"]), list(state["frozen"])
-        self._instructions, self._images, self._near = (
+        self._base_left, self.frozen = int(state["base_left"]), list(state["frozen"])
+        self._instructions, self._images, self.near = (
             state[name].cpu() for name in ("instructions", "images", "near")
         )
 

@@ -72,12 +72,12 @@ class OMLA(LoRA):
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Begin as LoRA does, and put the task's adapter where the prior is; the first adapter's start is the prior."""
         super().begin_task(task_index, dataset, policy)
-        pairs = self._library.pairs.get(task_index)
+        pairs = self.library.pairs.get(task_index)
         if pairs is None or not self.prior_rate:
             return
         if self._prior is None:
             start = {name: {k: t.detach().clone() for k, t in pair.items()} for name, pair in pairs.items()}
-            own = {name: value.clone() for name, value in self._base.items() if name not in pairs}
+            own = {name: value.clone() for name, value in self.base.items() if name not in pairs}
             self._prior = {"pairs": start, "own": own}
             return
         for name, pair in pairs.items():
@@ -94,7 +94,7 @@ class OMLA(LoRA):
         super().end_task(task_index, dataset, policy, generator)
         if self._prior is None:
             return
-        learned, kept = self._library.pairs[task_index], self._kept[task_index]
+        learned, kept = self.library.pairs[task_index], self._kept[task_index]
         self._prior = {
             "pairs": {
                 name: {k: torch.lerp(t, learned[name][k].detach(), self.prior_rate) for k, t in pair.items()}
@@ -116,7 +116,7 @@ class OMLA(LoRA):
         super().load_state_dict(state, datasets)
         prior = state["prior"]
         if prior is not None:
-            check_pairs(prior["pairs"], self._base)
-            if prior["pairs"].keys() ^ prior["own"].keys() != self._base.keys():
+            check_pairs(prior["pairs"], self.base)
+            if prior["pairs"].keys() ^ prior["own"].keys() != self.base.keys():
                 raise CheckpointError("the prior is not that of the weights which the tasks change")
         self._prior = prior

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from lifelong.algorithms.base import Algorithm, Phase
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
-from lifelong.errors import CheckpointError, ConfigError
+from lifelong.errors import CheckpointError
 from lifelong.policies.base import Policy
 from lifelong.types import NonNegative
 
@@ -52,15 +52,8 @@ class PackNet(Algorithm):
             prune_perc: Share of the free weights that a task frees again when it ends; it keeps the rest.
             post_prune_share: Number of epochs of retraining after pruning, as a share of the epochs of training.
             masks_only: Whether to mask gradients only, as in LIBERO's code, instead of restoring frozen weights.
-
-        Raises:
-            ConfigError: A share outside its range.
         """
-        self.masks_only = masks_only
-        if not 0 < prune_perc < 1:
-            raise ConfigError(f"algo.prune_perc is {prune_perc}; it must lie between 0 and 1, e.g. 0.75")
-        self.prune_perc = prune_perc
-        self.post_prune_share = post_prune_share
+        self.masks_only, self.prune_perc, self.post_prune_share = masks_only, prune_perc, post_prune_share
         self.task_index = 0
         self._pruned = False
         self._owner: dict[str, Tensor] = {}  # name -> uint8: 0 free, k + 1 owned by task k

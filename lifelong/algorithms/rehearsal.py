@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.compressed_memory import CompressedMemory
+from lifelong.data.compressed import CompressedMemory
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
@@ -14,7 +14,7 @@ from lifelong.types import Batch
 
 
 class Rehearsal(Algorithm):
-    """Every task's windows go into a memory when it ends, and are drawn from it in proportion to later batches."""
+    """Every task's windows go into a memory when it ends; windows of earlier tasks join later batches."""
 
     state_form = {"memory": MEMORY_FORM}
     plain_start = True
@@ -28,9 +28,14 @@ class Rehearsal(Algorithm):
         """
         self.memory, self.ratio = memory, ratio
 
+    def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
+        """Return the batch followed by `ratio` times as many windows of earlier tasks."""
+        return batch.join(self._drawn(batch, generator)) if len(self.memory) else batch
+
     def _drawn(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return `ratio` times as many windows of earlier tasks as the batch has, at least one."""
-        return self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
+        drawn = self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
+        return drawn.to(batch.actions.device)
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator

@@ -6,15 +6,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.anchor import ANCHOR_FORM, Anchor
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.anchor import ANCHOR_FORM, Anchored
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
 from lifelong.types import NonNegative, Positive
 
 
-class SI(Algorithm):
+class SI(Anchored):
     """Pull each weight towards its last anchor, the harder the more it lowered the loss on its path there.
 
     Zenke et al. 2017, "Continual learning through synaptic intelligence". Along the path of a task each
@@ -40,8 +39,8 @@ class SI(Algorithm):
             damping: Bound xi on the importance of weights that hardly moved (those whose displacement is well below
                 sqrt(xi), 0.03 here).
         """
-        self.strength, self.damping = strength, damping
-        self.anchor = Anchor()
+        super().__init__(strength)
+        self.damping = damping
         self._omega: dict[str, Tensor] = {}
         self._displacement: dict[str, Tensor] = {}  # Delta
         self._step: dict[str, tuple[Tensor, Tensor]] = {}  # of one step: gradient, weights before it
@@ -50,18 +49,16 @@ class SI(Algorithm):
         """Start a new path."""
         self._omega, self._displacement = {}, {}
 
-    def penalty(self, policy: Policy) -> Tensor | None:
-        """Return `strength * sum Omega (theta - anchor)^2`, a scalar; None during the first task."""
-        return self.anchor.penalty(policy, self.strength)
-
     @torch.no_grad()
     def after_backward(self, policy: Policy) -> None:
         """Store the gradient without the penalty's, and the weights before the step."""
-        self._step = {
-            name: (p.grad - self.strength * self.anchor.gradient(name, p), p.detach().clone())
-            for name, p in policy.named_parameters()
-            if p.grad is not None
-        }
+        self._step = {}
+        for name, p in policy.named_parameters():
+            if p.grad is not None:
+                pull = torch.zeros_like(p)  # the penalty's gradient
+                if name in self.anchor:
+                    pull = 2 * self.importance[name] * (p - self.anchor[name])
+                self._step[name] = p.grad - self.strength * pull, p.detach().clone()
 
     @torch.no_grad()
     def after_step(self, policy: Policy) -> None:
@@ -79,21 +76,21 @@ class SI(Algorithm):
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Turn the path into importance and move the anchor to the present weights."""
-        added = {n: torch.zeros_like(v) for n, v in self.anchor.importance.items()}
+        added = {n: torch.zeros_like(v) for n, v in self.importance.items()}
         for name, omega in self._omega.items():
             added[name] = omega.clamp_min(0) / (self._displacement[name].square() + self.damping)
-        self.anchor.move(policy, added)
+        self.move_anchor(policy, added)
         self._omega, self._displacement = {}, {}
 
     def state_dict(self) -> dict[str, Any]:
         """Return importance and anchor, and the path of the task being learned."""
         return {
-            "anchor": self.anchor.state_dict(),
+            "anchor": super().state_dict(),
             "omega": dict(self._omega),
             "way": dict(self._displacement),
         }
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned."""
-        self.anchor.load_state_dict(state["anchor"])
+        super().load_state_dict(state["anchor"], datasets)
         self._omega, self._displacement = dict(state["omega"]), dict(state["way"])

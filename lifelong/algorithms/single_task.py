@@ -10,7 +10,7 @@ from torch import Tensor
 from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, copy_weights
 
 
 class SingleTask(Algorithm):
@@ -30,14 +30,14 @@ class SingleTask(Algorithm):
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Restore the initial weights; at the first task, store them."""
         if self._initial is None:
-            self._initial = _copy(policy)
+            self._initial = copy_weights(policy)
         policy.load_state_dict(self._initial)
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Store the task's weights."""
-        self._learned[task_index] = _copy(policy)
+        self._learned[task_index] = copy_weights(policy)
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
@@ -45,7 +45,7 @@ class SingleTask(Algorithm):
         if task_index not in self._learned:
             yield policy
             return
-        present = _copy(policy)
+        present = copy_weights(policy)
         policy.load_state_dict(self._learned[task_index])
         try:
             yield policy
@@ -64,7 +64,3 @@ class SingleTask(Algorithm):
         """Restore what `state_dict` returned."""
         self._initial = state["initial"]
         self._learned = dict(state["learned"])
-
-
-def _copy(policy: Policy) -> dict[str, Tensor]:
-    return {name: tensor.detach().clone() for name, tensor in policy.state_dict().items()}

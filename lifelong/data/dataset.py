@@ -7,21 +7,14 @@ A action, L language embedding.
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from libero_env.demos.read import Episode
-from lifelong.data.frame_file import FrameFile
-from lifelong.data.source import (
-    DemoSource,
-    check_fits,
-    check_indices,
-    check_language,
-    demo_tensors,
-    last_frames,
-)
+from lifelong.data.frame_cache import FrameFile
+from lifelong.data.source import DemoSource, check_fits, check_language, demo_tensors, last_frames
 from lifelong.errors import DataError
 from lifelong.types import Batch, Observation, PolicySpec
 
@@ -65,15 +58,7 @@ class SequenceVLDataset:
 
     @classmethod
     def from_file(
-        cls,
-        path: str | Path,
-        *,
-        spec: PolicySpec,
-        language: Tensor,
-        task_id: int = 0,
-        limit: int | None = None,
-        pairing: Literal["aligned", "stored"] = "aligned",
-        labels: Literal["expert", "executed"] = "expert",
+        cls, path: str | Path, *, spec: PolicySpec, language: Tensor, task_id: int = 0, **reading: Any
     ) -> "SequenceVLDataset":
         """Read all frames of a demonstration file into memory.
 
@@ -82,22 +67,19 @@ class SequenceVLDataset:
             spec: Views, readings, their sizes, and `seq_len`.
             language: Embedding of the instruction, (L,).
             task_id: Position in the task sequence.
-            limit: As for `DemoSource`.
-            pairing: As for `DemoSource`.
-            labels: As for `DemoSource`.
+            reading: Further fields of `DemoSource`.
 
         Raises:
             DemoError: The file is broken; the message names file, demonstration, key and what was expected.
             DataError: The file is valid but does not fit the spec.
         """
-        source = DemoSource(Path(path), spec, limit, pairing, labels)
-        return cls.from_source(source, language=language, task_id=task_id)
+        return cls.from_source(DemoSource(Path(path), spec, **reading), language=language, task_id=task_id)
 
     @classmethod
     def from_source(cls, source: DemoSource, *, language: Tensor, task_id: int = 0) -> "SequenceVLDataset":
         """Read what a source describes into memory; see `from_file`."""
         language = check_language(language, source.spec)
-        return cls._filled(source.demos(), source.lengths(), source.spec, language, task_id)
+        return cls._filled(source.demos(), source.lengths, source.spec, language, task_id)
 
     @classmethod
     def from_demos(
@@ -171,7 +153,10 @@ class SequenceVLDataset:
             DataError: An index is out of range.
         """
         indices = torch.as_tensor(indices, dtype=torch.int64, device=self.last.device)
-        check_indices(indices, len(self))
+        if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < len(self)):
+            raise DataError(
+                f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}"
+            )
         frames = self.frames(indices)
         gather = lambda x: self._gather(x, frames)  # noqa: E731
         language = self.language.expand(len(indices), -1)

@@ -1,6 +1,5 @@
 """Demonstrations of a run's tasks: recorded if there are none, read when they are needed."""
 
-import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from libero_env.demos.read import demo_lengths
 from libero_env.demos.rendering import RenderJob, ensure_rendered
 from libero_env.perturbations import Perturbation, replace_perturbations
 from libero_env.tasks import Task
+from libero_env.text import closest
 from lifelong.data import DemoSource, open_windows
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import StageWindows, TaskWindows
@@ -40,17 +40,24 @@ def find_demos(
             required.
         DemoError: A file is broken, or demonstrations cannot be recorded.
     """
-    folder = check_folder(data)
-    found = dict(_existing_files(tasks, counts, data))
+    folder, found = check_folder(data), dict[str, Path]()
+    for task, count in zip(tasks, counts, strict=True) if folder else ():
+        file = Path(folder or "") / task.suite / f"{task.name}_demo.hdf5"
+        if file.is_file():
+            available = len(demo_lengths(file, count))
+            if available < count:
+                raise DataError(
+                    f"{file} has {available} demonstrations and {count} are required; use data.demos={available}"
+                )
+            found[task.id] = file
     for count in sorted(set(counts), reverse=True):
         missing = [t for t, n in zip(tasks, counts, strict=True) if n == count and t.id not in found]
         if not missing:
             continue
-        size = (data.image_size, data.image_size)
         paths = ensure_demos(
             missing,
             count,
-            camera_size=size,
+            camera_size=(data.image_size, data.image_size),
             drawing=data.drawing,
             root=folder,
             robot=data.robot,
@@ -72,26 +79,11 @@ def check_folder(data: DataSettings) -> Path | None:
     if folder.is_dir():
         return folder
     beside = [p.name for p in folder.parent.iterdir() if p.is_dir()] if folder.parent.is_dir() else []
-    close = difflib.get_close_matches(folder.name, beside, n=1)
-    hint = f" Did you mean {folder.parent / close[0]}?" if close else ""
+    near = closest(folder.name, beside)
+    hint = f" Did you mean {folder.parent / near}?" if near else ""
     raise DataError(
         f"data.folder={data.folder} does not exist.{hint} To record demonstrations into a new folder, make it first"
     )
-
-
-def _existing_files(
-    tasks: Sequence[Task], counts: Sequence[int], data: DataSettings
-) -> Iterator[tuple[str, Path]]:
-    """Yield the files in the original's layout, with the ids of their tasks."""
-    for task, count in zip(tasks, counts, strict=True) if data.folder else ():
-        file = Path(data.folder or "").expanduser() / task.suite / f"{task.name}_demo.hdf5"
-        if file.is_file():
-            available = len(demo_lengths(file, count))
-            if available < count:
-                raise DataError(
-                    f"{file} has {available} demonstrations and {count} are required; use data.demos={available}"
-                )
-            yield task.id, file
 
 
 def perturb_demos(
@@ -192,7 +184,6 @@ class DemoDatasets(Mapping[int, TaskWindows]):
             task_id=task,
             device=self.device,
             memory=self.data.memory,
-            backend=self.data.backend,
         )
 
     def __iter__(self) -> Iterator[int]:

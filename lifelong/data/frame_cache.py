@@ -2,7 +2,7 @@
 
 There is a folder for each demonstration file and each choice of what is read of it:
 
-    images.u8     (F, V, H, W, C) uint8 without a header, see `lifelong.data.frame_file`
+    images.u8     (F, V, H, W, C) uint8 without a header
     arrays.npz    proprioception, actions, last frames of the demonstrations
     index.json    shape and digest of the images, and what the folder was made from
 
@@ -12,6 +12,9 @@ process leaves none. If several processes need the same folder, one builds it an
 
 Each file has a checksum, and a folder where one does not fit is built again. Of the images, which may be larger than
 memory, 64 MiB are compared whenever they are opened: all, or blocks of 1 MiB at equal distances.
+
+Frames are read by position and not mapped: mapped pages count as memory of the process, and a mapped file that another
+process truncates ends this one with a signal.
 """
 
 import hashlib
@@ -20,12 +23,14 @@ import logging
 import math
 import os
 import shutil
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from filelock import FileLock, Timeout
 from torch import Tensor
@@ -42,41 +47,105 @@ from libero_env.storage import (
     read_record,
     write_record,
 )
-from lifelong.data.dataset import SequenceVLDataset
-from lifelong.data.frame_file import FrameFile
-from lifelong.data.source import DemoSource, check_language, demo_tensors, last_frames
+from lifelong.data.source import DemoSource, demo_tensors, last_frames
 from lifelong.errors import DataError
 
 _FORMAT = 1
 _SAMPLES, _SAMPLE_BYTES = 64, 4096  # number and size of the blocks of a file that are in its digest
 _BLOCKS, _BLOCK_BYTES = 64, 1 << 20  # likewise of the images
-_PATIENCE, _LONGEST_BUILD = (
-    10.0,
-    4 * 3600.0,
-)  # [s] for a process that builds: until a line says so, and in all
+_READ_AT_ONCE = 1 << 26  # [bytes] when all frames are read
+_PATIENCE = 10.0  # [s] for a process that builds, until a line says so
+_LONGEST_BUILD = 4 * 3600.0  # [s] for it in all
 _log = logging.getLogger(__name__)
 
 
-def open_on_disk(source: DemoSource, *, language: Tensor, task_id: int = 0) -> SequenceVLDataset:
-    """Return the windows of a file, with the images on disk. The folder is built if it does not exist.
+class FrameFile:
+    """Frames (F, ...) uint8 in a file without a header.
 
     Args:
-        source: What is read.
-        language: Embedding of the instruction, (L,).
-        task_id: Position in the task sequence.
+        path: File, which holds exactly these frames.
+        shape: Number of frames, and the shape of one.
 
-    Raises:
-        DemoError: The file is broken.
-        DataError: The file does not fit the spec, or there is not enough space on the disk.
+    Attributes:
+        shape: As given.
     """
-    language = check_language(language, source.spec)
-    folder, shape = _ensure_folder(source)
-    arrays = {name: torch.from_numpy(array) for name, array in read_npz(folder / "arrays.npz").items()}
-    proprio = {name: arrays[f"proprio/{name}"] for name in source.spec.proprio}
-    frames = FrameFile(folder / "images.u8", shape)
-    return SequenceVLDataset(
-        frames, proprio, arrays["actions"], arrays["last"], language, task_id, source.spec.seq_len
-    )
+
+    def __init__(self, path: Path, shape: tuple[int, ...]):
+        self.shape, self._path, self._size = shape, path, math.prod(shape[1:])
+        self._file = os.open(path, os.O_RDONLY)
+        weakref.finalize(self, os.close, self._file)
+        if hasattr(os, "posix_fadvise"):  # what lies beside a frame is not needed with it
+            os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, frames: Tensor) -> Tensor:
+        """Return frames by index, as a tensor does; see `rows`."""
+        return self.rows(frames)
+
+    @property
+    def nbytes(self) -> int:
+        """Number of bytes of the frames, on the disk."""
+        return math.prod(self.shape)
+
+    def rows(self, frames: Tensor, out: Tensor | None = None) -> Tensor:
+        """Return frames by index, (n, ...) uint8, as `torch.index_select` does.
+
+        Args:
+            frames: Indices, (n,) int64 in [0, F).
+            out: Tensor to write them to; None for a new one.
+
+        Raises:
+            DataError: The file cannot be read, or is shorter than it was.
+        """
+        found = torch.empty(len(frames), *self.shape[1:], dtype=torch.uint8) if out is None else out
+        places = found.view(len(frames), self._size).numpy()
+        for start, first, count in _runs(frames):
+            self._read(places[start : start + count], first)
+        return found
+
+    def expect(self, frames: Tensor) -> None:
+        """Let the system read frames ahead, while the caller does something else.
+
+        Args:
+            frames: Indices, (n,) int64 in [0, F).
+        """
+        if hasattr(os, "posix_fadvise"):
+            for _, first, count in _runs(frames):
+                os.posix_fadvise(self._file, first * self._size, count * self._size, os.POSIX_FADV_WILLNEED)
+
+    def to(self, device: torch.device | str) -> Tensor:
+        """Return all frames as a tensor on a device."""
+        step = max(1, _READ_AT_ONCE // self._size)
+        found = torch.empty(self.shape, dtype=torch.uint8, device=device)
+        for indices in torch.arange(len(self)).split(step):
+            found[indices[0] : indices[-1] + 1] = self.rows(indices).to(device)
+        return found
+
+    def _read(self, rows: np.ndarray, first: int) -> None:
+        """Fill rows (n, bytes) with the frames from `first` on."""
+        left, offset = rows.reshape(-1).data, first * self._size
+        while left:
+            try:
+                count = os.preadv(self._file, [left], offset)
+            except OSError as error:
+                raise DataError(f"{self._path}: the frames cannot be read ({error})") from error
+            if not count:
+                raise DataError(
+                    f"{self._path} ends before frame {offset // self._size} of {len(self)}: another process "
+                    "changed it. Run the same command again: the frames are written again"
+                )
+            left, offset = left[count:], offset + count
+
+
+def _runs(frames: Tensor) -> Iterator[tuple[int, int, int]]:
+    """Yield the parts of a list of indices that count up by one: place in the list, first index, length."""
+    numbers = frames.numpy()
+    ends = np.flatnonzero(np.diff(numbers) != 1) + 1
+    starts = np.concatenate([[0], ends]) if len(numbers) else ends
+    for start, end in zip(starts.tolist(), [*ends.tolist(), len(numbers)], strict=False):
+        yield start, int(numbers[start]), end - start
 
 
 def cache_root() -> Path:
@@ -84,22 +153,35 @@ def cache_root() -> Path:
     return cache_dir() / "frames"
 
 
-def _ensure_folder(source: DemoSource) -> tuple[Path, tuple[int, ...]]:
-    """Return the folder of a source and the shape of its images, after building it if there is none that is intact."""
-    fingerprint = _fingerprint(source.path)
-    made_from = {"source": str(source.path.resolve()), "file": fingerprint, "read": _array_settings(source)}
+def ensure_frames(source: DemoSource) -> tuple[Path, tuple[int, ...]]:
+    """Return the folder of a source and the shape of its images, after building it if there is none that is intact.
+
+    Raises:
+        DemoError: The file is broken.
+        DataError: The file does not fit the spec, or the folder cannot be written.
+    """
+    spec = asdict(source.spec)  # but `seq_len`, since windows are made from the arrays later
+    read = {key: spec[key] for key in ("views", "image_size", "proprio", "action_dim")}
+    read |= {"format": _FORMAT, **{key: getattr(source, key) for key in ("limit", "pairing", "labels")}}
+    made_from = {"source": str(source.path.resolve()), "file": _fingerprint(source.path), "read": read}
     digest = hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()[:24]
-    root = cache_root()
-    folder = root / f"{source.path.stem}-{digest}"
-    check_trusted(root)
-    if (shape := _intact_shape(folder)) is None:
-        with _building(folder, source):
-            if (
-                shape := _intact_shape(folder, silent=True)
-            ) is None:  # no other process has built it meanwhile
+    folder = cache_root() / f"{source.path.stem}-{digest}"
+    check_trusted(folder.parent)
+    if (shape := _intact_shape(folder)) is not None:
+        return folder, shape
+    try:
+        make_cache_folder(folder.parent)
+        with _building(folder):
+            shape = _intact_shape(folder, silent=True)
+            if shape is None:  # no other process has built it meanwhile
                 shutil.rmtree(folder, ignore_errors=True)
                 shape = _build(source, folder, made_from)
-                _remove_stale(root, made_from)
+                _remove_stale(folder.parent, made_from)
+    except OSError as error:
+        raise DataError(
+            f"{folder}: the frames of {source.path} cannot be written ({error}). Free some space, choose another "
+            "folder with LIBERO_CACHE, or set data.memory=host"
+        ) from error
     return folder, shape
 
 
@@ -109,7 +191,7 @@ def _intact_shape(folder: Path, silent: bool = False) -> tuple[int, ...] | None:
         return None
     try:
         index = read_record(folder / "index.json")
-        if index is None:  # also that of an earlier version, which has no checksum
+        if index is None:
             raise ValueError("index.json has no checksum, or another")
         if _images_digest(folder / "images.u8") != index["images"]:
             raise ValueError("images.u8 has another checksum than when it was written")
@@ -122,52 +204,37 @@ def _intact_shape(folder: Path, silent: bool = False) -> tuple[int, ...] | None:
 
 
 @contextmanager
-def _building(folder: Path, source: DemoSource) -> Iterator[None]:
+def _building(folder: Path) -> Iterator[None]:
     """Let one process at a time build a folder; the lock of a process that is killed is free."""
     lock = FileLock(folder.with_name(f".{folder.name}.lock"))
     try:
-        make_cache_folder(folder.parent)
-        try:
-            lock.acquire(timeout=_PATIENCE)
-        except Timeout:
-            _log.warning("waiting for another process, which writes %s", folder)
-            lock.acquire(timeout=_LONGEST_BUILD)
+        lock.acquire(timeout=_PATIENCE)
     except Timeout:
-        raise DataError(
-            f"{folder}: another process has written it for {_LONGEST_BUILD / 3600:.0f} hours; end that process"
-        ) from None
-    except OSError as error:
-        raise _cannot_be_written(folder, source, error) from error
+        _log.warning("waiting for another process, which writes %s", folder)
+        try:
+            lock.acquire(timeout=_LONGEST_BUILD)
+        except Timeout:
+            hours = _LONGEST_BUILD / 3600
+            raise DataError(
+                f"{folder}: another process has written it for {hours:.0f} hours; end that process"
+            ) from None
     try:
         yield
     finally:
         lock.release()
 
 
-def _cannot_be_written(folder: Path, source: DemoSource, error: OSError) -> DataError:
-    return DataError(
-        f"{folder}: the frames of {source.path} cannot be written ({error}). Free some space, choose another "
-        "folder with LIBERO_CACHE, or set data.memory=host"
-    )
-
-
 def _build(source: DemoSource, folder: Path, made_from: dict[str, Any]) -> tuple[int, ...]:
     """Write the folder of a source in one step; return the shape of the images."""
-    needed = source.nbytes()
-    try:
-        free = shutil.disk_usage(folder.parent).free
-        if needed > free:
-            raise OSError(f"{needed / 2**30:.1f} GiB are needed and {free / 2**30:.1f} GiB are free")
-        with atomic_folder(folder) as part:
-            part.chmod(0o755 & part.stat().st_mode)
-            shape = _write_arrays(source, part)
-            digest = _images_digest(part / "images.u8")
-            write_record(
-                part / "index.json", {"format": _FORMAT, "shape": shape, "images": digest, **made_from}
-            )
-        return shape
-    except OSError as error:
-        raise _cannot_be_written(folder, source, error) from error
+    needed, free = source.nbytes(), shutil.disk_usage(folder.parent).free
+    if needed > free:
+        raise OSError(f"{needed / 2**30:.1f} GiB are needed and {free / 2**30:.1f} GiB are free")
+    with atomic_folder(folder) as part:
+        part.chmod(0o755 & part.stat().st_mode)
+        shape = _write_arrays(source, part)
+        digest = _images_digest(part / "images.u8")
+        write_record(part / "index.json", {"format": _FORMAT, "shape": shape, "images": digest, **made_from})
+    return shape
 
 
 def _write_arrays(source: DemoSource, folder: Path) -> tuple[int, ...]:
@@ -191,8 +258,8 @@ def _remove_stale(root: Path, made_from: dict[str, Any]) -> None:
     """Remove folders that were made from the same file before it changed; processes that have them open keep them."""
     for index in root.glob("*/index.json"):
         with suppress(OSError, ValueError, KeyError, TypeError):  # a broken one is left to whoever needs it
-            found = json.loads(index.read_text(encoding="utf-8"))
-            if found["source"] == made_from["source"] and found["file"] != made_from["file"]:
+            other = json.loads(index.read_text(encoding="utf-8"))
+            if other["source"] == made_from["source"] and other["file"] != made_from["file"]:
                 shutil.rmtree(index.parent, ignore_errors=True)
 
 
@@ -203,11 +270,8 @@ def _images_digest(path: Path) -> str:
     blocks = min(_BLOCKS, math.ceil(size / _BLOCK_BYTES))
     with open(path, "rb") as file:
         for k in range(blocks):
-            file.seek(
-                (size - _BLOCK_BYTES) * k // (blocks - 1)
-                if size > _BLOCKS * _BLOCK_BYTES
-                else k * _BLOCK_BYTES
-            )
+            spread = size > _BLOCKS * _BLOCK_BYTES
+            file.seek((size - _BLOCK_BYTES) * k // (blocks - 1) if spread else k * _BLOCK_BYTES)
             digest.update(file.read(_BLOCK_BYTES))
     return digest.hexdigest()
 
@@ -223,15 +287,3 @@ def _fingerprint(path: Path) -> str:
                 file.seek(max(0, stat.st_size - _SAMPLE_BYTES) * k // (_SAMPLES - 1))
                 digest.update(file.read(_SAMPLE_BYTES))
     return digest.hexdigest()
-
-
-def _array_settings(source: DemoSource) -> dict[str, Any]:
-    """Return the settings that determine the arrays; `seq_len` does not, since windows are made from them later."""
-    spec = asdict(source.spec)
-    read = {key: spec[key] for key in ("views", "image_size", "proprio", "action_dim")}
-    return read | {
-        "format": _FORMAT,
-        "limit": source.limit,
-        "pairing": source.pairing,
-        "labels": source.labels,
-    }

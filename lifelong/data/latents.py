@@ -102,10 +102,10 @@ class LatentMemory(TaskMemory[LatentWindows]):
             DataError: The task is in the memory already.
         """
         self._require_new(task)
-        self._tasks[task] = LatentWindows.of(latents.cpu(), actions.cpu())
+        self.tasks[task] = LatentWindows.of(latents.cpu(), actions.cpu())
         for known, share in even_shares(self.shares, self.budget).items():
-            if share < len(self._tasks[known]):
-                self._tasks[known] = self._tasks[known].first(share)
+            if share < len(self.tasks[known]):
+                self.tasks[known] = self.tasks[known].first(share)
 
     def sample(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return windows drawn uniformly over all that are held, on the CPU, those of one task after those of another.
@@ -122,7 +122,7 @@ class LatentMemory(TaskMemory[LatentWindows]):
         """
         drawn, start = self._draw(n, generator), 0
         latents, actions = [], []
-        for windows in self._tasks.values():
+        for windows in self.tasks.values():
             rows = drawn[(drawn >= start) & (drawn < start + len(windows))] - start
             start += len(windows)
             latents.append(windows.values(rows))
@@ -131,7 +131,7 @@ class LatentMemory(TaskMemory[LatentWindows]):
 
     def state_dict(self) -> dict[str, Any]:
         """Return the budget and all latents, by task id."""
-        return {"budget": self.budget, "tasks": {task: w.state_dict() for task, w in self._tasks.items()}}
+        return {"budget": self.budget, "tasks": {task: w.state_dict() for task, w in self.tasks.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned.
@@ -145,4 +145,4 @@ class LatentMemory(TaskMemory[LatentWindows]):
         }
         for windows in tasks.values():
             windows.check()
-        self.budget, self._tasks = int(state["budget"]), tasks
+        self.budget, self.tasks = int(state["budget"]), tasks

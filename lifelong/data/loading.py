@@ -1,10 +1,10 @@
-"""A task's windows, read by the chosen backend and held in the chosen kind of memory.
+"""A task's windows, held in the chosen kind of memory.
 
     device   all frames in GPU memory; nothing is copied while training
     pinned   in host memory; batches are gathered in page-locked memory and copied while the GPU computes
     host     in host memory; batches are copied when they are requested
     disk     on disk, see `lifelong.data.frame_cache`; a batch is read when it is requested, or ahead, and copied as
-             for `pinned`. `mmap` is an earlier name of it
+             for `pinned`
     auto     `device` if the frames fit into GPU memory, else `pinned`; without a GPU `host`; `disk` if they do not
              fit into host memory
 
@@ -16,15 +16,14 @@ import torch
 from torch import Tensor
 
 from libero_env.memory import host_memory
+from libero_env.storage import read_npz
 from libero_env.text import show_bytes
-from lifelong.data import frame_cache
 from lifelong.data.dataset import SequenceVLDataset
-from lifelong.data.robomimic_backend import RobomimicWindows
-from lifelong.data.source import DemoSource
+from lifelong.data.frame_cache import FrameFile, ensure_frames
+from lifelong.data.source import DemoSource, check_language
 from lifelong.errors import DataError
 
-MEMORY = ("auto", "host", "pinned", "device", "disk", "mmap")
-BACKENDS = ("native", "robomimic")
+MEMORY = ("auto", "host", "pinned", "device", "disk")
 
 _GPU_RESERVE = 0.4  # [share of GPU memory] kept free for training
 _HOST_RESERVE = 0.25  # [share of host memory] kept free for everything else
@@ -38,8 +37,7 @@ def open_windows(
     task_id: int = 0,
     device: torch.device | str = "cpu",
     memory: str = "auto",
-    backend: str = "native",
-) -> SequenceVLDataset | RobomimicWindows:
+) -> SequenceVLDataset:
     """Return the windows of a demonstration file.
 
     Args:
@@ -48,20 +46,14 @@ def open_windows(
         task_id: Position in the task sequence.
         device: Device of the batches.
         memory: One of `MEMORY`.
-        backend: `native`, or `robomimic` to read each window through robomimic's SequenceDataset, which is slow and
-            shows that the data are the same.
 
     Raises:
         DemoError: The file is broken.
-        DataError: The file does not fit the spec or the memory, or the memory or backend is unknown or not available.
+        DataError: The file does not fit the spec or the memory, or the memory is unknown or not available.
     """
     device = torch.device(device)
-    for key, value, valid in (("memory", memory, MEMORY), ("backend", backend, BACKENDS)):
-        if value not in valid:
-            raise DataError(f"data.{key} is {value!r}; valid: {', '.join(valid)}")
-    if backend == "robomimic":
-        return RobomimicWindows(source, language=language, task_id=task_id, device=device)
-    memory = "disk" if memory == "mmap" else memory
+    if memory not in MEMORY:
+        raise DataError(f"data.memory is {memory!r}; valid: {', '.join(MEMORY)}")
     if memory == "auto":
         memory = choose_memory(source.nbytes(), device)
     elif memory != "disk":
@@ -69,13 +61,23 @@ def open_windows(
     if memory == "pinned" and device.type != "cuda":
         raise DataError(f"data.memory=pinned needs a GPU, and device={device}; valid: auto, host, disk")
     if memory == "disk":
-        dataset = frame_cache.open_on_disk(source, language=language, task_id=task_id)
+        dataset = _open_on_disk(source, language, task_id)
     else:
         dataset = SequenceVLDataset.from_source(source, language=language, task_id=task_id)
     if memory == "device":
         return dataset.to(device)
     pin = device.type == "cuda" and memory in ("pinned", "disk")
     return dataset.with_batches_on(device, pin_memory=pin) if device.type != "cpu" else dataset
+
+
+def _open_on_disk(source: DemoSource, language: Tensor, task_id: int) -> SequenceVLDataset:
+    language, (folder, shape) = check_language(language, source.spec), ensure_frames(source)
+    arrays = {name: torch.from_numpy(array) for name, array in read_npz(folder / "arrays.npz").items()}
+    proprio = {name: arrays[f"proprio/{name}"] for name in source.spec.proprio}
+    frames = FrameFile(folder / "images.u8", shape)
+    return SequenceVLDataset(
+        frames, proprio, arrays["actions"], arrays["last"], language, task_id, source.spec.seq_len
+    )
 
 
 def _check_fits(source: DemoSource, memory: str, device: torch.device) -> None:

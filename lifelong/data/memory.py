@@ -39,21 +39,21 @@ class TaskMemory(Generic[Kept]):
 
     def __init__(self, budget: Count) -> None:
         self.budget = budget
-        self._tasks: dict[int, Kept] = {}  # task id -> its windows
+        self.tasks: dict[int, Kept] = {}  # task id -> its windows
 
     def __len__(self) -> int:
         """Return the number of windows in the memory."""
-        return sum(map(len, self._tasks.values()))
+        return sum(map(len, self.tasks.values()))
 
     @property
     def shares(self) -> dict[int, int]:
         """Number of windows of each task, by task id."""
-        return {task: len(windows) for task, windows in self._tasks.items()}
+        return {task: len(windows) for task, windows in self.tasks.items()}
 
     def _require_new(self, task: int) -> None:
         """Raise DataError where the task is in the memory already."""
-        if task in self._tasks:
-            raise DataError(f"task {task} is in the memory already; it holds {sorted(self._tasks)}")
+        if task in self.tasks:
+            raise DataError(f"task {task} is in the memory already; it holds {sorted(self.tasks)}")
 
     def _draw(self, n: int, generator: torch.Generator) -> Tensor:
         """Draw positions of windows, (n,) int64, uniformly over all that are held; beyond their number they repeat.
@@ -77,14 +77,9 @@ class ReplayMemory(TaskMemory[Tensor]):
 
     Args:
         budget: Largest number of windows over all tasks.
-
-    Raises:
-        DataError: The budget is below one.
     """
 
     def __init__(self, budget: Count) -> None:
-        if budget < 1:
-            raise DataError(f"the memory's budget is {budget} windows; it must be at least 1")
         super().__init__(budget)  # a task's windows are indices (n,) into its dataset
         self._datasets: dict[int, TaskWindows] = {}
 
@@ -101,13 +96,13 @@ class ReplayMemory(TaskMemory[Tensor]):
         task = dataset.task_id
         self._require_new(task)
         self._datasets[task] = dataset
-        self._tasks[task] = torch.randperm(len(dataset), generator=generator)[: self.budget]
+        self.tasks[task] = torch.randperm(len(dataset), generator=generator)[: self.budget]
         self._shrink()
 
     def _shrink(self) -> None:
         """Reduce every task to its share; what small tasks do not need is given to the others."""
         for task, share in even_shares(self.shares, self.budget).items():
-            self._tasks[task] = self._tasks[task][:share].clone()
+            self.tasks[task] = self.tasks[task][:share].clone()
 
     def sample(self, n: int, generator: torch.Generator) -> Batch:
         """Return windows drawn uniformly over all that are held, those of one task after those of another.
@@ -123,16 +118,16 @@ class ReplayMemory(TaskMemory[Tensor]):
 
     def _windows(self, chosen: Tensor) -> Batch:
         """Return windows by their positions (B,) in the memory."""
-        kept = [WindowSubset(self._datasets[task], indices) for task, indices in self._tasks.items()]
+        kept = [WindowSubset(self._datasets[task], indices) for task, indices in self.tasks.items()]
         return JoinedWindows(kept).batch(chosen)
 
     def count_frames(self) -> int:
         """Count the frames of the windows, one that several windows cover once."""
-        return sum(count_frames(self._datasets[task], indices) for task, indices in self._tasks.items())
+        return sum(count_frames(self._datasets[task], indices) for task, indices in self.tasks.items())
 
     def state_dict(self) -> dict[str, Any]:
         """Return the budget and the indices by task id; frames are read again from the demonstrations."""
-        return {"budget": self.budget, "indices": {str(task): i.clone() for task, i in self._tasks.items()}}
+        return {"budget": self.budget, "indices": {str(task): i.clone() for task, i in self.tasks.items()}}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -160,7 +155,7 @@ class ReplayMemory(TaskMemory[Tensor]):
                     f"the memory holds window {int(kept.max())} of task {task}, whose dataset has "
                     f"{len(held[task])}: its demonstrations are not those of the interrupted run"
                 )
-        self.budget, self._tasks, self._datasets = int(state["budget"]), indices, held
+        self.budget, self.tasks, self._datasets = int(state["budget"]), indices, held
 
 
 class FirstWindows(ReplayMemory):
@@ -202,7 +197,7 @@ class FirstWindows(ReplayMemory):
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
         """Add a task; see `ReplayMemory.add`. The shares of the other tasks stay as they are."""
         super().add(dataset, generator)
-        self._tasks[dataset.task_id] = torch.arange(min(self.per_task, len(dataset)))
+        self.tasks[dataset.task_id] = torch.arange(min(self.per_task, len(dataset)))
 
     def _shrink(self) -> None:
-        self.budget = self.per_task * len(self._tasks)
+        self.budget = self.per_task * len(self.tasks)

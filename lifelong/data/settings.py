@@ -1,16 +1,17 @@
 """Settings of the demonstrations that a policy learns from."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
+from libero_env.demos.config import rendered_perturbations
 from libero_env.demos.contents import LOW_DIM_KEYS
-from libero_env.perturbations import Perturbation
+from libero_env.errors import LiberoError
+from libero_env.perturbations import Perturbation, parse_perturbations
 from libero_env.validation import OneOf, checked
-from lifelong.data.loading import BACKENDS, MEMORY
-from lifelong.data.perturbations import PerturbSetting, read_perturbations
+from lifelong.data.loading import MEMORY
 from lifelong.errors import ConfigError
 from lifelong.types import Natural, PathText, PolicySpec, Width
 
@@ -18,6 +19,9 @@ CAMERAS = {
     "agentview_rgb": "agentview",
     "eye_in_hand_rgb": "robot0_eye_in_hand",
 }  # view -> camera in the model
+# A text such as `light=1,camera=0.3`, or kinds with severities: on a command line `stream.perturb={light:1}` needs no
+# quotes within quotes, which a text with = does.
+PerturbSetting = str | Mapping[str, float | int]
 
 
 @checked
@@ -35,7 +39,6 @@ class DataSettings:
         robot: Model of the arm in demonstrations and evaluation, see `libero_env.assets.robot`.
         folder: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
         memory: Where frames are held, see `lifelong.data.loading`; batches do not depend on it.
-        backend: What reads the windows, see `lifelong.data.loading`; batches do not depend on it.
         drawing: How images are drawn, in the demonstrations and in evaluations of the policy: `fast`, `faithful`, or
             None for the default of the models. The saved configuration of a run has the one that was used.
         perturb: Perturbations of further copies of the demonstrations, as for `stream.perturb`, from which windows are,
@@ -54,7 +57,6 @@ class DataSettings:
     robot: Annotated[str, OneOf(ROBOTS)] = DEFAULT_ROBOT
     folder: PathText | None = None
     memory: Annotated[str, OneOf(MEMORY)] = "auto"
-    backend: Annotated[str, OneOf(BACKENDS)] = "native"
     drawing: Literal["fast", "faithful"] | None = None
     perturb: PerturbSetting | None = None
     perturb_copies: Annotated[int, Field(ge=0, le=1000)] = 1
@@ -96,3 +98,25 @@ class DataSettings:
             language_dim=language_dim,
             seq_len=self.seq_len,
         )
+
+
+def read_perturbations(
+    value: PerturbSetting | None, key: str, *, seed: int = 0, rendered: bool = False
+) -> tuple[Perturbation, ...]:
+    """Return the perturbations of a setting, in the order in which they are applied, without those of severity 0.
+
+    Args:
+        value: The setting; None for no perturbations.
+        key: Its name, for error messages.
+        seed: Seed of those that name none.
+        rendered: Whether recorded demonstrations are to be rendered under them.
+
+    Raises:
+        ConfigError: A kind does not exist, a severity is out of range, or a kind cannot be rendered.
+    """
+    text = value if isinstance(value, str) else ",".join(f"{k}={v}" for k, v in (value or {}).items())
+    try:
+        found = tuple(one for one in parse_perturbations(text, seed) if one.severity)
+        return rendered_perturbations(found) if rendered else found
+    except LiberoError as error:
+        raise ConfigError(f"{key} is {text!r}: {error}") from error

@@ -5,6 +5,7 @@ Shape legend: F frames, V views, H W C image, D size of a reading, A action, L l
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -36,8 +37,9 @@ class DemoSource:
     pairing: Literal["aligned", "stored"] = "aligned"
     labels: Literal["expert", "executed"] = "expert"
 
+    @cached_property
     def lengths(self) -> list[int]:
-        """Return the number of frames of each demonstration; only shapes are read.
+        """Number of frames of each demonstration; only shapes are read, once.
 
         Raises:
             DemoError: The file is broken.
@@ -51,7 +53,7 @@ class DemoSource:
     def nbytes(self) -> int:
         """Return the number of bytes of the images in memory."""
         height, width = self.spec.image_size
-        return sum(self.lengths()) * len(self.spec.views) * height * width * 3
+        return sum(self.lengths) * len(self.spec.views) * height * width * 3
 
     def demos(self) -> Iterator[Episode]:
         """Yield the demonstrations, with one in memory at a time.
@@ -73,7 +75,9 @@ def demo_tensors(demo: Episode, spec: PolicySpec) -> tuple[Tensor, dict[str, Ten
         Images, (F, V, H, W, C) uint8, upright; readings, name to (F, D) float32; actions, (F, A) float32.
     """
     images = torch.from_numpy(np.stack([demo.obs[view] for view in spec.views], axis=1))
-    return images, {name: _floats(demo.obs[name]) for name in spec.proprio}, _floats(demo.actions)
+    floats = {name: demo.obs[name] for name in spec.proprio} | {"": demo.actions}
+    tensors = {name: torch.from_numpy(np.asarray(x, dtype=np.float32)) for name, x in floats.items()}
+    return images, tensors, tensors.pop("")
 
 
 def last_frames(lengths: list[int]) -> Tensor:
@@ -121,17 +125,3 @@ def check_language(language: Tensor, spec: PolicySpec) -> Tensor:
             f"({spec.language_dim},). Choose the language encoder that the spec was made for"
         )
     return language
-
-
-def check_indices(indices: Tensor, windows: int) -> None:
-    """Check the indices of windows.
-
-    Raises:
-        DataError: One of them is not in [0, windows).
-    """
-    if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < windows):
-        raise DataError(f"window indices must lie in [0, {windows}), got {indices.min()} .. {indices.max()}")
-
-
-def _floats(array: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.asarray(array, dtype=np.float32))

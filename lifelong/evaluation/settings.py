@@ -8,7 +8,7 @@ from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.perturbations import Perturbation
 from libero_env.sim.backend import MUJOCO, Backend
 from libero_env.validation import checked
-from lifelong.data.perturbations import PerturbSetting, read_perturbations
+from lifelong.data.settings import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
 from lifelong.results.records import MatrixCells, measured_tasks
 from lifelong.stats.metrics import Transfer

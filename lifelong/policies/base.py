@@ -161,6 +161,11 @@ def device_of(policy: nn.Module) -> torch.device:
     return next(policy.parameters()).device
 
 
+def copy_weights(policy: nn.Module) -> dict[str, Tensor]:
+    """Return a copy of all parameters and buffers by name."""
+    return {name: tensor.detach().clone() for name, tensor in policy.state_dict().items()}
+
+
 @contextmanager
 def in_mode(policy: nn.Module, *, training: bool) -> Iterator[None]:
     """Put a policy in training or in evaluation mode within the context; its own mode is restored.

@@ -66,9 +66,9 @@ class BCTransformer(HistoryPolicy):
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""
         images, language = observation.images, self.instruction(observation)
-        seen = encode_views(self.encoders, images, language)
         first = self.language(language)[:, None].expand(*images.shape[:2], -1)
-        return torch.stack([first, *self.proprio(observation.proprio), *seen], dim=2)
+        tokens = [first, *self.proprio(observation.proprio), *encode_views(self.encoders, images, language)]
+        return torch.stack(tokens, dim=2)
 
     def modalities(self, features: Tensor) -> dict[str, Tensor]:
         """Return the tokens of the instruction, the readings and each camera, each (B, T, n, E)."""

@@ -190,7 +190,6 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
         "path",
         "benchmark.order",
         "data.memory",
-        "data.backend",
         "eval.reuse",
         "eval.transfer",
         "eval.shift",

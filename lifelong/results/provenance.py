@@ -37,7 +37,6 @@ VOLATILE = (
     "threads",
     "wandb",
     "data.memory",
-    "data.backend",
     "eval.transfer",  # how records are read, not what they hold
     "eval.shift",  # evaluations besides all others
 )

@@ -9,7 +9,6 @@ from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, PackNet, Sequential
 from lifelong.algorithms.importance import BatchFisher, SampleFisher
 from lifelong.data.memory import ReplayMemory
-from lifelong.errors import ConfigError
 from lifelong.seeding import generator
 from tests.harness.algorithms import by_hand, learn, outputs
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
@@ -76,11 +75,6 @@ def test_ewc_old_importance_decays_by_gamma():
     algorithm.end_task(1, data, policy, generator(0))
     expected = 1.5 * by_hand(policy, data).square().mean(0)
     torch.testing.assert_close(algorithm.state_dict()["importance"]["linear.weight"], expected)
-
-
-def test_an_estimate_without_windows_is_refused():
-    with pytest.raises(ConfigError, match="valid: 0 .all. or more, at least 1"):
-        BatchFisher(batch_size=0)
 
 
 # --- PackNet

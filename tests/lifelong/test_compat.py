@@ -71,7 +71,7 @@ def test_agem_augments_its_reference_as_the_original_only(compat):
     algorithm.set_augmentation(mirrored)
     algorithm.end_task(0, Windows(0), LinearPolicy(), generator(0))
     algorithm.mix(Windows(1).batch(torch.arange(20)), generator(0))
-    reference, stored = algorithm._reference, Windows(0)
+    reference, stored = algorithm.reference, Windows(0)
     sign = -1 if compat == "libero" else 1
     assert torch.equal(reference.actions[:, 0], sign * stored.targets[reference.window_ids])
 

@@ -12,8 +12,7 @@ from lifelong import checkpoints
 from lifelong.algorithms import ER, CompressedER
 from lifelong.algorithms.base import load_algorithm
 from lifelong.data import SequenceVLDataset
-from lifelong.data.compressed_memory import CompressedMemory
-from lifelong.data.compressed_windows import compress
+from lifelong.data.compressed import CompressedMemory, compress
 from lifelong.data.memory import ReplayMemory
 from lifelong.errors import CheckpointError, DataError
 from lifelong.seeding import generator
@@ -84,7 +83,7 @@ def original(batch, steps: int = 1):
 def test_the_bytes_never_exceed_the_budget_and_are_shared_evenly(tasks, steps):
     memory = filled(tasks, steps=steps)
     assert memory.nbytes() <= BUDGET
-    sizes = [windows.nbytes() for windows in memory._tasks.values()]
+    sizes = [windows.nbytes() for windows in memory.tasks.values()]
     assert max(sizes) <= BUDGET // tasks
     next_window = 700 if steps == 1 else 2600  # bytes that it takes at most
     assert len(memory) == 60 or min(sizes) > BUDGET // tasks - next_window
@@ -130,15 +129,15 @@ def test_pictures_are_a_fraction_of_the_frames():
 
 
 def test_neighbouring_windows_share_their_frames():
-    windows = filled(2, budget=100_000, steps=5)._tasks[0]
+    windows = filled(2, budget=100_000, steps=5).tasks[0]
     assert len(windows) == 60 and len(windows.ends) == 60
-    short = filled(6, budget=20_000, steps=5)._tasks[0]
+    short = filled(6, budget=20_000, steps=5).tasks[0]
     assert 4 < len(short) < 60
     assert len(short.ends) < 2.5 * len(short)  # of five steps
 
 
 def test_a_smaller_share_is_a_prefix_of_the_larger_one():
-    many, few = filled(2)._tasks[0], filled(6)._tasks[0]
+    many, few = filled(2).tasks[0], filled(6).tasks[0]
     assert 0 < len(few) < len(many)
     assert torch.equal(few.window_ids, many.window_ids[: len(few)])
     assert torch.equal(few.codes, many.codes[: len(few.codes)])
@@ -149,7 +148,7 @@ def test_every_window_is_as_likely_to_be_kept():
     for seed in range(60):
         memory = CompressedMemory(4_000)
         memory.add(scene(0), generator(seed))
-        counts[memory._tasks[0].window_ids.long()] += 1
+        counts[memory.tasks[0].window_ids.long()] += 1
     share = float(counts.sum() / 60 / 60)
     spread = (60 * share * (1 - share)) ** 0.5
     assert 0.02 < share < 0.5
@@ -159,7 +158,7 @@ def test_every_window_is_as_likely_to_be_kept():
 def test_draws_are_uniform_over_what_is_held_and_depend_on_the_generator_alone():
     memory = filled(3)
     drawn = memory.sample(len(memory), generator(3))
-    held = {(task, int(i)) for task, windows in memory._tasks.items() for i in windows.window_ids}
+    held = {(task, int(i)) for task, windows in memory.tasks.items() for i in windows.window_ids}
     assert {(int(t), int(i)) for t, i in zip(drawn.task_ids, drawn.window_ids, strict=True)} == held
     again = filled(3).sample(len(memory), generator(3))
     sequences.assert_same(vars(again.observation), vars(drawn.observation))
@@ -173,14 +172,14 @@ def test_instructions_of_tasks_that_are_learned_together_stay_apart():
     batch = memory.sample(120, generator(1))
     expected = joined.batch(batch.window_ids).observation.language
     assert torch.equal(batch.observation.language, expected)
-    assert len(memory._tasks[1].languages) == 2
+    assert len(memory.tasks[1].languages) == 2
 
 
 def test_what_small_tasks_do_not_need_is_given_to_the_others():
     memory = CompressedMemory(12_000)
     memory.add(scene(0, frames=3), generator(0))
     memory.add(scene(1), generator(1))
-    assert memory.shares[0] == 3 and memory._tasks[1].nbytes() > 9_000
+    assert memory.shares[0] == 3 and memory.tasks[1].nbytes() > 9_000
 
 
 def test_a_share_without_a_window_is_refused_and_says_what_to_change():
@@ -252,7 +251,7 @@ def test_a_state_whose_parts_do_not_fit_is_refused(change, tmp_path):
 
 
 def test_a_picture_of_another_kind_or_size_is_refused():
-    windows = filled(1)._tasks[0]
+    windows = filled(1).tasks[0]
     size = windows.ends[0].item()
     for file_format, shape in (("PNG", (64, 32)), ("WEBP", (16, 16))):
         file = io.BytesIO()

@@ -101,7 +101,7 @@ def test_count_flops_changes_neither_policy_nor_algorithm():
     step_costs(policy, algorithm, windows, 8)
     action_costs(policy)
     assert policy.training and all(p.grad is None for p in policy.parameters())
-    assert algorithm._reference is None
+    assert algorithm.reference is None
     assert torch.equal(torch.random.get_rng_state(), state)
     assert all(torch.equal(v, before[k]) for k, v in policy.state_dict().items())
 

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from libero_env.errors import DemoError
 from lifelong.data import DemoSource, SequenceVLDataset, dataset, loading, open_windows
 from lifelong.errors import DataError
-from lifelong.types import PolicySpec
+from lifelong.types import Batch, PolicySpec
 from tests.harness.fuzz import examples
+from tests.harness.robomimic_windows import read_with_robomimic
 
 pytestmark = pytest.mark.unit
 SPEC = PolicySpec(
@@ -46,7 +47,10 @@ def write_file(path: Path, lengths=(4, 3), pairing: object = "libero", labels: b
 
 def everything(source: DemoSource, **how: str) -> list[torch.Tensor]:
     windows = open_windows(source, language=LANGUAGE, **how)
-    batch = windows.batch(torch.arange(len(windows)))
+    return arrays(windows.batch(torch.arange(len(windows))))
+
+
+def arrays(batch: Batch) -> list[torch.Tensor]:
     readings = batch.observation.proprio["ee_pos"]
     return [batch.observation.images, readings, batch.actions, batch.window_ids, batch.padding()]
 
@@ -67,13 +71,14 @@ def test_windows_do_not_depend_on_how_they_are_read_and_held(
     shifted = pairing == "aligned" and stated in (None, "libero", b"libero")
     frames = sum(n - shifted for n in lengths[:limit])
     source = DemoSource(path, SPEC, limit, pairing)
-    ways = [{"memory": memory} for memory in ("host", "disk", "device", "auto")] + [{"backend": "robomimic"}]
+    ways = [{"memory": memory} for memory in ("host", "disk", "device", "auto")]
     if not frames:
         for how in ways:
             with pytest.raises(DataError, match="demonstration"):
                 everything(source, **how)
         return
     first, *others = (everything(source, **how) for how in ways)
+    others.append(arrays(read_with_robomimic(source, LANGUAGE)))
     assert len(first[0]) == frames
     for other in others:
         assert all(torch.equal(a, b) for a, b in zip(first, other, strict=True))
@@ -86,7 +91,7 @@ def test_windows_do_not_depend_on_how_they_are_read_and_held(
 
 
 @pytest.mark.parametrize("stated", ["bogus", b"bogus", 1])
-@pytest.mark.parametrize("how", [{"memory": "host"}, {"memory": "disk"}, {"backend": "robomimic"}])
+@pytest.mark.parametrize("how", [{"memory": "host"}, {"memory": "disk"}])
 def test_an_unknown_pairing_gives_no_windows(tmp_path, stated, how):
     path = write_file(tmp_path / "x_demo.hdf5", pairing=stated)
     with pytest.raises(DemoError, match=r"x_demo\.hdf5.*pairing"):
@@ -94,7 +99,7 @@ def test_an_unknown_pairing_gives_no_windows(tmp_path, stated, how):
 
 
 @pytest.mark.parametrize("key", ["actions", "obs/ee_pos"])
-@pytest.mark.parametrize("how", [{"memory": "host"}, {"memory": "disk"}, {"backend": "robomimic"}])
+@pytest.mark.parametrize("how", [{"memory": "host"}, {"memory": "disk"}])
 def test_values_that_are_not_finite_name_the_file_instead_of_the_learning_rate(tmp_path, key, how):
     path = write_file(tmp_path / "x_demo.hdf5")
     with h5py.File(path, "a") as file:
@@ -106,7 +111,7 @@ def test_values_that_are_not_finite_name_the_file_instead_of_the_learning_rate(t
 def test_rows_that_were_never_filled_are_refused(tmp_path, monkeypatch):
     source = DemoSource(write_file(tmp_path / "x_demo.hdf5"), SPEC, pairing="stored")
     for wrong in ([4, 4], [4, 2], [4], [4, 3, 1]):
-        monkeypatch.setattr(DemoSource, "lengths", lambda self, wrong=wrong: wrong)
+        monkeypatch.setattr(DemoSource, "lengths", wrong)
         with pytest.raises(DataError, match="changed meanwhile"):
             SequenceVLDataset.from_source(source, language=LANGUAGE)
 
@@ -119,23 +124,3 @@ def test_frames_that_do_not_fit_into_memory_are_refused_before_they_are_read(tmp
         DataError, match=r"needs 360 B of host memory and 100 B are free; set data\.memory=disk"
     ):
         open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="host")
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda file: file["data"].create_group("other"), "data/other"),
-        (lambda file: file["data/demo_0"].attrs.__setitem__("num_samples", 9), "num_samples 9"),
-        (lambda file: file["data/demo_0"].attrs.__setitem__("num_samples", "many"), "num_samples many"),
-        (lambda file: file["data/demo_1"].__delitem__("actions"), "demo_1/actions is missing"),
-    ],
-)
-def test_robomimic_gets_only_what_it_reads_right(tmp_path, change, words):
-    pytest.importorskip("robomimic.utils.dataset")
-    path = write_file(tmp_path / "x_demo.hdf5")
-    with h5py.File(path, "a") as file:
-        change(file)
-    source = DemoSource(path, SPEC, limit=1)
-    assert len(open_windows(source, language=LANGUAGE)) == 3
-    with pytest.raises((DataError, DemoError), match=words):
-        open_windows(source, language=LANGUAGE, backend="robomimic")

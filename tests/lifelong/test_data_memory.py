@@ -1,4 +1,4 @@
-"""Wherever frames are held and whatever reads them, batches are the same to the bit."""
+"""Wherever frames are held, batches are the same to the bit; robomimic reads the same."""
 
 import itertools
 import json
@@ -10,17 +10,18 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from filelock import FileLock
 
 from libero_env.demos.read import Episode, demo_lengths, read_demos
 from libero_env.errors import DemoError
 from lifelong.data import DemoSource, ReplayMemory, SequenceVLDataset, frame_cache, loading, open_windows
-from lifelong.data.frame_cache import cache_root
-from lifelong.data.frame_file import FrameFile
+from lifelong.data.frame_cache import FrameFile, cache_root
 from lifelong.data.loading import choose_memory
 from lifelong.data.windows import JoinedWindows, WindowSubset, batches_in_order
 from lifelong.errors import DataError
 from lifelong.streams import StageWindows
 from lifelong.types import Batch, PolicySpec
+from tests.harness.robomimic_windows import read_with_robomimic
 
 pytestmark = pytest.mark.unit
 SPEC = PolicySpec(image_size=(6, 8), language_dim=4, seq_len=5)
@@ -82,14 +83,14 @@ def everything(dataset) -> Batch:
 
 
 @pytest.mark.parametrize("pairing", ["aligned", "stored"])
-@pytest.mark.parametrize("memory", ["auto", "host", "device", "disk", "mmap"])
+@pytest.mark.parametrize("memory", ["auto", "host", "device", "disk"])
 def test_batches_are_the_same_in_all_memories(path: Path, memory: str, pairing: str) -> None:
     source = DemoSource(path, SPEC, limit=3, pairing=pairing)
     plain = SequenceVLDataset.from_file(
         path, spec=SPEC, language=LANGUAGE, task_id=3, limit=3, pairing=pairing
     )
     held = open_windows(source, language=LANGUAGE, task_id=3, memory=memory)
-    assert len(held) == len(plain) == sum(source.lengths())
+    assert len(held) == len(plain) == sum(source.lengths)
     assert source.nbytes() == plain.images.nbytes
     assert_same(everything(held), everything(plain))
 
@@ -176,7 +177,7 @@ def test_files_of_a_killed_process_are_not_taken_as_complete(
 @pytest.mark.parametrize(
     ("name", "how"),
     [*itertools.product(["images.u8", "arrays.npz", "index.json"], ["truncated", "changed"])]
-    + [("index.json", "of an earlier version"), ("images.u8", "missing")],
+    + [("images.u8", "missing")],
 )
 def test_frames_that_are_broken_are_written_again(path: Path, caplog, name: str, how: str) -> None:
     source = DemoSource(path, SPEC)
@@ -189,9 +190,6 @@ def test_frames_that_are_broken_are_written_again(path: Path, caplog, name: str,
         file.write_bytes(content[:half])
     elif how == "changed":
         file.write_bytes(content[:half] + bytes([content[half] ^ 4]) + content[half + 1 :])
-    elif how == "of an earlier version":
-        index = json.loads(content)
-        file.write_text(json.dumps({key: index[key] for key in ("source", "file", "shape")}))
     assert_same(everything(open_windows(source, language=LANGUAGE, memory="disk")), expected)
     (line,) = [m for m in caplog.messages if "written again" in m]
     assert line.startswith(str(file.parent)) and line.endswith("written again")
@@ -262,17 +260,22 @@ def test_the_next_batch_is_read_ahead_in_every_kind_of_dataset(path: Path, monke
     assert expected == [held.frames(second).flatten().tolist()]
 
 
-def test_large_files_of_frames_are_compared_in_parts(tmp_path: Path) -> None:
-    file = tmp_path / "images.u8"
-    with file.open("wb") as handle:
-        handle.truncate(100 << 20)
-    before = frame_cache._images_digest(file)
-    for at, size in ((0, 1), ((100 << 20) - 1, 1), (30 << 20, 2 << 20)):
+def test_large_files_of_frames_are_compared_in_parts(path: Path, monkeypatch, caplog) -> None:
+    monkeypatch.setattr(frame_cache, "_BLOCK_BYTES", 32)  # so that the frames are more than all blocks
+    source = DemoSource(path, SPEC)
+    expected = everything(open_windows(source, language=LANGUAGE, memory="disk"))
+    (file,) = cache_root().glob("task_demo-*/images.u8")
+    size = file.stat().st_size
+    assert size > 64 * 32
+    for at in (0, size - 1):
         with file.open("rb+") as handle:
             handle.seek(at)
-            handle.write(b"\1" * size)
-        assert frame_cache._images_digest(file) != before
-        before = frame_cache._images_digest(file)
+            byte = handle.read(1)
+            handle.seek(at)
+            handle.write(bytes([byte[0] ^ 1]))
+        assert_same(everything(open_windows(source, language=LANGUAGE, memory="disk")), expected)
+        (file,) = cache_root().glob("task_demo-*/images.u8")
+    assert len(caplog.messages) == 2
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,12 +289,14 @@ def test_a_process_that_writes_for_too_long_is_named(path: Path, monkeypatch, ca
     monkeypatch.setattr(frame_cache, "_PATIENCE", 0.01)
     monkeypatch.setattr(frame_cache, "_LONGEST_BUILD", 0.01)
     source = DemoSource(path, SPEC)
+    open_windows(source, language=LANGUAGE, memory="disk")
+    (folder,) = cache_root().glob("task_demo-*")
+    (folder / "index.json").unlink()
     with (
-        frame_cache._building(folder := cache_root() / "folder", source),
+        FileLock(folder.with_name(f".{folder.name}.lock")),
         pytest.raises(DataError, match="another process has written it"),
-        frame_cache._building(folder, source),
     ):
-        pytest.fail("two processes write the same folder")
+        open_windows(source, language=LANGUAGE, memory="disk")
     assert caplog.messages == [f"waiting for another process, which writes {folder}"]
 
 
@@ -359,12 +364,10 @@ def test_the_memory_of_this_machine_is_measured() -> None:
     assert 0 < free < total
 
 
-def test_unknown_memories_and_backends_name_the_valid_ones(path: Path) -> None:
+def test_memories_that_do_not_exist_name_the_valid_ones(path: Path) -> None:
     source = DemoSource(path, SPEC)
-    with pytest.raises(DataError, match="valid: auto, host, pinned, device, disk, mmap"):
+    with pytest.raises(DataError, match="valid: auto, host, pinned, device, disk"):
         open_windows(source, language=LANGUAGE, memory="tape")
-    with pytest.raises(DataError, match="valid: native, robomimic"):
-        open_windows(source, language=LANGUAGE, backend="lerobot")
     with pytest.raises(DataError, match="valid: auto, host, disk"):
         open_windows(source, language=LANGUAGE, memory="pinned")
 
@@ -385,45 +388,18 @@ def test_lengths_are_those_of_the_demonstrations(path: Path) -> None:
             assert demo_lengths(path, limit, pairing=pairing) == [len(demo) for demo in found]
 
 
-@pytest.fixture
-def robomimic() -> None:
-    pytest.importorskip("robomimic.utils.dataset")
-
-
 @pytest.mark.parametrize("file_pairing", ["libero", "aligned"])
 @pytest.mark.parametrize("pairing", ["aligned", "stored"])
 @pytest.mark.parametrize("labels", ["expert", "executed"])
-def test_robomimic_gives_the_same_windows(robomimic, tmp_path, capfd, file_pairing, pairing, labels) -> None:
+def test_robomimic_reads_the_same_windows(tmp_path, file_pairing, pairing, labels) -> None:
+    pytest.importorskip("robomimic.utils.dataset")
     path = write_file(
         tmp_path / "x_demo.hdf5", lengths=(*LENGTHS, *[3] * 8), pairing=file_pairing, expert=True
     )
     source = DemoSource(path, SPEC, limit=11, pairing=pairing, labels=labels)
     plain = open_windows(source, language=LANGUAGE, task_id=2)
-    theirs = open_windows(source, language=LANGUAGE, task_id=2, backend="robomimic")
-    assert (len(theirs), theirs.demos) == (len(plain), plain.demos)
-    assert_same(everything(theirs), everything(plain))
-    assert capfd.readouterr() == ("", "")
-
-
-def test_robomimic_refuses_what_it_cannot_read(robomimic, path: Path) -> None:
-    read = lambda: open_windows(DemoSource(path, SPEC), language=LANGUAGE, backend="robomimic")  # noqa: E731
-    with pytest.raises(DataError, match="must lie in"):
-        read().batch(torch.tensor([sum(LENGTHS)]))
-    with h5py.File(path, "a") as file:
-        file["data/demo_0/expert_actions"] = file["data/demo_0/actions"][()]
-    with pytest.raises(DataError, match=r"labels=executed"):
-        read()
-    with h5py.File(path, "a") as file:
-        del file["data/demo_0/expert_actions"], file["data/demo_3"].attrs["num_samples"]
-    with pytest.raises(DataError, match=r"num_samples.*backend=native"):
-        read()
-
-
-def test_without_robomimic_the_remedy_is_named(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "robomimic", None)
-    monkeypatch.setitem(__import__("sys").modules, "robomimic.utils", None)
-    with pytest.raises(DataError, match=r"pip install --no-deps robomimic.*backend=native"):
-        open_windows(DemoSource(path, SPEC), language=LANGUAGE, backend="robomimic")
+    theirs = read_with_robomimic(source, LANGUAGE, task_id=2)
+    assert_same(theirs, plain.batch(torch.arange(len(plain))))
 
 
 def test_the_index_states_what_frames_were_made_from(path: Path) -> None:

@@ -121,7 +121,7 @@ def test_the_penalty_is_the_weighted_sum_on_earlier_windows():
     moved(policy.eval(), "")
     mixed = algorithm.mix(batch, generator(0))
     assert mixed.task_ids.tolist() == [1] * 8 + [0] * 4
-    drawn = algorithm._distilled
+    drawn = algorithm.distilled
     assert drawn.task_ids.tolist() == [0] * 4
     found = distances(policy, teacher, drawn.observation)
     expected = 2 * found["image"] + 3 * found["language"] + 5 * found["proprio"] + 7 * found["policy"]
@@ -134,7 +134,7 @@ def test_what_is_distilled_on_is_augmented_as_batches_are():
     algorithm.set_augmentation(RandomShift(3))
     algorithm.end_task(0, sequences.dataset(0), make_policy(), generator(0))
     algorithm.mix(sequences.dataset(1).batch(torch.arange(8)), generator(0))
-    drawn = algorithm._distilled
+    drawn = algorithm.distilled
     kept = sequences.dataset(0).batch(drawn.window_ids)
     assert torch.equal(drawn.actions, kept.actions)
     assert not torch.equal(drawn.observation.images, kept.observation.images)

@@ -115,7 +115,7 @@ def test_features_stay_bit_identical_and_the_rest_learns(kind):
     assert torch.equal(encoded(policy, dataset, torch.arange(20)), before)
     moved = {name for name, value in policy.state_dict().items() if not torch.equal(value, weights[name])}
     frozen = set(feature_parameters(make_policy(kind), dataset.batch(torch.arange(2))))
-    assert frozen == set(algorithm._frozen) and moved == set(dict(policy.named_parameters())) - frozen
+    assert frozen == set(algorithm.frozen) and moved == set(dict(policy.named_parameters())) - frozen
     assert any("encoders" in name for name in frozen) and any("head" in name for name in moved)
 
 
@@ -152,7 +152,7 @@ def test_several_base_tasks_keep_latents_of_the_last_one():
 @pytest.mark.parametrize("kind", POLICIES)
 def test_replayed_latents_are_the_features_of_the_frames_within_half_a_step(kind):
     policy, algorithm = learned(3, kind)
-    for task, windows in algorithm.memory._tasks.items():
+    for task, windows in algorithm.memory.tasks.items():
         order = torch.randperm(20, generator=generator(task))
         exact = encoded(policy, sequences.dataset(task), order)
         error = (windows.values(torch.arange(20)) - exact).abs()
@@ -240,15 +240,15 @@ def test_the_adjustment_acts_on_the_trained_part_of_any_policy(kind):
     dataset = sequences.dataset(1)
     algorithm.begin_task(1, dataset, policy)
     algorithm.trained(policy)
-    assert len(algorithm._near) == 1  # with two tasks the only pair is in both halves
+    assert len(algorithm.near) == 1  # with two tasks the only pair is in both halves
     algorithm.mix(dataset.batch(torch.arange(6)), generator(0))
     with_it = algorithm.penalty(policy)
-    algorithm._near = algorithm._near[:0]
+    algorithm.near = algorithm.near[:0]
     algorithm.mix(dataset.batch(torch.arange(6)), generator(0))
     assert with_it.item() != algorithm.penalty(policy).item()
     with_it.backward()
     graded = {name for name, p in policy.named_parameters() if p.grad is not None and p.grad.any()}
-    assert graded and not graded & set(algorithm._frozen)
+    assert graded and not graded & set(algorithm.frozen)
 
 
 def test_similar_pairs_are_in_the_upper_half_by_both():

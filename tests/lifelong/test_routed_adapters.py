@@ -198,8 +198,8 @@ def test_iscil_adapters_start_as_the_one_that_is_retrieved_most():
     sequences.assert_same(algorithm.state_dict()["library"][3], algorithm.state_dict()["library"][1])
     algorithm.trained(policy)
     with torch.no_grad():
-        algorithm._library.parameters(3)[0].zero_()
-    assert algorithm._library.parameters(1)[0].any()
+        algorithm.library.parameters(3)[0].zero_()
+    assert algorithm.library.parameters(1)[0].any()
 
 
 def test_iscil_starts_from_the_base_where_that_is_nearest():
@@ -211,7 +211,7 @@ def test_iscil_starts_from_the_base_where_that_is_nearest():
 
 def test_policies_that_iscil_cannot_embed_are_named():
     algorithm = iscil(base_tasks=0)
-    algorithm._library.pairs[0] = {}
+    algorithm.library.pairs[0] = {}
     with pytest.raises(ConfigError, match="DeepPolicy has no encode"), algorithm.policy_for(0, DeepPolicy()):
         pass
 
@@ -229,10 +229,24 @@ def fitted(*seeds: int, hidden: int = 4) -> dict[int, Discriminator]:
     return {s: Discriminator.fit(inputs(s), hidden, 300, 1e-2, generator(s)) for s in seeds}
 
 
+def knowing(known: dict[int, Discriminator], chosen: dict[int, dict[str, int]]) -> CLARE:
+    """CLARE before task 3, with autoencoders of tasks and what they choose, by layer."""
+    pair = {"a": torch.zeros(1, 6), "b": torch.zeros(6, 1)}
+    algorithm = clare()
+    state = {
+        **algorithm.state_dict(),
+        "task_index": 3,
+        "library": {2: dict.fromkeys(chosen[2], pair)},
+        "discriminators": {t: dict.fromkeys(chosen[t], d.weights) for t, d in known.items()},
+        "chosen": chosen,
+    }
+    algorithm.load_state_dict(state, {})
+    return algorithm
+
+
 def test_clare_picks_the_autoencoder_that_was_trained_on_such_inputs():
-    algorithm, known = clare(), fitted(1, 2, 3)
-    algorithm._discriminators = {t: {"layer": d} for t, d in known.items()}
-    algorithm._chosen = {1: {"layer": BASE}, 2: {"layer": 2}, 3: {"layer": 2}}
+    known = fitted(1, 2, 3)
+    algorithm = knowing(known, {1: {"layer": BASE}, 2: {"layer": 2}, 3: {"layer": 2}})
     for seed, used in ((1, BASE), (2, 2), (3, 2)):
         fresh = torch.randn(40, 2, 2, generator=generator(7)) @ torch.randn(
             2, 6, generator=generator(99, seed)
@@ -242,13 +256,10 @@ def test_clare_picks_the_autoencoder_that_was_trained_on_such_inputs():
 
 
 def test_clare_expands_above_the_threshold_only():
-    algorithm, known = clare(), fitted(1, 2)
-    algorithm._discriminators = {t: {"old": d, "new": d} for t, d in known.items()}
-    algorithm._chosen = {1: {"old": BASE, "new": BASE}, 2: {"old": 2, "new": 2}}
-    algorithm.task_index = 3
-    assert algorithm._compare({"old": inputs(2), "new": inputs(5)}) == {"old": 2, "new": 3}
+    algorithm = knowing(fitted(1, 2), {1: {"old": BASE, "new": BASE}, 2: {"old": 2, "new": 2}})
+    assert algorithm.compare({"old": inputs(2), "new": inputs(5)}) == {"old": 2, "new": 3}
     algorithm.threshold = 1e9
-    assert 3 not in algorithm._compare({"old": inputs(2), "new": inputs(5)}).values()
+    assert 3 not in algorithm.compare({"old": inputs(2), "new": inputs(5)}).values()
 
 
 def test_clare_adds_to_every_layer_or_at_least_to_the_first():
@@ -258,7 +269,7 @@ def test_clare_adds_to_every_layer_or_at_least_to_the_first():
         learn(algorithm, policy, 0)
         algorithm.begin_task(1, sequences.dataset(1), policy)
         layers = list(adaptable_modules(policy, ("*",)))
-        assert list(algorithm._library[1]) == (layers if everywhere else layers[:1])
+        assert list(algorithm.library[1]) == (layers if everywhere else layers[:1])
 
 
 def test_clare_layers_that_are_not_new_use_the_adapter_of_the_nearest_task():

@@ -36,7 +36,7 @@ HOSTILE = [
         "lifelong.training.precision.subprocess.run",
         "lifelong.results.records.os.system",
     ),
-    *("lifelong.nn.heads.torch.load", "lifelong.nn.heads.torch.nn.Linear", "lifelong.data.source.Path"),
+    *("lifelong.nn.heads.torch.load", "lifelong.nn.heads.torch.nn.Linear", "lifelong.data.dataset.Path"),
     *(
         "libero_env.cli.main.main",
         "libero_env.cli.__main__.main",
