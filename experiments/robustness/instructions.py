@@ -15,7 +15,7 @@ import numpy as np
 from hydra import compose, initialize_config_dir
 
 from libero_env.perturbations import parse_perturbations
-from libero_env.perturbations.problem import reword_task
+from libero_env.perturbations.perturbation import reword_task
 from libero_env.tasks import get_task
 from lifelong.composition import config_folder
 from lifelong.settings import Configuration, plain_data

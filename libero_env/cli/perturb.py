@@ -81,7 +81,7 @@ def certify(
     """
     from libero_env.design.certify_perturbed import certify_perturbed, shares_table
     from libero_env.perturbations import KINDS, Perturbation
-    from libero_env.perturbations.draws import kept_path
+    from libero_env.perturbations.sampling import attempts_file
     from libero_env.storage import atomic_write_text
 
     names = kinds or [name for name, kind in KINDS.items() if kind.physical]
@@ -98,8 +98,8 @@ def certify(
     print(*shares_table(certificates, perturbations), sep="\n")
     if keep:
         named = {str(one): one for one in perturbations}
-        solved = json.loads(kept_path().read_text(encoding="utf-8")) if kept_path().is_file() else {}
+        solved = json.loads(attempts_file().read_text(encoding="utf-8")) if attempts_file().is_file() else {}
         for certificate in certificates:
             solved |= certificate.attempts(named[certificate.perturbation])
-        atomic_write_text(kept_path(), json.dumps(dict(sorted(solved.items())), indent=0) + "\n")
-        print(kept_path())
+        atomic_write_text(attempts_file(), json.dumps(dict(sorted(solved.items())), indent=0) + "\n")
+        print(attempts_file())

@@ -18,9 +18,8 @@ from libero_env.demos.contents import Pairing
 from libero_env.demos.write import make_header
 from libero_env.envs.config import Drawing, Names, Robot, Size
 from libero_env.errors import InvalidInputError
-from libero_env.perturbations.catalog import KINDS
 from libero_env.perturbations.episodes import checked_perturbations
-from libero_env.perturbations.value import Perturbation, format_perturbations
+from libero_env.perturbations.perturbation import KINDS, Perturbation, format_perturbations
 from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE

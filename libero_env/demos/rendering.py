@@ -22,8 +22,7 @@ from libero_env.demos.read import read_episodes
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
 from libero_env.parallel import progress_bar
-from libero_env.perturbations.problem import reword_task
-from libero_env.perturbations.value import format_perturbations
+from libero_env.perturbations.perturbation import format_perturbations, reword_task
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
 

@@ -20,8 +20,8 @@ from libero_env.errors import InvalidInputError, LiberoError, PlacementError
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.rollout import run_experts
 from libero_env.parallel import progress_bar, run_each
-from libero_env.perturbations.draws import draw_name, trying
-from libero_env.perturbations.value import Perturbation
+from libero_env.perturbations.perturbation import Perturbation
+from libero_env.perturbations.sampling import trying
 from libero_env.storage import atomic_write_text
 from libero_env.tasks import Task
 
@@ -65,8 +65,8 @@ class PerturbedCertificate:
 
     def attempts(self, one: Perturbation) -> dict[str, int]:
         """Return the numbers of the draws to use that are not the first, by their names."""
-        own = {draw_name(one, self.task, start): n for start, n in self.solved.items() if n}
-        return own | ({draw_name(one, self.task): self.drawn_again} if self.drawn_again else {})
+        own = {one.sample_name(self.task, start): n for start, n in self.solved.items() if n}
+        return own | ({one.sample_name(self.task): self.drawn_again} if self.drawn_again else {})
 
 
 def certify_perturbed(
@@ -121,7 +121,7 @@ def attempt_perturbed(
     perturbation is drawn for the whole task, that is drawn again first.
     """
     digest, whole = _digest(task, one, len(starts), redraws), 0
-    redraws = redraws if one.definition.is_drawn else 0
+    redraws = redraws if one.definition.is_sampled else 0
     try:
         outcomes = _outcomes(task, one, starts, 0, whole)
         at_first = _won(outcomes)
@@ -150,8 +150,8 @@ def _outcomes(
     task: Task, one: Perturbation, starts: Sequence[int], attempt: int, whole: int
 ) -> dict[int, str]:
     """Return why the expert fails from each start with the draws of a number; "" where it succeeds."""
-    attempts = {draw_name(one, task.id, start): attempt for start in starts} | {
-        draw_name(one, task.id): whole
+    attempts = {one.sample_name(task.id, start): attempt for start in starts} | {
+        one.sample_name(task.id): whole
     }
     try:
         with trying(attempts):

@@ -11,7 +11,7 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import LiberoError
 from libero_env.expert import Expert
 from libero_env.expert.rollout import MAX_STEPS
-from libero_env.perturbations.value import Perturbation
+from libero_env.perturbations.perturbation import Perturbation
 from libero_env.sim.observations import image_name
 from libero_env.tasks.task import Task
 from libero_env.timing import CONTROL_HZ

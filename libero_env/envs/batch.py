@@ -25,8 +25,8 @@ from libero_env.envs.scenes import open_scenes, sample_states
 from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.init_states.store import load_init_states
 from libero_env.memory import require_memory
-from libero_env.perturbations.drawing import start_name
 from libero_env.perturbations.episodes import TRIES
+from libero_env.perturbations.sampling import start_name
 from libero_env.sim.engine import make_goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward
@@ -341,7 +341,7 @@ class BatchEnv(LiberoVectorEnv):
             if not perturbed.is_physical or not self.goals.check([i])[0][0]:
                 break
             again += 1
-            if not perturbed.draws_starts or again == TRIES:
+            if not perturbed.samples_starts or again == TRIES:
                 raise PlacementError(
                     f"{self.base_task.id}, start {name}: the perturbed goal holds at the start"
                 )

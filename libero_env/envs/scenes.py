@@ -10,9 +10,8 @@ from libero_env.envs.config import EnvConfig
 from libero_env.errors import InvalidInputError
 from libero_env.init_states.placement import sample_settled
 from libero_env.perturbations.episodes import PerturbedEpisodes, needs_materials, scene_problem
-from libero_env.perturbations.problem import perturb_task
+from libero_env.perturbations.perturbation import Perturbation, perturb_task
 from libero_env.perturbations.published import published_changes, rest_of
-from libero_env.perturbations.value import Perturbation
 from libero_env.sim.scene import InitialStates, Scene, build_scene
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.tasks import Task, get_task

@@ -1,27 +1,32 @@
-from .catalog import KINDS, get_kind
-from .channels import ActionChannel, ActionFilter, ObservationChannel, ObservationFilter
-from .drawing import draw_key
-from .kind import LAYERS, Kind
-from .problem import perturb_task, reword_task
-from .starts import RobotJoints, StartChange
-from .value import Perturbation, format_perturbations, parse_perturbations, replace_perturbations
+from .kinds import LAYERS, ActionFilter, Episode, Kind, ObservationFilter, StartChange
+from .perturbation import (
+    KINDS,
+    Perturbation,
+    format_perturbations,
+    get_kind,
+    parse_perturbations,
+    perturb_task,
+    replace_perturbations,
+    reword_task,
+)
+from .sampling import sample_key
+from .starts import RobotJoints
 
 __all__ = [
     "KINDS",
     "LAYERS",
-    "ActionChannel",
     "ActionFilter",
+    "Episode",
     "Kind",
-    "ObservationChannel",
     "ObservationFilter",
     "Perturbation",
     "RobotJoints",
     "StartChange",
-    "draw_key",
     "format_perturbations",
     "get_kind",
     "parse_perturbations",
     "perturb_task",
     "replace_perturbations",
     "reword_task",
+    "sample_key",
 ]

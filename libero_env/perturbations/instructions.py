@@ -62,7 +62,7 @@ def _patterns() -> Mapping[str, re.Pattern[str]]:
 
 
 def _reworded(sentence: str, rng: np.random.Generator) -> str:
-    """Return one of the rewordings; how much it changes is drawn too."""
+    """Return one of the rewordings; how much it changes is random too."""
     wording, boldness = _wording(), rng.random()
     clauses = [_say(clause, boldness, rng) for clause in split_clauses(sentence)]
     said = clauses[0]

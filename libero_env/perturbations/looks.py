@@ -1,4 +1,4 @@
-"""Kinds that change how a scene is drawn: the agent's camera, the lights, surfaces, colours of objects."""
+"""Kinds that change how a scene is rendered: the agent's camera, the lights, surfaces, colours of objects."""
 
 import colorsys
 from weakref import WeakKeyDictionary
@@ -8,8 +8,8 @@ import numpy as np
 
 from libero_env.assets.arena import SPARE, surface_styles
 from libero_env.geometry import quat_to_mat, rotation_about
-from libero_env.perturbations.drawing import direction, sign
-from libero_env.perturbations.kind import Kind
+from libero_env.perturbations.kinds import Kind
+from libero_env.perturbations.sampling import direction, sign
 from libero_env.sim.look import HEADLIGHT, CameraView, Lamp, Look
 from libero_env.sim.scene import Scene
 
@@ -92,7 +92,7 @@ _MATERIALS = {
 }
 _FURNITURE = ("furniture_colours", "room_living_room", "room_kitchen_background", "room_office_book_shelf")
 _SAME = 0.02  # RGB distance below which a style is the surface's own
-_LIKE = 0.08  # styles whose distances differ by less are drawn from
+_LIKE = 0.08  # styles whose distances differ by less are sampled from
 _COLOUR_WORDS = ("black", "white", "red", "yellow")
 
 
@@ -182,7 +182,7 @@ KINDS = (
         0.8,
         "the surface that objects stand on has the material whose mean colour is nearest to this distance from its own",
         _table,
-        draws_materials=True,
+        needs_materials=True,
     ),
     Kind(
         "background",
@@ -192,7 +192,7 @@ KINDS = (
         "walls and floor have materials whose mean colours are nearest to this distance from their own; furniture has "
         "another colour to that share",
         _background,
-        draws_materials=True,
+        needs_materials=True,
     ),
     Kind(
         "colour",

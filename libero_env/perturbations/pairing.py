@@ -11,7 +11,7 @@ import numpy as np
 
 from libero_env.errors import PlacementError
 from libero_env.init_states.placement import collision_boxes, lowest_point, settle
-from libero_env.perturbations.drawing import DrawKey
+from libero_env.perturbations.sampling import SampleKey
 from libero_env.perturbations.starts import contacts, posed
 from libero_env.sim.scene import Scene, zone_boxes
 from libero_env.sim.simulation import LoopSimulations
@@ -20,7 +20,7 @@ from libero_env.tasks.problem import Problem, Region
 _GAP = 0.02  # [m] between a new object and what is there, seen from above
 _LIFT = 0.001  # [m] above the surface, from where it settles
 _TRIES = 300
-_ATTEMPTS = 30  # draws of all places
+_ATTEMPTS = 30  # samples of all places
 
 
 class Pairing:
@@ -41,13 +41,13 @@ class Pairing:
         self._simulations: LoopSimulations | None = None
         self._known: dict[tuple[bytes, int], tuple[np.ndarray, int]] = {}
 
-    def row(self, row: np.ndarray, key: DrawKey, first: int = 0) -> tuple[np.ndarray, int]:
-        """Return the start that belongs to a start of the scene without perturbations, and the number of its draw.
+    def row(self, row: np.ndarray, key: SampleKey, first: int = 0) -> tuple[np.ndarray, int]:
+        """Return the start that belongs to a start of the scene without perturbations, and the number of its sample.
 
         Args:
             row: State [time, qpos, qvel, poses of the fixtures] of that scene.
             key: Key of the places of what is new.
-            first: Number of the first draw of these places that may be used.
+            first: Number of the first sample of these places that may be used.
 
         Raises:
             PlacementError: What is new finds no free place, or a moved object collides.
@@ -60,7 +60,7 @@ class Pairing:
         paired, attempt = self._known[name]
         return paired.copy(), attempt
 
-    def _first_valid(self, row: np.ndarray, key: DrawKey, first: int) -> tuple[np.ndarray, int]:
+    def _first_valid(self, row: np.ndarray, key: SampleKey, first: int) -> tuple[np.ndarray, int]:
         paired, before = self._paired(row), contacts(self.base, row)
         if not (self.added or self.exchanged):
             if self._shifts and len(contacts(self.scene, paired)) > len(before):

@@ -1,76 +1,28 @@
 """Kinds that change the problem: what the task says, and which objects are there. A perturbed task is a task."""
 
-from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from libero_env.assets.arena import WORKSPACES
-from libero_env.errors import InvalidInputError
-from libero_env.perturbations.drawing import draw_key
-from libero_env.perturbations.draws import first_attempt
+from libero_env.errors import InvalidInputError, PlacementError
+from libero_env.init_states.store import load_init_states
 from libero_env.perturbations.goals import is_named, other_goals
 from libero_env.perturbations.instructions import reword
-from libero_env.perturbations.kind import Kind
-from libero_env.perturbations.layouts import move_layout
-from libero_env.perturbations.starts import carried
+from libero_env.perturbations.kinds import Kind
+from libero_env.perturbations.sampling import direction
+from libero_env.perturbations.starts import carried, contacts, shifted
 from libero_env.sim.scene import Scene
 from libero_env.storage import read_yaml
 from libero_env.tasks.problem import Atom, Problem, Region
 from libero_env.tasks.task import Task
 
-if TYPE_CHECKING:
-    from libero_env.perturbations.value import Perturbation
-
 _REACH = (-0.2, -0.25, 0.1, 0.25)  # [m] rectangle that the arm reaches easily on every workspace
 _MARGIN = 0.05  # [m] by which the distractors' region is larger than that of the task's own objects
-_MAX_KNOWN = 256
-_known: OrderedDict[Any, Task] = OrderedDict()  # perturbed tasks
+_LAYOUT_TRIES = 200  # directions for each object
 DISTRACTOR_REGION = "distractor_region"
-
-
-def perturb_task(task: Task, perturbations: "Iterable[Perturbation]", scene: Scene) -> Task:
-    """Return a task as perturbations change it; those of other layers are ignored.
-
-    Suite, index and name stay, so that its results can be paired with those of the task without perturbations.
-
-    Args:
-        task: Task.
-        perturbations: Perturbations in the order in which they are applied.
-        scene: Compiled scene of the task.
-
-    Raises:
-        InvalidInputError: The task has no other goal.
-        PlacementError: Objects cannot be moved so far.
-    """
-    found = [one for one in perturbations if one.definition.layer == "problem" and one.severity]
-    attempts = [first_attempt(one, task.id) for one in found]
-    key = (task, tuple(found), tuple(attempts), scene.pack, scene.robot)
-    if key not in _known:
-        _known[key] = _perturbed(task, zip(found, attempts, strict=True), scene)
-        while len(_known) > _MAX_KNOWN:
-            _known.popitem(last=False)
-    return _known[key]
-
-
-def reword_task(task: Task, perturbations: "Iterable[Perturbation]") -> Task:
-    """Return a task in the words that perturbations give it, without its scene; those of other kinds are ignored."""
-    for one in perturbations:
-        if one.kind == "instruction" and one.severity:
-            attempt = first_attempt(one, task.id)
-            rng = draw_key(one.kind, one.seed, task.id, attempt=attempt).generator()
-            return with_instruction(task, reword(task.language, one.amount, rng))
-    return task
-
-
-def _perturbed(task: Task, drawn: "Iterable[tuple[Perturbation, int]]", scene: Scene) -> Task:
-    changed = task
-    for one, attempt in drawn:
-        rng = draw_key(one.kind, one.seed, task.id, attempt=attempt).generator()
-        changed = one.definition.draw(one.amount, rng, changed, scene)
-    return changed
 
 
 def _goal(count: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
@@ -155,6 +107,84 @@ def _around(problem: Problem, workspace: str) -> tuple[float, float, float, floa
     return (*low.round(6).tolist(), *high.round(6).tolist())
 
 
+def _layout(metres: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
+    """Return the task with the regions of its objects moved by the same distance, each in another direction.
+
+    What the goal is about besides the objects that are carried stays in its place, as do fixtures. Where the
+    instruction tells objects of one category apart by their places, all objects move together.
+
+    Raises:
+        PlacementError: An object cannot be moved so far without touching another in one of the stored initial states.
+    """
+    rows = list(load_init_states(task, scene))
+    free = [contacts(scene, row) for row in rows]
+    shifts: dict[str, np.ndarray] = {}
+    for group in _groups(task.problem):
+        for _ in range(_LAYOUT_TRIES):
+            step = metres * direction(rng, 2)
+            moved = [_moved(scene, row, task.problem, group, step) for row in rows]
+            if all(contacts(scene, row) <= before for row, before in zip(moved, free, strict=True)):
+                rows = moved
+                shifts |= dict.fromkeys(group, step)
+                break
+        else:
+            raise PlacementError(f"{task.id}: {', '.join(group)} cannot be moved by {metres:.3f} m")
+    return replace(task, problem=_with_shifts(task.problem, shifts))
+
+
+def _groups(problem: Problem) -> list[list[str]]:
+    """Return the objects that stand on the workspace and are moved; those of a group by the same."""
+    roots, atoms = carried(problem), problem.goal.atoms()
+    taken = [atom.args[0] for atom in atoms if atom.args[0] in problem.objects]
+    counts = Counter(problem.objects.values())
+    if any(
+        counts[problem.objects[name]] > 1 for atom in atoms for name in atom.args if name in problem.objects
+    ):
+        return [list(roots)]
+    on_table = any(_is_place(problem, name) for atom in atoms for name in atom.args[1:])
+    kept = {name for atom in atoms for name in _objects_of(problem, atom.args[1:])}
+    if on_table:  # such as `to the right of the plate`: what is named beside it is a landmark
+        words = set(problem.language.lower().split())
+        kept |= {n for n, c in problem.objects.items() if words & set(c.split("_")) and n not in taken}
+    return [[name] for name in roots if name not in kept]
+
+
+def _is_place(problem: Problem, name: str) -> bool:
+    region = problem.region(name)
+    return region is not None and bool(region.ranges)
+
+
+def _objects_of(problem: Problem, names: Sequence[str]) -> list[str]:
+    """Return the objects of names and regions."""
+    regions = [problem.region(name) for name in names]
+    targets = [name if region is None else region.target for name, region in zip(names, regions, strict=True)]
+    return [name for name in targets if name in problem.objects]
+
+
+def _moved(
+    scene: Scene, row: np.ndarray, problem: Problem, group: Sequence[str], step: np.ndarray
+) -> np.ndarray:
+    loads = carried(problem)
+    for name in group:
+        row = shifted(scene, row, (name, *loads[name]), step)
+    return row
+
+
+def _with_shifts(problem: Problem, shifts: dict[str, np.ndarray]) -> Problem:
+    """Return a problem in which each object has a region of its own, moved from where it was."""
+    regions, init = list(problem.regions), []
+    for atom in problem.init:
+        region = problem.region(atom.args[-1])
+        if atom.args[0] in shifts and region is not None and len(atom.args) == 2:
+            x, y = shifts[atom.args[0]]
+            ranges = tuple((a + x, b + y, c + x, d + y) for a, b, c, d in region.ranges)
+            own = Region(f"{region.name}_of_{atom.args[0]}", region.target, ranges, region.yaw, region.rgba)
+            regions.append(own)
+            atom = Atom(atom.predicate, (atom.args[0], own.address))
+        init.append(atom)
+    return replace(problem, regions=tuple(regions), init=tuple(init))
+
+
 KINDS = (
     Kind(
         "goal",
@@ -173,7 +203,7 @@ KINDS = (
         "m",
         0.1,
         "the places of objects are moved so far; what the goal puts them on or in, and fixtures, stay",
-        move_layout,
+        _layout,
         physical=True,
     ),
     Kind(

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from libero_env.assets.arena import workspace_of_problem
-from libero_env.perturbations.channels import ObservationChannel, ObservationFilter
 from libero_env.perturbations.corruptions import corrupt
-from libero_env.perturbations.drawing import DrawKey
-from libero_env.perturbations.starts import RobotJoints, StartChange
+from libero_env.perturbations.kinds import Change, Episode, ObservationFilter
+from libero_env.perturbations.starts import RobotJoints
 from libero_env.sim.look import CameraView, Look
 from libero_env.tasks.published.plus import camera_pose, joint_pose
 from libero_env.tasks.published.suites import PublishedTask
@@ -20,7 +19,7 @@ _PICTURE = f"{CAMERA}_rgb"
 
 @dataclass(frozen=True)
 class Corruption(ObservationFilter):
-    """Noise on the pictures of `agentview`, drawn anew for each, see `libero_env.perturbations.corruptions`.
+    """Noise on the pictures of `agentview`, sampled anew for each, see `libero_env.perturbations.corruptions`.
 
     LIBERO-Plus' code leaves the first picture after an initial state is set without noise; here it has it too.
 
@@ -32,24 +31,16 @@ class Corruption(ObservationFilter):
     kind: str
     severity: int
 
-    def open(self, key: DrawKey) -> ObservationChannel:
-        """Return the channel of an episode."""
-        return _CorruptionChannel(self, key)
-
-
-class _CorruptionChannel(ObservationChannel):
-    def __init__(self, corruption: Corruption, key: DrawKey):
-        self._corruption, self._key = corruption, key
-
-    def image(self, name: str, image: np.ndarray, step: int) -> np.ndarray:
+    def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return the picture with noise."""
         if name != _PICTURE:
             return image
-        own = self._corruption
-        upside_down = corrupt(image[::-1], own.kind, own.severity, self._key.generator(step))  # as theirs are
+        rng = episode.key.generator(episode.step)
+        upside_down = corrupt(image[::-1], self.kind, self.severity, rng)  # as theirs are
         return upside_down[::-1]
 
 
-def published_changes(task: Task) -> tuple[Look | StartChange | ObservationFilter, ...]:
+def published_changes(task: Task) -> tuple[Change, ...]:
     """Return what the environment of a task changes beside the problem; nothing for most tasks.
 
     Args:
@@ -60,7 +51,7 @@ def published_changes(task: Task) -> tuple[Look | StartChange | ObservationFilte
     variant, workspace = task.variant, workspace_of_problem(task.problem.name).name
     pose = camera_pose(workspace, variant.view)
     view = CameraView(tuple(pose.pos.tolist()), tuple(pose.quat_wxyz.tolist()))
-    changes: list[Look | StartChange | ObservationFilter] = [Look(cameras={CAMERA: view})]
+    changes: list[Change] = [Look(cameras={CAMERA: view})]
     if variant.pose and task.robot_state == "skipped":
         changes.append(RobotJoints(tuple(joint_pose(variant.pose).tolist())))
     if variant.noise is not None:

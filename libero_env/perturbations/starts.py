@@ -1,6 +1,5 @@
 """Kinds that change the start of an episode: the joints of the arm, the poses of objects."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -11,27 +10,14 @@ import numpy as np
 
 from libero_env.assets.arena import WORKSPACES
 from libero_env.geometry import quat_from_axis_angle, quat_multiply
-from libero_env.perturbations.drawing import direction, sign
-from libero_env.perturbations.kind import Kind
+from libero_env.perturbations.kinds import Kind, StartChange
+from libero_env.perturbations.sampling import direction, sign
 from libero_env.sim.scene import Scene
 from libero_env.tasks.problem import Problem
 
 _DIRECTIONS = 60  # tries for each object
 _FULL_STEP, _FULL_TURN = 0.05, np.deg2rad(30.0)  # [m], [rad] at severity 1
-_LIMIT_MARGIN = 0.02  # [rad] between a drawn joint and the end of its range
-
-
-class StartChange(ABC):
-    """A change of the state that an episode starts in."""
-
-    @abstractmethod
-    def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
-        """Return the changed state, or None where it is not possible, such as with a collision.
-
-        Args:
-            scene: Scene of the task.
-            row: State [time, qpos, qvel, poses of the fixtures]; it is not changed.
-        """
+_LIMIT_MARGIN = 0.02  # [rad] between a sampled joint and the end of its range
 
 
 @dataclass(frozen=True)

@@ -472,7 +472,7 @@ class EvalProtocol:
 
 
 def _perturbation_problems(text: str) -> Iterator[str]:
-    from libero_env.perturbations.value import format_perturbations, parse_perturbations  # slow to import
+    from libero_env.perturbations.perturbation import format_perturbations, parse_perturbations  # slow to import
 
     try:
         if text != (ordered := format_perturbations(parse_perturbations(text))):

@@ -12,7 +12,7 @@ from libero_env.cli.main import main
 from libero_env.design import certify_perturbed
 from libero_env.design.certify_perturbed import REDRAWS, attempt_perturbed, shares_table
 from libero_env.errors import LiberoError
-from libero_env.perturbations import Perturbation, draws
+from libero_env.perturbations import Perturbation, sampling
 from libero_env.tasks import get_suite, get_task
 
 TASK = get_task("libero_goal/3")
@@ -41,11 +41,11 @@ def test_what_the_expert_does_not_solve_is_drawn_again_for_that_start(expert):
     expert.solves = lambda row: not np.array_equal(row, failing)
     found = attempt_perturbed(TASK, ROBOT, range(3))
     assert found.solved == {"0": 0, "1": 1, "2": 0} and found.redraws == 1 and found.at_first == 2
-    name = draws.draw_name(ROBOT, TASK.id, 1)
+    name = ROBOT.sample_name(TASK.id, 1)
     assert found.attempts(ROBOT) == {name: 1}
 
     env = LiberoEnv(TASK, cameras=(), perturb=[ROBOT])
-    with draws.trying(found.attempts(ROBOT)):
+    with sampling.trying(found.attempts(ROBOT)):
         observation, info = env.reset(options={"init_state": 1})
     assert info["attempts"].tolist() == [1] and not np.array_equal(observation["joint_states"], failing)
     assert np.array_equal(observation["joint_states"], expert.joints[-1][0])
@@ -66,7 +66,7 @@ def test_a_task_that_is_mostly_not_solved_is_drawn_again_as_a_whole(expert):
 
 
 def test_results_are_on_disk_and_are_not_run_again(expert, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(draws, "kept_path", lambda: tmp_path / "draws.json")
+    monkeypatch.setattr(sampling, "attempts_file", lambda: tmp_path / "draws.json")
     words = [
         "perturb",
         "certify",
@@ -85,7 +85,7 @@ def test_results_are_on_disk_and_are_not_run_again(expert, tmp_path, capsys, mon
     text = capsys.readouterr().out
     assert "robot=0.4                   2      0.0%      100.0%        2" in text
     kept = json.loads((tmp_path / "draws.json").read_text())
-    assert kept == {draws.draw_name(ROBOT, "libero_goal/3", start): 1 for start in (0, 1)}
+    assert kept == {ROBOT.sample_name("libero_goal/3", start): 1 for start in (0, 1)}
     count = len(expert.joints)
     assert main(words) == 0 and len(expert.joints) == count
     (file,) = tmp_path.glob("*/*/robot*.json")

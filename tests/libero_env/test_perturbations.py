@@ -15,13 +15,14 @@ from libero_env.perturbations import (
     LAYERS,
     Perturbation,
     RobotJoints,
-    draw_key,
     format_perturbations,
     parse_perturbations,
+    sample_key,
 )
+from libero_env.perturbations.filters import PixelNoise
 from libero_env.perturbations.instructions import edit_distance, reword, split_clauses
+from libero_env.perturbations.kinds import Episode
 from libero_env.perturbations.looks import CAMERA, pivot_of
-from libero_env.perturbations.observations import PixelNoise
 from libero_env.sim.look import CameraView, Lamp, Look
 from libero_env.tasks import get_suite
 
@@ -361,9 +362,17 @@ def test_objects_start_at_a_distance_from_their_places_and_carry_what_stands_on_
     env.close()
 
 
-def channel(name, severity):
+def arriving(name, severity):
+    """Return a function of the name, the image and the step that returns what arrives of an image."""
     kind = KINDS[name]
-    return kind.draw(kind.amount(severity), np.random.default_rng(0)).open(draw_key(name, 0, TASK))
+    change = kind.sample(kind.amount(severity), np.random.default_rng(0))
+    episode = Episode(sample_key(name, 0, TASK))
+
+    def image(name, picture, step):
+        episode.step = step
+        return change.image(name, picture, episode)
+
+    return image
 
 
 @pytest.mark.unit
@@ -371,23 +380,21 @@ def test_pictures_are_blurred_hidden_late_and_lost():
     taken = np.random.default_rng(0).integers(0, 25, (13, 128, 128, 3), np.uint8)
     step = np.zeros((128, 128, 3), np.uint8)
     step[:, 64:] = 255
-    edge = np.diff(channel("blur", 0.5).image("a_rgb", step, 0)[64, :, 0].astype(float))  # it is the kernel
+    edge = np.diff(arriving("blur", 0.5)("a_rgb", step, 0)[64, :, 0].astype(float))  # it is the kernel
     across = np.arange(127) - edge @ np.arange(127) / edge.sum()
     assert np.sqrt(edge @ across**2 / edge.sum()) == pytest.approx(KINDS["blur"].amount(0.5), rel=0.1)
 
-    hide = channel("occlusion", 0.5)
-    hidden = [
-        (hide.image("a_rgb", picture, t) != picture).any(axis=-1) for t, picture in enumerate(taken[:3])
-    ]
+    hide = arriving("occlusion", 0.5)
+    hidden = [(hide("a_rgb", picture, t) != picture).any(axis=-1) for t, picture in enumerate(taken[:3])]
     assert hidden[0].mean() == pytest.approx(KINDS["occlusion"].amount(0.5), abs=0.01)
     assert all(np.array_equal(hidden[0], other) for other in hidden)
 
-    late, steps = channel("latency", 0.2), int(KINDS["latency"].amount(0.2))
-    arrived = [late.image("a_rgb", picture, t) for t, picture in enumerate(taken)]
+    late, steps = arriving("latency", 0.2), int(KINDS["latency"].amount(0.2))
+    arrived = [late("a_rgb", picture, t) for t, picture in enumerate(taken)]
     assert steps == 2 and all(np.array_equal(a, taken[max(0, t - 2)]) for t, a in enumerate(arrived))
 
-    lost = channel("dropped_frames", 0.7)
-    arrived = [lost.image("a_rgb", picture, t) for t, picture in enumerate(taken)]
+    lost = arriving("dropped_frames", 0.7)
+    arrived = [lost("a_rgb", picture, t) for t, picture in enumerate(taken)]
     kept = [np.array_equal(a, b) for a, b in zip(taken, arrived, strict=True)]
     assert kept[0] and 0 < sum(kept[1:]) < 10
     assert all(now or np.array_equal(arrived[t], arrived[t - 1]) for t, now in enumerate(kept) if t)
@@ -422,13 +429,13 @@ def test_sensors_are_off_by_metres_and_radians():
 
 
 def test_actions_are_scaled_and_noisy_but_not_the_gripper():
-    key, action = draw_key("x", 0, TASK), np.full(7, 0.5)
-    gain = KINDS["gain"].draw(2.0, key.generator()).open(key).act(action, 0)
+    episode, action = Episode(sample_key("x", 0, TASK)), np.full(7, 0.5)
+    gain = KINDS["gain"].sample(2.0, episode.key.generator()).act(action, episode)
     assert gain[6] == 0.5 and np.allclose(gain[:6], gain[0]) and gain[0] in (0.25, 1.0)
-    noisy = KINDS["action_noise"].draw(0.2, key.generator()).open(key)
-    acted = np.array([noisy.act(action, step) for step in range(500)])
+    noise = KINDS["action_noise"].sample(0.2, episode.key.generator())
+    acted = np.array([noise.act(action, Episode(episode.key, step)) for step in range(500)])
     assert (acted[:, 6] == 0.5).all() and acted[:, :6].std() == pytest.approx(0.2, rel=0.05)
-    assert np.array_equal(acted[3], noisy.act(action, 3))
+    assert np.array_equal(acted[3], noise.act(action, Episode(episode.key, 3)))
 
 
 @pytest.mark.unit

@@ -1,0 +1,285 @@
+"""Kinds that change what is observed (noise, blur, late and lost pictures, a biased sensor), and what is executed."""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageFilter
+
+from libero_env.geometry import quat_from_axis_angle, quat_multiply, quat_to_axis_angle
+from libero_env.perturbations.kinds import ActionFilter, Episode, Kind, ObservationFilter
+from libero_env.perturbations.sampling import direction, sign
+
+RGB = "_rgb"
+_BLUR_HEIGHT = 128  # [pixels] height of the image in which blur is measured
+_FINGERS = 0.1  # bias of the fingers over that of positions
+
+
+@dataclass(frozen=True)
+class PixelNoise(ObservationFilter):
+    """Independent normal noise of each pixel and colour, new in each picture.
+
+    Attributes:
+        deviation: Standard deviation, [grey levels of 255].
+    """
+
+    deviation: float
+
+    def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return the picture with noise."""
+        if not name.endswith(RGB):
+            return image
+        rng = episode.key.generator(name, episode.step)
+        noise = self.deviation * rng.standard_normal(image.shape, np.float32)
+        return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Blur(ObservationFilter):
+    """Gaussian blur of each picture.
+
+    Attributes:
+        deviation: Standard deviation in an image of 128 pixels height, [pixels]; in others in proportion.
+    """
+
+    deviation: float
+
+    def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return the blurred picture."""
+        if not name.endswith(RGB):
+            return image
+        radius = self.deviation * image.shape[0] / _BLUR_HEIGHT
+        return np.asarray(Image.fromarray(image).filter(ImageFilter.GaussianBlur(radius)))
+
+
+@dataclass(frozen=True)
+class Occlusion(ObservationFilter):
+    """A grey rectangle before each camera, which stays for the episode.
+
+    Attributes:
+        share: Share of the picture that it hides.
+    """
+
+    share: float
+
+    def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return the picture behind the rectangle."""
+        if not name.endswith(RGB):
+            return image
+        rng, (height, width) = episode.key.generator(name), image.shape[:2]
+        ratio, place, grey = 2.0 ** rng.uniform(-0.5, 0.5), rng.uniform(size=2), rng.integers(30, 226)
+        tall = np.clip(np.sqrt(self.share * ratio), self.share, 1.0)
+        rows, columns = round(height * tall), round(width * self.share / tall)
+        top, left = np.rint(place * (height - rows, width - columns)).astype(int)
+        hidden = image.copy()
+        hidden[top : top + rows, left : left + columns] = grey
+        return hidden
+
+
+@dataclass(frozen=True)
+class Latency(ObservationFilter):
+    """Pictures arrive later; until the first arrives, it is the one at the start.
+
+    Attributes:
+        steps: Number of control steps.
+    """
+
+    has_memory = True
+    steps: int
+
+    def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return an earlier picture."""
+        taken: deque[tuple[int, np.ndarray]] = episode.memory.setdefault(name, deque())
+        if taken and taken[-1][0] == episode.step:
+            taken.pop()
+        taken.append((episode.step, image.copy()))
+        while len(taken) > 1 and taken[1][0] <= episode.step - self.steps:
+            taken.popleft()
+        return taken[0][1]
+
+
+@dataclass(frozen=True)
+class DroppedFrames(ObservationFilter):
+    """Pictures are lost, of all cameras at once; the last one that arrived stays.
+
+    Attributes:
+        share: Probability that the pictures of a step are lost; those at the start arrive.
+    """
+
+    has_memory = True
+    share: float
+
+    def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return the last picture that arrived."""
+        arrived = episode.memory
+        if name not in arrived or episode.key.generator(episode.step).random() >= self.share:
+            arrived[name] = image.copy()
+        return arrived[name]
+
+
+@dataclass(frozen=True)
+class StateBias(ObservationFilter):
+    """The robot's sensors are off by a constant: joints and orientation by an angle, the hand by a distance.
+
+    Attributes:
+        amount: Distance in joint space and angle of the hand, [rad]; distance of the hand, [m]. Fingers: a tenth.
+    """
+
+    amount: float
+
+    def state(self, entries: Mapping[str, np.ndarray], episode: Episode) -> Mapping[str, np.ndarray]:
+        """Return what the sensors say."""
+        turn = quat_from_axis_angle(direction(episode.key.generator("turn"), 3), self.amount)[None]
+        biased = dict(entries)
+        for name, size, factor in (
+            ("joint_states", 7, 1.0),
+            ("ee_pos", 3, 1.0),
+            ("gripper_states", 2, _FINGERS),
+        ):
+            if name in entries:
+                offset = factor * self.amount * direction(episode.key.generator(name), size)
+                biased[name] = entries[name] + offset
+        if "ee_quat" in entries:
+            biased["ee_quat"] = quat_multiply(turn, entries["ee_quat"][None])[0]
+        if "ee_ori" in entries:
+            axis = entries["ee_ori"]
+            angle = float(np.linalg.norm(axis))
+            quat = quat_from_axis_angle(axis / angle if angle else np.eye(3)[0], angle)
+            biased["ee_ori"] = quat_to_axis_angle(quat_multiply(turn, quat[None]))[0]
+        return biased
+
+
+@dataclass(frozen=True)
+class ActionDelay(ActionFilter):
+    """Actions are executed later; until the first arrives, the robot holds its pose.
+
+    Attributes:
+        steps: Number of control steps.
+    """
+
+    steps: int
+
+    def act(self, action: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return an earlier action."""
+        waiting: deque[np.ndarray] = episode.memory.setdefault("waiting", deque())
+        waiting.append(action.copy())
+        return np.zeros_like(action) if len(waiting) <= self.steps else waiting.popleft()
+
+
+@dataclass(frozen=True)
+class ActionGain(ActionFilter):
+    """The movement of the arm is scaled; the gripper is not.
+
+    Attributes:
+        factor: Factor.
+    """
+
+    factor: float
+
+    def act(self, action: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return the scaled action."""
+        scaled = action.copy()
+        scaled[:-1] *= self.factor
+        return scaled
+
+
+@dataclass(frozen=True)
+class ActionNoise(ActionFilter):
+    """Independent normal noise on the movement of the arm, new in each step; the gripper has none.
+
+    Attributes:
+        deviation: Standard deviation, where actions are in [-1, 1].
+    """
+
+    deviation: float
+
+    def act(self, action: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return the noisy action."""
+        noisy = action.copy()
+        rng = episode.key.generator(episode.step)
+        noisy[:-1] += self.deviation * rng.standard_normal(len(action) - 1)
+        return noisy
+
+
+KINDS = (
+    Kind(
+        "noise",
+        "observation",
+        "grey levels",
+        50.0,
+        "normal noise on each pixel of all cameras, with this standard deviation of 255 levels",
+        lambda levels, rng: PixelNoise(levels),
+    ),
+    Kind(
+        "blur",
+        "observation",
+        "pixels of 128",
+        4.0,
+        "Gaussian blur of all cameras, with this standard deviation in an image of 128 pixels height",
+        lambda pixels, rng: Blur(pixels),
+    ),
+    Kind(
+        "occlusion",
+        "observation",
+        "share of the picture",
+        0.4,
+        "a grey rectangle hides this share of each picture, at a place that stays for the episode",
+        lambda share, rng: Occlusion(share),
+    ),
+    Kind(
+        "latency",
+        "observation",
+        "control steps",
+        10,
+        "pictures arrive this many steps of 50 ms later; the robot's own state does not",
+        lambda steps, rng: Latency(int(steps)),
+        scale="count",
+    ),
+    Kind(
+        "dropped_frames",
+        "observation",
+        "share",
+        0.9,
+        "this share of the pictures is lost, and the last that arrived stays",
+        lambda share, rng: DroppedFrames(share),
+    ),
+    Kind(
+        "proprio_bias",
+        "observation",
+        "m and rad",
+        0.1,
+        "the robot's sensors are off by this distance of the hand, and this angle of the hand and in joint space",
+        lambda amount, rng: StateBias(amount),
+    ),
+    Kind(
+        "delay",
+        "action",
+        "control steps",
+        4,
+        "actions are executed this many steps of 50 ms later",
+        lambda steps, rng: ActionDelay(int(steps)),
+        scale="count",
+        physical=True,
+        is_sampled=False,
+    ),
+    Kind(
+        "gain",
+        "action",
+        "ratio",
+        2.0,
+        "movements of the arm are larger or smaller by this factor",
+        lambda ratio, rng: ActionGain(ratio ** sign(rng)),
+        scale="ratio",
+        physical=True,
+    ),
+    Kind(
+        "action_noise",
+        "action",
+        "of the action's range",
+        0.5,
+        "normal noise on the arm's actions, with this standard deviation where actions are in [-1, 1]",
+        lambda deviation, rng: ActionNoise(deviation),
+        physical=True,
+    ),
+)

@@ -1,0 +1,190 @@
+"""The dataclass `Perturbation`, its text (`camera=0.3,light=0.5`), and tasks as perturbations change them."""
+
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field
+
+from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.perturbations import filters, looks, problem, starts
+from libero_env.perturbations.instructions import reword
+from libero_env.perturbations.kinds import Kind, Layer
+from libero_env.perturbations.sampling import SampleKey, first_attempt, sample_key
+from libero_env.sim.scene import Scene
+from libero_env.tasks.task import Task
+from libero_env.text import shown
+from libero_env.validation import checked
+
+KINDS: Mapping[str, Kind] = {
+    kind.name: kind for kinds in (problem.KINDS, looks.KINDS, starts.KINDS, filters.KINDS) for kind in kinds
+}
+"""All kinds by name, in the order in which they are applied."""
+
+EXPECTED = (
+    "expected KIND=SEVERITY, or several with commas between: camera=0.3,light=0.5; severities are from 0 to 1"
+)
+_MAX_CACHED = 256
+_cached: OrderedDict[Any, Task] = OrderedDict()  # perturbed tasks
+
+
+def get_kind(name: str) -> Kind:
+    """Return a kind of perturbation.
+
+    Raises:
+        UnknownNameError: It does not exist; the message lists the kinds.
+    """
+    if name not in KINDS:
+        raise UnknownNameError("kind of perturbation", name, KINDS)
+    return KINDS[name]
+
+
+@checked
+class Perturbation:
+    """A change of a task or of its episodes.
+
+    Attributes:
+        kind: Name of the kind, see `libero_env.perturbations.KINDS`.
+        severity: Severity in [0, 1]; 0 changes nothing, and the kind says what 1 is.
+        seed: Seed of what is sampled.
+
+    Raises:
+        UnknownNameError: The kind does not exist.
+        InvalidInputError: Severity or seed are out of range.
+    """
+
+    kind: Annotated[str, AfterValidator(lambda name: get_kind(name).name)]
+    severity: Annotated[float, Field(ge=0, le=1)]
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+
+    @property
+    def definition(self) -> Kind:
+        """Kind of the perturbation."""
+        return KINDS[self.kind]
+
+    @property
+    def layer(self) -> Layer:
+        """Layer that it acts on."""
+        return self.definition.layer
+
+    @property
+    def amount(self) -> float:
+        """Physical amount, in the unit of the kind."""
+        return self.definition.amount(self.severity)
+
+    def sample_name(self, task: str, start: object = "") -> str:
+        """Return the name of a sample in the file of those that can be solved.
+
+        Args:
+            task: Id of the task without perturbations.
+            start: Index of the initial state; empty for what is sampled once for the task.
+        """
+        return f"{task} {self.kind}={self.severity:g}@{self.seed} {start}".rstrip()
+
+    def first_attempt(self, task: str, start: object = "") -> int:
+        """Return the number of the first sample that may be used; see `sample_name`."""
+        return first_attempt(self.sample_name(task, start))
+
+    def key(self, task: str, start: object = "", attempt: int = 0) -> SampleKey:
+        """Return the key of a sample; see `sample_key`."""
+        return sample_key(self.kind, self.seed, task, start, attempt)
+
+    def __str__(self) -> str:
+        seed = f"@{self.seed}" if self.seed else ""
+        return f"{self.kind}={self.severity:g}{seed}"
+
+
+def parse_perturbations(text: str, seed: int = 0) -> tuple[Perturbation, ...]:
+    """Return the perturbations of a text, in the order in which they are applied.
+
+    Args:
+        text: `KIND=SEVERITY` with commas between; `camera=0.3@7` has the seed 7.
+        seed: Seed of those that name none.
+
+    Raises:
+        UnknownNameError: A kind does not exist.
+        InvalidInputError: A part has another form, a severity is out of range, or kinds exclude each other.
+    """
+    perturbations = []
+    for part in filter(None, map(str.strip, text.split(","))):
+        kind, _, rest = part.partition("=")
+        severity, at, own_seed = rest.partition("@")
+        get_kind(kind.strip())
+        try:
+            perturbations.append(Perturbation(kind.strip(), float(severity), int(own_seed) if at else seed))
+        except ValueError:  # those of `Perturbation` too
+            raise InvalidInputError(f"perturbation {shown(part)}: {EXPECTED}") from None
+    return in_order(perturbations)
+
+
+def in_order(perturbations: Iterable[Perturbation]) -> tuple[Perturbation, ...]:
+    """Return perturbations in the order in which they are applied.
+
+    Raises:
+        InvalidInputError: A kind is named twice, or kinds exclude each other.
+    """
+    names = list(KINDS)
+    ordered = sorted(perturbations, key=lambda one: names.index(one.kind))
+    for first, second in zip(ordered, ordered[1:], strict=False):
+        if first.kind == second.kind:
+            raise InvalidInputError(f"perturbation {first.kind} is named twice: {first} and {second}")
+    active = [one for one in ordered if one.severity]
+    for one in active:
+        rivals = [other.kind for other in active if other is not one and other.layer == one.layer]
+        if one.definition.exclusive and rivals:
+            raise InvalidInputError(f"perturbation {one.kind} cannot be combined with {', '.join(rivals)}")
+    return tuple(ordered)
+
+
+def replace_perturbations(
+    perturbations: Iterable[Perturbation], others: Iterable[Perturbation]
+) -> tuple[Perturbation, ...]:
+    """Return perturbations and others, which take the place of those of the same kind.
+
+    Raises:
+        InvalidInputError: Kinds exclude each other.
+    """
+    by_kind = {one.kind: one for one in (*perturbations, *others)}
+    return in_order(by_kind.values())
+
+
+def format_perturbations(perturbations: Iterable[Perturbation]) -> str:
+    """Return the text of perturbations, in the order in which they are applied; without those of severity 0."""
+    return ",".join(str(one) for one in in_order(perturbations) if one.severity)
+
+
+def perturb_task(task: Task, perturbations: Iterable[Perturbation], scene: Scene) -> Task:
+    """Return a task as perturbations change it; those of other layers are ignored.
+
+    Suite, index and name stay, so that its results can be paired with those of the task without perturbations.
+
+    Args:
+        task: Task.
+        perturbations: Perturbations in the order in which they are applied.
+        scene: Compiled scene of the task.
+
+    Raises:
+        InvalidInputError: The task has no other goal.
+        PlacementError: Objects cannot be moved so far.
+    """
+    active = tuple(one for one in perturbations if one.layer == "problem" and one.severity)
+    attempts = tuple(one.first_attempt(task.id) for one in active)
+    cache_key = (task, active, attempts, scene.pack, scene.robot)
+    if cache_key not in _cached:
+        changed = task
+        for one, attempt in zip(active, attempts, strict=True):
+            rng = one.key(task.id, attempt=attempt).generator()
+            changed = one.definition.sample(one.amount, rng, changed, scene)
+        _cached[cache_key] = changed
+        while len(_cached) > _MAX_CACHED:
+            _cached.popitem(last=False)
+    return _cached[cache_key]
+
+
+def reword_task(task: Task, perturbations: Iterable[Perturbation]) -> Task:
+    """Return a task in the words that perturbations give it, without its scene; those of other kinds are ignored."""
+    for one in perturbations:
+        if one.kind == "instruction" and one.severity:
+            rng = one.key(task.id, attempt=one.first_attempt(task.id)).generator()
+            return problem.with_instruction(task, reword(task.language, one.amount, rng))
+    return task
