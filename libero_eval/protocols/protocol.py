@@ -472,7 +472,10 @@ class EvalProtocol:
 
 
 def _perturbation_problems(text: str) -> Iterator[str]:
-    from libero_env.perturbations.perturbation import format_perturbations, parse_perturbations  # slow to import
+    from libero_env.perturbations.perturbation import (  # slow to import
+        format_perturbations,
+        parse_perturbations,
+    )
 
     try:
         if text != (ordered := format_perturbations(parse_perturbations(text))):
