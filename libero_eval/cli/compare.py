@@ -12,7 +12,7 @@ from libero_env.cli.options import Field, FilePath, Positional, Probability, Sha
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
-    from libero_eval.judging.comparability import Side
+    from libero_eval.judging.comparability import Group
     from lifelong.stats.power import Question
 
 _Signed = Annotated[float, Field(ge=-1, le=1)]
@@ -40,20 +40,20 @@ def compare(
         tasks: Show every task in the terminal.
         out: Folder for compare.html and compare.json.
     """
-    from libero_eval.judging.comparison import judge, write_judgement
-    from libero_eval.judging.text import render
+    from libero_eval.judging.comparison import compare_groups, write_comparison
+    from libero_eval.judging.page import render
 
-    sides = [*_single_sides(results), *(_group(words) for words in group)]
-    first_twice = _single_sides(control) if control else None
+    groups = [*_single_groups(results), *(_group(words) for words in group)]
+    first_twice = _single_groups(control) if control else None
     pair = (first_twice[0], first_twice[1]) if first_twice else None
-    found = judge(sides, control=pair, allow=allow, alpha=alpha)
-    print(render(found, tasks=tasks))
+    comparison = compare_groups(groups, control=pair, allow=allow, alpha=alpha)
+    print(render(comparison, tasks=tasks))
     if out:
         from libero_eval.judging.page import write_page
 
         print()
-        print(write_page(found, out / "compare.html"))
-        print(write_judgement(found, out / "compare.json"))
+        print(write_page(comparison, out / "compare.html"))
+        print(write_comparison(comparison, out / "compare.json"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,7 +146,7 @@ def _observed(words: Sequence[str]) -> tuple[float, float, float]:
 
     if len(words) != 2:
         raise ConfigError(f"libero power takes two results, not {len(words)}")
-    pairs = match(*_single_sides(words)).pairs
+    pairs = match(*_single_groups(words)).pairs
     counts = count(pairs)
     first, second = float(pairs.first.mean()), float(pairs.second.mean())
     print(
@@ -156,25 +156,25 @@ def _observed(words: Sequence[str]) -> tuple[float, float, float]:
     return first, second - first, counts.discordant / counts.pairs
 
 
-def _single_sides(words: Sequence[str]) -> "list[Side]":
+def _single_groups(words: Sequence[str]) -> "list[Group]":
     from libero_eval.evaluation_file import EvaluationResult
-    from libero_eval.judging.comparability import Side
+    from libero_eval.judging.comparability import Group
 
     split = [_named(w) for w in words]
     labels = _labels([path for _, path in split])
     return [
-        Side(name or label, (EvaluationResult.read(path),), (path,))
+        Group(name or label, (EvaluationResult.read(path),), (path,))
         for (name, path), label in zip(split, labels, strict=True)
     ]
 
 
-def _group(words: Sequence[str]) -> "Side":
+def _group(words: Sequence[str]) -> "Group":
     from libero_eval.evaluation_file import EvaluationResult
-    from libero_eval.judging.comparability import Side
+    from libero_eval.judging.comparability import Group
 
     if len(words) < 2:
         raise ConfigError(f"--group {' '.join(words)}: write --group NAME RESULT RESULT ...")
-    return Side(words[0], tuple(EvaluationResult.read(w) for w in words[1:]), tuple(words[1:]))
+    return Group(words[0], tuple(EvaluationResult.read(w) for w in words[1:]), tuple(words[1:]))
 
 
 def _named(word: str) -> tuple[str | None, str]:

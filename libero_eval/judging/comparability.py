@@ -6,9 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.sim.backend import MUJOCO
+from libero_env.text import flatten, plain, shorten
 from libero_eval.evaluation_file import EvaluationResult
 from lifelong.errors import ComparisonError
-from lifelong.report.comparison import MUJOCO, check_same_back_end
+from lifelong.report.comparison import check_same_back_end
 from lifelong.stats.episodes import Pairs
 
 # What the outcome of an episode depends on by design. Other entries of the environment (renderer, processor) and
@@ -19,7 +21,7 @@ UNKNOWN = "not recorded"
 
 
 @dataclass(frozen=True)
-class Side:
+class Group:
     """One policy of a comparison.
 
     Attributes:
@@ -35,12 +37,12 @@ class Side:
 
 @dataclass(frozen=True)
 class Matched:
-    """The episodes that two sides have in common.
+    """The episodes that two groups have in common.
 
     Attributes:
         pairs: Their outcomes; `pairs.tasks` are positions in `tasks`.
         tasks: Ids of the tasks.
-        dropped: Number of episodes of each side without a partner.
+        dropped: Number of episodes of each without a partner.
     """
 
     pairs: Pairs
@@ -48,11 +50,11 @@ class Matched:
     dropped: tuple[int, int]
 
 
-def check_comparable(sides: Sequence[Side], allow: Iterable[str] = ()) -> list[str]:
+def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list[str]:
     """Compare protocols, tasks and environments of all results with those of the first.
 
     Args:
-        sides: Policies to be compared.
+        groups: Policies to be compared.
         allow: Names of settings that may differ, or of groups of them: `protocol`, `protocol.horizon`,
             `environment.robot`, `tasks`.
 
@@ -60,22 +62,22 @@ def check_comparable(sides: Sequence[Side], allow: Iterable[str] = ()) -> list[s
         Remarks on what differs and was allowed, or does not matter much.
 
     Raises:
-        ComparisonError: A setting differs; the message names both values. Back ends are never mixed.
+        ComparisonError: A setting differs; the message names both values. Backends are never mixed.
     """
-    rows = [(s.label, r) for s in sides for r in s.results]
+    rows = [(s.label, r) for s in groups for r in s.results]
     base_label, base = rows[0]
-    found_on = {back_end_of(result): label for label, result in rows}
-    check_same_back_end({label: name for name, label in found_on.items()})
+    check_same_back_end({label: backend_of(result) for label, result in rows})
     expected, refused, notes = settings(base), {}, {}
     for label, result in rows[1:]:
-        found = settings(result)
-        for key in sorted(expected.keys() | found.keys()):
-            if key.startswith("tasks.") and not (key in expected and key in found):
+        others = settings(result)
+        for key in sorted(expected.keys() | others.keys()):
+            if key.startswith("tasks.") and not (key in expected and key in others):
                 continue  # a task of one of them only: its episodes have no partner
-            values = expected.get(key, UNKNOWN), found.get(key, UNKNOWN)
+            values = expected.get(key, UNKNOWN), others.get(key, UNKNOWN)
             if values[0] == values[1]:
                 continue
-            text = f"{key}: {_short(values[0])} in {base_label}, {_short(values[1])} in {label}"
+            one, other = (shorten(str(value), 60) for value in values)
+            text = f"{key}: {one} in {base_label}, {other} in {label}"
             if UNKNOWN in values and key.startswith("environment."):
                 notes[key] = f"{text}; taken to be the same"
             elif any(key == a or key.startswith(a + ".") for a in allow):
@@ -98,23 +100,23 @@ def settings(result: EvaluationResult) -> dict[str, Any]:
     """Return everything that must be equal, flat, by dotted name: protocol, environment, instructions of the tasks."""
     world = {k: v for k, v in result.environment.items() if k.partition("_")[0] in WORLD and v is not None}
     tasks = {r.task: {"name": r.name, "instruction": r.instruction} for r in result.tasks}
-    return _flat({"protocol": result.protocol, "environment": world, "tasks": tasks})
+    return flatten(plain({"protocol": result.protocol, "environment": world, "tasks": tasks}))
 
 
-def back_end_of(result: EvaluationResult) -> str:
-    """Return the back end of a result; those that name none are of `mujoco`."""
+def backend_of(result: EvaluationResult) -> str:
+    """Return the backend of a result; those that name none are of `mujoco`."""
     world = result.protocol.get("world")
     return str(world.get("backend", MUJOCO)) if isinstance(world, Mapping) else MUJOCO
 
 
-def match(first: Side, second: Side) -> Matched:
-    """Pair the episodes of two sides by task and initial state.
+def match(first: Group, second: Group) -> Matched:
+    """Pair the episodes of two groups by task and initial state.
 
     Raises:
         ComparisonError: They have no start in common.
     """
-    tables = [[_outcomes(r) for r in side.results] for side in (first, second)]
-    shared = set.intersection(*(set(t) for side in tables for t in side))
+    tables = [[_outcomes(r) for r in group.results] for group in (first, second)]
+    shared = set.intersection(*(set(t) for group in tables for t in group))
     if not shared:
         raise ComparisonError(
             f"{first.label} and {second.label} were not evaluated in the same starts: "
@@ -122,8 +124,8 @@ def match(first: Side, second: Side) -> Matched:
         )
     order = [t.task for t in first.results[0].tasks if any(key[0] == t.task for key in shared)]
     keys = sorted(shared, key=lambda key: (order.index(key[0]), key[1]))
-    columns = [np.array([[t[key] for t in side] for key in keys], dtype=bool) for side in tables]
-    dropped = [sum(len(t) - len(shared) for t in side) for side in tables]
+    columns = [np.array([[t[key] for t in group] for key in keys], dtype=bool) for group in tables]
+    dropped = [sum(len(t) - len(shared) for t in group) for group in tables]
     pairs = Pairs(
         tasks=np.array([order.index(task) for task, _ in keys]),
         starts=np.array([start for _, start in keys]),
@@ -152,20 +154,19 @@ def _outcomes(result: EvaluationResult) -> dict[tuple[str, int], bool]:
 
 def _lesser_differences(first: EvaluationResult, second: EvaluationResult) -> dict[str, tuple[Any, Any]]:
     """Return versions and properties of the environment that differ but do not forbid a comparison."""
-    found = {}
-    for name, a, b in (
-        ("versions", first.versions, second.versions),
-        ("environment", first.environment, second.environment),
-    ):
-        for key in sorted(a.keys() & b.keys()):
-            strict = key.partition("_")[0] in WORLD
-            if not strict and a[key] != b[key] and key not in PASSING:
-                found[f"{name}.{key}"] = (a[key], b[key])
-    return found
+    both = ({"versions": r.versions, "environment": r.environment} for r in (first, second))
+    a, b = (flatten(values) for values in both)
+    return {
+        key: (a[key], b[key])
+        for key in sorted(a.keys() & b.keys(), reverse=True)
+        if a[key] != b[key]
+        and not key.partition(".")[2].startswith(WORLD)
+        and key.partition(".")[2] not in PASSING
+    }
 
 
-def _starts(side: Side) -> str:
-    result = side.results[0]
+def _starts(group: Group) -> str:
+    result = group.results[0]
     task = result.tasks[0]
     return f"{len(result.tasks)} tasks from {task.task}, starts {_ranges(task.init_states)}"
 
@@ -179,15 +180,3 @@ def _ranges(numbers: Sequence[int]) -> str:
         else:
             parts.append([number, number])
     return ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in parts)
-
-
-def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    if isinstance(value, Mapping):
-        parts = (_flat(v, f"{prefix}.{k}" if prefix else str(k)) for k, v in value.items())
-        return {k: v for part in parts for k, v in part.items()}
-    return {prefix: list(value) if isinstance(value, tuple) else value}
-
-
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= 60 else text[:57] + "..."

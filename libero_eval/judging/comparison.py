@@ -1,8 +1,7 @@
-"""Comparison of evaluated policies, start by start: differences, tests, a control arm, and what could be shown."""
+"""Contrast of evaluated policies, start by start: differences, tests, a control arm, and what could be shown."""
 
-import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -10,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.storage import atomic_write_text
+from libero_env.sim.backend import MUJOCO
+from libero_env.storage import write_json
 from libero_env.text import json_safe
 from libero_eval.judging.comparability import (
+    Group,
     Matched,
-    Side,
-    back_end_of,
+    backend_of,
     check_comparable,
     match,
     same_policy,
@@ -23,7 +23,6 @@ from libero_eval.judging.comparability import (
 )
 from libero_eval.judging.group_scores import GroupScores, group_scores
 from lifelong.errors import ConfigError, ResultsError
-from lifelong.report.comparison import MUJOCO
 from lifelong.stats.episodes import (
     ALPHA,
     Difference,
@@ -41,14 +40,14 @@ FORMAT = "libero-comparison/1"
 
 
 @dataclass(frozen=True)
-class Part:
+class Row:
     """The difference on all tasks together, on a suite, or on a task.
 
     Attributes:
         name: `all`, a suite, or the id of a task.
         title: The instruction of a task; empty otherwise.
         difference: The difference.
-        adjusted: P-value adjusted by Holm over the family: all comparisons of this kind of part; for tasks, the tasks
+        adjusted: P-value adjusted by Holm over the family: all comparisons of this kind of row; for tasks, the tasks
             of this comparison. None for a control arm, which is not tested for being better.
     """
 
@@ -59,7 +58,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class Contrast:
     """Two policies in the same starts, first minus second.
 
     Attributes:
@@ -76,9 +75,9 @@ class Comparison:
 
     first: str
     second: str
-    total: Part
-    suites: tuple[Part, ...]
-    tasks: tuple[Part, ...]
+    total: Row
+    suites: tuple[Row, ...]
+    tasks: tuple[Row, ...]
     sequential: SequentialTest | None
     shown: float
     dropped: tuple[int, int]
@@ -97,7 +96,7 @@ class Rate:
 
 
 @dataclass(frozen=True)
-class Judgement:
+class Comparison:
     """Everything that a comparison found.
 
     Attributes:
@@ -111,8 +110,8 @@ class Judgement:
     """
 
     rates: tuple[Rate, ...]
-    comparisons: tuple[Comparison, ...]
-    controls: tuple[Comparison, ...]
+    comparisons: tuple[Contrast, ...]
+    controls: tuple[Contrast, ...]
     groups: GroupScores | None
     notes: tuple[str, ...]
     alpha: float = ALPHA
@@ -120,25 +119,25 @@ class Judgement:
 
     def to_plain(self) -> dict[str, Any]:
         """Return everything as plain data for JSON."""
-        plain = _plain({"format": FORMAT, **asdict(self)})
+        plain = json_safe({"format": FORMAT, **asdict(self)})
         if self.groups:
             plain["groups"]["improvement"] = [
                 {"of": a, "over": b, **asdict(e)} for (a, b), e in self.groups.improvement.items()
             ]
-        return json_safe(plain)
+        return plain
 
 
-def judge(
-    sides: Sequence[Side],
+def compare_groups(
+    groups: Sequence[Group],
     *,
-    control: tuple[Side, Side] | None = None,
+    control: tuple[Group, Group] | None = None,
     allow: Sequence[str] = (),
     alpha: float = ALPHA,
-) -> Judgement:
+) -> Comparison:
     """Compare every pair of policies in the starts that they have in common.
 
     Args:
-        sides: At least two policies. Two results of one policy with different seeds are also a control arm.
+        groups: At least two policies. Two results of one policy with different seeds are also a control arm.
         control: Two results of one policy, for the control arm alone.
         allow: Settings that may differ, see `check_comparable`.
         alpha: Probability of a false difference in each family of tests.
@@ -148,15 +147,15 @@ def judge(
         ConfigError: There are fewer than two policies, or two of one name.
         MissingPackageError: rliable, for several runs of a policy, is not installed.
     """
-    if len(sides) < 2 and not (control and not sides):
+    if len(groups) < 2 and not (control and not groups):
         raise ConfigError("a comparison needs two results, or --control with two results of one policy")
-    labels = [s.label for s in sides]
+    labels = [s.label for s in groups]
     if twice := sorted({name for name in labels if labels.count(name) > 1}):
         raise ConfigError(f"two policies are called {', '.join(twice)}; write NAME=RESULT to name them")
-    notes = check_comparable([*sides, *(control or ())], allow)
-    rivals: list[tuple[Side, Side]] = []
+    notes = check_comparable([*groups, *(control or ())], allow)
+    rivals: list[tuple[Group, Group]] = []
     controls = [control] if control else []
-    for a, b in combinations(sides, 2):
+    for a, b in combinations(groups, 2):
         (controls if _is_control(a, b) else rivals).append((a, b))
     notes += [note for a, b in controls for note in _control_notes(a, b)]
     comparisons = _adjusted([_compare(a, b, alpha) for a, b in rivals])
@@ -166,49 +165,48 @@ def judge(
             "no control arm: evaluate one of the policies again with another --seed and name both results "
             "with --control, to see which differences arise by chance alone"
         )
-    backend = back_end_of((sides or control)[0].results[0])  # type: ignore[index]  # there is one of them
+    backend = backend_of((groups or control)[0].results[0])  # type: ignore[index]  # there is one of them
     if backend != MUJOCO:
         notes.append(f"simulated by backend={backend}; not to be compared with results of others")
-    return Judgement(
-        rates=tuple(_rate(s) for s in sides),
+    return Comparison(
+        rates=tuple(_rate(s) for s in groups),
         comparisons=tuple(comparisons),
         controls=tuple(_compare(a, b, alpha) for a, b in controls),
-        groups=_groups(sides),
+        groups=_group_scores(groups),
         notes=tuple(notes),
         alpha=alpha,
         backend=backend,
     )
 
 
-def write_judgement(found: Judgement, path: Path) -> Path:
+def write_comparison(comparison: Comparison, path: Path) -> Path:
     """Write everything as JSON, in one step; numbers that are not finite become null.
 
     Raises:
         ResultsError: The file cannot be written.
     """
-    text = json.dumps(found.to_plain(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     try:
-        atomic_write_text(path, text)
+        write_json(path, comparison.to_plain())
     except OSError as error:
         raise ResultsError(f"{path}: the comparison cannot be written ({error})") from error
     return path
 
 
-def _compare(a: Side, b: Side, alpha: float) -> Comparison:
+def _compare(a: Group, b: Group, alpha: float) -> Contrast:
     matched = match(a, b)
     pairs, names = matched.pairs, matched.tasks
     suites = list(dict.fromkeys(name.partition("/")[0] for name in names))
     titles = {t.task: t.instruction for r in a.results for t in r.tasks}
     total = difference(pairs)
     by_suite = [
-        Part(s, "", difference(pairs.of_tasks([i for i, n in enumerate(names) if n.startswith(s + "/")])))
+        Row(s, "", difference(pairs.of_tasks([i for i, n in enumerate(names) if n.startswith(s + "/")])))
         for s in suites
     ]
-    by_task = [Part(name, titles[name], _task_difference(matched, i)) for i, name in enumerate(names)]
-    return Comparison(
+    by_task = [Row(name, titles[name], _task_difference(matched, i)) for i, name in enumerate(names)]
+    return Contrast(
         first=a.label,
         second=b.label,
-        total=Part("all", "", total),
+        total=Row("all", "", total),
         suites=tuple(by_suite) if len(suites) > 1 else (),
         tasks=tuple(by_task),
         sequential=sequential_test(pairs, alpha) if pairs.single else None,
@@ -240,22 +238,24 @@ def _task_difference(matched: Matched, task: int) -> Difference:
     )
 
 
-def _adjusted(comparisons: Sequence[Comparison]) -> list[Comparison]:
+def _adjusted(comparisons: Sequence[Contrast]) -> list[Contrast]:
     """Adjust the p-values by Holm: totals together, suites of all comparisons together, tasks of each comparison."""
     totals = holm([c.total.difference.p_value for c in comparisons])
     suites = iter(holm([p.difference.p_value for c in comparisons for p in c.suites]))
-    found = []
-    for comparison, adjusted in zip(comparisons, totals, strict=True):
-        tasks = holm([p.difference.p_value for p in comparison.tasks])
-        found.append(
-            replace(
-                comparison,
-                total=replace(comparison.total, adjusted=adjusted),
-                suites=tuple(replace(p, adjusted=next(suites)) for p in comparison.suites),
-                tasks=tuple(replace(p, adjusted=v) for p, v in zip(comparison.tasks, tasks, strict=True)),
-            )
+    return [
+        replace(
+            contrast,
+            total=replace(contrast.total, adjusted=adjusted),
+            suites=tuple(replace(row, adjusted=next(suites)) for row in contrast.suites),
+            tasks=tuple(
+                replace(row, adjusted=value)
+                for row, value in zip(
+                    contrast.tasks, holm([row.difference.p_value for row in contrast.tasks]), strict=True
+                )
+            ),
         )
-    return found
+        for contrast, adjusted in zip(comparisons, totals, strict=True)
+    ]
 
 
 def _shown(total: Difference, alpha: float) -> float:
@@ -270,26 +270,26 @@ def _shown(total: Difference, alpha: float) -> float:
     return shown_difference(replace(question, discordance=max(share, base / 1000)), total.pairs)
 
 
-def _rate(side: Side) -> Rate:
-    wins = sum(sum(t.successes) for r in side.results for t in r.tasks)
-    episodes = sum(len(t.successes) for r in side.results for t in r.tasks)
+def _rate(group: Group) -> Rate:
+    wins = sum(sum(t.successes) for r in group.results for t in r.tasks)
+    episodes = sum(len(t.successes) for r in group.results for t in r.tasks)
     low, high = wilson_interval(wins, episodes)
     return Rate(
-        label=side.label,
-        paths=side.paths,
-        runs=len(side.results),
+        label=group.label,
+        paths=group.paths,
+        runs=len(group.results),
         episodes=episodes,
-        errors=sum(sum(e is not None for e in t.errors) for r in side.results for t in r.tasks),
+        errors=sum(sum(e is not None for e in t.errors) for r in group.results for t in r.tasks),
         success=Estimate(wins / episodes, float(low), float(high)),
     )
 
 
-def _groups(sides: Sequence[Side]) -> GroupScores | None:
-    """Return aggregates over runs, on the tasks that all runs have; None unless each side has two runs."""
-    if not sides or any(len(s.results) < 2 for s in sides):
+def _group_scores(groups: Sequence[Group]) -> GroupScores | None:
+    """Return aggregates over runs, on the tasks that all runs have; None unless each has two runs."""
+    if not groups or any(len(s.results) < 2 for s in groups):
         return None
     rates = {
-        s.label: [{t.task: float(np.mean(t.successes)) for t in r.tasks} for r in s.results] for s in sides
+        s.label: [{t.task: float(np.mean(t.successes)) for t in r.tasks} for r in s.results] for s in groups
     }
     shared = set.intersection(*(set(row) for rows in rates.values() for row in rows))
     names = sorted(shared)
@@ -298,7 +298,7 @@ def _groups(sides: Sequence[Side]) -> GroupScores | None:
     )
 
 
-def _is_control(a: Side, b: Side) -> bool:
+def _is_control(a: Group, b: Group) -> bool:
     """Return whether both are one policy under the same settings, so that they differ by chance alone."""
     if len(a.results) != 1 or len(b.results) != 1:
         return False
@@ -306,7 +306,7 @@ def _is_control(a: Side, b: Side) -> bool:
     return same_policy(first, second) and settings(first) == settings(second)
 
 
-def _control_notes(a: Side, b: Side) -> list[str]:
+def _control_notes(a: Group, b: Group) -> list[str]:
     first, second = a.results[0], b.results[0]
     if not same_policy(first, second):
         return [
@@ -321,19 +321,8 @@ def _control_notes(a: Side, b: Side) -> list[str]:
     return []
 
 
-def _dropped(c: Comparison) -> str:
+def _dropped(c: Contrast) -> str:
     return (
         f"{c.first} and {c.second}: {c.total.difference.pairs} pairs; without a partner and not counted: "
         f"{c.dropped[0]} episodes of {c.first}, {c.dropped[1]} of {c.second}"
     )
-
-
-def _plain(value: Any) -> Any:
-    """Return nested data without arrays; keys that are no text are left to the caller."""
-    if isinstance(value, Mapping):
-        return {k if isinstance(k, str) else " over ".join(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    return value

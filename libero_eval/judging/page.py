@@ -1,63 +1,312 @@
-"""A self-contained page about a comparison of evaluated policies."""
+"""A comparison as plain text for a terminal, and as a self-contained page with its figures."""
 
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
 from libero_env.storage import atomic_write_text
-from libero_eval.judging import text
-from libero_eval.judging.comparison import Comparison, Judgement
-from libero_eval.judging.figures import forest_figure, profile_figure, sequential_figure
+from libero_env.text import text_table
+from libero_eval.judging.comparison import Comparison, Contrast, Row
+from libero_eval.judging.group_scores import Profile
 from lifelong.errors import ResultsError
-from lifelong.report.figures import as_svg
+from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below, shorten
 from lifelong.report.tables import page_template
+from lifelong.stats.episodes import Difference, SequentialTest
+from lifelong.stats.intervals import Estimate
+
+WORST = 5  # tasks in the table of a terminal
+MOST_ROWS = 60  # of a forest plot
 
 
-def write_page(found: Judgement, path: Path) -> Path:
+def render(comparison: Comparison, *, tasks: bool = False) -> str:
+    """Return the tables of a comparison.
+
+    Args:
+        comparison: The comparison.
+        tasks: Whether to show every task instead of those that differ most.
+    """
+    blocks = [_rates(comparison)]
+    blocks += [_contrast_text(c, comparison.alpha, tasks) for c in comparison.comparisons]
+    blocks += [_control_text(c) for c in comparison.controls]
+    blocks += [_groups(comparison)] if comparison.groups else []
+    blocks += ["\n".join(f"note: {note}" for note in comparison.notes)] if comparison.notes else []
+    return "\n\n".join(blocks)
+
+
+def verdict(c: Contrast, alpha: float) -> str:
+    """Return one sentence on what a comparison shows."""
+    d, p = c.total.difference, c.total.adjusted
+    assert p is not None
+    tested = f"{p_equation(p)}, {d.test}"
+    if p <= alpha:
+        better, worse = (c.first, c.second) if d.value > 0 else (c.second, c.first)
+        return f"{better} is better than {worse} in these starts: {points(d.interval)} points ({tested})."
+    text = f"No difference is shown: {c.first} − {c.second} is {points(d.interval)} points ({tested})."
+    if math.isfinite(c.shown):
+        text += (
+            f" {d.pairs} pairs that differ as often show a difference of {100 * c.shown:.1f} points "
+            "in four of five cases."
+        )
+    return text
+
+
+def sequential_text(c: Contrast) -> str:
+    """Return one sentence on the test that may be stopped early."""
+    assert c.sequential is not None
+    test, count = c.sequential, c.total.difference.pairs
+    if test.decided_after is None:
+        return f"Stopped at any time: not decided after {count} pairs ({p_equation(test.p_value)}); more may be added."
+    better = c.first if test.first_better else c.second
+    return (
+        f"Stopped at any time: decided for {better} after {test.decided_after} of {count} pairs "
+        f"({p_equation(test.p_value)})."
+    )
+
+
+def chance_text(c: Contrast) -> str:
+    """Return one sentence on what a control arm shows."""
+    d = c.total.difference
+    if d.counts is None or d.by_chance is None:
+        return f"One policy twice differs by {points(d.interval)} points by chance alone."
+    return (
+        f"One policy twice differs in {d.counts.discordant} of {d.pairs} starts; by chance alone that makes up to "
+        f"±{100 * d.by_chance:.1f} points in 19 of 20 comparisons."
+    )
+
+
+def points(e: Estimate) -> str:
+    """Format a difference with its interval in percentage points: +1.8 [0.6, 3.0]."""
+    return f"{100 * e.value:+.1f} {interval_text(e)}".replace("-", "−")
+
+
+def interval_text(e: Estimate) -> str:
+    """Format an interval in percentage points; nothing where it is unknown."""
+    return f"[{100 * e.low:.1f}, {100 * e.high:.1f}]".replace("-", "−") if math.isfinite(e.low) else ""
+
+
+def p_text(p: float) -> str:
+    """Format a p-value: three digits after the point, or that it is smaller."""
+    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
+
+
+def p_equation(p: float) -> str:
+    """Format a p-value in a sentence: p = 0.012, p < 0.001."""
+    return f"p = {p_text(p)}" if p >= 0.001 else f"p {p_text(p)}"
+
+
+def _rates(comparison: Comparison) -> str:
+    if not comparison.rates:
+        return "control arm only"
+    rows: list[list[object]] = [["policy", "runs", "episodes", "errors", "success %", "95 %"]]
+    rows += [
+        [r.label, r.runs, r.episodes, r.errors, f"{100 * r.success.value:.1f}", interval_text(r.success)]
+        for r in comparison.rates
+    ]
+    return text_table(rows)
+
+
+def _contrast_text(c: Contrast, alpha: float, all_tasks: bool) -> str:
+    lines = [verdict(c, alpha)]
+    lines += [sequential_text(c)] if c.sequential else []
+    lines += ["", _table(c, (c.total, *c.suites))]
+    moved = [p for p in c.tasks if p.difference.value != 0]
+    shown = c.tasks if all_tasks else sorted(moved, key=lambda p: -abs(p.difference.value))[:WORST]
+    if shown and len(c.tasks) > 1:
+        head = "every task" if all_tasks else f"tasks that differ most (of {len(c.tasks)})"
+        lines += ["", f"{head}; Holm over the tasks", _table(c, shown)]
+    return "\n".join(lines)
+
+
+def _control_text(c: Contrast) -> str:
+    head = f"control arm: {c.first} − {c.second}, one policy twice"
+    return "\n".join([head, chance_text(c), "", _table(c, (c.total, *c.suites))])
+
+
+def _table(c: Contrast, rows: Sequence[Row]) -> str:
+    first, second = _short(c.first), _short(c.second)
+    heads = [f"{first} %", f"{second} %", "difference", "95 %", f"only {first}", f"only {second}"]
+    cells = [[row.name, *_cells(row.difference, row.adjusted)] for row in rows]
+    return text_table([["", "pairs", *heads, "p", "Holm"], *cells])
+
+
+def _cells(d: Difference, adjusted: float | None) -> list[str]:
+    only = [str(d.counts.only_first), str(d.counts.only_second)] if d.counts else ["–", "–"]
+    return [
+        str(d.pairs),
+        f"{100 * d.first:.1f}",
+        f"{100 * d.second:.1f}",
+        f"{100 * d.value:+.1f}".replace("-", "−"),
+        interval_text(d.interval),
+        *only,
+        p_text(d.p_value),
+        "–" if adjusted is None else p_text(adjusted),
+    ]
+
+
+def _groups(comparison: Comparison) -> str:
+    assert comparison.groups is not None
+    g = comparison.groups
+    rows = [["", "runs", "mean %", "95 %", "IQM %", "95 %"]]
+    for name, runs in g.runs.items():
+        cells = [(f"{100 * e.value:.1f}", interval_text(e)) for e in (g.mean[name], g.iqm[name])]
+        rows.append([name, str(runs), *cells[0], *cells[1]])
+    return "\n".join(
+        [
+            "over runs (rliable; intervals draw runs anew, and are too narrow for fewer than five)",
+            text_table(rows),
+            *(
+                f"a run of {a} beats one of {b} on a task with probability {e.value:.2f} [{e.low:.2f}, {e.high:.2f}]"
+                for (a, b), e in g.improvement.items()
+            ),
+        ]
+    )
+
+
+def _short(label: str, length: int = 16) -> str:
+    return label if len(label) <= length else "…" + label[1 - length :]
+
+
+def write_page(comparison: Comparison, path: Path) -> Path:
     """Write the page; it needs no other file and no network.
 
     Args:
-        found: The comparison.
+        comparison: The comparison.
         path: File to write.
 
     Raises:
         ResultsError: The file cannot be written.
     """
-    tests = {f"{c.first} − {c.second}": c.sequential for c in found.comparisons if c.sequential}
+    tests = {f"{c.first} − {c.second}": c.sequential for c in comparison.comparisons if c.sequential}
     page = page_template("page.html", "libero_eval.judging").render(
-        title=_title(found),
-        rates=found.rates,
-        comparisons=[_comparison(c, found) for c in found.comparisons],
-        controls=[_control(c) for c in found.controls],
-        notes=found.notes,
-        groups=found.groups,
-        alpha=found.alpha,
+        title=_title(comparison),
+        rates=comparison.rates,
+        comparisons=[_contrast_content(c, comparison) for c in comparison.comparisons],
+        controls=[
+            {"comparison": c, "rows": (c.total, *c.suites), "verdict": chance_text(c)}
+            for c in comparison.controls
+        ],
+        notes=comparison.notes,
+        groups=comparison.groups,
+        alpha=comparison.alpha,
         sequential=as_svg(sequential_figure(tests)) if tests else None,
-        profiles=as_svg(profile_figure(found.groups.profiles)) if found.groups else None,
-        p_text=text.p_text,
-        interval_text=text.interval_text,
+        profiles=as_svg(profile_figure(comparison.groups.profiles)) if comparison.groups else None,
+        p_text=p_text,
+        interval_text=interval_text,
     )
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
         atomic_write_text(path, page)
     except OSError as error:
         raise ResultsError(f"{path}: the page cannot be written ({error})") from error
     return path
 
 
-def _title(found: Judgement) -> str:
-    names = [r.label for r in found.rates] or [found.controls[0].first, found.controls[0].second]
+def _title(comparison: Comparison) -> str:
+    names = [r.label for r in comparison.rates] or [
+        comparison.controls[0].first,
+        comparison.controls[0].second,
+    ]
     return " against ".join(names) if len(names) < 4 else f"{len(names)} policies compared"
 
 
-def _comparison(c: Comparison, found: Judgement) -> dict[str, Any]:
+def _contrast_content(c: Contrast, comparison: Comparison) -> dict[str, Any]:
     return {
         "comparison": c,
-        "parts": (c.total, *c.suites),
-        "verdict": text.verdict(c, found.alpha),
-        "sequential": text.sequential_text(c) if c.sequential else None,
-        "forest": as_svg(forest_figure(c, found.controls[0] if found.controls else None)),
+        "rows": (c.total, *c.suites),
+        "verdict": verdict(c, comparison.alpha),
+        "sequential": sequential_text(c) if c.sequential else None,
+        "forest": as_svg(forest_figure(c, comparison.controls[0] if comparison.controls else None)),
     }
 
 
-def _control(c: Comparison) -> dict[str, Any]:
-    return {"comparison": c, "parts": (c.total, *c.suites), "verdict": text.chance_text(c)}
+def forest_figure(c: Contrast, control: Contrast | None = None) -> Figure:
+    """Draw the difference of every task with its interval; above them all tasks, suites and the control arm.
+
+    Tasks whose difference is significant after Holm are filled. Of more than sixty tasks, those that differ most are
+    drawn.
+
+    Args:
+        c: The comparison.
+        control: One policy twice, drawn above in grey, with a band of what chance alone makes.
+    """
+    tasks = sorted(c.tasks, key=lambda p: -abs(p.difference.value))[:MOST_ROWS]
+    tasks = [p for p in c.tasks if p in tasks]
+    rows: list[tuple[Row, str, str]] = [(c.total, "all tasks", INK)]
+    rows += [(p, p.name, LINE_COLOURS[0]) for p in c.suites]
+    if control:
+        rows.append((control.total, "control: one policy twice", LINE_COLOURS[-1]))
+    if len(c.tasks) > 1:
+        rows += [(p, f"{p.name}  {shorten(p.title, 44)}", LINE_COLOURS[0]) for p in tasks]
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(7.6, 0.7 + 0.2 * len(rows)), layout="constrained")
+        axes = figure.subplots()
+        for place, (row, _, colour) in enumerate(rows):
+            e = row.difference.interval
+            strong = row.adjusted is not None and row.adjusted <= 0.05
+            axes.plot(
+                [100 * e.low, 100 * e.high], [place, place], color=colour, lw=1.6 if place == 0 else 1.1
+            )
+            face = colour if strong else "white"
+            axes.plot(100 * e.value, place, "s" if place == 0 else "o", ms=4.2, mec=colour, mfc=face, mew=1.0)
+        if control and control.total.difference.by_chance is not None:
+            band = 100 * control.total.difference.by_chance
+            axes.axvspan(-band, band, color=LINE_COLOURS[-1], alpha=0.15, lw=0)
+        axes.axvline(0, color=INK, lw=0.6)
+        axes.set_yticks(range(len(rows)), [shorten(name) for _, name, _ in rows])
+        axes.tick_params(axis="y", length=0)
+        axes.set_ylim(len(rows) - 0.4, -0.6)
+        axes.set_xlabel(f"{shorten(c.first, 30)} − {shorten(c.second, 30)}, percentage points")
+        axes.grid(axis="x", lw=0.4, alpha=0.3, color=INK)
+        hide_spines(axes)
+    return figure
+
+
+def sequential_figure(tests: Mapping[str, SequentialTest]) -> Figure:
+    """Draw the evidence of each comparison against the number of pairs, with the line at which it is decided.
+
+    Args:
+        tests: Sequential tests by label, all with the same alpha.
+    """
+    alpha = next(iter(tests.values())).alpha
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(5.6, 2.7), layout="constrained")
+        axes = figure.subplots()
+        lowest = 0.0
+        for number, (label, test) in enumerate(tests.items()):
+            colour = LINE_COLOURS[number % len(LINE_COLOURS)]
+            path = np.concatenate([[0.0], test.log_e]) / np.log(10)
+            lowest = min(lowest, float(path.min()))
+            axes.step(
+                np.arange(len(path)), path, where="post", color=colour, lw=1.3, label=shorten(label, 60)
+            )
+            if test.decided_after is not None:
+                axes.plot(test.decided_after, path[test.decided_after], "o", ms=5, mfc="white", mec=colour)
+        axes.axhline(-np.log10(alpha), color=INK, lw=0.7, ls="--")
+        axes.set_ylim(bottom=max(lowest - 0.3, -4))
+        axes.set_xlabel("pairs, one start of every task after the other")
+        axes.set_ylabel("evidence, log₁₀ e")
+        hide_spines(axes)
+        legend_below(figure)
+    return figure
+
+
+def profile_figure(profiles: Mapping[str, Profile]) -> Figure:
+    """Draw the share of runs and tasks whose success is above each threshold, with bands."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(5.6, 2.7), layout="constrained")
+        axes = figure.subplots()
+        for number, (label, p) in enumerate(profiles.items()):
+            colour = LINE_COLOURS[number % len(LINE_COLOURS)]
+            axes.plot(100 * p.thresholds, 100 * p.shares, color=colour, lw=1.4, label=shorten(label, 60))
+            axes.fill_between(100 * p.thresholds, 100 * p.low, 100 * p.high, color=colour, alpha=0.16, lw=0)
+        axes.set_xlim(0, 100)
+        axes.set_ylim(0, 101)
+        axes.set_xlabel("success above (%)")
+        axes.set_ylabel("of runs and tasks (%)")
+        hide_spines(axes)
+        legend_below(figure)
+    return figure

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 
+from libero_env.text import text_table
 from lifelong.errors import ConfigError
 from lifelong.stats.power import (
     Question,
@@ -28,11 +29,11 @@ def answer(question: Question) -> str:
         f"different starts (two proportions): {unpaired} episodes of each policy",
     ]
     if 2 * paired <= SIMULATED:
-        found = sequential_stopping(question, 2 * paired)
-        half = f"half of the evaluations stop by {found.median:.0f} pairs, " if found.median > 0 else ""
+        stopping = sequential_stopping(question, 2 * paired)
+        half = f"half of the evaluations stop by {stopping.median:.0f} pairs, " if stopping.median > 0 else ""
         lines.append(
             f"same starts, stopped as soon as it is decided: {half}"
-            f"{100 * found.power:.0f} % are decided by {found.limit}"
+            f"{100 * stopping.power:.0f} % are decided by {stopping.limit}"
         )
     return "\n".join(lines)
 
@@ -40,14 +41,14 @@ def answer(question: Question) -> str:
 def shown(question: Question, episodes: int) -> str:
     """Say which difference a number of episodes of each policy in the same starts shows."""
     downwards = replace(question, difference=-question.base / 1000, discordance=question.discordance)
-    found = {"worse": shown_difference(downwards, episodes)}
+    sizes = {"worse": shown_difference(downwards, episodes)}
     if question.base < 1:
-        found["better"] = shown_difference(replace(question, difference=(1 - question.base) / 1000), episodes)
+        sizes["better"] = shown_difference(replace(question, difference=(1 - question.base) / 1000), episodes)
     lines = [
         f"{episodes} pairs, success {100 * question.base:.1f} %, power {100 * question.power:.0f} %, alpha "
         f"{question.alpha:g}{_tests(question)}: shown are"
     ]
-    for name, size in found.items():
+    for name, size in sizes.items():
         text = f"{100 * size:.1f} points" if math.isfinite(size) else "no difference that is possible"
         lines.append(f"  {name} by {text}" if math.isfinite(size) else f"  {name}: {text}")
     return "\n".join(lines)
@@ -63,13 +64,11 @@ def table(question: Question) -> str:
         for share in (*DISCORDANCES, None):
             cells.append(_episodes(question, gap, share))
         rows.append([*cells, str(unpaired_episodes(replace(question, difference=gap, discordance=None)))])
-    widths = [max(len(row[i]) for row in rows) for i in range(len(heads))]
-    text = "\n".join("  ".join(f"{c:>{w}}" for c, w in zip(row, widths, strict=True)) for row in rows)
     return (
         f"episodes of each policy, success {100 * question.base:.0f} %, power {100 * question.power:.0f} %, "
         f"alpha {question.alpha:g}{_tests(question)}\n"
         "in the same starts, by the share of starts in which exactly one of the two succeeds; in other starts\n\n"
-        f"{text}\n\n"
+        f"{text_table(rows, left=0)}\n\n"
         "a suite of ten tasks has 500 starts, four suites have 2000; --difference and --discordance ask for one case"
     )
 

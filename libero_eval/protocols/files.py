@@ -84,8 +84,9 @@ def _content(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in content.items():
         inherited = base.get(key)
-        both = isinstance(inherited, dict) and isinstance(value, dict)
-        merged[key] = {**inherited, **value} if both else value
+        if isinstance(inherited, dict) and isinstance(value, dict):
+            value = {**inherited, **value}
+        merged[key] = value
     return merged
 
 

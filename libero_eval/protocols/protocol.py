@@ -129,8 +129,8 @@ class Episodes:
         if by_suite and (missing := [s for s in SUITES if s not in by_suite]):
             yield f"episode.horizon has no value for {', '.join(missing)}"
         least = 1 + (self.settle_steps or 0) * self.settle_counted
-        horizons = by_suite.values() if by_suite else [self.horizon or least]
-        if (lowest := min(horizons)) < least:
+        single = self.horizon if isinstance(self.horizon, int) else least
+        if (lowest := min([*by_suite.values(), single])) < least:
             yield f"episode.horizon is {lowest}; it must be at least {least}"
         order = self.reset_order
         if "set_init_state" not in order or len(set(order)) != len(order):
@@ -459,7 +459,7 @@ class EvalProtocol:
         """
         expected = {name: value for name, value in self.flat().items() if value is not None}
         by_section = {k: v for k, v in announced.items() if k in SECTIONS and isinstance(v, Mapping)}
-        stated = announced | {f"{s}.{name}": v for s, part in by_section.items() for name, v in part.items()}
+        stated = {**announced, **{f"{s}.{k}": v for s, part in by_section.items() for k, v in part.items()}}
         wrong = [
             f"{name}: protocol {self.name} has {value!r}, the policy {stated[name]!r}"
             for name, value in expected.items()

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from libero_env.perturbations import KINDS
 from libero_env.storage import atomic_write_text, write_json
 from libero_env.text import text_table
-from libero_eval.judging.text import interval_text, p_text
+from libero_eval.judging.page import interval_text, p_text
 from libero_eval.robustness.results import Axis, Robustness, name_of
 from lifelong.errors import ResultsError
 from lifelong.report.figures import (

@@ -11,11 +11,11 @@ from hypothesis import given
 
 from libero_env.text import json_safe
 from libero_env.validation import validate
-from libero_eval.cli.compare import _single_sides
+from libero_eval.cli.compare import _single_groups
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.exports import export_lerobot, export_vla_eval
-from libero_eval.judging.comparison import judge, write_judgement
-from libero_eval.judging.text import render
+from libero_eval.judging.comparison import compare_groups, write_comparison
+from libero_eval.judging.page import render
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.repeat import repeated
@@ -60,10 +60,10 @@ def test_any_result_is_used_or_refused(values, tmp_path_factory):
         repeated(REQUEST, result)
         export_lerobot(result, folder / "lerobot")
         export_vla_eval(result, folder / "vla-eval")
-        found = judge(_single_sides([str(folder), str(folder)]), control=None, allow=[], alpha=0.05)
+        found = compare_groups(_single_groups([str(folder), str(folder)]), control=None, allow=[], alpha=0.05)
         with contextlib.redirect_stdout(io.StringIO()):
             print(render(found, tasks=True))
-        write_judgement(found, folder / "compare.json")
+        write_comparison(found, folder / "compare.json")
 
     survive("results of evaluations", use)
     survive(

@@ -8,25 +8,25 @@ import pytest
 
 from libero_env.cli.main import main  # noqa: E402
 from libero_eval.exports import export_lerobot, export_vla_eval  # noqa: E402
-from libero_eval.judging.comparability import Side, check_comparable, match, settings  # noqa: E402
-from libero_eval.judging.comparison import Judgement, judge, write_judgement  # noqa: E402
+from libero_eval.judging.comparability import Group, check_comparable, match, settings  # noqa: E402
+from libero_eval.judging.comparison import Comparison, compare_groups, write_comparison  # noqa: E402
 from libero_eval.judging.group_scores import group_scores  # noqa: E402
-from libero_eval.judging.text import render  # noqa: E402
+from libero_eval.judging.page import render  # noqa: E402
 from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
 from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
 
 pytestmark = pytest.mark.unit
 
 
-def side(label: str, *results) -> Side:
-    return Side(label, results, tuple(f"{label}{i}" for i in range(len(results))))
+def side(label: str, *results) -> Group:
+    return Group(label, results, tuple(f"{label}{i}" for i in range(len(results))))
 
 
 @pytest.fixture(scope="module")
-def found() -> Judgement:
+def found() -> Comparison:
     """Two policies on two suites, and the first again with another seed."""
     suites = ("libero_goal", "libero_object")
-    return judge(
+    return compare_groups(
         [
             side("good", drawn_result(0.9, 1, suites=suites)),
             side("bad", drawn_result(0.75, 2, suites=suites, policy="other:make")),
@@ -68,7 +68,7 @@ def test_holm_is_over_comparisons_suites_and_tasks(found):
 
 def test_the_order_of_the_policies_turns_the_sign_only():
     sides = [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.8, 2, policy="b:b"))]
-    one, other = (judge(order).comparisons[0].total.difference for order in (sides, sides[::-1]))
+    one, other = (compare_groups(order).comparisons[0].total.difference for order in (sides, sides[::-1]))
     assert (one.value, one.score.low) == pytest.approx((-other.value, -other.score.high))
     assert one.p_value == other.p_value
 
@@ -81,7 +81,7 @@ def test_texts_name_what_is_shown_and_what_is_not(found):
     )
     assert "control arm: good − good again, one policy twice" in text
     assert "tasks that differ most (of 20)" in text and len(render(found, tasks=True)) > len(text)
-    equal = judge([side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, policy="b:b"))])
+    equal = compare_groups([side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, policy="b:b"))])
     text = render(equal)
     assert "No difference is shown: a − b" in text and "in four of five cases" in text
     assert "not decided after 500 pairs" in text and "note: no control arm" in text
@@ -116,10 +116,10 @@ def test_texts_name_what_is_shown_and_what_is_not(found):
 def test_results_made_differently_are_refused(changes, field, values):
     sides = [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, policy="b:b", **changes))]
     with pytest.raises(ComparisonError, match="cannot be compared") as error:
-        judge(sides)
+        compare_groups(sides)
     assert f"{field}: {values}" in str(error.value) and f"--allow {field}" in str(error.value)
     allowed = [field, *([] if "horizon" not in field else ["protocol.horizon"])]
-    notes = judge(sides, allow=allowed).notes
+    notes = compare_groups(sides, allow=allowed).notes
     assert any(note.startswith(f"{field}: {values}") and note.endswith("; allowed") for note in notes)
     assert check_comparable(sides, allow=[field.partition(".")[0]])
 
@@ -132,12 +132,12 @@ def test_other_instructions_are_refused():
     with pytest.raises(
         ComparisonError, match="tasks.libero_goal/0.instruction: do what libero_goal/0 asks in a, open it"
     ):
-        judge(sides)
+        compare_groups(sides)
 
 
 def test_versions_and_renderers_are_told_but_not_refused():
     other = {"versions": {"mujoco": "3.3.2"}, "environment": ENVIRONMENT | {"renderer": "osmesa"}}
-    notes = judge(
+    notes = compare_groups(
         [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, policy="b:b", **other))]
     ).notes
     assert "versions.mujoco: 4.0.0 in a, 3.3.2 in b" in notes
@@ -160,7 +160,8 @@ def test_episodes_without_a_partner_are_dropped_and_counted():
     assert matched.dropped == (4, 1) and matched.tasks == ("s/0",)
     assert matched.pairs.starts.tolist() == [2, 3] and matched.pairs.second[:, 0].tolist() == [True, False]
     assert any(
-        "2 pairs; without a partner and not counted: 4 episodes of a, 1 of b" in n for n in judge(sides).notes
+        "2 pairs; without a partner and not counted: 4 episodes of a, 1 of b" in n
+        for n in compare_groups(sides).notes
     )
 
 
@@ -172,7 +173,7 @@ def test_no_common_start_is_refused():
     with pytest.raises(
         ComparisonError, match="1 tasks from s/0, starts 0–1 against 1 tasks from s/0, starts 7–8, 40"
     ):
-        judge(sides)
+        compare_groups(sides)
 
 
 def test_a_single_task_with_one_start_is_judged():
@@ -180,7 +181,7 @@ def test_a_single_task_with_one_start_is_judged():
         side("a", result_of(task_result("s/0", [1]))),
         side("b", result_of(task_result("s/0", [0]), policy="b:b")),
     ]
-    only = judge(sides).comparisons[0]
+    only = compare_groups(sides).comparisons[0]
     assert only.total.adjusted == 1.0 and only.suites == () and only.total.difference.over_tasks is None
     interval = only.total.difference.interval
     assert -1 < interval.low < 0 < interval.high == 1
@@ -188,15 +189,15 @@ def test_a_single_task_with_one_start_is_judged():
 
 def test_equal_outcomes_of_a_control_arm_are_told():
     twins = [side("a", drawn_result(0.9, 1)), side("a2", drawn_result(0.9, 1, seed=1))]
-    judged = judge([], control=(twins[0], twins[1]))
+    judged = compare_groups([], control=(twins[0], twins[1]))
     assert judged.comparisons == () and any("equal to the bit" in note for note in judged.notes)
-    wrong = judge([], control=(twins[0], side("b", drawn_result(0.9, 1, policy="b:b"))))
+    wrong = compare_groups([], control=(twins[0], side("b", drawn_result(0.9, 1, policy="b:b"))))
     assert any("not results of one policy" in note for note in wrong.notes)
 
 
 def test_one_policy_under_two_protocols_is_no_control_arm():
     sides = [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, protocol={"name": "libero"}))]
-    judged = judge(sides, allow=["protocol"])
+    judged = compare_groups(sides, allow=["protocol"])
     assert len(judged.comparisons) == 1 and not judged.controls
 
 
@@ -208,15 +209,15 @@ def test_weights_identify_a_policy():
         side("a", drawn_result(0.9, 1, evaluated=first)),
         side("b", drawn_result(0.9, 2, evaluated=second)),
     ]
-    assert len(judge(sides).controls) == 1
+    assert len(compare_groups(sides).controls) == 1
 
 
 def test_too_few_results_and_equal_names_are_refused():
     one = side("a", drawn_result(0.9, 1))
     with pytest.raises(ConfigError, match="needs two results"):
-        judge([one])
+        compare_groups([one])
     with pytest.raises(ConfigError, match="two policies are called a"):
-        judge([one, side("a", drawn_result(0.8, 2, policy="b:b"))])
+        compare_groups([one, side("a", drawn_result(0.8, 2, policy="b:b"))])
 
 
 def test_runs_of_methods_are_aggregated_by_rliable():
@@ -225,7 +226,7 @@ def test_runs_of_methods_are_aggregated_by_rliable():
         [drawn_result(rate, d, evaluated={"weights": f"{rate}{d}"}) for d in range(3)] for rate in (0.9, 0.7)
     ]
     state = np.random.get_state()[1].copy()  # noqa: NPY002
-    judged = judge([side("good", *groups[0]), side("bad", *groups[1])])
+    judged = compare_groups([side("good", *groups[0]), side("bad", *groups[1])])
     assert (np.random.get_state()[1] == state).all()  # noqa: NPY002
     found = judged.groups
     scores = np.array([[np.mean(t.successes) for t in r.tasks] for r in groups[0]])
@@ -244,12 +245,12 @@ def test_runs_of_methods_are_aggregated_by_rliable():
 
 
 def test_the_file_holds_everything(found, tmp_path):
-    values = json.loads(write_judgement(found, tmp_path / "c.json").read_text())
+    values = json.loads(write_comparison(found, tmp_path / "c.json").read_text())
     assert values["format"] == "libero-comparison/1" and len(values["comparisons"][0]["tasks"]) == 20
     assert len(values["comparisons"][0]["sequential"]["log_e"]) == 1000
     (tmp_path / "file").write_text("")
     with pytest.raises(ResultsError, match="cannot be written"):
-        write_judgement(found, tmp_path / "file" / "c.json")
+        write_comparison(found, tmp_path / "file" / "c.json")
 
 
 def test_the_page_needs_no_other_file(found, tmp_path):

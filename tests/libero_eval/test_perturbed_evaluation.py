@@ -7,7 +7,7 @@ from libero_env.cli.main import main
 from libero_env.perturbations import KINDS
 from libero_env.tasks import get_task
 from libero_eval.evaluation_file import EvaluationResult
-from libero_eval.judging.comparability import Side, check_comparable, match
+from libero_eval.judging.comparability import Group, check_comparable, match
 from libero_eval.protocols.environment import ProtocolEnv
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
@@ -61,7 +61,7 @@ def test_an_evaluation_records_its_perturbations(tmp_path, monkeypatch, capsys):
     assert told == ["put the bowl on the stove", changed.tasks[0].instruction] and len(set(told)) == 2
     assert changed.tasks[0].name == plain.tasks[0].name and "_" not in told[1]
 
-    sides = [Side("plain", (plain,)), Side("changed", (changed,))]
+    sides = [Group("plain", (plain,)), Group("changed", (changed,))]
     with pytest.raises(ComparisonError, match="protocol.world.perturb"):
         check_comparable(sides)
     check_comparable(sides, allow=["protocol", "tasks"])

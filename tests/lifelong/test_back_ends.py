@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from libero_env.cli.main import main
-from libero_eval.judging.comparability import Side, back_end_of, check_comparable, check_same_back_end
-from libero_eval.judging.comparison import judge
+from libero_eval.judging.comparability import Group, backend_of, check_comparable, check_same_back_end
+from libero_eval.judging.comparison import compare_groups
 from libero_eval.protocols.files import load_protocol
 from lifelong.errors import ComparisonError, ConfigError, ProtocolError
 from lifelong.evaluation.settings import EvalSettings
@@ -24,30 +24,29 @@ def result(seed, backend=None):
     return replace(found, protocol={**PROTOCOL, "world": {**PROTOCOL.get("world", {}), **world}})
 
 
-def test_a_card_names_it_and_keeps_its_digest_without():
-    card = load_protocol("libero")
-    assert card.world.backend == "mujoco" and "backend" not in card.resolved()["world"]
-    warp = card.changed({"world.backend": "warp"})
-    assert warp.resolved()["world"]["backend"] == "warp" and warp.digest != card.digest
-    assert warp.changed({"world.backend": "mujoco"}).digest == card.digest
-    with pytest.raises(ProtocolError, match="backend"):
-        card.changed({"world.backend": "physx"})
+def test_a_protocol_names_it():
+    protocol = load_protocol("libero")
+    assert protocol.world.backend == "mujoco"
+    changed = protocol.changed({"world.backend": "warp"})
+    assert changed.digest != protocol.digest and changed.resolved()["world"]["backend"] == "warp"
+    with pytest.raises(ProtocolError, match="world.backend"):
+        protocol.changed({"world.backend": "bullet"})
 
 
 def test_results_of_different_ones_are_not_compared():
-    sides = [Side("old", (result(1),)), Side("new", (result(2, "warp"),))]
+    sides = [Group("old", (result(1),)), Group("new", (result(2, "warp"),))]
     with pytest.raises(ComparisonError) as caught:
         check_comparable(sides, allow=["protocol", "environment"])
     assert str(caught.value) == (
         "results of different back ends are not compared: old on backend=mujoco, new on backend=warp; evaluate all on "
         "one, see --backend"
     )
-    assert [back_end_of(one.results[0]) for one in sides] == ["mujoco", "warp"]
+    assert [backend_of(one.results[0]) for one in sides] == ["mujoco", "warp"]
 
 
 @pytest.mark.parametrize("backend", [None, "warp"])
 def test_a_comparison_names_it(backend):
-    found = judge([Side("a", (result(1, backend),)), Side("b", (result(2, backend),))])
+    found = compare_groups([Group("a", (result(1, backend),)), Group("b", (result(2, backend),))])
     assert found.to_plain()["backend"] == (backend or "mujoco")
     assert any("backend=warp" in note for note in found.notes) == (backend == "warp")
 
