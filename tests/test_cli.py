@@ -3,6 +3,7 @@
 import contextlib
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from ctypes.util import find_library
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from libero_env import paths
 from libero_env.cli import doctor
@@ -30,6 +32,17 @@ def test_every_command_has_help(command, capsys):
     with contextlib.suppress(SystemExit):
         cli.main([*command.split(), "--help"])
     assert f"libero {command}" in capsys.readouterr().out
+
+
+OPTIONS = yaml.safe_load((ROOT / "tests" / "commands.yaml").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+def test_no_option_is_lost(command, capsys):
+    with contextlib.suppress(SystemExit):
+        cli.main([*command.split(), "--help"])
+    shown = re.findall(r"(?<![\w-])--[\w-]+", capsys.readouterr().out)
+    assert set(OPTIONS[command]) <= set(shown)
 
 
 def test_tasks_are_listed_in_the_asked_order(capsys):
