@@ -5,13 +5,13 @@ box is |R size|, and being on a region of the table needs no contact. `semantics
 """
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.objects.model import GLOW_GROUP, ObjectModel
+from libero_env.objects.model import GLOW_GROUP, OPPOSITE_STATES, ObjectModel
 from libero_env.sim.scene import ROBOT, Scene, zone_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Region, declare_predicate
@@ -128,22 +128,22 @@ def stack(view: StateView, entity: str, target: str) -> bool:
 
 def open_(view: StateView, address: str) -> bool:
     """Return whether any joint of an entity, or of the part that a region is on, is in the range of `open`."""
-    return any(_joints_in_state(view, address, "open", "close"))
+    return any(_joints_in_state(view, address, "open"))
 
 
 def close(view: StateView, address: str) -> bool:
     """Return whether all joints of an entity, or of the part that a region is on, are in the range of `close`."""
-    return all(_joints_in_state(view, address, "close", "open"))
+    return all(_joints_in_state(view, address, "close"))
 
 
 def turn_on(view: StateView, entity: str) -> bool:
     """Return whether any joint of an entity is in the range of `turnon`."""
-    return any(_joints_in_state(view, entity, "turnon", "turnoff"))
+    return any(_joints_in_state(view, entity, "turnon"))
 
 
 def turn_off(view: StateView, entity: str) -> bool:
     """Return whether all joints of an entity are in the range of `turnoff`."""
-    return all(_joints_in_state(view, entity, "turnoff", "turnon"))
+    return all(_joints_in_state(view, entity, "turnoff"))
 
 
 def print_joint_state(view: StateView, entity: str) -> bool:
@@ -272,7 +272,7 @@ def glowing_sites(view: StateView) -> set[int]:
     return sites
 
 
-def _joints_in_state(view: StateView, address: str, state: str, opposite: str) -> list[bool]:
+def _joints_in_state(view: StateView, address: str, state: str) -> list[bool]:
     """Return for each joint whether it is in a state, see `reaches_state`.
 
     An entity without joints has none that is open, and all it has are closed, as in the original.
@@ -281,34 +281,28 @@ def _joints_in_state(view: StateView, address: str, state: str, opposite: str) -
     if owner is None:
         raise UnknownNameError("object, fixture or region of one", address, view.scene.joints)
     values = view.joint_positions(address).values()
-    return [reaches_state(view.scene.entities[owner], value, state, opposite) for value in values]
+    return [bool(reaches_state(view.scene.entities[owner], value, state)) for value in values]
 
 
-def reaches_state(model: ObjectModel, qpos: float, state: str, opposite: str) -> bool:
+def reaches_state(model: ObjectModel, qpos: Any, state: str) -> Any:
     """Return whether a joint is as far as the range of a state begins, seen from the range of the opposite.
 
     Args:
         model: Object or fixture with the joint.
-        qpos: Position of the joint, rad or m.
+        qpos: Position of the joint, rad or m; or positions, an array.
         state: `open`, `close`, `turnon` or `turnoff`.
-        opposite: The state at the other end.
 
     Raises:
         LiberoError: The model has no range for the state.
     """
-    bound, upwards = state_bound(model, state, opposite)
+    bound, upwards = state_bound(model, state)
     if state == "turnon":
         return qpos >= bound if upwards else qpos <= bound
     return qpos > bound if upwards else qpos < bound
 
 
-def state_bound(model: ObjectModel, state: str, opposite: str) -> tuple[float, bool]:
+def state_bound(model: ObjectModel, state: str) -> tuple[float, bool]:
     """Return the position at which the range of a state begins, and whether it lies upwards of it.
-
-    Args:
-        model: Object or fixture with the joint.
-        state: `open`, `close`, `turnon` or `turnoff`.
-        opposite: The state at the other end.
 
     Raises:
         LiberoError: The model has no range for the state.
@@ -320,6 +314,7 @@ def state_bound(model: ObjectModel, state: str, opposite: str) -> tuple[float, b
             f"{', '.join(ranges) or 'no state'}"
         )
     low, high = sorted(ranges[state])
+    opposite = OPPOSITE_STATES[state]
     upwards = opposite not in ranges or low + high > sum(ranges[opposite])
     return (low if upwards else high), upwards
 

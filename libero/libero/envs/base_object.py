@@ -113,19 +113,19 @@ class BaseObject:
 
     def is_open(self, qpos: float) -> bool:
         """Return whether a joint position is in the open range."""
-        return reaches_state(self.model, qpos, "open", "close")
+        return bool(reaches_state(self.model, qpos, "open"))
 
     def is_close(self, qpos: float) -> bool:
         """Return whether a joint position is in the closed range."""
-        return reaches_state(self.model, qpos, "close", "open")
+        return bool(reaches_state(self.model, qpos, "close"))
 
     def turn_on(self, qpos: float) -> bool:
         """Return whether a joint position is in the range of on."""
-        return reaches_state(self.model, qpos, "turnon", "turnoff")
+        return bool(reaches_state(self.model, qpos, "turnon"))
 
     def turn_off(self, qpos: float) -> bool:
         """Return whether a joint position is in the range of off."""
-        return reaches_state(self.model, qpos, "turnoff", "turnon")
+        return bool(reaches_state(self.model, qpos, "turnoff"))
 
     _fixed = False
 

@@ -10,7 +10,6 @@ from libero_env.expert.grasping.handles import Part, find_handle, find_inner_sid
 from libero_env.expert.skills.skill import Skill, funnel_lift
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
-from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.predicates import evaluate, state_bound
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
@@ -136,7 +135,7 @@ class MoveJoint(Skill):
         assert owner is not None
         model = view.scene.entities[owner]
         low, high = sorted(model.articulation[self.state])
-        _, upwards = state_bound(model, self.state, OPPOSITE_STATES[self.state])
+        _, upwards = state_bound(model, self.state)
         return (low, high, high - low, 1.0) if upwards else (high, low, high - low, -1.0)
 
     def _goal_value(self, view: StateView, part: Part) -> float:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.errors import UnknownNameError
-from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY
+from libero_env.objects.model import ROOT_BODY
 from libero_env.sim import predicates
 from libero_env.sim.mjwarp.simulations import WarpSimulations
 from libero_env.sim.predicates import (
@@ -57,7 +57,7 @@ class WarpGoals:
     ):
         self._scene, self._simulations, self._views = views[0].scene, simulations, views
         self._goal, self.atoms, self._semantics = ground(goal, self._scene), tuple(atoms), semantics
-        of_all: dict[Any, Callable[..., Held]] = {
+        of_all: dict[Any, Callable[..., Any]] = {
             predicates.on: self._on,
             predicates.in_: self._in,
             predicates.up: lambda name: self._pos(name)[:, 2] >= UP_HEIGHT,
@@ -154,8 +154,7 @@ class WarpGoals:
         if owner is None or address not in scene.joints:
             raise UnknownNameError("object, fixture or region of one", address, scene.joints)
         positions = [qpos[:, scene.model.jnt_qposadr[joint]] for joint in scene.joints[address]]
-        model, opposite = scene.entities[owner], OPPOSITE_STATES[state]
-        held = [reaches_state(model, position, state, opposite) for position in positions]
+        held = [reaches_state(scene.entities[owner], position, state) for position in positions]
         return np.array(held, bool).reshape(len(positions), self._simulations.num)
 
 
