@@ -58,8 +58,7 @@ def get_path_dict() -> dict[str, str]:
 
 def get_libero_path(query_key: str) -> str:
     """Return one of the paths, and warn if it does not exist; raise an UnknownNameError if the key does not exist."""
-    from libero._adapters.envs.files import ensure
-    from libero._adapters.unpickling import allow_arrays
+    from libero._adapters.envs.files import allow_arrays, ensure
 
     if query_key not in _KEYS:
         raise UnknownNameError("path", query_key, _KEYS)

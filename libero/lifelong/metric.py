@@ -18,8 +18,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from libero._adapters.envs.files import generated_paths
-from libero._adapters.lifelong.batches import map_tensors
-from libero._adapters.lifelong.observations import image_tensor
+from libero._adapters.lifelong.batches import image_tensor, map_tensors
 from libero.lifelong.utils import available_device, safe_device
 from libero_env.envs.batch import BatchEnv
 from libero_env.init_states.pickles import read_states

@@ -1,12 +1,25 @@
-"""The original's batches, nested dictionaries of tensors, as the batches of `lifelong`."""
+"""The original's batches and observations as those of `lifelong`.
 
-from collections.abc import Callable, Iterable, Iterator
+The original: nested dictionaries of tensors, images (B, T, C, H, W) in [0, 1], bottom row first as OpenGL renders.
+`lifelong`: `Observation`, images (B, T, V, H, W, C) uint8, top row first.
+
+Shape legend: B batch, T time, V views, C H W image, D dimension of a proprioceptive input, L language embedding.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
+
+from lifelong.errors import PolicyError
+from lifelong.types import Observation, PolicySpec
+
+# key of `data` -> proprioceptive input and its dimension
+PROPRIO = {"use_joint": ("joint_states", 7), "use_gripper": ("gripper_states", 2), "use_ee": ("ee_pos", 3)}
 
 
 @dataclass(frozen=True)
@@ -59,3 +72,62 @@ def _join(a: Any, b: Any) -> Any:
     if isinstance(a, Tensor):
         return torch.cat([a, b.to(a.device)])
     return {k: _join(v, b[k]) for k, v in a.items() if k in b} if isinstance(a, dict) else a
+
+
+def policy_spec(cfg: Any, shape_meta: Mapping[str, Any], history: int) -> PolicySpec:
+    """Return the spec of a policy that keeps `history` frames when it acts; `data.use_*` select its inputs.
+
+    Raises:
+        PolicyError: There is a depth image, or images differ in size.
+    """
+    shapes = shape_meta["all_shapes"]
+    views = [key for key in shapes if "rgb" in key and (cfg.data.use_eye_in_hand or "eye_in_hand" not in key)]
+    sizes = {tuple(shapes[view])[1:] for view in views}
+    if any("depth" in key for key in shapes):
+        raise PolicyError("these policies take colour images only: leave data.obs.modality.depth empty")
+    if len(sizes) != 1:
+        raise PolicyError(
+            f"a policy needs images of one size; {views or 'no views'} have sizes {sorted(sizes)}"
+        )
+    return PolicySpec(
+        views=tuple(views),
+        image_size=sizes.pop(),
+        proprio={name: size for key, (name, size) in PROPRIO.items() if cfg.data[key]},
+        action_dim=shape_meta["ac_dim"],
+        language_dim=cfg.policy.language_encoder.network_kwargs.input_size,
+        seq_len=max(history, cfg.data.seq_len),
+    )
+
+
+def to_native(obs: Mapping[str, Tensor], task_emb: Tensor, spec: PolicySpec) -> Observation:
+    """Convert the original's dictionary to an `Observation`, with images rounded to 256 levels.
+
+    Args:
+        obs: View -> (B, T, C, H, W), proprioceptive input -> (B, T, D).
+        task_emb: Embedding of the instruction, (B, L).
+        spec: Views and proprioceptive inputs to take.
+    """
+    images = torch.stack([uint8_image(obs[view]).flip(-3) for view in spec.views], dim=2).contiguous()
+    proprio = {name: proprio_input(obs, name) for name in spec.proprio}
+    return Observation(images, proprio, task_emb.float())
+
+
+def proprio_input(obs: Mapping[str, Tensor], name: str) -> Tensor:
+    """Return one proprioceptive input; the hand's position is also the beginning of `ee_states`."""
+    if name == "ee_pos" and name not in obs and "ee_states" in obs:
+        return obs["ee_states"][..., :3].float()
+    if name not in obs:
+        raise PolicyError(f"the observation lacks {name}; it has {', '.join(obs)}. See data.obs.modality")
+    return obs[name].float()
+
+
+def uint8_image(images: Tensor) -> Tensor:
+    """Convert (..., C, H, W) in [0, 1] to (..., H, W, C) uint8."""
+    if images.dtype != torch.uint8:
+        images = (images * 255).round().clamp(0, 255).to(torch.uint8)
+    return images.movedim(-3, -1).contiguous()
+
+
+def image_tensor(image: np.ndarray | Tensor) -> Tensor:
+    """Convert (..., H, W, C) uint8 to (..., C, H, W) in [0, 1]."""
+    return torch.as_tensor(np.ascontiguousarray(image)).movedim(-1, -3).contiguous().float() / 255

@@ -15,8 +15,7 @@ import numpy as np
 from libero._adapters.envs.models import facade_pack
 from libero._adapters.envs.observations import Observer, cameras
 from libero._adapters.envs.robosuite_methods import RobosuiteMethods
-from libero._adapters.envs.sim import ClientSimulations, MjSim
-from libero._adapters.envs.window import Window
+from libero._adapters.envs.sim import ClientSimulations, MjSim, Window
 from libero._adapters.lookup import lookup
 from libero.libero.envs import bddl_utils as BDDLUtils
 from libero.libero.envs.bddl_utils import task_file

@@ -1,8 +1,76 @@
-"""Arenas by class."""
+"""Arenas by class: a scene before it is compiled, with the interface of robosuite's arenas."""
 
-from typing import Any
+from collections.abc import Mapping, Sequence
+from operator import attrgetter
+from typing import Any, ClassVar
 
-from libero.libero.envs.arenas.base_arena import Arena, WorkspaceArena
+import mujoco
+
+from libero._adapters.envs.models import facade_pack
+from libero._adapters.lookup import alias_modules
+from libero_env.assets.arena import load_workspace
+
+
+class Arena:
+    """Floor, walls, table, cameras and lights as an editable model.
+
+    Attributes:
+        spec: The model.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec):
+        self.spec = spec
+
+    worldbody = property(attrgetter("spec.worldbody"), doc="The world body.")
+
+    def set_camera(
+        self,
+        camera_name: str,
+        pos: Sequence[float],
+        quat: Sequence[float],
+        camera_attribs: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Set the pose of a camera, or add one; of `camera_attribs`, `fovy` has an effect."""
+        camera = self.spec.camera(camera_name)
+        camera = self.spec.worldbody.add_camera(name=camera_name) if camera is None else camera
+        camera.pos, camera.quat = pos, quat
+        if camera_attribs and "fovy" in camera_attribs:
+            camera.fovy = float(camera_attribs["fovy"])
+
+    def get_xml(self) -> str:
+        """Return the model as MJCF."""
+        return self.spec.to_xml()
+
+
+class WorkspaceArena(Arena):
+    """The arena of one workspace.
+
+    Args:
+        floor_style, wall_style: Names in `libero.libero.envs.arenas.style`.
+        scene: Style of the whole scene, such as `warm`.
+        kwargs: Other arguments of the original's classes, such as `table_full_size`, have no effect.
+    """
+
+    category: ClassVar[str]
+
+    def __init__(
+        self,
+        floor_style: str | None = None,
+        wall_style: str | None = None,
+        scene: str | None = None,
+        **kwargs: Any,
+    ):
+        spec = mujoco.MjSpec()
+        styles = {"floor": floor_style, "wall": wall_style, "scene": scene}
+        self.workspace = load_workspace(self.category)
+        facade_pack().add_arena(spec, self.workspace, {k: v for k, v in styles.items() if v is not None})
+        super().__init__(spec)
+
+    table_offset = property(attrgetter("workspace.offset"), doc="Origin of the regions, (3,) m.")
+    table_top_abs = property(attrgetter("workspace.offset"), doc="Position of the table top, (3,) m.")
+
+    def configure_location(self) -> None:
+        """Do nothing: tables have the sizes and places of the benchmark."""
 
 
 def _arena(name: str, category: str) -> Any:
@@ -16,3 +84,14 @@ KitchenTableArena = _arena("KitchenTableArena", "kitchen_table")
 LivingRoomTableArena = _arena("LivingRoomTableArena", "living_room_table")
 StudyTableArena = _arena("StudyTableArena", "study_table")
 TableArena = _arena("TableArena", "table")
+
+alias_modules(
+    __name__,
+    base_arena="Arena WorkspaceArena",
+    coffee_table_arena="CoffeeTableArena",
+    empty_arena="EmptyArena",
+    kitchen_arena="KitchenTableArena",
+    living_room_arena="LivingRoomTableArena",
+    study_arena="StudyTableArena",
+    table_arena="TableArena",
+)

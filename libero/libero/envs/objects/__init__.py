@@ -1,5 +1,6 @@
 """Objects by family, and the registry. The class of each category is here too: `AlphabetSoup`, `FlatStove`, ..."""
 
+from libero._adapters.lookup import alias_modules
 from libero.libero.envs.base_object import (
     OBJECTS_DICT,
     VISUAL_CHANGE_OBJECTS_DICT,
@@ -17,3 +18,9 @@ from libero.libero.envs.objects.target_zones import TargetZone
 from libero.libero.envs.objects.turbosquid_objects import TurbosquidObjects
 
 globals().update({cls.__name__: cls for cls in OBJECTS_DICT.values()})
+
+alias_modules(
+    __name__,
+    base_object="OBJECTS_DICT VISUAL_CHANGE_OBJECTS_DICT get_object_dict get_object_fn register_object "
+    "register_visual_change_object",
+)

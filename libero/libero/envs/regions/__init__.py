@@ -1,19 +1,17 @@
 """Samplers of positions and of joint positions, by problem and region."""
 
-from libero._adapters.lookup import lookup
-from libero.libero.envs.regions.object_property_sampler import (
-    ObjectPropertySampler,
-    OpenCloseSampler,
-    TurnOnOffSampler,
-)
+from libero._adapters.lookup import alias_modules, lookup
 from libero.libero.envs.regions.samplers import (
     InSiteRegionRandomSampler,
     Libero100TableRegionSampler,
     MultiRegionRandomSampler,
     ObjectBasedSampler,
+    ObjectPropertySampler,
+    OpenCloseSampler,
     SiteRegionRandomSampler,
     SiteSequentialCompositeSampler,
     TableRegionSampler,
+    TurnOnOffSampler,
 )
 
 _TABLES = {
@@ -39,3 +37,12 @@ def get_region_samplers(problem_name: str, region_sampler_name: str) -> type:
 def update_region_samplers(problem_name: str, region_sampler_name: str, region_sampler: type) -> None:
     """Add a sampler or replace one."""
     REGION_SAMPLERS.setdefault(problem_name, {})[region_sampler_name] = region_sampler
+
+
+alias_modules(
+    __name__,
+    base_region_sampler="InSiteRegionRandomSampler MultiRegionRandomSampler SiteRegionRandomSampler "
+    "SiteSequentialCompositeSampler",
+    workspace_region_sampler="Libero100TableRegionSampler ObjectBasedSampler TableRegionSampler",
+    object_property_sampler="ObjectPropertySampler OpenCloseSampler TurnOnOffSampler",
+)

@@ -1,4 +1,4 @@
-"""The arm: properties that do not depend on its mount."""
+"""The arm: what does not depend on its mount, and the arm on a pedestal and on the ground."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -44,3 +44,24 @@ def behind_a_table(x: float, height: float) -> Callable[[float], tuple[float, fl
 
 
 COMMON_OFFSETS = {"bins": (-0.5, -0.1, 0.0), "empty": (-0.6, 0.0, 0.0), "table": behind_a_table(-0.16, 0.0)}
+
+
+class MountedPanda(Panda):
+    """The arm on a pedestal."""
+
+    default_mount = "RethinkMount"
+    base_xpos_offset = {
+        **COMMON_OFFSETS,
+        "kitchen_table": behind_a_table(-0.16, 0.0),
+        "study_table": behind_a_table(-0.25, 0.0),
+    }
+
+
+class OnTheGroundPanda(Panda):
+    """The arm on the ground."""
+
+    base_xpos_offset = {
+        **COMMON_OFFSETS,
+        "coffee_table": behind_a_table(-0.16, 0.41),
+        "living_room_table": behind_a_table(-0.16, 0.42),
+    }

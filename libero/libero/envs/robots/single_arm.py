@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from libero._adapters.envs.domain import Domain
-from libero.libero.envs.robots.mounted_panda import MountedPanda
-from libero.libero.envs.robots.on_the_ground_panda import OnTheGroundPanda
+from libero._adapters.envs.sim import Domain
+from libero.libero.envs.robots.panda import MountedPanda, OnTheGroundPanda
 from libero_env.assets.robot import GRIP_SITE, OPEN_FINGERS
 from libero_env.envs.checks import checked_actions
 from libero_env.errors import LiberoError, UnknownNameError

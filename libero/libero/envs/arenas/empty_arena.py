@@ -1,3 +1,0 @@
-"""Path of the original; see `libero.libero.envs.arenas`."""
-
-from libero.libero.envs.arenas import EmptyArena  # noqa: F401
