@@ -1,6 +1,7 @@
 """Examination of a run directory: whether everything in it is as it was written, belongs together, and is complete."""
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -8,9 +9,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from libero_env.errors import LiberoError
-from libero_env.text import json_safe
+from libero_env.storage import read_json
+from libero_env.text import to_json
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
-from lifelong.errors import CheckpointError, LifelongError
+from lifelong.errors import LifelongError, ResultsError
 from lifelong.results.log import ResultLog
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord, measured_tasks
 from lifelong.results.results import Results
@@ -38,7 +40,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Examination:
-    """What was found in a run directory.
+    """The state of a run directory.
 
     Attributes:
         path: The directory.
@@ -65,10 +67,10 @@ def find_runs(path: Path) -> list[Path]:
     names = ("config.yaml", "results.jsonl")
     if any((path / name).is_file() for name in names):
         return [path]
-    found = sorted({file.parent for name in names for file in path.glob(f"**/{name}")})
-    if not found:
+    runs = sorted({file.parent for name in names for file in path.glob(f"**/{name}")})
+    if not runs:
         raise LifelongError(f"{path}: no run directory, which has config.yaml and results.jsonl")
-    return found
+    return runs
 
 
 def examine(path: Path) -> Examination:
@@ -77,108 +79,92 @@ def examine(path: Path) -> Examination:
     Args:
         path: Directory of a run, finished or not.
     """
-    return _Examiner(path).examine()
+    counts = {"records": 0, "checkpoints": 0, "evaluations": 0}
+    findings: list[Finding] = []
 
-
-class _Examiner:
-    def __init__(self, path: Path):
-        self.path, self.folder = path, RunDirectory(path).checkpoints
-        self.counts = {"records": 0, "checkpoints": 0, "evaluations": 0}
-        self.found: list[Finding] = []
-
-    def examine(self) -> Examination:
-        if self._try(lambda: read_saved_config(self.path / "config.yaml")) is None:
-            self.folder = CheckpointFolder(self.folder.path)  # whose checkpoints may be of any run
-        results = self._try(lambda: ResultLog(self.path / "results.jsonl").read())
-        if results is not None:
-            self._check_records(results)
-        self._check_checkpoints(results)
-        for file in sorted(self.path.glob(f"**/{FILE_NAME}")):
-            if self._try(partial(EvaluationResult.read, file)) is not None:
-                self.counts["evaluations"] += 1
-        for file in sorted(self.path.rglob(".*.part")):
-            self._note(f"{file} was left by a process that was killed; a resume removes it")
-        return Examination(self.path, self.counts, tuple(self.found))
-
-    def _check_records(self, results: Results) -> None:
-        self.counts["records"] = len(results.records)
-        for problem in results.problems:
-            self._fault(problem)
-        if not results.records:
-            return self._fault(
-                f"{self.path / 'results.jsonl'} has no records: it is missing, or the run never began"
-            )
+    def attempt(read: Callable[[], Any], counted: str = "") -> Any:
         try:
-            size, learned = len(results.run.tasks), results.learned_tasks()
-        except LifelongError as error:
-            return self._fault(f"{self.path / 'results.jsonl'}: {error}")
-        if not results.finished:
-            self._note(f"the run is not finished: {learned} of {size} tasks are learned and evaluated")
-        for text in _missing_records(results):
-            self._fault(f"{self.path / 'results.jsonl'} lacks {text}; the run's command measures it again")
-        for text in _false_copies(results):
-            self._fault(f"{self.path / 'results.jsonl'}: {text}")
-        self._check_summary(results)
-
-    def _check_summary(self, results: Results) -> None:
-        """Compare results.json with the records that it was made from."""
-        file = self.path / "results.json"
-        if not file.exists():
-            if results.finished:
-                self._fault(f"{file} is missing; the run's command writes it again")
-            return
-        try:
-            written = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
-            return self._fault(f"{file} is broken ({error}); the run's command writes it again")
-        if not isinstance(written, dict):
-            return self._fault(f"{file} is broken: expected an object; the run's command writes it again")
-        now = json.loads(json.dumps(json_safe(summarize(results))))
-        earlier = written.get("statistics") != now["statistics"]  # other intervals from the same records
-        compared = [key for key in _COMPARED if not (earlier and key == "metrics")]
-        differing = [key for key in compared if not _alike(written.get(key), now[key])]
-        if differing:
-            self._fault(
-                f"{file} is not what results.jsonl gives ({', '.join(differing)}); the run's command writes it again"
-            )
-
-    def _check_checkpoints(self, results: Results | None) -> None:
-        folder = self.folder
-        tasks, ended = folder.tasks(), {r.task for r in results.of(TaskEndRecord)} if results else set()
-        for task in tasks:
-            self._check_checkpoint(folder.task_path(task), folder.load_task)
-        for path in (folder.progress_path, folder.previous_path):
-            self._check_checkpoint(path, folder.load_progress)
-        self._check_checkpoint(folder.best_path, lambda _: folder.load_best())
-        for file in sorted(folder.path.glob(f"*{BROKEN_SUFFIX}")):
-            self._note(f"{file} is a damaged checkpoint that was set aside; it may be removed")
-        if lost := sorted(ended - set(tasks)):
-            level = self._fault if lost[-1] == max(ended) else self._note
-            level(
-                f"{folder.path} has no checkpoints after tasks {', '.join(map(str, lost))}, which are learned"
-            )
-
-    def _check_checkpoint(self, path: Path, load: Callable[[Path], Any]) -> None:
-        if not path.exists():
-            return
-        try:
-            load(path)
-            self.counts["checkpoints"] += 1
-        except CheckpointError as error:
-            self._fault(str(error))
-
-    def _try(self, read: Callable[[], Any]) -> Any:
-        try:
-            return read()
+            value = read()
         except (LiberoError, OSError) as error:
-            self._fault(str(error))
+            findings.append(Finding("fault", str(error)))
             return None
+        if counted:
+            counts[counted] += 1
+        return value
 
-    def _fault(self, text: str) -> None:
-        self.found.append(Finding("fault", text))
+    folder = RunDirectory(path).checkpoints
+    if attempt(lambda: read_saved_config(path / "config.yaml")) is None:
+        folder = CheckpointFolder(folder.path)  # whose checkpoints may be of any run
+    results: Results | None = attempt(lambda: ResultLog(path / "results.jsonl").read())
+    if results is not None:
+        counts["records"] = len(results.records)
+        findings += _record_findings(results, path)
+    tasks = folder.tasks()
+    for task in tasks:
+        attempt(partial(folder.load_task, folder.task_path(task)), "checkpoints")
+    for file in filter(Path.exists, (folder.progress_path, folder.previous_path)):
+        attempt(partial(folder.load_progress, file), "checkpoints")
+    if folder.best_path.exists():
+        attempt(folder.load_best, "checkpoints")
+    ended = {record.task for record in results.of(TaskEndRecord)} if results else set()
+    if lost := sorted(ended - set(tasks)):
+        text = f"{folder.path} has no checkpoints after tasks {', '.join(map(str, lost))}, which are learned"
+        findings.append(Finding("fault" if lost[-1] == max(ended) else "note", text))
+    for file in sorted(path.glob(f"**/{FILE_NAME}")):
+        attempt(partial(EvaluationResult.read, file), "evaluations")
+    for file in sorted(folder.path.glob(f"*{BROKEN_SUFFIX}")):
+        findings.append(
+            Finding("note", f"{file} is a damaged checkpoint that was set aside; it may be removed")
+        )
+    for file in sorted(path.rglob(".*.part")):
+        findings.append(Finding("note", f"{file} was left by a process that was killed; a resume removes it"))
+    return Examination(path, counts, tuple(findings))
 
-    def _note(self, text: str) -> None:
-        self.found.append(Finding("note", text))
+
+def _record_findings(results: Results, path: Path) -> Iterator[Finding]:
+    """Yield what is wrong with the records, and with the summary that was made from them."""
+    log = path / "results.jsonl"
+    for problem in results.problems:
+        yield Finding("fault", problem)
+    if not results.records:
+        yield Finding("fault", f"{log} has no records: it is missing, or the run never began")
+        return
+    try:
+        size, learned = len(results.run.tasks), results.learned_tasks()
+    except LifelongError as error:
+        yield Finding("fault", f"{log}: {error}")
+        return
+    if not results.finished:
+        yield Finding("note", f"the run is not finished: {learned} of {size} tasks are learned and evaluated")
+    for text in _missing_records(results):
+        yield Finding("fault", f"{log} lacks {text}; the run's command measures it again")
+    for text in _false_copies(results):
+        yield Finding("fault", f"{log}: {text}")
+    summary = path / "results.json"
+    if summary.exists() or results.finished:
+        try:
+            _check_summary(summary, results)
+        except ResultsError as error:
+            yield Finding("fault", f"{error}; the run's command writes it again")
+
+
+def _check_summary(file: Path, results: Results) -> None:
+    """Compare results.json with the records that it was made from.
+
+    Raises:
+        ResultsError: It is missing, broken, or says something else.
+    """
+    if not file.exists():
+        raise ResultsError(f"{file} is missing")
+    try:
+        written = read_json(file, ResultsError)
+    except ResultsError as error:
+        raise ResultsError(f"{file} is broken ({error})") from error
+    if not isinstance(written, dict):
+        raise ResultsError(f"{file} is broken: expected an object")
+    now = json.loads(to_json(summarize(results)))
+    if differing := [key for key in _COMPARED if not _alike(written.get(key), now[key])]:
+        raise ResultsError(f"{file} is not what results.jsonl gives ({', '.join(differing)})")
 
 
 def _missing_records(results: Results) -> Iterator[str]:
@@ -213,9 +199,9 @@ def _false_copies(results: Results) -> Iterator[str]:
 
 def _gaps(epochs: dict[int, set[int]]) -> Iterator[tuple[int, list[int]]]:
     every = set().union(*epochs.values())
-    for task, found in epochs.items():
-        if every - found:
-            yield task, sorted(every - found)
+    for task, there in epochs.items():
+        if every - there:
+            yield task, sorted(every - there)
 
 
 def _listed(numbers: list[int]) -> str:
@@ -229,5 +215,5 @@ def _alike(a: Any, b: Any) -> bool:
     if isinstance(a, list) and isinstance(b, list):
         return len(a) == len(b) and all(map(_alike, a, b))
     if isinstance(a, float) and isinstance(b, float):
-        return abs(a - b) < 1e-9
+        return math.isclose(a, b, abs_tol=1e-9)
     return bool(a == b)

@@ -89,7 +89,7 @@ def test_checkpoints_of_other_tasks_and_runs_are_found(run):
     ]
     config = yaml.safe_load((run / "config.yaml").read_text())
     (run / "config.yaml").write_text(yaml.safe_dump(config | {"seed": 2}))
-    assert all("of another configuration" in text for text in faults(run)) and len(faults(run)) == 3
+    assert all("of another configuration" in text for text in faults(run)) and len(faults(run)) == 4
 
 
 def test_every_lost_or_changed_line_is_found(run):
