@@ -78,8 +78,8 @@ def load_workspace(category: str) -> Workspace:
     """
     if category not in WORKSPACES:
         raise UnknownNameError("workspace", category, WORKSPACES)
-    room, own = _read(_ROOM), _read(WORKSPACES[category])
-    parameters = {**own, **{key: _merged(room[key], own.get(key, {})) for key in _SHARED}}
+    room, specific = _read(_ROOM), _read(WORKSPACES[category])
+    parameters = {**specific, **{key: _merged(room[key], specific.get(key, {})) for key in _SHARED}}
     return Workspace(
         name=category,
         problem=parameters["problem"],
@@ -98,11 +98,11 @@ def workspace_of_problem(problem: str) -> Workspace:
     Raises:
         UnknownNameError: The problem class does not exist; the message lists the valid ones.
     """
-    known = {load_workspace(category).problem: category for category in WORKSPACES}
-    for name, category in known.items():
+    categories = {load_workspace(category).problem: category for category in WORKSPACES}
+    for name, category in categories.items():
         if name.casefold() == problem.casefold():
             return load_workspace(category)
-    raise UnknownNameError("problem", problem, known)
+    raise UnknownNameError("problem", problem, categories)
 
 
 def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]) -> None:
@@ -145,11 +145,11 @@ def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
 
 def surface_styles() -> dict[str, Mapping[str, Any]]:
     """Return the styles of floors, walls and tables by a name of their own, such as `floor_dark`."""
-    known = {
+    styles = {
         f"{kind}_{name}": style for kind in ("floor", "wall") for name, style in load_styles()[kind].items()
     }
     tables = {name: load_workspace(name).parameters.get("table") for name in WORKSPACES}
-    return known | {f"table_{name}": table["style"] for name, table in tables.items() if table is not None}
+    return styles | {f"table_{name}": table["style"] for name, table in tables.items() if table is not None}
 
 
 def add_spare_materials(spec: mujoco.MjSpec) -> None:
@@ -285,6 +285,6 @@ def _read(name: str) -> Mapping[str, Any]:
     return read_yaml(f"assets/workspaces/{name}.yaml")
 
 
-def _merged(common: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return both, where entries of `own` take precedence; those that are null there are left out."""
-    return {key: value for key, value in {**common, **own}.items() if value is not None}
+def _merged(common: Mapping[str, Any], specific: Mapping[str, Any]) -> dict[str, Any]:
+    """Return both, where entries of `specific` take precedence; those that are null there are left out."""
+    return {key: value for key, value in {**common, **specific}.items() if value is not None}

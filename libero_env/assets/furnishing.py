@@ -28,32 +28,34 @@ def load_styles() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
     return read_yaml("assets/workspaces/styles.yaml")
 
 
-def styles_of(own: Mapping[str, str], scene_properties: Mapping[str, str]) -> dict[str, Mapping[str, Any]]:
+def styles_of(
+    defaults: Mapping[str, str], scene_properties: Mapping[str, str]
+) -> dict[str, Mapping[str, Any]]:
     """Return the parameters of the styles of `floor` and `wall`.
 
     Args:
-        own: Default styles, those of the workspace.
+        defaults: Styles of the workspace.
         scene_properties: Styles of the task file; they take precedence, after them that of their `scene`.
 
     Raises:
         UnknownNameError: A property or a style does not exist; the message lists the valid ones.
     """
     chosen = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
-    known = load_styles()
+    valid = load_styles()
     for kind, name in chosen.items():
-        if kind not in known:
-            raise UnknownNameError("scene property", kind, known)
-        if name not in known[kind]:
-            raise UnknownNameError(f"{kind} style", name, known[kind])
-    scene = known["scene"][chosen.pop("scene", "base")]
-    styles = {**own, **scene, **chosen}
-    return {kind: known[kind][styles[kind]] for kind in ("floor", "wall")}
+        if kind not in valid:
+            raise UnknownNameError("scene property", kind, valid)
+        if name not in valid[kind]:
+            raise UnknownNameError(f"{kind} style", name, valid[kind])
+    scene = valid["scene"][chosen.pop("scene", "base")]
+    styles = {**defaults, **scene, **chosen}
+    return {kind: valid[kind][styles[kind]] for kind in ("floor", "wall")}
 
 
-def furniture_of(own: Sequence[str], scene_properties: Mapping[str, str]) -> tuple[str, ...]:
+def furniture_of(defaults: Sequence[str], scene_properties: Mapping[str, str]) -> tuple[str, ...]:
     """Return the names of the sets of furniture: those of the workspace, and those that the scene's style adds."""
     scene = scene_properties.get("scene", scene_properties.get("scene_style", "base"))
-    return tuple(dict.fromkeys([*own, *load_styles()["scene"][scene].get("furniture", ())]))
+    return tuple(dict.fromkeys([*defaults, *load_styles()["scene"][scene].get("furniture", ())]))
 
 
 def add_material(

@@ -75,11 +75,11 @@ def arena_spec(root: Path, workspace: Workspace, scene_properties: Mapping[str, 
         UnknownNameError: A property or a style does not exist.
         LiberoError: Files are missing.
     """
-    own = workspace.parameters["styles"]
-    styles_of(own, scene_properties)  # raises where a name is wrong
+    defaults = workspace.parameters["styles"]
+    styles_of(defaults, scene_properties)  # raises where a name is wrong
     chosen = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
     scene = chosen.pop("scene", "base")
-    textures = {**own, **load_styles()["scene"][scene], **chosen}
+    textures = {**defaults, **load_styles()["scene"][scene], **chosen}
     file = scene_file(root, workspace.name, scene)
     assets, world = read_file(file, root)
     for element in assets:

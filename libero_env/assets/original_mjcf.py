@@ -140,11 +140,11 @@ def used_assets(assets: Iterable[ET.Element], *parts: ET.Element) -> list[ET.Ele
     """
     needed = {(kind, element.get(kind)) for part in parts for element in part.iter() for kind in _REFERENCES}
     needed |= {("texture", a.get("texture")) for a in assets if (a.tag, a.get("name")) in needed}
-    kept = [a for a in assets if (a.tag, a.get("name")) in needed or a.get("type") == "skybox"]
-    for asset in kept:
+    used = [a for a in assets if (a.tag, a.get("name")) in needed or a.get("type") == "skybox"]
+    for asset in used:
         if (file := asset.get("file")) and not Path(file).is_file():
             raise LiberoError(f"{file}: no such file; {REMEDY}")
-    return kept
+    return used
 
 
 def to_xml(name: str, assets: Iterable[ET.Element], bodies: Iterable[ET.Element]) -> str:

@@ -205,9 +205,9 @@ def problems(pack: Pack) -> list[str]:
     except MissingPackageError as error:
         lines.append(f"robot: {error}")
     for category in pack.categories():
-        lines += _build_problems(category, lambda category=category: pack.build(category).spec)
+        lines += _build_problems(category, _object_alone, pack)
     for name in WORKSPACES:
-        lines += _build_problems(name, lambda name=name: _arena_alone(pack, name))
+        lines += _build_problems(name, _arena_alone, pack)
     if not isinstance(pack, OriginalPack):
         return lines
     root = Path(pack.root)
@@ -217,12 +217,16 @@ def problems(pack: Pack) -> list[str]:
     return lines + list(check_folder(root).differences)
 
 
-def _build_problems(what: str, make: Callable[[], mujoco.MjSpec]) -> list[str]:
+def _build_problems(name: str, make: Callable[[Pack, str], mujoco.MjSpec], pack: Pack) -> list[str]:
     try:
-        make().compile()
+        make(pack, name).compile()
     except (LiberoError, ValueError) as error:  # MuJoCo raises ValueError for a broken mesh or texture
-        return [f"{what}: {error}"]
+        return [f"{name}: {error}"]
     return []
+
+
+def _object_alone(pack: Pack, category: str) -> mujoco.MjSpec:
+    return pack.build(category).spec
 
 
 def _arena_alone(pack: Pack, workspace: str) -> mujoco.MjSpec:
@@ -238,8 +242,8 @@ def _is_absent(value: str) -> bool:
 @cache
 def _builtin_digest() -> str:
     package = Path(__file__).parents[1]
-    found = (path for name in _SOURCES for path in (package / name, *(package / name).rglob("*")))
-    files = sorted(path for path in found if path.suffix in (".py", ".yaml") and path.is_file())
+    paths = (path for name in _SOURCES for path in (package / name, *(package / name).rglob("*")))
+    files = sorted(path for path in paths if path.suffix in (".py", ".yaml") and path.is_file())
     digest = hashlib.sha256()
     for path in files:
         digest.update(path.relative_to(package).as_posix().encode() + b"\0" + path.read_bytes())

@@ -89,8 +89,8 @@ class FolderCheck:
         if not self.differences:
             return f"the {len(published_files())} published files (commit {COMMIT[:7]}), unchanged"
         counts = {"missing": self.missing, "replaced": self.replaced, "damaged": self.damaged}
-        found = ", ".join(f"{len(names)} {kind}" for kind, names in counts.items() if names)
-        return f"modified: of {len(published_files())} published files {found}"
+        counted = ", ".join(f"{len(names)} {kind}" for kind, names in counts.items() if names)
+        return f"modified: of {len(published_files())} published files {counted}"
 
 
 @cache
@@ -146,9 +146,9 @@ def check_folder(root: Path) -> FolderCheck:
     if (record := read_cached_record(stored)) is not None and record.get("stamp") == stamp.hexdigest():
         fields = ("missing", "replaced", "damaged")
         return FolderCheck(record["digest"], *(tuple(record[field]) for field in fields))
-    found = _compare(root, {name: size for name, (size, _) in stamps.items()})
-    write_cached_record(stored, {"folder": str(root), "stamp": stamp.hexdigest(), **asdict(found)})
-    return found
+    result = _compare(root, {name: size for name, (size, _) in stamps.items()})
+    write_cached_record(stored, {"folder": str(root), "stamp": stamp.hexdigest(), **asdict(result)})
+    return result
 
 
 def _compare(root: Path, sizes: Mapping[str, int]) -> FolderCheck:
@@ -177,13 +177,13 @@ def _digest(digests: Mapping[str, str]) -> str:
 
 
 def _walk(root: Path) -> list[tuple[str, os.stat_result]]:
-    found = []
+    stats = []
     for folder, _, names in os.walk(root, followlinks=True):
         for name in names:
             path = Path(folder, name)
             with suppress(OSError):  # a link that leads nowhere
-                found.append((path.relative_to(root).as_posix(), path.stat()))
-    return found
+                stats.append((path.relative_to(root).as_posix(), path.stat()))
+    return stats
 
 
 def _some(names: tuple[str, ...]) -> str:
@@ -197,20 +197,20 @@ def installed_folder() -> Path | None:
     Raises:
         ChangedAssetsError: Some of the distributions are missing, have another version, or are in different folders.
     """
-    found = {name: dist for name in WHEELS if (dist := _distribution(name))}
-    if not found:
+    distributions = {name: dist for name in WHEELS if (dist := _distribution(name))}
+    if not distributions:
         return None
-    if missing := [name for name in WHEELS if name not in found]:
+    if missing := [name for name in WHEELS if name not in distributions]:
         raise ChangedAssetsError(
             f"the original's models are in {len(WHEELS)} packages, of which {', '.join(missing)} are not installed "
-            f"here ({', '.join(found)} are). {REMEDY}"
+            f"here ({', '.join(distributions)} are). {REMEDY}"
         )
-    if other := [f"{name} {dist.version}" for name, dist in found.items() if dist.version != VERSION]:
+    if other := [f"{name} {dist.version}" for name, dist in distributions.items() if dist.version != VERSION]:
         raise ChangedAssetsError(
             f"{', '.join(other)}: version {VERSION} holds the published files of the original's models, and nothing is "
             f"known about other versions. {REMEDY}"
         )
-    folders = sorted({Path(str(dist.locate_file(FOLDER))).absolute() for dist in found.values()})
+    folders = sorted({Path(str(dist.locate_file(FOLDER))).absolute() for dist in distributions.values()})
     if len(folders) > 1:
         raise ChangedAssetsError(
             f"the packages of the original's models are in different folders, {' and '.join(map(str, folders))}, but "

@@ -211,8 +211,8 @@ def decimate(
         for k in range(3):
             corners = _facing(points, new_points[new[chosen, k]], new_points, new[chosen])
             result[chosen, k] = texcoord[there[nearest(corners, samples[there])]]
-    found, compact = np.unique(result.reshape(-1, 2), axis=0, return_inverse=True)
-    return new_points, new, found, compact.reshape(-1, 3).astype(np.int32)
+    distinct, compact = np.unique(result.reshape(-1, 2), axis=0, return_inverse=True)
+    return new_points, new, distinct, compact.reshape(-1, 3).astype(np.int32)
 
 
 def nearest(points: np.ndarray, among: np.ndarray) -> np.ndarray:
@@ -237,8 +237,8 @@ def _samples(
         spread = np.tile(weights, (len(chosen) // len(weights), 1))[:, :, None]
         where, texcoord = ((spread * array[chosen]).sum(axis=1) for array in (corners, texcoords))
         parts.append((_facing(points, where, points, triangles[chosen]), texcoord, chosen))
-    samples, found, owner = map(np.concatenate, zip(*parts, strict=True))
-    return samples, found, owner
+    samples, coordinates, owner = map(np.concatenate, zip(*parts, strict=True))
+    return samples, coordinates, owner
 
 
 def _facing(whole: np.ndarray, where: np.ndarray, points: np.ndarray, triangles: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic.dataclasses import dataclass
 
@@ -105,6 +105,7 @@ def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
         InvalidInputError: Not exactly one of suite, task and task file is given.
     """
     from libero_env.demos.config import DemoConfig
+    from libero_env.sim.backend import Backend
     from libero_env.tasks import get_suite, get_task, read_task
 
     if sum(one is not None for one in (request.benchmark, request.task, request.bddl)) != 1:
@@ -126,7 +127,7 @@ def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
             modalities=shown,
             drawing=request.drawing,
             robot=request.robot,
-            backend=request.backend,
+            backend=Backend.read(request.backend),
         )
         for task in tasks
     ]
@@ -341,7 +342,7 @@ def rerender_file(
     config = RenderConfig(drawing=drawing)
     if perturb is not None:
         config = replace(recorded_rendering(file), perturb=parse_perturbations(perturb, perturb_seed))
-    chosen = {"cameras": cameras, "size": size, "drawing": drawing}
+    chosen: dict[str, Any] = {"cameras": cameras, "size": size, "drawing": drawing}
     if depth or segmentation or perturb is None:
         chosen["modalities"] = modalities(depth=depth, segmentation=segmentation)
     config = replace(config, **{key: value for key, value in chosen.items() if value is not None})

@@ -150,8 +150,8 @@ def find_demo_files(paths: list[Path]) -> list[Path]:
         DemoError: There are none.
     """
     paths = paths or [demos_dir()]
-    found = [[path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")) for path in paths]
-    files = [file for group in found for file in group if file in paths or _is_whole(file)]
+    groups = [[path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")) for path in paths]
+    files = [file for group in groups for file in group if file in paths or _is_whole(file)]
     if not files:
         where = ", ".join(map(str, paths))
         raise DemoError(

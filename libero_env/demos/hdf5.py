@@ -47,7 +47,7 @@ def open_demo_file(file: Path) -> h5py.File:
     """Open a demonstration file for reading, after a check of everything that it is made of.
 
     Raises:
-        BrokenDemoError: The file is truncated or damaged, is no HDF5 file, or refers to something outside of it.
+        BrokenDemoError: The file is truncated or damaged, is not an HDF5 file, or refers to something outside of it.
         DemoError: It does not exist, or cannot be opened now.
     """
     if not file.is_file():
@@ -141,7 +141,7 @@ def read_attributes(item: h5py.Group, where: str) -> dict[str, Any]:
         names = list(item.attrs)
     if unnamed := [name for name in names if not isinstance(name, str) or not name.isprintable()]:
         raise BrokenDemoError(
-            f"{where} has the attribute {unnamed[0]!r}, which is no name; the file is damaged"
+            f"{where} has the attribute {unnamed[0]!r}, which is not a name; the file is damaged"
         )
     return {name: read_attribute(item, name, where) for name in names}
 
@@ -226,7 +226,7 @@ def _members(group: h5g.GroupID, path: str, file: Path, limit: int) -> Iterator[
         text = name.decode("utf-8", "replace")
         where = f"{path}/{text}" if path else text
         if not text.isprintable() or "/" in text or text in (".", "..") or "\ufffd" in text:
-            raise BrokenDemoError(f"{file}: {where!r} is no name of a group or dataset")
+            raise BrokenDemoError(f"{file}: {where!r} is not a name of a group or dataset")
         if kind != h5l.TYPE_HARD:
             raise BrokenDemoError(
                 f"{file}: {where} is {_LINKS.get(kind, 'an unknown kind of link')}; expected the data itself, in this "
@@ -245,10 +245,10 @@ def _check_layout(dataset: h5d.DatasetID, where: str) -> list[tuple[int, int]]:
         )
     if layout == h5d.CONTIGUOUS and (begin := dataset.get_offset()) is not None:
         return [(begin, begin + dataset.get_storage_size())]
-    found: list[tuple[int, int]] = []
+    spans: list[tuple[int, int]] = []
     if layout == h5d.CHUNKED and hasattr(dataset, "chunk_iter"):  # builds of h5py with an old HDF5 lack it
-        dataset.chunk_iter(lambda info: found.append((info.byte_offset, info.byte_offset + info.size)))
-    return found
+        dataset.chunk_iter(lambda info: spans.append((info.byte_offset, info.byte_offset + info.size)))
+    return spans
 
 
 def _check_heaps(file: Path, data: list[tuple[int, int]], base: int) -> None:

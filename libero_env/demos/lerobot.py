@@ -108,7 +108,7 @@ def export_published(
     _check_absent(root)
     layout, config = PUBLISHED[name], config or Regeneration()
     writer = ImageDatasetWriter if layout.codec is None else VideoDatasetWriter
-    kept, failed = 0, []
+    exported, failed = 0, []
     with atomic_folder(root) as folder, closing(writer(folder, layout)) as dataset:
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
             language = recorded_task(file).language
@@ -116,10 +116,10 @@ def export_published(
                 where = f"{file}: {episode.name}"
                 if episode.success:
                     dataset.add(episode, language, where)
-                    kept += 1
+                    exported += 1
                 else:
                     failed.append(where)
-        if failed and not kept:
+        if failed and not exported:
             raise DemoError(f"{failed[0]}: neither this demonstration nor any other reaches its goal again")
         dataset.close()
         episodes, frames = dataset.finish()

@@ -68,17 +68,20 @@ class Layout:
         """
         fps = {"fps": float(self.fps)} if self.states_fps else {}
         number = {"shape": [1], "names": None}
-        found: dict[str, Any] = {}
+        features: dict[str, Any] = {}
         for key, (height, width, channels) in shapes.items():
             info = self._video_info(height, width, channels)
             kind = {"dtype": "image" if self.codec is None else "video"}
-            found[key] = kind | {"shape": [height, width, channels], "names": list(_AXES)} | fps | info
-        found[self.state] = {"dtype": "float32", "shape": [8], "names": list(self.state_names)} | fps
-        found[self.action] = {"dtype": "float32", "shape": [7], "names": list(self.action_names)} | fps
-        found["timestamp"] = {"dtype": "float32", **number}
+            features[key] = kind | {"shape": [height, width, channels], "names": list(_AXES)} | fps | info
+        features[self.state] = {"dtype": "float32", "shape": [8], "names": list(self.state_names)} | fps
+        features[self.action] = {"dtype": "float32", "shape": [7], "names": list(self.action_names)} | fps
+        features["timestamp"] = {"dtype": "float32", **number}
         if self.outcome:
-            found |= {"next.reward": {"dtype": "float32", **number}, "next.done": {"dtype": "bool", **number}}
-        return found | {key: {"dtype": "int64", **number} for key in INDICES}
+            features |= {
+                "next.reward": {"dtype": "float32", **number},
+                "next.done": {"dtype": "bool", **number},
+            }
+        return features | {key: {"dtype": "int64", **number} for key in INDICES}
 
     def _video_info(self, height: int, width: int, channels: int) -> dict[str, Any]:
         if self.codec is None:

@@ -86,12 +86,12 @@ class ImageStatistics:
         below = np.cumsum(self.counts, axis=1)
         mean = self.counts @ levels / total
         std = np.sqrt(np.maximum(self.counts @ levels**2 / total - mean**2, 0.0))
-        found = {"min": levels[(self.counts > 0).argmax(axis=1)], "mean": mean, "std": std}
-        found["max"] = levels[255 - (self.counts[:, ::-1] > 0).argmax(axis=1)]
+        summary = {"min": levels[(self.counts > 0).argmax(axis=1)], "mean": mean, "std": std}
+        summary["max"] = levels[255 - (self.counts[:, ::-1] > 0).argmax(axis=1)]
         for name, q in zip(_QUANTILE_NAMES, QUANTILES, strict=True):
-            found[name] = levels[(below >= q * total[:, None]).argmax(axis=1)]
+            summary[name] = levels[(below >= q * total[:, None]).argmax(axis=1)]
         return {
-            **{key: value.reshape(3, 1, 1).tolist() for key, value in found.items()},
+            **{key: value.reshape(3, 1, 1).tolist() for key, value in summary.items()},
             "count": [self.frames],
         }
 

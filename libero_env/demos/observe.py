@@ -50,18 +50,18 @@ def recorded_task(file: Path) -> Task:
     header = read_header(file)
     name, text = Path(str(header.get("bddl_file_name", ""))), str(header.get("bddl_file_content", ""))
     try:
-        known = next((t for t in get_suite(name.parent.name).tasks if t.name == name.stem), None)
+        named = next((t for t in get_suite(name.parent.name).tasks if t.name == name.stem), None)
     except UnknownNameError:
-        known = None
+        named = None
     if not text.strip():
-        if known is None:
+        if named is None:
             raise DemoError(
                 f"{file}: neither bddl_file_content nor bddl_file_name states which task was recorded"
             )
-        return known
+        return named
     problem = bddl.parse(text, f"{file} bddl_file_content")
-    if known is not None and same_meaning(known.problem, problem):
-        return known
+    if named is not None and same_meaning(named.problem, problem):
+        return named
     return Task("file", 0, name.stem, language_from_name(name.stem), problem.language, problem)
 
 

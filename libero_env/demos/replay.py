@@ -228,7 +228,7 @@ def regenerate(file: Path, config: Regeneration) -> Iterator[Episode]:
 def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regeneration) -> Episode:
     env = renderer.env.batch
     labels = episode.labels if config.labels == "expert" else episode.actions
-    kept = np.flatnonzero(~published_noop_steps(episode.actions))
+    moving = np.flatnonzero(~published_noop_steps(episode.actions))
     env.simulations.set_physics_state(0, episode.states[0])
     for _ in range(config.settle_steps):
         env.simulations.step([0], _WAIT)
@@ -236,7 +236,7 @@ def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regen
         key: [] for key in (*env.observer.empty_images(0), *EXPORTED_STATE)
     }
     states, actions, success = [], [], False
-    recorded = list(zip(episode.actions[kept], labels[kept], strict=True))
+    recorded = list(zip(episode.actions[moving], labels[moving], strict=True))
     extra = [(episode.labels[-1], episode.labels[-1])] * config.extra_steps
     for i, (executed, label) in enumerate([*recorded, *extra]):
         if success and i >= len(recorded):

@@ -63,7 +63,7 @@ def compile_stored(xml: str, spec: mujoco.MjSpec) -> mujoco.MjModel:
         spec: Scene of the same task, complete. It is not changed.
 
     Raises:
-        DemoError: The text is no XML or has elements that grow without bound, or MuJoCo cannot compile the model, as
+        DemoError: The text is not XML or has elements that grow without bound, or MuJoCo cannot compile the model, as
             when its files are elsewhere; the message is MuJoCo's.
     """
     _parse(xml, "the stored model")
@@ -121,7 +121,7 @@ def read_fixture_poses(xml: str, scene: Scene, where: str = "the stored model") 
         Fixture -> pose (7,), pos and quat wxyz; without the fixtures that are missing.
 
     Raises:
-        DemoError: The text is not XML, or a pose is no pose.
+        DemoError: The text is not XML, or a pose is not one.
     """
     root = _parse(xml, where)
     poses = {}

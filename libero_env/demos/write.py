@@ -81,12 +81,12 @@ class DemoWriter:
 
     def recorded_states(self) -> dict[int, np.ndarray]:
         """Return the states (T, 1 + nq + nv) of each recorded demonstration, by its number."""
-        found = {}
+        by_number = {}
         for file, name in list(self._sources()):
             with open_demo_file(file) as handle:
                 states = read_values(handle["data"][name], "states", f"{file}: {name}")
-            found[demo_number(name)] = np.zeros(0) if states is None else states
-        return found
+            by_number[demo_number(name)] = np.zeros(0) if states is None else states
+        return by_number
 
     def discard_parts(self) -> None:
         """Remove the parts that an interrupted recording left."""
@@ -169,9 +169,9 @@ class DemoWriter:
                 seen.add(name)
                 yield file, name
 
-    def _check_header(self, file: Path, found: Mapping[str, Any]) -> None:
+    def _check_header(self, file: Path, stated: Mapping[str, Any]) -> None:
         for key in _CONFIG_KEYS if self.header else ():
-            here, expected = (_plain(values.get(key)) for values in (found, self.header))
+            here, expected = (_plain(values.get(key)) for values in (stated, self.header))
             if here != expected:
                 raise OtherRecordingError(
                     f"{file}: was recorded with {key} = {shorten(repr(here), 80)}, not "

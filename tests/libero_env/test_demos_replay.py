@@ -228,19 +228,6 @@ def test_reserved_starts_are_the_stored_ones(tmp_path, monkeypatch):
         np.testing.assert_array_equal(episode.fixtures, env.simulations.fixtures[0])
 
 
-def test_a_header_is_computed_once_per_job(tmp_path, monkeypatch):
-    """Since it compiles the scene, which takes longer than a check of the file."""
-    calls = []
-    header = DemoConfig.header
-    monkeypatch.setattr(DemoConfig, "header", lambda config: calls.append(config) or header(config))
-    monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
-    job = RecordingJob(DemoConfig(TASK, (8, 8)), tmp_path / "a.hdf5")
-    for n in (2, 7, 7):  # one chunk, two chunks, nothing to record
-        (report,) = make_demos([job], n, workers=1, progress=False).values()
-        assert report.recorded == n
-    assert calls == [job.config]
-
-
 def test_a_user_defined_task_file_is_recorded(tmp_path, monkeypatch):
     monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
     file = tmp_path / "my_task.bddl"

@@ -93,17 +93,6 @@ def test_existing_files_are_not_overwritten_and_empty_ones_not_written(path, tmp
     assert not (tmp_path / "c.hdf5").exists()
 
 
-@pytest.mark.parametrize(
-    ("key", "words"), [("states", "demo_1/states is missing"), ("actions", "demo_1/actions is missing")]
-)
-def test_missing_keys_are_named(path, key, words):
-    with h5py.File(path, "r+") as handle:
-        del handle[f"data/demo_1/{key}"]
-    with pytest.raises(DemoError, match=words) as caught:
-        examine(path)
-    assert path.name in str(caught.value) and "expected" in str(caught.value)
-
-
 def test_the_task_is_found_by_name_and_by_text(tmp_path):
     task = get_task("libero_goal/3")
     names = {"bddl_file_name": f"somewhere/bddl_files/libero_goal/{task.name}.bddl"}

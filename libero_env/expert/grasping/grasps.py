@@ -100,18 +100,18 @@ def find_grasps(
     feasible = sorted((c for c in candidates if c[3] <= GRIPPER.max_grasp_width), key=lambda c: c[0])
     if not feasible:
         raise _too_wide(name, min((c[3] for c in candidates), default=np.inf))
-    kept: dict[tuple, Grasp] = {}
+    by_cell: dict[tuple, Grasp] = {}
     for cost, pos, yaw, width in feasible:
-        cell = (*np.round(pos / spacing).astype(int), round(yaw / 0.35)) if spacing else (len(kept),)
-        if cell not in kept and (
+        cell = (*np.round(pos / spacing).astype(int), round(yaw / 0.35)) if spacing else (len(by_cell),)
+        if cell not in by_cell and (
             tilt is None or kernels.pads_meet_upright_faces(points, pos, np.cos(yaw), np.sin(yaw))
         ):
-            kept[cell] = Grasp(rotation @ pos, rotation @ downward(yaw, axis), width, cost)
-        if len(kept) == max_count:
+            by_cell[cell] = Grasp(rotation @ pos, rotation @ downward(yaw, axis), width, cost)
+        if len(by_cell) == max_count:
             break
-    if not kept:
+    if not by_cell:
         raise GraspError(f"{name} has no faces that the finger pads meet squarely from this side")
-    return list(kept.values())
+    return list(by_cell.values())
 
 
 def choose_grasp(

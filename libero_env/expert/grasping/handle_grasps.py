@@ -91,10 +91,10 @@ def find_candidates(handle: Handle, gripping: bool, hinged: bool, base: np.ndarr
         if wrist_twist(handle.pos[None], mat[None], base)[0] > _MAX_TWIST:
             continue
         if gripping:
-            found = _grip_candidates(handle, mat)
+            poses = _grip_candidates(handle, mat)
         else:
-            found = _push_candidates(handle, mat, _FOLLOW_RATIOS if hinged and steep else (1.0,))
-        rows += [(cost + rotation_cost, mat, *rest) for cost, *rest in found]
+            poses = _push_candidates(handle, mat, _FOLLOW_RATIOS if hinged and steep else (1.0,))
+        rows += [(cost + rotation_cost, mat, *rest) for cost, *rest in poses]
     columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * 6
     return Candidates(*columns)
 

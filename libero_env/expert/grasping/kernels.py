@@ -62,7 +62,7 @@ def body_grasps(section: np.ndarray, c: float, s: float) -> np.ndarray:
     """
     u, v = section[:, 0] * c + section[:, 1] * s, section[:, 1] * c - section[:, 0] * s
     low, high = v.min(), v.max()
-    found = np.empty((3 * len(_SHIFTS), 4))
+    rows = np.empty((3 * len(_SHIFTS), 4))
     count = 0
     for shift in _SHIFTS:
         middle = 0.5 * (low + high) + shift
@@ -78,9 +78,9 @@ def body_grasps(section: np.ndarray, c: float, s: float) -> np.ndarray:
         room = max(0.5 * (_OPENING - width) - _SPARE, 0.0)
         for offset in (0.0, room, -room):
             centre = 0.5 * (first + last) + offset
-            found[count] = centre * c - middle * s, centre * s + middle * c, width, abs(shift) + abs(offset)
+            rows[count] = centre * c - middle * s, centre * s + middle * c, width, abs(shift) + abs(offset)
             count += 1
-    return found[:count]
+    return rows[:count]
 
 
 @compiled
@@ -102,7 +102,7 @@ def wall_grasps(section: np.ndarray, column: np.ndarray, height: float, c: float
     u, v = u[order], v[order]
     column_u = column[:, 0] * c + column[:, 1] * s
     column_v = column[:, 1] * c - column[:, 0] * s
-    found = np.empty((64, 4))
+    rows = np.empty((64, 4))
     count = 0
     for middle in np.arange(v.min() + 0.01, v.max() - 0.009, _WALL_STEP):
         strip = np.flatnonzero(np.abs(v - middle) < _FINGER_HALF)
@@ -132,12 +132,12 @@ def wall_grasps(section: np.ndarray, column: np.ndarray, height: float, c: float
                 if slope > _MAX_WALL_SLOPE:
                     break
                 cost = 2.0 * width + 40.0 * max(0.012 - overlap, 0.0) + 6.0 * max(overlap - 0.02, 0.0)
-                if count == len(found):
-                    found = np.concatenate((found, np.empty_like(found)))
+                if count == len(rows):
+                    rows = np.concatenate((rows, np.empty_like(rows)))
                 x, y = centre * c - middle * s, centre * s + middle * c
-                found[count] = x, y, width, cost + 3.0 * abs(offset) + slope
+                rows[count] = x, y, width, cost + 3.0 * abs(offset) + slope
                 count += 1
-    return found[:count]
+    return rows[:count]
 
 
 @compiled

@@ -139,14 +139,14 @@ def _joint_address(place: str, scene: Scene) -> str | None:
 def _required_open(atom: Atom, view: StateView) -> list[Atom]:
     """Return the parts that have to be open to reach the place of a placement, and its object."""
     scene = view.scene
-    found = []
+    parts = []
     address = _joint_address(atom.args[1], scene)
     if atom.predicate == "In" and address is not None:
-        found.append(address)
+        parts.append(address)
     for region in scene.problem.regions:
         part = None if region.ranges else _joint_address(region.address, scene)
         if part is None or region.address not in scene.joints or region.address.endswith("_side"):
             continue
         if any(contains(box, view.body_pos(atom.args[0])) for box in region_boxes(view, region.address)):
-            found.append(part)
-    return [Atom("Open", (part,)) for part in found if scene.joints.get(part)]
+            parts.append(part)
+    return [Atom("Open", (part,)) for part in parts if scene.joints.get(part)]

@@ -107,8 +107,8 @@ def _candidate_places(placement: Placement, failures: Sequence[FailedAttempt]) -
         group = groups.setdefault((*orientation, *np.round(place.entry), depth), [])
         if len(group) < SEARCH.places_per_group:
             group.append(place)
-    kept = [place for group in groups.values() for place in group]
-    return sorted(kept, key=lambda place: place.cost)[: SEARCH.places]
+    varied = [place for group in groups.values() for place in group]
+    return sorted(varied, key=lambda place: place.cost)[: SEARCH.places]
 
 
 def _candidate_grasps(
@@ -138,7 +138,7 @@ def _candidate_grasps(
     axis, error = finger_axis(view.eef_mat), None
     towards = (near - middle) * [1, 1, 0]
     towards /= max(float(np.linalg.norm(towards)), 1e-9)
-    found: list[Grasp] = []
+    candidates: list[Grasp] = []
     for tilt in tilts:
         tilt_cost = 0.0 if tilt is None else 0.4 * float(np.arccos(tilt[2, 2]))
         number = (SEARCH.top_grasps if tilt is None else tilted_grasps) * (1 + len(failures))
@@ -159,10 +159,10 @@ def _candidate_grasps(
             extra = collision_cost(voxels, obstacles, grasp) + grip_cost(cloud, grasp)
             extra = extra + _retry_cost(placement.object_pose, grasp, failures)
             extra = extra + SEARCH.side_cost * float((middle - grasp.pos_world) @ towards)
-            found.append(replace(grasp, cost=grasp.cost + tilt_cost + extra))
-    if not found:
+            candidates.append(replace(grasp, cost=grasp.cost + tilt_cost + extra))
+    if not candidates:
         raise error or GraspError(f"{name} cannot be grasped")
-    return sorted(found, key=lambda grasp: grasp.cost)
+    return sorted(candidates, key=lambda grasp: grasp.cost)
 
 
 def _retry_cost(object_pose: Pose, grasp: Grasp, failures: Sequence[FailedAttempt]) -> float:

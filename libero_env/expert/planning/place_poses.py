@@ -193,19 +193,19 @@ def find_place_poses(placement: Placement) -> list[PlacePose]:
     even = [_Rotation.about_vertical(yaw) for yaw in _even_yaws(_NUM_YAWS)]
     parallel_yaws = _parallel_yaws(placement.cloud, placement.sides[0])
     parallel = [_Rotation.about_vertical(yaw) for yaw in parallel_yaws]
-    found = _search(placement, even, overlap) or _search(placement, parallel, overlap)
-    if not found and not placement.target_is_flat:
+    places = _search(placement, even, overlap) or _search(placement, parallel, overlap)
+    if not places and not placement.target_is_flat:
         yaws = [*parallel_yaws, *_even_yaws(_NUM_YAWS // 2)]
         for lean in _LEANS:
             leaning = [_Rotation.leaning(yaw, lean, side) for side in placement.sides for yaw in yaws]
-            found += _search(placement, leaning, overlap)
-    if not found:
-        found = _search(placement, [*even, *parallel], 8 * overlap)
-    if not found:
+            places += _search(placement, leaning, overlap)
+    if not places:
+        places = _search(placement, [*even, *parallel], 8 * overlap)
+    if not places:
         raise PlaceError(f"{placement.atom}: there is no room for {placement.atom.args[0]}")
-    lowest = min(place.pos[2] for place in found)
-    found = [replace(place, cost=place.cost + 3.0 * (place.pos[2] - lowest)) for place in found]
-    return sorted(found, key=lambda place: place.cost)
+    lowest = min(place.pos[2] for place in places)
+    places = [replace(place, cost=place.cost + 3.0 * (place.pos[2] - lowest)) for place in places]
+    return sorted(places, key=lambda place: place.cost)
 
 
 @dataclass(frozen=True)
@@ -229,12 +229,12 @@ class _Rotation:
 
 def _search(placement: Placement, rotations: list[_Rotation], max_overlap: float) -> list[PlacePose]:
     """Return places of an object with some rotations, of whose points at most a share is in occupied cells."""
-    found: list[PlacePose] = []
+    places: list[PlacePose] = []
     for rotation in rotations:
         body = (placement.cloud - placement.object_pose.pos) @ rotation.mat.T
         for spots in target_spots(placement):
-            found += _search_spots(placement, body, rotation, spots, max_overlap)
-    return found
+            places += _search_spots(placement, body, rotation, spots, max_overlap)
+    return places
 
 
 def _search_spots(
@@ -264,13 +264,13 @@ def _search_spots(
         gap = origins[:, 2] - voxels.resting_heights(middle, origins[:, :2], spots.below)
         costs = costs + _UNSUPPORTED_COST * (gap > 0.01)
     ways, overlaps = _find_entries(voxels, tested, origins, entries, max_overlap)
-    found = []
+    places = []
     for pos, cost, room, entry, overlap in zip(origins, costs, rooms, ways, overlaps, strict=True):
         if entry is not None:
             total = cost + rotation.cost + 8.0 * overlap + 0.5 * (entry[2] > -0.5)
             mat = rotation.mat @ placement.object_pose.mat
-            found.append(PlacePose(pos, mat, entry, total, float(room)))
-    return found
+            places.append(PlacePose(pos, mat, entry, total, float(room)))
+    return places
 
 
 def _even_yaws(number: int) -> list[float]:
