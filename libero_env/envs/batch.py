@@ -21,8 +21,9 @@ from libero_env.envs.checks import (
     checked_numbers,
 )
 from libero_env.envs.config import AFTER, EnvConfig, show_options
-from libero_env.envs.scenes import open_scenes, sample_states
+from libero_env.envs.scenes import open_scenes
 from libero_env.errors import InvalidInputError, PlacementError
+from libero_env.init_states.placement import sample_states
 from libero_env.init_states.store import load_init_states
 from libero_env.memory import require_memory
 from libero_env.perturbations.episodes import TRIES

@@ -1,6 +1,5 @@
-"""The scenes of an environment's task, with and without perturbations, and new placements in them."""
+"""The scenes of an environment's task, with and without perturbations."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -8,12 +7,10 @@ import numpy as np
 
 from libero_env.envs.config import EnvConfig
 from libero_env.errors import InvalidInputError
-from libero_env.init_states.placement import sample_settled
 from libero_env.perturbations.episodes import PerturbedEpisodes, needs_materials, scene_problem
 from libero_env.perturbations.perturbation import Perturbation, perturb_task
 from libero_env.perturbations.published import published_changes, rest_of
-from libero_env.sim.scene import InitialStates, Scene, build_scene
-from libero_env.sim.simulation import LoopSimulations
+from libero_env.sim.scene import Scene, build_scene
 from libero_env.tasks import Task, get_task
 from libero_env.tasks.published.suites import require_available
 from libero_env.text import shown
@@ -67,17 +64,3 @@ def open_scenes(task: Task | str, config: EnvConfig, num: int) -> TaskScenes:
     scene = compiled(scene_problem(changed, base))
     perturbed = PerturbedEpisodes(changes, base, base_scene, scene, num)
     return TaskScenes(changed, scene, base, base_scene, rest_of(base), perturbed)
-
-
-def sample_states(scene: Scene, generators: Sequence[np.random.Generator]) -> InitialStates:
-    """Return new placements of a scene at rest, one from each generator.
-
-    Raises:
-        PlacementError: The objects do not fit, or do not come to rest.
-    """
-    simulations, speed = LoopSimulations(scene.model, 1, scene.fixture_bodies), np.zeros(scene.model.nv)
-    try:
-        starts = [sample_settled(scene, simulations, 0, rng) for rng in generators]
-    finally:
-        simulations.close()
-    return np.stack([np.concatenate([[0.0], s.qpos, speed, s.fixtures.ravel()]) for s in starts])

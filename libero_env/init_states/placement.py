@@ -3,7 +3,7 @@
 They are checked against the task: its init atoms hold, its goal does not.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -13,8 +13,8 @@ from libero_env.errors import PlacementError
 from libero_env.geometry import quat_from_axis_angle, quat_to_mat
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY
 from libero_env.sim.predicates import evaluate
-from libero_env.sim.scene import ROBOT, Scene, fixture_pose, initial_qpos
-from libero_env.sim.simulation import Simulations
+from libero_env.sim.scene import ROBOT, InitialStates, Scene, fixture_pose, initial_qpos
+from libero_env.sim.simulation import LoopSimulations, Simulations
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom, Region
 
@@ -337,6 +337,20 @@ def sample_settled(
     raise PlacementError(
         f"{scene.problem.language!r}: none of {samples} sampled starts agrees with the task: {reason}"
     )
+
+
+def sample_states(scene: Scene, generators: Sequence[np.random.Generator]) -> InitialStates:
+    """Return new placements of a scene at rest, one from each generator.
+
+    Raises:
+        PlacementError: The objects do not fit, or do not come to rest.
+    """
+    simulations, speed = LoopSimulations(scene.model, 1, scene.fixture_bodies), np.zeros(scene.model.nv)
+    try:
+        starts = [sample_settled(scene, simulations, 0, rng) for rng in generators]
+    finally:
+        simulations.close()
+    return np.stack([np.concatenate([[0.0], s.qpos, speed, s.fixtures.ravel()]) for s in starts])
 
 
 def start_faults(view: StateView) -> list[str]:

@@ -12,11 +12,10 @@ from libero_env.assets.pack import BUILTIN
 from libero_env.errors import BrokenFileError, LiberoError, PlacementError
 from libero_env.init_states.original_resets import drawn_fixtures
 from libero_env.init_states.pickles import StateFileError, read_states
-from libero_env.init_states.placement import sample_settled
+from libero_env.init_states.placement import sample_states
 from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
 from libero_env.sim.scene import InitialStates, Scene, build_scene
-from libero_env.sim.simulation import LoopSimulations
 from libero_env.storage import atomic_write_npz, cached_arrays, read_npz, read_packaged_npz
 from libero_env.tasks.published.suites import PublishedTask
 from libero_env.tasks.task import Task
@@ -37,13 +36,8 @@ def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -
     Returns:
         The states, of which the i-th depends on the task's name and i alone.
     """
-    simulations, nv = LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies), scene.model.nv
     name = int.from_bytes(hashlib.sha256(task.name.encode()).digest()[:8], "big")
-    rows = []
-    for i in range(num):
-        start = sample_settled(scene, simulations, 0, np.random.default_rng([_SEED, name, i]))
-        rows.append(np.concatenate([[0.0], start.qpos, np.zeros(nv), start.fixtures.ravel()]))
-    return np.array(rows)
+    return sample_states(scene, [np.random.default_rng([_SEED, name, i]) for i in range(num)])
 
 
 def load_init_states(task: Task, scene: Scene) -> InitialStates:

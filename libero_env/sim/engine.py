@@ -1,7 +1,7 @@
 """What works by the means of a backend: simulations of a model, the truth of goals in them, and their observer."""
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -108,15 +108,13 @@ def make_goals(
     return ViewedGoals(goal, atoms, views, semantics)
 
 
-def make_observer(
-    scene: Scene,
-    simulations: Simulations,
-    *,
-    observations: Sequence[str],
-    cameras: Sequence[str],
-    camera_size: tuple[int, int],
-) -> Observer:
-    """Return an observer that draws by the means of the simulations' backend; arguments as of `Observer`.
+def make_observer(scene: Scene, simulations: Simulations, **options: Any) -> Observer:
+    """Return an observer that renders by the means of the simulations' backend.
+
+    Args:
+        scene: Scene that is simulated.
+        simulations: Simulations to observe.
+        **options: Further arguments of `Observer`.
 
     Raises:
         UnknownNameError: An observation or a camera does not exist.
@@ -125,4 +123,4 @@ def make_observer(
     kind = Observer
     if simulations.backend.is_warp:
         from libero_env.sim.mjwarp.pictures import WarpObserver as kind  # with the extra `warp` only
-    return kind(scene, simulations, observations=observations, cameras=cameras, camera_size=camera_size)
+    return kind(scene, simulations, **options)
