@@ -142,7 +142,7 @@ def _valid(target: str, key: str) -> str:
     """The values that a key takes, by its annotation; upper ends beyond what any machine can do are left out."""
     from hydra.utils import get_object
 
-    from libero_env.validation import accepted, parameters_of
+    from libero_env.validation import parameters_of
 
     known = parameters_of(get_object(target))
     words = accepted(known.types[key]) if known and key in known.types else ""
@@ -159,6 +159,43 @@ def meaning(target: str, key: str, files: list[Path]) -> str:
     values = [value for *_, name, value in found if name == key]
     choices = any(isinstance(v, str) and comment.startswith(f"{v},") and f"`{v}`" not in text for v in values)
     return f"{text.rstrip('.')} ({comment})" if choices else text
+
+
+def accepted(kind: Any) -> str:
+    """Return in words which values a type takes, such as `whole number, at least 1`; empty where that is not known."""
+    from pydantic import TypeAdapter
+
+    from libero_env.validation import is_plain
+
+    if not is_plain(kind):
+        return ""
+    adapter = TypeAdapter(tuple[kind], config={"arbitrary_types_allowed": True})
+    return _in_words(adapter.json_schema()["prefixItems"][0])
+
+
+def _in_words(schema: Mapping[str, Any]) -> str:
+    """Return a JSON schema in words."""
+    if "anyOf" in schema:
+        return " or ".join(dict.fromkeys(filter(None, map(_in_words, schema["anyOf"]))))
+    if "enum" in schema or "const" in schema:
+        return ", ".join(map(str, schema.get("enum", [schema.get("const")])))
+    kind = str(schema.get("type", ""))
+    if kind == "array":
+        entries = _in_words(schema.get("items", {}))
+        return f"list of {entries}" if entries else "list"
+    words = {"integer": "whole number", "number": "number", "boolean": "true, false", "string": "text"}
+    bounds = {
+        "minimum": "at least",
+        "exclusiveMinimum": "above",
+        "maximum": "at most",
+        "exclusiveMaximum": "below",
+    }
+    limits = [
+        f"{text} {schema[key] if isinstance(schema[key], int) else format(schema[key], 'g')}"
+        for key, text in bounds.items()
+        if key in schema
+    ]
+    return ", ".join(filter(None, [words.get(kind, kind), *limits]))
 
 
 def _entry(target: str, key: str) -> str:

@@ -191,14 +191,6 @@ class OneOf:
         return core_schema.literal_schema(list(self.names))
 
 
-def accepted(kind: Any) -> str:
-    """Return in words which values a type takes, such as `whole number, at least 1`; empty where that is not known."""
-    if not is_plain(kind):
-        return ""
-    schema = _adapter(kind).json_schema()
-    return _in_words({**schema["prefixItems"][0], "$defs": schema.get("$defs")})
-
-
 @functools.lru_cache(maxsize=512)
 def _has_schema(kind: Any) -> bool:
     from pydantic import PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError
@@ -383,27 +375,6 @@ def _expected(error: "ErrorDetails") -> str:
 
 def _number(value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:g}"
-
-
-def _in_words(schema: Mapping[str, Any]) -> str:
-    """Return a JSON schema in words."""
-    if "anyOf" in schema:
-        return " or ".join(dict.fromkeys(filter(None, map(_in_words, schema["anyOf"]))))
-    if "enum" in schema or "const" in schema:
-        return ", ".join(map(str, schema.get("enum", [schema.get("const")])))
-    kind = str(schema.get("type", ""))
-    if kind == "array":
-        entries = _in_words(schema.get("items", {}))
-        return f"list of {entries}" if entries else "list"
-    words = {"integer": "whole number", "number": "number", "boolean": "true, false", "string": "text"}
-    bounds = {
-        "minimum": "at least",
-        "exclusiveMinimum": "above",
-        "maximum": "at most",
-        "exclusiveMaximum": "below",
-    }
-    limits = [f"{text} {_number(schema[key])}" for key, text in bounds.items() if key in schema]
-    return ", ".join(filter(None, [words.get(kind, kind), *limits]))
 
 
 def _fields(kind: Any) -> list[str] | None:

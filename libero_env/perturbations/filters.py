@@ -1,14 +1,14 @@
 """Kinds that change what is observed (noise, blur, late and lost pictures, a biased sensor), and what is executed."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from PIL import Image, ImageFilter
 
 from libero_env.geometry import quat_from_axis_angle, quat_multiply, quat_to_axis_angle
-from libero_env.perturbations.kinds import ActionFilter, Episode, Kind, ObservationFilter
+from libero_env.perturbations.kinds import ActionFilter, Episode, ObservationFilter
 from libero_env.perturbations.sampling import direction, sign
 
 RGB = "_rgb"
@@ -202,84 +202,14 @@ class ActionNoise(ActionFilter):
         return noisy
 
 
-KINDS = (
-    Kind(
-        "noise",
-        "observation",
-        "grey levels",
-        50.0,
-        "normal noise on each pixel of all cameras, with this standard deviation of 255 levels",
-        lambda levels, rng: PixelNoise(levels),
-    ),
-    Kind(
-        "blur",
-        "observation",
-        "pixels of 128",
-        4.0,
-        "Gaussian blur of all cameras, with this standard deviation in an image of 128 pixels height",
-        lambda pixels, rng: Blur(pixels),
-    ),
-    Kind(
-        "occlusion",
-        "observation",
-        "share of the picture",
-        0.4,
-        "a grey rectangle hides this share of each picture, at a place that stays for the episode",
-        lambda share, rng: Occlusion(share),
-    ),
-    Kind(
-        "latency",
-        "observation",
-        "control steps",
-        10,
-        "pictures arrive this many steps of 50 ms later; the robot's own state does not",
-        lambda steps, rng: Latency(int(steps)),
-        scale="count",
-    ),
-    Kind(
-        "dropped_frames",
-        "observation",
-        "share",
-        0.9,
-        "this share of the pictures is lost, and the last that arrived stays",
-        lambda share, rng: DroppedFrames(share),
-    ),
-    Kind(
-        "proprio_bias",
-        "observation",
-        "m and rad",
-        0.1,
-        "the robot's sensors are off by this distance of the hand, and this angle of the hand and in joint space",
-        lambda amount, rng: StateBias(amount),
-    ),
-    Kind(
-        "delay",
-        "action",
-        "control steps",
-        4,
-        "actions are executed this many steps of 50 ms later",
-        lambda steps, rng: ActionDelay(int(steps)),
-        scale="count",
-        physical=True,
-        is_sampled=False,
-    ),
-    Kind(
-        "gain",
-        "action",
-        "ratio",
-        2.0,
-        "movements of the arm are larger or smaller by this factor",
-        lambda ratio, rng: ActionGain(ratio ** sign(rng)),
-        scale="ratio",
-        physical=True,
-    ),
-    Kind(
-        "action_noise",
-        "action",
-        "of the action's range",
-        0.5,
-        "normal noise on the arm's actions, with this standard deviation where actions are in [-1, 1]",
-        lambda deviation, rng: ActionNoise(deviation),
-        physical=True,
-    ),
-)
+SAMPLERS: dict[str, Callable[[float, np.random.Generator], ObservationFilter | ActionFilter]] = {
+    "noise": lambda levels, rng: PixelNoise(levels),
+    "blur": lambda pixels, rng: Blur(pixels),
+    "occlusion": lambda share, rng: Occlusion(share),
+    "latency": lambda steps, rng: Latency(int(steps)),
+    "dropped_frames": lambda share, rng: DroppedFrames(share),
+    "proprio_bias": lambda amount, rng: StateBias(amount),
+    "delay": lambda steps, rng: ActionDelay(int(steps)),
+    "gain": lambda ratio, rng: ActionGain(ratio ** sign(rng)),
+    "action_noise": lambda deviation, rng: ActionNoise(deviation),
+}

@@ -8,7 +8,6 @@ import numpy as np
 
 from libero_env.assets.arena import SPARE, surface_styles
 from libero_env.geometry import quat_to_mat, rotation_about
-from libero_env.perturbations.kinds import Kind
 from libero_env.perturbations.sampling import direction, sign
 from libero_env.sim.look import HEADLIGHT, CameraView, Lamp, Look
 from libero_env.sim.scene import Scene
@@ -155,52 +154,11 @@ def _colour(share: float, rng: np.random.Generator, scene: Scene) -> Look:
     return Look(colours=colours)
 
 
-KINDS = (
-    Kind(
-        "camera",
-        "look",
-        "degrees",
-        _FULL_ANGLE,
-        "the agent's camera moves about the point of the workspace that it looks at, upright, and up to 1.2 times "
-        "nearer or farther",
-        _camera,
-    ),
-    Kind("fov", "look", "degrees", 20.0, "the agent's camera has a wider or narrower field of view", _fov),
-    Kind(
-        "light",
-        "look",
-        "lux ratio",
-        _FULL_RATIO,
-        "all lights are brighter or darker by this factor, and turned by up to 60 degrees",
-        _light,
-        scale="ratio",
-    ),
-    Kind(
-        "table",
-        "look",
-        "RGB distance",
-        0.8,
-        "the surface that objects stand on has the material whose mean colour is nearest to this distance from its own",
-        _table,
-        needs_materials=True,
-    ),
-    Kind(
-        "background",
-        "look",
-        "RGB distance",
-        0.8,
-        "walls and floor have materials whose mean colours are nearest to this distance from their own; furniture has "
-        "another colour to that share",
-        _background,
-        needs_materials=True,
-    ),
-    Kind(
-        "colour",
-        "look",
-        "share",
-        0.7,
-        "this share of the colour of each movable object is replaced by another; colours that the instruction names "
-        "stay",
-        _colour,
-    ),
-)
+SAMPLERS = {
+    "camera": _camera,
+    "fov": _fov,
+    "light": _light,
+    "table": _table,
+    "background": _background,
+    "colour": _colour,
+}

@@ -1,7 +1,7 @@
 """The dataclass `Perturbation`, its text (`camera=0.3,light=0.5`), and tasks as perturbations change them."""
 
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
@@ -12,12 +12,20 @@ from libero_env.perturbations.instructions import reword
 from libero_env.perturbations.kinds import Kind, Layer
 from libero_env.perturbations.sampling import SampleKey, first_attempt, sample_key
 from libero_env.sim.scene import Scene
+from libero_env.storage import read_yaml
 from libero_env.tasks.task import Task
 from libero_env.text import shown
 from libero_env.validation import checked
 
+_SAMPLERS: Mapping[str, Callable[..., Any]] = {
+    **problem.SAMPLERS,
+    **looks.SAMPLERS,
+    **starts.SAMPLERS,
+    **filters.SAMPLERS,
+}
 KINDS: Mapping[str, Kind] = {
-    kind.name: kind for kinds in (problem.KINDS, looks.KINDS, starts.KINDS, filters.KINDS) for kind in kinds
+    name: Kind(name, sample=_SAMPLERS[name], **keys)
+    for name, keys in read_yaml("perturbations/data/kinds.yaml").items()
 }
 """All kinds by name, in the order in which they are applied."""
 

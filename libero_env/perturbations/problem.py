@@ -11,7 +11,6 @@ from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.init_states.store import load_init_states
 from libero_env.perturbations.goals import is_named, other_goals
 from libero_env.perturbations.instructions import reword
-from libero_env.perturbations.kinds import Kind
 from libero_env.perturbations.sampling import direction
 from libero_env.perturbations.starts import carried, contacts, shifted
 from libero_env.sim.scene import Scene
@@ -185,52 +184,10 @@ def _with_shifts(problem: Problem, shifts: dict[str, np.ndarray]) -> Problem:
     return replace(problem, regions=tuple(regions), init=tuple(init))
 
 
-KINDS = (
-    Kind(
-        "goal",
-        "problem",
-        "goals",
-        1,
-        "the scene has another goal, with its instruction; the severity does not matter",
-        _goal,
-        scale="count",
-        physical=True,
-        exclusive=True,
-    ),
-    Kind(
-        "layout",
-        "problem",
-        "m",
-        0.1,
-        "the places of objects are moved so far; what the goal puts them on or in, and fixtures, stay",
-        _layout,
-        physical=True,
-    ),
-    Kind(
-        "objects",
-        "problem",
-        "share",
-        1.0,
-        "this share of the objects that the task is not about are others, in the same places",
-        _objects,
-        physical=True,
-    ),
-    Kind(
-        "distractors",
-        "problem",
-        "objects",
-        6,
-        "so many objects stand around that the task does not have",
-        _distractors,
-        scale="count",
-        physical=True,
-    ),
-    Kind(
-        "instruction",
-        "problem",
-        "token edit distance",
-        0.8,
-        "the instruction says the same in other words, at this normalised edit distance",
-        _instruction,
-    ),
-)
+SAMPLERS = {
+    "goal": _goal,
+    "layout": _layout,
+    "objects": _objects,
+    "distractors": _distractors,
+    "instruction": _instruction,
+}

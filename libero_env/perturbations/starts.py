@@ -10,7 +10,7 @@ import numpy as np
 
 from libero_env.assets.arena import WORKSPACES
 from libero_env.geometry import quat_from_axis_angle, quat_multiply
-from libero_env.perturbations.kinds import Kind, StartChange
+from libero_env.perturbations.kinds import StartChange
 from libero_env.perturbations.sampling import direction, sign
 from libero_env.sim.scene import Scene
 from libero_env.tasks.problem import Problem
@@ -161,23 +161,4 @@ def _object_pose(metres: float, rng: np.random.Generator, scene: Scene) -> Scatt
     return ScatteredObjects(metres, _FULL_TURN * metres / _FULL_STEP, int(rng.integers(2**63)))
 
 
-KINDS = (
-    Kind(
-        "robot",
-        "start",
-        "rad",
-        0.5,
-        "the arm starts elsewhere, at this distance in joint space, within its limits and touching nothing",
-        _robot,
-        physical=True,
-    ),
-    Kind(
-        "object_pose",
-        "start",
-        "m",
-        _FULL_STEP,
-        "each object starts this far from its place and turned by up to 30 degrees, each start otherwise",
-        _object_pose,
-        physical=True,
-    ),
-)
+SAMPLERS = {"robot": _robot, "object_pose": _object_pose}
