@@ -190,11 +190,11 @@ def _in_words(schema: Mapping[str, Any]) -> str:
         "maximum": "at most",
         "exclusiveMaximum": "below",
     }
-    limits = [
-        f"{text} {schema[key] if isinstance(schema[key], int) else format(schema[key], 'g')}"
-        for key, text in bounds.items()
-        if key in schema
-    ]
+    limits = []
+    for key, text in bounds.items():
+        if key in schema:
+            bound = schema[key]
+            limits.append(f"{text} {bound if isinstance(bound, int) else format(bound, 'g')}")
     return ", ".join(filter(None, [words.get(kind, kind), *limits]))
 
 

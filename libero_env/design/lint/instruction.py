@@ -10,32 +10,12 @@ from libero_env.tasks import Task
 from libero_env.tasks.problem import Problem
 
 # words of categories that do not name the object
-_QUALITIES = set(
-    [
-        "and",
-        "of",
-        "the",
-        "two",
-        "new",
-        "black",
-        "white",
-        "red",
-        "yellow",
-        "wooden",
-        "flat",
-        "short",
-        "glazed",
-        "rim",
-        "region",
-        "side",
-        "contain",
-        "init",
-    ]
-)
+_QUALITIES = {
+    *("and", "of", "the", "two", "new", "black", "white", "red", "yellow", "wooden", "flat", "short"),
+    *("glazed", "rim", "region", "side", "contain", "init"),
+}
 _ALSO = {"shelf": "cabinet", "cabinet": "drawer"}  # other words in common use
-_PARTS = set(
-    ["drawer", "compartment", "layer", "side", "shelf", "region", "of"]
-)  # parts of objects that have sides
+_PARTS = {"drawer", "compartment", "layer", "side", "shelf", "region", "of"}  # of objects that have sides
 _SIDES = ({"top", "middle", "bottom"}, {"left", "right"}, {"front", "back"})
 
 
