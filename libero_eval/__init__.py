@@ -1,1 +1,8 @@
-"""Judge any policy: protocols, policy servers, resumable evaluations, comparisons, robustness."""
+"""Judging any policy: protocols, policy servers, resumable evaluations, comparisons, robustness.
+
+The names below are loaded when they are first used.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -40,13 +40,12 @@ from lifelong.streams import StreamSettings
 from lifelong.training.fit import EpochEnd, fit
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import BatchAugmentation
+from lifelong.tuning.proxy import CHUNK, MEASURED
 from lifelong.types import Batch, Count, NonNegative
 
 Start = Literal["final", "initial"]
 Measure = Callable[[Policy], float]  # 0 is perfect
 STARTS: tuple[Start, ...] = ("final", "initial")
-MEASURED = 512  # largest number of held-out windows of a task
-_CHUNK = 128  # windows of a forward pass
 
 
 @dataclass(frozen=True)
@@ -282,7 +281,7 @@ def error_on(policy: Policy, batch: Batch) -> float:
     """
     device, errors = device_of(policy), []
     with torch.no_grad(), in_mode(policy, training=False):
-        for rows in torch.arange(len(batch)).split(_CHUNK):
+        for rows in torch.arange(len(batch)).split(CHUNK):
             part = batch.rows(rows).to(device)
             errors.append((policy.predict(part).float() - part.actions).abs().mean((1, 2)).cpu())
     return float(torch.cat(errors).mean())

@@ -9,6 +9,7 @@ import sys
 import pytest
 
 import libero_env
+import libero_eval
 import lifelong
 
 pytestmark = pytest.mark.unit
@@ -32,10 +33,14 @@ OFFERED = {
         *("Algorithm", "Batch", "EvalSettings", "FitSettings", "LifelongError", "Policy", "PolicySpec"),
         *("fit", "lifelong_metrics", "rollout", "write_report"),
     },
+    "libero_eval": {
+        *("Comparison", "EvalProtocol", "EvalRequest", "EvaluationResult", "TaskResult"),
+        *("compare_groups", "evaluate", "load_protocol"),
+    },
 }
 PACKAGES = sorted(
     module.name
-    for root in (libero_env, lifelong)
+    for root in (libero_env, lifelong, libero_eval)
     for module in [
         pkgutil.ModuleInfo(None, root.__name__, True),  # type: ignore[arg-type]
         *pkgutil.walk_packages(root.__path__, f"{root.__name__}."),
@@ -64,6 +69,7 @@ def test_every_offered_name_exists(package):
     [
         ("libero_env", {"mujoco", "torch", "numpy", "h5py"}),
         ("lifelong", {"mujoco", "torch", "numpy", "hydra"}),
+        ("libero_eval", {"mujoco", "torch", "numpy", "hydra"}),
     ],
 )
 def test_importing_a_package_loads_nothing_heavy(package, heavy):

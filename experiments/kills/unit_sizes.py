@@ -13,7 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from libero_eval.evaluate import plan_evaluation, policy_threads
+from libero_eval.plan import plan_evaluation, policy_threads
 from libero_eval.requests import EvalRequest
 
 

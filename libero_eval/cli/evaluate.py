@@ -26,8 +26,8 @@ class EvalOptions(EvalRequest):
 
 def evaluate(options: EvalOptions) -> None:
     """Evaluate a policy; print a row for each task, the mean, and the file of the results."""
-    from libero_eval.evaluate import plan_evaluation, run
     from libero_eval.evaluation_file import FILE_NAME
+    from libero_eval.plan import plan_evaluation, run
     from libero_eval.work.progress import HEADER, describe_status, table_row, total_rows
 
     if options.status:

@@ -8,8 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from libero_env.perturbations import format_perturbations, get_kind, parse_perturbations
-from libero_eval.evaluate import load_policy, plan_evaluation, policy_threads, work_quietly
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
+from libero_eval.plan import load_policy, plan_evaluation, policy_threads, work_quietly
 from libero_eval.policies import PolicyUnderTest
 from libero_eval.requests import PAIRS, RobustnessRequest
 from libero_eval.robustness.results import Outcomes, Robustness, name_of

@@ -29,7 +29,7 @@ from lifelong.types import Batch, PolicySpec
 
 FORMAT = 1  # of a trial's record; another one is measured again
 MEASURED = 512  # largest number of held-out windows of a task
-_CHUNK = 128  # windows of a forward pass
+CHUNK = 128  # windows of a forward pass
 _GROUPS = ("algo", "policy", "data", "augmentation", "train", "language")  # that a trial depends on
 # Tasks of libero_90: packages into a basket, in a scene that of the reported suites only libero_10 has. Five, because
 # strengths that are chosen on two hold back a longer stream (experiments/tuning)
@@ -237,6 +237,6 @@ def _error(algorithm: Algorithm, policy: Policy, task: int, batch: Batch, settin
     """Return the mean absolute error of the policy's actions on windows of a task."""
     with algorithm.policy_for(task, policy) as acting, autocast(torch.device("cpu"), settings.precision):
         acting.eval()
-        parts = [batch.rows(rows) for rows in torch.arange(len(batch)).split(_CHUNK)]
+        parts = [batch.rows(rows) for rows in torch.arange(len(batch)).split(CHUNK)]
         errors = [(acting.predict(part).float() - part.actions).abs().flatten(1).mean(1) for part in parts]
     return float(torch.cat(errors).mean())

@@ -12,8 +12,8 @@ import pytest
 
 from libero_env import memory
 from libero_env.cli import main as cli
-from libero_eval.evaluate import choose_init_states, plan_evaluation
 from libero_eval.evaluation_file import EvaluationResult, overall
+from libero_eval.plan import choose_init_states, plan_evaluation
 from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
 from libero_eval.user_policy import ORIGINAL_NAMES, CallableActor, UserPolicy, as_original, load_callable
