@@ -35,13 +35,17 @@ def checked_perturbations(value: object) -> tuple[Perturbation | Change, ...]:
         return tuple(one for one in parse_perturbations(value) if one.severity)
     if not isinstance(value, Iterable) or isinstance(value, Mapping | bytes):
         raise InvalidInputError(f"perturb is {shown(value)}; expected a text such as camera=0.3,light=0.5")
-    sampled, fixed = [], []
+    sampled: list[Perturbation] = []
+    fixed: list[Change] = []
     for one in value:
         if not isinstance(one, Perturbation | Change):
             raise InvalidInputError(
                 f"perturb has {shown(one)}; expected a Perturbation, or a change that it could sample, such as a Look"
             )
-        (sampled if isinstance(one, Perturbation) else fixed).append(one)
+        if isinstance(one, Perturbation):
+            sampled.append(one)
+        else:
+            fixed.append(one)
     return (*(one for one in in_order(sampled) if one.severity), *fixed)
 
 

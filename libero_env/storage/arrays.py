@@ -49,14 +49,34 @@ def atomic_write_npz(target: Path, arrays: Mapping[str, Any], *, fsync: bool = F
         file.write(seal)
 
 
-def read_npz(path: Path) -> Arrays:
+def read_npz(path: Path, *, needs_checksum: bool = False) -> Arrays:
     """Read the arrays of a file of `atomic_write_npz`, or of one without the checksum at its end.
+
+    Args:
+        path: File to read.
+        needs_checksum: Whether a file without the checksum is broken.
 
     Raises:
         BrokenFileError: The checksums do not fit, or the file has something else than arrays of numbers and texts.
         OSError: The file cannot be read.
     """
-    return read_sealed_npz(path)[0]
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_ARRAYS_BYTES:
+        raise BrokenFileError(f"{path} is not a file of at most {show_bytes(MAX_ARRAYS_BYTES)}")
+    content = path.read_bytes()
+    seal, digest = content[-_SEAL_BYTES:], hashlib.sha256(memoryview(content)[:-_SEAL_BYTES]).hexdigest()
+    if (needs_checksum or seal.startswith(_SEAL)) and seal != _SEAL + digest.encode():
+        raise BrokenFileError(f"{path} has another checksum than when it was written")
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            entries = archive.infolist()
+            if sum(entry.file_size for entry in entries) > MAX_ARRAYS_BYTES:
+                raise ValueError(f"more than {show_bytes(MAX_ARRAYS_BYTES)} of arrays")
+            if {entry.compress_type for entry in entries} - {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+                raise ValueError("an unusual compression")
+            return {name.removesuffix(".npy"): _parse_npy(archive.read(name)) for name in archive.namelist()}
+    except _ARRAY_ERRORS as error:
+        raise BrokenFileError(f"{path} is not a file of arrays ({' '.join(str(error).split())})") from None
 
 
 def read_packaged_npz(path: Path) -> Arrays:
@@ -78,34 +98,6 @@ def read_packaged_npz(path: Path) -> Arrays:
 def are_finite(arrays: Arrays) -> bool:
     """Return whether all numbers are finite."""
     return all(np.isfinite(array).all() for array in arrays.values() if array.dtype.kind == "f")
-
-
-def read_sealed_npz(path: Path) -> tuple[Arrays, bool]:
-    """Return the arrays of a file and whether it has the checksum at its end; raises as `read_npz`."""
-    found = path.stat()
-    if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_ARRAYS_BYTES:
-        raise BrokenFileError(f"{path} is no file of at most {show_bytes(MAX_ARRAYS_BYTES)}")
-    content = path.read_bytes()
-    seal = content[-_SEAL_BYTES:]
-    sealed = seal.startswith(_SEAL)
-    if (
-        sealed
-        and hashlib.sha256(memoryview(content)[:-_SEAL_BYTES]).hexdigest().encode() != seal[len(_SEAL) :]
-    ):
-        raise BrokenFileError(f"{path} has another checksum than when it was written")
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            if sum(info.file_size for info in archive.infolist()) > MAX_ARRAYS_BYTES:
-                raise ValueError(f"more than {show_bytes(MAX_ARRAYS_BYTES)} of arrays")
-            if {info.compress_type for info in archive.infolist()} - {
-                zipfile.ZIP_STORED,
-                zipfile.ZIP_DEFLATED,
-            }:
-                raise ValueError("an unusual compression")
-            names = archive.namelist()
-            return {name.removesuffix(".npy"): _parse_npy(archive.read(name)) for name in names}, sealed
-    except _ARRAY_ERRORS as error:
-        raise BrokenFileError(f"{path} is no file of arrays ({' '.join(str(error).split())})") from None
 
 
 def _parse_npy(content: bytes) -> np.ndarray:

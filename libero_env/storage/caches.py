@@ -18,8 +18,8 @@ from libero_env.storage.arrays import (
     Arrays,
     are_finite,
     atomic_write_npz,
+    read_npz,
     read_record,
-    read_sealed_npz,
     write_record,
 )
 from libero_env.storage.files import PART_SUFFIX
@@ -40,16 +40,14 @@ def cached_arrays(path: Path, make: Callable[[], Arrays], fits: Callable[[Arrays
     Returns:
         The same arrays with a cache or without: what is wrong with it is one line of the log, never an error.
     """
-    if (found := read_cache(path, fits)) is None:
-        found = make()
-        write_cache(path, found)
-    return found
+    if (arrays := read_cache(path, fits)) is None:
+        arrays = make()
+        write_cache(path, arrays)
+    return arrays
 
 
 def read_cache(path: Path, fits: Callable[[Arrays], bool]) -> Arrays | None:
     """Return the arrays of a cache file; None where it does not exist, is broken, or is not to be trusted.
-
-    Files of earlier versions, without the checksum at their end, are checked by those of their parts, and get one.
 
     Args:
         path: File, in a folder of the cache folder.
@@ -58,7 +56,7 @@ def read_cache(path: Path, fits: Callable[[Arrays], bool]) -> Arrays | None:
     if not _is_trusted(path.parent):
         return None
     try:
-        arrays, sealed = read_sealed_npz(path)
+        arrays = read_npz(path, needs_checksum=True)
     except BrokenFileError as error:
         _log.warning("%s; it is made again", error)
         return None
@@ -67,8 +65,6 @@ def read_cache(path: Path, fits: Callable[[Arrays], bool]) -> Arrays | None:
     if not fits(arrays) or not are_finite(arrays):
         _log.warning("%s has other arrays than expected; it is made again", path)
         return None
-    if not sealed:
-        write_cache(path, arrays)
     return arrays
 
 
@@ -173,14 +169,14 @@ def check_trusted(folder: Path) -> None:
         LiberoError: Another user can.
     """
     try:
-        found, root = folder.stat(), folder.parent.stat()
+        status, root = folder.stat(), folder.parent.stat()
     except OSError:
         return
     remedy = "set LIBERO_CACHE to a folder of your own"
-    if found.st_mode & stat.S_IWOTH:
+    if status.st_mode & stat.S_IWOTH:
         raise LiberoError(f"{folder} is writable by every user: chmod -R o-w {folder.parent}, or {remedy}")
     owners = {0, os.geteuid(), *(() if root.st_mode & stat.S_IWOTH else (root.st_uid,))}
-    if found.st_uid not in owners:
+    if status.st_uid not in owners:
         raise LiberoError(f"{folder} belongs to another user, who may have put anything there: {remedy}")
 
 
