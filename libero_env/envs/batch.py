@@ -346,7 +346,7 @@ class BatchEnv(LiberoVectorEnv):
                 raise PlacementError(
                     f"{self.base_task.id}, start {name}: the perturbed goal holds at the start"
                 )
-        self.observer.set_look(i, perturbed.look(name))
+        self.observer.set_appearance(i, perturbed.appearance(name))
 
     def _stored_states(self, indices: np.ndarray) -> InitialStates:
         """Return stored initial states by index, (k,)."""

@@ -1,8 +1,8 @@
 """Perturbations of tasks and episodes: values that compose on one environment.
 
 A perturbation has a kind, a severity in [0, 1] with a physical meaning, and a seed. Kinds act on one of five layers, in
-this order: the problem (which becomes another task), the look, the start, the observation and the action. What a kind
-samples is an absolute change, such as the pose of a camera, which can also be given to an environment as it is.
+this order: the problem (which becomes another task), the appearance, the start, the observation and the action. What a
+kind samples is an absolute change, such as the pose of a camera, which can also be given to an environment as it is.
 """
 
 import lazy_loader

@@ -11,14 +11,14 @@ from libero_env.perturbations.kinds import Change, Episode, Layer, layer_of
 from libero_env.perturbations.pairing import Pairing
 from libero_env.perturbations.perturbation import Perturbation, in_order, parse_perturbations
 from libero_env.perturbations.sampling import sample_key
-from libero_env.sim.look import Look, joined
+from libero_env.sim.appearance import Appearance, joined
 from libero_env.sim.scene import Scene
 from libero_env.tasks import Task
 from libero_env.tasks.problem import Problem
 from libero_env.text import shown
 
 TRIES = 200  # samples of a start until one is valid
-_NEEDS_SCENE = ("look", "start")
+_NEEDS_SCENE = ("appearance", "start")
 
 
 def checked_perturbations(value: object) -> tuple[Perturbation | Change, ...]:
@@ -40,7 +40,7 @@ def checked_perturbations(value: object) -> tuple[Perturbation | Change, ...]:
     for one in value:
         if not isinstance(one, Perturbation | Change):
             raise InvalidInputError(
-                f"perturb has {shown(one)}; expected a Perturbation, or a change that it could sample, such as a Look"
+                f"perturb has {shown(one)}; expected a Perturbation, or a change such as an Appearance"
             )
         if isinstance(one, Perturbation):
             sampled.append(one)
@@ -157,9 +157,11 @@ class PerturbedEpisodes:
         for layer, filters in self._filters.items():
             filters[i] = self._opened(layer, self._starts[i])
 
-    def look(self, start: object) -> Look:
-        """Return the look of the episode of a start; what is sampled for it goes before absolute changes."""
-        return joined([*self._fixed_of("look"), *(self._sample(k, start) for k in self._of("look"))])
+    def appearance(self, start: object) -> Appearance:
+        """Return the appearance of a start's episode; what is sampled for it goes before absolute changes."""
+        return joined(
+            [*self._fixed_of("appearance"), *(self._sample(k, start) for k in self._of("appearance"))]
+        )
 
     def act(self, ids: Sequence[int] | np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Return the actions that are executed, for those that were chosen, (num, A), and count the step."""

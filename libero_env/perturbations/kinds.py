@@ -1,6 +1,6 @@
 """Kinds of perturbations, and what is sampled from them: changes, plain values that can also be given as they are.
 
-A change belongs to one of five layers, which are applied in the order of `LAYERS`: another `Task`, a `Look`, a
+A change belongs to one of five layers, which are applied in the order of `LAYERS`: another `Task`, an `Appearance`, a
 `StartChange`, an `ObservationFilter`, an `ActionFilter`.
 """
 
@@ -12,11 +12,11 @@ from typing import Any, Literal
 import numpy as np
 
 from libero_env.perturbations.sampling import SampleKey
-from libero_env.sim.look import Look
+from libero_env.sim.appearance import Appearance
 from libero_env.sim.scene import Scene
 
-Layer = Literal["problem", "look", "start", "observation", "action"]
-LAYERS: tuple[Layer, ...] = ("problem", "look", "start", "observation", "action")
+Layer = Literal["problem", "appearance", "start", "observation", "action"]
+LAYERS: tuple[Layer, ...] = ("problem", "appearance", "start", "observation", "action")
 
 
 @dataclass
@@ -89,12 +89,12 @@ class ActionFilter(ABC):
         """
 
 
-Change = Look | StartChange | ObservationFilter | ActionFilter
+Change = Appearance | StartChange | ObservationFilter | ActionFilter
 
 
 def layer_of(change: Change) -> Layer:
     """Return the layer that a change belongs to."""
-    return "look" if isinstance(change, Look) else change.layer
+    return "appearance" if isinstance(change, Appearance) else change.layer
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Kind:
     @property
     def is_rendered(self) -> bool:
         """Whether only what is seen or said changes, so that recorded states can be rendered with it."""
-        return self.layer in ("look", "observation") or (self.layer == "problem" and not self.physical)
+        return self.layer in ("appearance", "observation") or (self.layer == "problem" and not self.physical)
 
     def amount(self, severity: float) -> float:
         """Return the amount at a severity in [0, 1], in `unit`."""

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field
 
 from libero_env.errors import InvalidInputError, UnknownNameError
-from libero_env.perturbations import filters, looks, problem, starts
+from libero_env.perturbations import appearance, filters, problem, starts
 from libero_env.perturbations.instructions import reword
 from libero_env.perturbations.kinds import Kind, Layer
 from libero_env.perturbations.sampling import SampleKey, first_attempt, sample_key
@@ -19,7 +19,7 @@ from libero_env.validation import checked
 
 _SAMPLERS: Mapping[str, Callable[..., Any]] = {
     **problem.SAMPLERS,
-    **looks.SAMPLERS,
+    **appearance.SAMPLERS,
     **starts.SAMPLERS,
     **filters.SAMPLERS,
 }

@@ -8,7 +8,7 @@ from libero_env.assets.arena import workspace_of_problem
 from libero_env.perturbations.corruptions import corrupt
 from libero_env.perturbations.kinds import Change, Episode, ObservationFilter
 from libero_env.perturbations.starts import RobotJoints
-from libero_env.sim.look import CameraView, Look
+from libero_env.sim.appearance import Appearance, CameraView
 from libero_env.tasks.published.plus import camera_pose, joint_pose
 from libero_env.tasks.published.suites import PublishedTask
 from libero_env.tasks.task import Task
@@ -51,7 +51,7 @@ def published_changes(task: Task) -> tuple[Change, ...]:
     variant, workspace = task.variant, workspace_of_problem(task.problem.name).name
     pose = camera_pose(workspace, variant.view)
     view = CameraView(tuple(pose.pos.tolist()), tuple(pose.quat_wxyz.tolist()))
-    changes: list[Change] = [Look(cameras={CAMERA: view})]
+    changes: list[Change] = [Appearance(cameras={CAMERA: view})]
     if variant.pose and task.robot_state == "skipped":
         changes.append(RobotJoints(tuple(joint_pose(variant.pose).tolist())))
     if variant.noise is not None:

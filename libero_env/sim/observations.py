@@ -31,7 +31,7 @@ from gymnasium import spaces
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.geometry import quat_multiply, quat_rotate, quat_to_axis_angle
 from libero_env.objects.model import ROOT_BODY
-from libero_env.sim.look import Look, SceneLook
+from libero_env.sim.appearance import Appearance, SceneAppearance
 from libero_env.sim.predicates import glowing_sites
 from libero_env.sim.render import Renderer, RenderTarget
 from libero_env.sim.scene import FAITHFUL, Scene
@@ -128,19 +128,19 @@ class Observer:
         self._entities = _EntityObserver(scene) if "objects" in observations else None
         self._hand = scene.model.body("robot0_right_hand").id
         self._labels_of: dict[str, Labels] = {}
-        self._looks: dict[int, SceneLook] = {}
+        self._appearances: dict[int, SceneAppearance] = {}
         self._data = mujoco.MjData(scene.model)  # kinematics of the simulation that is rendered
 
-    def set_look(self, i: int, look: Look) -> None:
+    def set_appearance(self, i: int, appearance: Appearance) -> None:
         """Draw simulation i otherwise than its model says, until this is called again.
 
         Raises:
-            UnknownNameError: The look names a camera, a light, a material or an object that does not exist.
+            UnknownNameError: The appearance names a camera, a light, a material or an object that does not exist.
         """
-        if look == Look():
-            self._looks.pop(i, None)
+        if appearance == Appearance():
+            self._appearances.pop(i, None)
         else:
-            self._looks[i] = SceneLook(look, self.scene)
+            self._appearances[i] = SceneAppearance(appearance, self.scene)
 
     def space(self) -> spaces.Dict:
         """Return the observation space of one simulation."""
@@ -254,7 +254,7 @@ class Observer:
         It maps the camera frame, axes as in OpenCV, to columns and rows; (0, 0) is the top left corner of the image.
         """
         (height, width), index = self.camera_size, self.renderer.camera_id(camera)
-        own = self._looks[i].fovy(index) if i in self._looks else None
+        own = self._appearances[i].fovy(index) if i in self._appearances else None
         fovy = np.deg2rad(self.scene.model.cam_fovy[index] if own is None else own)
         focal = 0.5 * height / np.tan(0.5 * fovy)
         return np.array([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
@@ -275,7 +275,7 @@ class Observer:
 
     def _render(self, i: int, targets: list[RenderTarget]) -> None:
         self._update_kinematics(i)
-        self.renderer.render(self._data, targets, glowing_sites(self.views[i]), self._looks.get(i))
+        self.renderer.render(self._data, targets, glowing_sites(self.views[i]), self._appearances.get(i))
 
     def _update_kinematics(self, i: int) -> None:
         data, model = self._data, self.simulations.model
@@ -284,8 +284,8 @@ class Observer:
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
-        if (look := self._looks.get(i)) is not None:
-            look.place_cameras(data)
+        if (appearance := self._appearances.get(i)) is not None:
+            appearance.place_cameras(data)
 
 
 class _EntityObserver:

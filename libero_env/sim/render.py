@@ -18,8 +18,8 @@ import mujoco
 import numpy as np
 
 from libero_env.errors import RenderError, UnknownNameError
+from libero_env.sim.appearance import SceneAppearance
 from libero_env.sim.culling import Culling
-from libero_env.sim.look import SceneLook
 
 BACKENDS = ("egl", "osmesa", "glfw")
 REMEDY = (
@@ -191,7 +191,7 @@ class Renderer:
         data: mujoco.MjData,
         targets: Sequence[RenderTarget],
         glowing_sites: Iterable[int] = (),
-        look: SceneLook | None = None,
+        appearance: SceneAppearance | None = None,
     ) -> None:
         """Render images of one state.
 
@@ -199,7 +199,7 @@ class Renderer:
             data: State whose kinematics, cameras and lights are up to date.
             targets: Cameras, and the arrays to write their images to.
             glowing_sites: Indices of the sites to show.
-            look: What is drawn otherwise; poses of cameras are in `data` already.
+            appearance: What is drawn otherwise; poses of cameras are in `data` already.
 
         Raises:
             RenderError: No OpenGL backend works here, or the context belongs to another thread or process.
@@ -220,11 +220,11 @@ class Renderer:
                 )
                 for site in glowing_sites:
                     self._add_site(data, site)
-                if look is not None:
-                    look.apply(self._scene, self._geoms[: self._scene.ngeom])
+                if appearance is not None:
+                    appearance.apply(self._scene, self._geoms[: self._scene.ngeom])
             else:  # without the headlight, which stays at the first camera
                 mujoco.mjv_updateCamera(self._model, data, self._camera, self._scene)
-            fovy = None if look is None else look.apply_to_camera(self._scene, target.camera)
+            fovy = None if appearance is None else appearance.apply_to_camera(self._scene, target.camera)
             left_out = self._leave_out(data, target.camera, fovy)
             if any(out is not None for out in (target.rgb, target.depth, target.depth_buffer)):
                 self._render_rgb_and_depth(target)

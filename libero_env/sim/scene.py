@@ -214,7 +214,7 @@ def build_scene(
         drawing: One of `DRAWINGS`; by default that of `default_drawing`.
         robot: One of `libero_env.assets.robot.ROBOTS`.
         spare_materials: Whether the model also has the styles of all floors, walls and tables as materials, for a
-            `libero_env.sim.look.Look`. Nothing else depends on it.
+            `libero_env.sim.appearance.Appearance`. Nothing else depends on it.
 
     Raises:
         ProblemError: A region is not a site of its target's model, or a goal has a state that the model does not have.

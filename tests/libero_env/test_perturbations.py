@@ -19,11 +19,11 @@ from libero_env.perturbations import (
     parse_perturbations,
     sample_key,
 )
+from libero_env.perturbations.appearance import CAMERA, pivot_of
 from libero_env.perturbations.filters import PixelNoise
 from libero_env.perturbations.instructions import edit_distance, reword, split_clauses
 from libero_env.perturbations.kinds import Episode
-from libero_env.perturbations.looks import CAMERA, pivot_of
-from libero_env.sim.look import CameraView, Lamp, Look
+from libero_env.sim.appearance import Appearance, CameraView, Light
 from libero_env.tasks import get_suite
 
 TASK = "libero_goal/3"
@@ -87,7 +87,7 @@ def test_what_is_typed_wrongly_is_one_line(text):
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_does_something(kind, plain):
     base, seen = plain
-    pictures = KINDS[kind].layer in ("look", "observation")
+    pictures = KINDS[kind].layer in ("appearance", "observation")
     env = LiberoEnv(TASK, perturb=f"{kind}=1", **SMALL | ({} if pictures else {"cameras": ()}))
     changed = episode(env, steps=4)
     known = [{name: obs[name] for name in changed[0]} for obs in seen]
@@ -108,7 +108,7 @@ def test_severity_0_changes_no_bit(plain):
     env = LiberoEnv(TASK, perturb=nothing, **SMALL)
     assert same(episode(env), seen) and env.config.perturb == () and env.batch.perturbed is None
     env.close()
-    empty = LiberoEnv(TASK, perturb=[Look()], **SMALL)
+    empty = LiberoEnv(TASK, perturb=[Appearance()], **SMALL)
     assert same(episode(empty), seen)
     empty.close()
 
@@ -144,7 +144,7 @@ def test_kinds_do_not_disturb_each_other_and_another_seed_is_another_draw():
 def test_absolute_changes_can_be_given_as_they_are():
     qpos = (0.1, -0.2, 0.0, -2.3, 0.0, 2.2, 0.7)
     view = CameraView(pos=(1.0, 0.1, 1.5), quat=(0.6, 0.35, 0.35, 0.63), fovy=50.0)
-    env, observation, _ = world_of([RobotJoints(qpos), Look(cameras={CAMERA: view})])
+    env, observation, _ = world_of([RobotJoints(qpos), Appearance(cameras={CAMERA: view})])
     assert np.array_equal(observation["joint_states"], qpos)
     pose = env.observer.camera_to_world(0, CAMERA)
     assert np.array_equal(pose[:3, 3], view.pos)
@@ -154,7 +154,7 @@ def test_absolute_changes_can_be_given_as_they_are():
     assert np.linalg.norm(moved["joint_states"] - qpos) == pytest.approx(KINDS["robot"].amount(0.4))
     env.close()
     with pytest.raises(UnknownNameError, match="lamp"):
-        world_of([Look(lights={"lamp": Lamp()})])
+        world_of([Appearance(lights={"lamp": Light()})])
 
 
 @pytest.mark.parametrize("severity", [0.2, 1.0])
@@ -447,5 +447,7 @@ def test_the_page_shows_every_kind():
 @pytest.mark.unit
 def test_a_configuration_with_perturbations_goes_to_other_processes():
     view = CameraView(fovy=50.0)
-    config = EnvConfig(perturb=[Perturbation("noise", 0.5, 3), Look(cameras={CAMERA: view}), PixelNoise(2.0)])
+    config = EnvConfig(
+        perturb=[Perturbation("noise", 0.5, 3), Appearance(cameras={CAMERA: view}), PixelNoise(2.0)]
+    )
     assert pickle.loads(pickle.dumps(config)) == config

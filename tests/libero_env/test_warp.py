@@ -13,9 +13,9 @@ from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.rollout import MAX_STEPS
 from libero_env.sim import backend as backends
+from libero_env.sim.appearance import Appearance
 from libero_env.sim.backend import Backend
 from libero_env.sim.engine import ViewedGoals, make_goals, make_simulations
-from libero_env.sim.look import Look
 from libero_env.sim.predicates import register_predicate
 from libero_env.tasks.problem import And, Atom, ForAll, Not, Or
 
@@ -276,11 +276,11 @@ def test_what_it_does_not_offer_is_said_in_one_line(options, told):
     assert "\n" not in str(caught.value)
 
 
-def test_looks_need_the_other_back_end(pair):
+def test_appearances_need_the_other_back_end(pair):
     observer = pair[1].observer
-    observer.set_look(0, Look())
+    observer.set_appearance(0, Appearance())
     with pytest.raises(LiberoError, match="need backend=mujoco"):
-        observer.set_look(0, Look(materials={"wall": "floor"}))
+        observer.set_appearance(0, Appearance(materials={"wall": "floor"}))
     with pytest.raises(InvalidInputError, match="name its camera in cameras="):
         observer.render(0, "agentview")
 

@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from libero_env.errors import InvalidInputError, LiberoError
-from libero_env.sim.look import Look
+from libero_env.sim.appearance import Appearance
 from libero_env.sim.mjwarp.device import room_for
 from libero_env.sim.mjwarp.simulations import WarpSimulations
 from libero_env.sim.observations import Observer, image_name
@@ -45,13 +45,13 @@ class WarpObserver(Observer):
         if self.segmentation:
             raise LiberoError("backend=warp draws rgb and depth; segmentation needs backend=mujoco")
 
-    def set_look(self, i: int, look: Look) -> None:
-        """Raise unless the look is that of the model.
+    def set_appearance(self, i: int, appearance: Appearance) -> None:
+        """Raise unless the appearance is that of the model.
 
         Raises:
             LiberoError: It is another: cameras, lights and materials are those of the model here.
         """
-        if look != Look():
+        if appearance != Appearance():
             raise LiberoError(
                 "backend=warp draws every simulation as its model says; perturbations of cameras, lights and "
                 "materials need backend=mujoco"

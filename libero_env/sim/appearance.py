@@ -1,7 +1,7 @@
 """How one simulation is drawn otherwise than its model says: cameras, lights, materials and colours.
 
-A `Look` changes what is drawn and nothing else. The compiled model, which many simulations share, is never written to:
-poses of cameras go to the kinematics that are drawn, the rest to the elements of MuJoCo's abstract scene.
+An `Appearance` changes what is drawn and nothing else. The compiled model, which many simulations share, is never
+written to: poses of cameras go to the kinematics that are drawn, the rest to the elements of MuJoCo's abstract scene.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +18,7 @@ from libero_env.sim.scene import Scene
 
 HEADLIGHT = "headlight"  # name of the light at the camera, which models do not name
 _GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
-Part = TypeVar("Part", "CameraView", "Lamp")
+Part = TypeVar("Part", "CameraView", "Light")
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class CameraView:
 
 
 @dataclass(frozen=True)
-class Lamp:
+class Light:
     """A light. None keeps what the model has.
 
     Attributes:
@@ -56,7 +56,7 @@ class Lamp:
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """How one simulation is drawn otherwise than its model says.
 
     Attributes:
@@ -68,13 +68,13 @@ class Look:
     """
 
     cameras: Mapping[str, CameraView] = field(default_factory=dict)
-    lights: Mapping[str, Lamp] = field(default_factory=dict)
+    lights: Mapping[str, Light] = field(default_factory=dict)
     materials: Mapping[str, str] = field(default_factory=dict)
     colours: Mapping[str, tuple[tuple[float, float, float], float]] = field(default_factory=dict)
 
-    def __or__(self, other: "Look") -> "Look":
+    def __or__(self, other: "Appearance") -> "Appearance":
         """Return both looks at once; where both change the same, the other's counts."""
-        return Look(
+        return Appearance(
             cameras=_joined(self.cameras, other.cameras),
             lights=_joined(self.lights, other.lights),
             materials={**self.materials, **other.materials},
@@ -82,9 +82,9 @@ class Look:
         )
 
 
-def joined(looks: Iterable[Look]) -> Look:
-    """Return several looks as one; later ones take precedence."""
-    return reduce(Look.__or__, looks, Look())
+def joined(appearances: Iterable[Appearance]) -> Appearance:
+    """Return several appearances as one; later ones take precedence."""
+    return reduce(Appearance.__or__, appearances, Appearance())
 
 
 def _joined(first: Mapping[str, Part], second: Mapping[str, Part]) -> dict[str, Part]:
@@ -95,36 +95,36 @@ def _joined(first: Mapping[str, Part], second: Mapping[str, Part]) -> dict[str, 
     return both
 
 
-class SceneLook:
-    """A look of one scene, with the indices of its model.
+class SceneAppearance:
+    """An appearance of one scene, with the indices of its model.
 
     Args:
-        look: Look.
+        appearance: Appearance.
         scene: Scene that is drawn.
 
     Raises:
         UnknownNameError: A camera, a light, a material or an object does not exist.
     """
 
-    def __init__(self, look: Look, scene: Scene):
+    def __init__(self, appearance: Appearance, scene: Scene):
         model = scene.model
-        self.look = look
+        self.appearance = appearance
         self._views = [
             (_index(model, "camera", name), view, None if view.quat is None else _matrix(view.quat))
-            for name, view in look.cameras.items()
+            for name, view in appearance.cameras.items()
         ]
         self._fovy = {index: view.fovy for index, view, _ in self._views if view.fovy is not None}
-        self._lamps = {
-            -1 if name == HEADLIGHT else _index(model, "light", name): lamp
-            for name, lamp in look.lights.items()
+        self._lights = {
+            -1 if name == HEADLIGHT else _index(model, "light", name): light
+            for name, light in appearance.lights.items()
         }
         self._active_lights = np.flatnonzero(model.light_active).tolist()
         self._materials = {
             _index(model, "material", old): _material(model, _index(model, "material", new))
-            for old, new in look.materials.items()
+            for old, new in appearance.materials.items()
         }
         self._colours: dict[int, tuple[np.ndarray, float]] = {}
-        for name, (colour, share) in look.colours.items():
+        for name, (colour, share) in appearance.colours.items():
             own = np.asarray(colour, float), float(share)
             if name in scene.entities:
                 geoms = np.flatnonzero(np.isin(model.geom_bodyid, scene.bodies[name]))
@@ -151,7 +151,7 @@ class SceneLook:
             drawn: Scene after `mjv_updateScene`.
             geoms: Its elements.
         """
-        if self._lamps:
+        if self._lights:
             self._apply_lights(drawn)
         if not (self._materials or self._colours):
             return
@@ -176,14 +176,14 @@ class SceneLook:
     def _apply_lights(self, drawn: mujoco.MjvScene) -> None:
         numbers = iter(self._active_lights)
         for light in drawn.lights[: drawn.nlight]:
-            lamp = self._lamps.get(-1 if light.headlight else next(numbers))
-            if lamp is None:
+            change = self._lights.get(-1 if light.headlight else next(numbers))
+            if change is None:
                 continue
             for name in ("ambient", "diffuse", "specular"):
-                if (colour := getattr(lamp, name)) is not None:
+                if (colour := getattr(change, name)) is not None:
                     getattr(light, name)[:] = colour
             for name in ("pos", "dir"):
-                if (vector := getattr(lamp, name)) is not None and not light.headlight:
+                if (vector := getattr(change, name)) is not None and not light.headlight:
                     getattr(light, name)[:] = vector
 
 

@@ -9,13 +9,13 @@ import numpy as np
 from libero_env.assets.arena import SPARE, surface_styles
 from libero_env.geometry import quat_to_mat, rotation_about
 from libero_env.perturbations.sampling import direction, sign
-from libero_env.sim.look import HEADLIGHT, CameraView, Lamp, Look
+from libero_env.sim.appearance import HEADLIGHT, Appearance, CameraView, Light
 from libero_env.sim.scene import Scene
 
 CAMERA = "agentview"  # the camera that does not move with the robot
 _DISTANCE = 1.2  # factor of the distance, or its inverse, at the full angle
 _FULL_ANGLE = 30.0  # [degrees]
-_LAMP_ANGLE = 60.0  # [degrees] by which lights turn at the full ratio
+_LIGHT_ANGLE = 60.0  # [degrees] by which lights turn at the full ratio
 _FULL_RATIO = 3.0
 
 
@@ -54,33 +54,33 @@ def pivot_of(scene: Scene, camera: str = CAMERA) -> np.ndarray:
     return model.cam_pos[index] + reach * forward
 
 
-def _camera(degrees: float, rng: np.random.Generator, scene: Scene) -> Look:
+def _camera(degrees: float, rng: np.random.Generator, scene: Scene) -> Appearance:
     towards, factor = rng.uniform(0, 2 * np.pi), _DISTANCE ** (sign(rng) * degrees / _FULL_ANGLE)
-    return Look(cameras={CAMERA: orbit(scene, towards, degrees, factor)})
+    return Appearance(cameras={CAMERA: orbit(scene, towards, degrees, factor)})
 
 
-def _fov(degrees: float, rng: np.random.Generator, scene: Scene) -> Look:
+def _fov(degrees: float, rng: np.random.Generator, scene: Scene) -> Appearance:
     fovy = float(scene.model.cam_fovy[scene.model.camera(CAMERA).id]) + sign(rng) * degrees
-    return Look(cameras={CAMERA: CameraView(fovy=fovy)})
+    return Appearance(cameras={CAMERA: CameraView(fovy=fovy)})
 
 
-def _light(ratio: float, rng: np.random.Generator, scene: Scene) -> Look:
+def _light(ratio: float, rng: np.random.Generator, scene: Scene) -> Appearance:
     model, factor = scene.model, ratio ** sign(rng)
     share = np.log(ratio) / np.log(_FULL_RATIO)
     axis = direction(rng, 3) * (1.0, 1.0, 0.0)
-    turn = rotation_about(axis / np.linalg.norm(axis), np.deg2rad(_LAMP_ANGLE * share))
+    turn = rotation_about(axis / np.linalg.norm(axis), np.deg2rad(_LIGHT_ANGLE * share))
     head = model.vis.headlight
-    lamps = {HEADLIGHT: _scaled(head.ambient, head.diffuse, head.specular, factor)}
+    lights = {HEADLIGHT: _scaled(head.ambient, head.diffuse, head.specular, factor)}
     for i in range(model.nlight):
-        lamp = _scaled(model.light_ambient[i], model.light_diffuse[i], model.light_specular[i], factor)
+        light = _scaled(model.light_ambient[i], model.light_diffuse[i], model.light_specular[i], factor)
         turned = tuple((turn @ model.light_dir[i]).tolist())
-        lamps[model.light(i).name] = Lamp(None, turned, lamp.ambient, lamp.diffuse, lamp.specular)
-    return Look(lights=lamps)
+        lights[model.light(i).name] = Light(None, turned, light.ambient, light.diffuse, light.specular)
+    return Appearance(lights=lights)
 
 
-def _scaled(ambient: np.ndarray, diffuse: np.ndarray, specular: np.ndarray, factor: float) -> Lamp:
+def _scaled(ambient: np.ndarray, diffuse: np.ndarray, specular: np.ndarray, factor: float) -> Light:
     colours = [tuple((factor * np.asarray(c, float)).tolist()) for c in (ambient, diffuse, specular)]
-    return Lamp(ambient=colours[0], diffuse=colours[1], specular=colours[2])
+    return Light(ambient=colours[0], diffuse=colours[1], specular=colours[2])
 
 
 # Names of the materials of surfaces: the builtin models', then the original's.
@@ -95,19 +95,19 @@ _LIKE = 0.08  # styles whose distances differ by less are sampled from
 _COLOUR_WORDS = ("black", "white", "red", "yellow")
 
 
-def _table(distance: float, rng: np.random.Generator, scene: Scene) -> Look:
+def _table(distance: float, rng: np.random.Generator, scene: Scene) -> Appearance:
     on_floor = not scene.workspace.parameters.get("table")
-    return Look(materials=_other_style(scene, "floor" if on_floor else "table", distance, rng))
+    return Appearance(materials=_other_style(scene, "floor" if on_floor else "table", distance, rng))
 
 
-def _background(distance: float, rng: np.random.Generator, scene: Scene) -> Look:
+def _background(distance: float, rng: np.random.Generator, scene: Scene) -> Appearance:
     on_floor = not scene.workspace.parameters.get("table")
     kinds = ("wall",) if on_floor else ("wall", "floor")
     styles = [_other_style(scene, kind, distance, rng) for kind in kinds]
     tint = colorsys.hsv_to_rgb(rng.uniform(), 0.8, 0.9), min(1.0, distance)
     names = {scene.model.material(i).name for i in range(scene.model.nmat)}
     furniture = dict.fromkeys(names & set(_FURNITURE), tint)
-    return Look(materials={k: v for style in styles for k, v in style.items()}, colours=furniture)
+    return Appearance(materials={k: v for style in styles for k, v in style.items()}, colours=furniture)
 
 
 def _other_style(scene: Scene, kind: str, distance: float, rng: np.random.Generator) -> dict[str, str]:
@@ -144,14 +144,14 @@ def _mean_colour(model: mujoco.MjModel, material: int) -> np.ndarray:
     return pixels[:, :3].mean(axis=0) / 255 * model.mat_rgba[material, :3]
 
 
-def _colour(share: float, rng: np.random.Generator, scene: Scene) -> Look:
+def _colour(share: float, rng: np.random.Generator, scene: Scene) -> Appearance:
     said = {word for word in _COLOUR_WORDS if word in scene.problem.language.lower().split()}
     colours = {}
     for name, category in scene.problem.objects.items():
         colour = colorsys.hsv_to_rgb(rng.uniform(), 0.8, 0.9)
         if not said & set(category.split("_")):  # what the instruction calls black stays so
             colours[name] = (colour, share)
-    return Look(colours=colours)
+    return Appearance(colours=colours)
 
 
 SAMPLERS = {
