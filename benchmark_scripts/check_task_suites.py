@@ -1,6 +1,6 @@
-"""Run `libero.scripts.check_task_suites`."""
+"""Run `libero.scripts.tasks.check_task_suites`."""
 
-from libero.scripts.check_task_suites import main
+from libero.scripts.tasks import check_task_suites
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(check_task_suites())

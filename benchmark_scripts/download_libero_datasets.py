@@ -1,6 +1,6 @@
-"""Run `libero.scripts.download_libero_datasets`."""
+"""Run `libero.scripts.demonstrations.download_libero_datasets`."""
 
-from libero.scripts.download_libero_datasets import main
+from libero.scripts.demonstrations import download_libero_datasets
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(download_libero_datasets())

@@ -1,6 +1,6 @@
-"""Run `libero.scripts.render_single_task`."""
+"""Run `libero.scripts.tasks.render_single_task`."""
 
-from libero.scripts.render_single_task import main
+from libero.scripts.tasks import render_single_task
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(render_single_task())

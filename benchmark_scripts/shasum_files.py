@@ -1,6 +1,6 @@
-"""Run `libero.scripts.shasum_files`."""
+"""Run `libero.scripts.files.shasum_files`."""
 
-from libero.scripts.shasum_files import main
+from libero.scripts.files import shasum_files
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(shasum_files())

@@ -1,6 +1,6 @@
-"""Run `libero.scripts.check_dataset_integrity`."""
+"""Run `libero.scripts.demonstrations.check_dataset_integrity`."""
 
-from libero.scripts.check_dataset_integrity import main
+from libero.scripts.demonstrations import check_dataset_integrity
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(check_dataset_integrity())

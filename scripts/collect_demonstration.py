@@ -1,6 +1,6 @@
-"""Run `libero.scripts.collect_demonstration`."""
+"""Run `libero.scripts.demonstrations.collect_demonstration`."""
 
-from libero.scripts.collect_demonstration import main
+from libero.scripts.demonstrations import collect_demonstration
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(collect_demonstration())

@@ -1,6 +1,6 @@
-"""Run `libero.scripts.config_copy`."""
+"""Run `libero.scripts.files.config_copy`."""
 
-from libero.scripts.config_copy import main
+from libero.scripts.files import config_copy
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(config_copy())

@@ -1,6 +1,6 @@
-"""Run `libero.scripts.create_dataset`."""
+"""Run `libero.scripts.demonstrations.create_dataset`."""
 
-from libero.scripts.create_dataset import main
+from libero.scripts.demonstrations import create_dataset
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(create_dataset())

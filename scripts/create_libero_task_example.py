@@ -1,6 +1,6 @@
-"""Run `libero.scripts.create_libero_task_example`."""
+"""Run `libero.scripts.tasks.create_libero_task_example`."""
 
-from libero.scripts.create_libero_task_example import main
+from libero.scripts.tasks import create_libero_task_example
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(create_libero_task_example())

@@ -1,6 +1,6 @@
-"""Run `libero.scripts.create_template`."""
+"""Run `libero.scripts.files.create_template`."""
 
-from libero.scripts.create_template import main
+from libero.scripts.files import create_template
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(create_template())

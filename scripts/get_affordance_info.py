@@ -1,6 +1,6 @@
-"""Run `libero.scripts.get_affordance_info`."""
+"""Run `libero.scripts.tasks.get_affordance_info`."""
 
-from libero.scripts.get_affordance_info import main
+from libero.scripts.tasks import get_affordance_info
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(get_affordance_info())

@@ -1,6 +1,6 @@
-"""Run `libero.scripts.get_dataset_info`."""
+"""Run `libero.scripts.demonstrations.get_dataset_info`."""
 
-from libero.scripts.get_dataset_info import main
+from libero.scripts.demonstrations import get_dataset_info
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(get_dataset_info())

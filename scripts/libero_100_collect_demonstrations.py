@@ -1,6 +1,6 @@
-"""Run `libero.scripts.libero_100_collect_demonstrations`."""
+"""Run `libero.scripts.demonstrations.libero_100_collect_demonstrations`."""
 
-from libero.scripts.libero_100_collect_demonstrations import main
+from libero.scripts.demonstrations import libero_100_collect_demonstrations
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(libero_100_collect_demonstrations())

@@ -1,6 +1,5 @@
 """The original's command line scripts: results and error messages."""
 
-import importlib
 import runpy
 import subprocess
 import sys
@@ -12,21 +11,7 @@ import pytest
 from PIL import Image
 
 from libero.libero.envs import ControlEnv
-from libero.scripts import (
-    check_dataset_integrity,
-    check_task_suites,
-    collect_demonstration,
-    config_copy,
-    create_dataset,
-    create_libero_task_example,
-    create_template,
-    download_libero_datasets,
-    get_affordance_info,
-    get_dataset_info,
-    libero_100_collect_demonstrations,
-    render_single_task,
-    shasum_files,
-)
+from libero.scripts import demonstrations, files, tasks
 from libero_env.demos.read import Episode, read_demos
 from libero_env.demos.write import DemoWriter, make_header
 from libero_env.envs.batch import BatchEnv
@@ -75,9 +60,8 @@ def test_files_run_their_modules(path, capsys, monkeypatch):
         assert sys.path[0] == str(ROOT)
     else:
         namespace = runpy.run_path(str(path))
-        assert namespace["main"] is importlib.import_module(f"libero.scripts.{path.stem}").main
         with pytest.raises(SystemExit) as stopped:
-            namespace["main"](["--help"])
+            namespace[path.stem](["--help"])
         assert stopped.value.code == 0
         assert "--help" in capsys.readouterr().out
 
@@ -93,7 +77,7 @@ def test_a_script_as_a_process(tmp_path):
 @pytest.mark.sim
 def test_create_dataset(collected, tmp_path, capsys):
     argv = ["--demo-file", str(collected), "--dataset-path", str(tmp_path), "--size", "16"]
-    assert create_dataset.main([*argv, "--use-camera-obs", "--use-depth"]) == 0
+    assert demonstrations.create_dataset([*argv, "--use-camera-obs", "--use-depth"]) == 0
     made = tmp_path / "libero_goal" / f"{get_task(TASK).name}_demo.hdf5"
     assert f"{made}\ndemos: 2\ntransitions: 12\n" in capsys.readouterr().out
     first = read_demos(made)[0]
@@ -108,65 +92,66 @@ def test_create_dataset(collected, tmp_path, capsys):
         "ee_ori": (3,),
         "ee_states": (6,),
     }
-    assert create_dataset.main([*argv, "--use-actions", "--no-proprio", "--dataset-name", "acted"]) == 0
+    assert (
+        demonstrations.create_dataset([*argv, "--use-actions", "--no-proprio", "--dataset-name", "acted"])
+        == 0
+    )
     with h5py.File(tmp_path / "acted.hdf5") as acted, h5py.File(collected) as before:
         assert list(acted["data/demo_1/obs"]) == []
         assert "robot_states" not in acted["data/demo_1"]
         # the first actions act from the recorded state: positions to the bit, the arm's goals are forgotten between
         assert np.allclose(acted["data/demo_1/states"], before["data/demo_1/states"], atol=1e-6)
-    assert create_dataset.main(["--demo-file", str(tmp_path / "none.hdf5")]) == 2
+    assert demonstrations.create_dataset(["--demo-file", str(tmp_path / "none.hdf5")]) == 2
     assert "error: create_dataset.py: " in capsys.readouterr().err
 
 
 @pytest.mark.unit
 def test_get_dataset_info(collected, tmp_path, capsys):
-    assert get_dataset_info.main(["--dataset", str(collected), "--verbose"]) == 0
+    assert demonstrations.get_dataset_info(["--dataset", str(collected), "--verbose"]) == 0
     out = capsys.readouterr().out
     assert "demos: 2" in out
     assert "length_mean: 6.0" in out
     assert "demo_1\n    actions: (6, 7)\n" in out
     assert "language_instruction" in out
-    assert get_dataset_info.main(["--dataset", str(collected), "--filter_key", "train"]) == 2
+    assert demonstrations.get_dataset_info(["--dataset", str(collected), "--filter_key", "train"]) == 2
     assert "no subset 'train'" in capsys.readouterr().err
     marked = tmp_path / "marked.hdf5"
     marked.write_bytes(collected.read_bytes())
     with h5py.File(marked, "r+") as file:
         file["mask/train"] = np.array([b"demo_1"])
         file["data/demo_1/actions"][0, 0] = 1.5
-    assert get_dataset_info.main(["--dataset", str(marked), "--filter_key", "train"]) == 1
+    assert demonstrations.get_dataset_info(["--dataset", str(marked), "--filter_key", "train"]) == 1
     assert "demos: 1" in (out := capsys.readouterr().out)
     assert "not in [-1, 1]" in out
 
 
 @pytest.mark.unit
 def test_check_dataset_integrity(collected, tmp_path, capsys):
-    assert check_dataset_integrity.main([str(collected), "--num-demos", "2"]) == 0
+    assert demonstrations.check_dataset_integrity([str(collected), "--num-demos", "2"]) == 0
     assert "1 of 1 files are complete" in capsys.readouterr().out
     (tmp_path / "torn.hdf5").write_bytes(collected.read_bytes()[:1000])
-    assert check_dataset_integrity.main([str(collected), str(tmp_path)]) == 1
+    assert demonstrations.check_dataset_integrity([str(collected), str(tmp_path)]) == 1
     out = capsys.readouterr().out
     assert "2 demonstrations; expected 50" in out
     assert f"FAIL  {tmp_path / 'torn.hdf5'}" in out
     assert "0 of 2 files are complete" in out
-    assert check_dataset_integrity.main([str(tmp_path / "empty")]) == 2
+    assert demonstrations.check_dataset_integrity([str(tmp_path / "empty")]) == 2
 
 
 @pytest.mark.unit
 def test_get_affordance_info(capsys):
-    assert get_affordance_info.main(["flat_stove", "basket", "milk"]) == 0
+    assert tasks.get_affordance_info(["flat_stove", "basket", "milk"]) == 0
     assert capsys.readouterr().out == "flat_stove: cook_region\nbasket: contain_region\n"
-    assert get_affordance_info.main(["flatstove"]) == 2
+    assert tasks.get_affordance_info(["flatstove"]) == 2
     assert "Did you mean 'flat_stove'" in capsys.readouterr().err
 
 
 @pytest.mark.unit
 def test_create_libero_task_example(tmp_path, capsys):
-    assert create_libero_task_example.main(["--folder", str(tmp_path)]) == 0
+    assert tasks.create_libero_task_example(["--folder", str(tmp_path)]) == 0
     paths = capsys.readouterr().out.split()
-    assert len(paths) == len(create_libero_task_example.TASKS)
-    assert [bddl.read(path).language for path in paths] == [
-        t.language for t in create_libero_task_example.TASKS
-    ]
+    assert len(paths) == len(tasks.EXAMPLES)
+    assert [bddl.read(path).language for path in paths] == [t.language for t in tasks.EXAMPLES]
 
 
 @pytest.mark.sim
@@ -178,7 +163,7 @@ def test_templates_work_unchanged(tmp_path, capsys, monkeypatch):
         ("object", "MyBox3"),
         ("arena", "MyRoom"),
     ):
-        assert create_template.main(["-t", kind, "-n", name, "-o", str(tmp_path)]) == 0
+        assert files.create_template(["-t", kind, "-n", name, "-o", str(tmp_path)]) == 0
     made = capsys.readouterr().out.split()
     assert [Path(path).name for path in made] == [
         "my_problem.py",
@@ -213,53 +198,53 @@ def test_templates_work_unchanged(tmp_path, capsys, monkeypatch):
 def test_missing_options_of_templates_are_asked_for(tmp_path, monkeypatch, capsys):
     answers = iter(["object", "my box", "object", "MyBox"])
     monkeypatch.setattr("builtins.input", lambda question: next(answers))
-    assert create_template.main(["--out", str(tmp_path)]) == 2
+    assert files.create_template(["--out", str(tmp_path)]) == 2
     assert "--template is missing" in capsys.readouterr().err
-    monkeypatch.setattr(create_template.sys.stdin, "isatty", lambda: True, raising=False)
-    assert create_template.main(["--out", str(tmp_path)]) == 2
+    monkeypatch.setattr(files.sys.stdin, "isatty", lambda: True, raising=False)
+    assert files.create_template(["--out", str(tmp_path)]) == 2
     assert "'my box' is not a valid class name" in capsys.readouterr().err
-    assert create_template.main(["--out", str(tmp_path)]) == 0
+    assert files.create_template(["--out", str(tmp_path)]) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"my_box.py", "my_box.xml"}
-    assert create_template.main(["-t", "object", "-n", "MyBox", "-o", str(tmp_path)]) == 2
+    assert files.create_template(["-t", "object", "-n", "MyBox", "-o", str(tmp_path)]) == 2
     assert "my_box.py exists" in capsys.readouterr().err
-    assert create_template.main(["-t", "object", "-n", "MyBox", "-o", str(tmp_path), "--overwrite"]) == 0
+    assert files.create_template(["-t", "object", "-n", "MyBox", "-o", str(tmp_path), "--overwrite"]) == 0
 
 
 @pytest.mark.unit
 def test_config_copy(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert config_copy.main([]) == 0
+    assert files.config_copy([]) == 0
     assert (tmp_path / "configs" / "config.yaml").read_text() == (
         ROOT / "libero/configs/config.yaml"
     ).read_text()
-    assert config_copy.main([]) == 2
+    assert files.config_copy([]) == 2
     assert "configs exists" in capsys.readouterr().err
-    assert config_copy.main(["elsewhere"]) == config_copy.main(["--overwrite"]) == 0
+    assert files.config_copy(["elsewhere"]) == files.config_copy(["--overwrite"]) == 0
 
 
 @pytest.mark.unit
 def test_download_libero_datasets(tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr(
-        download_libero_datasets,
+        demonstrations,
         "libero_dataset_download",
         lambda *args, **kwargs: asked.append((args, kwargs)),
     )
     argv = ["--download-dir", str(tmp_path), "--datasets", "libero_goal", "--use-huggingface"]
-    assert download_libero_datasets.main(argv) == 0
+    assert demonstrations.download_libero_datasets(argv) == 0
     assert asked == [(("libero_goal", tmp_path), {"use_huggingface": True})]
     assert "libero_goal: 0 of 10 files" in capsys.readouterr().out
-    assert download_libero_datasets.main(["--download-dir", str(tmp_path)]) == 1
+    assert demonstrations.download_libero_datasets(["--download-dir", str(tmp_path)]) == 1
 
 
 @pytest.mark.unit
 def test_check_task_suites(monkeypatch, capsys, tmp_path):
-    assert check_task_suites.main(["libero_goal"]) == 0
+    assert tasks.check_task_suites(["libero_goal"]) == 0
     assert capsys.readouterr().out == "libero_goal: 10 tasks, 0 faults\n"
-    monkeypatch.setattr(check_task_suites, "get_libero_path", lambda key: str(tmp_path))
-    assert check_task_suites.main(["libero_goal"]) == 1
+    monkeypatch.setattr(tasks, "get_libero_path", lambda key: str(tmp_path))
+    assert tasks.check_task_suites(["libero_goal"]) == 1
     assert "libero_goal: 10 tasks, 10 faults\n" in capsys.readouterr().out
-    assert check_task_suites.main(["libero_gaol"]) == 2
+    assert tasks.check_task_suites(["libero_gaol"]) == 2
 
 
 @pytest.mark.sim
@@ -276,32 +261,32 @@ def test_render_single_task(collected, tmp_path, capsys):
         "--out",
         str(tmp_path),
     ]
-    assert render_single_task.main(argv) == 0
+    assert tasks.render_single_task(argv) == 0
     (path,) = capsys.readouterr().out.split()
     stored = np.asarray(Image.open(path)).astype(int)
     assert stored.shape == (32, 64, 3)
     assert stored.std() > 10
-    assert render_single_task.main([*argv, "--demo_file", str(collected)]) == 0
+    assert tasks.render_single_task([*argv, "--demo_file", str(collected)]) == 0
     assert (np.asarray(Image.open(path)) != stored).any()
-    assert render_single_task.main(["--task_id", "1"]) == 2
+    assert tasks.render_single_task(["--task_id", "1"]) == 2
     assert "which task?" in capsys.readouterr().err
-    assert render_single_task.main(["--benchmark_name", "libero_goal", "--task_id", "10"]) == 2
+    assert tasks.render_single_task(["--benchmark_name", "libero_goal", "--task_id", "10"]) == 2
     assert "libero_goal has 0 to 9" in capsys.readouterr().err
 
 
 @pytest.mark.unit
 def test_shasum_files(tmp_path, capsys):
     (tmp_path / "a.txt").write_text("hello")
-    assert shasum_files.main([str(tmp_path)]) == 0
+    assert files.shasum_files([str(tmp_path)]) == 0
     line = capsys.readouterr().out
     assert line == f"2cf24dba5fb0a30e26e83b2ac5b9e29e1b161e5c1fa7425e73043362938b9824  {tmp_path / 'a.txt'}\n"
     (tmp_path / "sums").write_text(line)
-    assert shasum_files.main(["--check", str(tmp_path / "sums")]) == 0
+    assert files.shasum_files(["--check", str(tmp_path / "sums")]) == 0
     (tmp_path / "a.txt").write_text("goodbye")
-    assert shasum_files.main(["--check", str(tmp_path / "sums")]) == 1
+    assert files.shasum_files(["--check", str(tmp_path / "sums")]) == 1
     assert "a.txt: FAILED" in capsys.readouterr().out
     (tmp_path / "sums").write_text("nonsense")
-    assert shasum_files.main(["--check", str(tmp_path / "sums")]) == 2
+    assert files.shasum_files(["--check", str(tmp_path / "sums")]) == 2
 
 
 class Leaver:
@@ -325,21 +310,26 @@ def test_collecting_scripts(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(teleop_screens, "open_screen", lambda kind, keyboard, *_: Leaver(keyboard))
     (tmp_path / "mine.bddl").write_text(get_task(TASK).bddl_text)
     argv = ["--bddl-file", str(tmp_path / "mine.bddl"), "--directory", str(tmp_path / "data")]
-    assert collect_demonstration.main([*argv, "--num-demonstration", "3", "--device", "keyboard"]) == 1
+    assert (
+        demonstrations.collect_demonstration([*argv, "--num-demonstration", "3", "--device", "keyboard"]) == 1
+    )
     out = capsys.readouterr().out
     assert "space: open or close the gripper" in out
     target = tmp_path / "data" / "libero_tabletop_manipulation_mine" / "demo.hdf5"
     assert f"{target}: 0 of 3 demonstrations" in out
-    assert collect_demonstration.main([*argv, "--controller", "IK_POSE"]) == 2
+    assert demonstrations.collect_demonstration([*argv, "--controller", "IK_POSE"]) == 2
     assert "OSC_POSE only" in capsys.readouterr().err
-    assert collect_demonstration.main([*argv, "--robots", "Sawyer"]) == 2
-    assert collect_demonstration.main([*argv, "--num-demonstration", "0"]) == 2
+    assert demonstrations.collect_demonstration([*argv, "--robots", "Sawyer"]) == 2
+    with pytest.raises(SystemExit):
+        demonstrations.collect_demonstration([*argv, "--num-demonstration", "0"])
     assert (
-        libero_100_collect_demonstrations.main(["--task-id", "99", "--directory", str(tmp_path / "data")])
+        demonstrations.libero_100_collect_demonstrations(
+            ["--task-id", "99", "--directory", str(tmp_path / "data")]
+        )
         == 1
     )
     assert get_task("libero_10/9").language in capsys.readouterr().out
-    assert libero_100_collect_demonstrations.main(["--task-id", "100"]) == 2
+    assert demonstrations.libero_100_collect_demonstrations(["--task-id", "100"]) == 2
     assert "LIBERO-100 has 0 to 99" in capsys.readouterr().err
 
 

@@ -1,0 +1,241 @@
+"""Scripts of demonstrations: record by hand, make data sets of them, look at data sets, check and download them."""
+
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import h5py
+
+from libero.libero.benchmark import get_benchmark
+from libero.libero.utils.dataset_utils import get_dataset_info as dataset_info
+from libero.libero.utils.download_utils import (
+    check_libero_dataset,
+    datasets_folder,
+    libero_dataset_download,
+)
+from libero.scripts.command import script
+from libero_env.cli.demos import check_files
+from libero_env.cli.options import Positional, Positive, Seed, Side
+from libero_env.cli.teleop import Sensitivity, TeleopRequest, UsbId, teleop
+from libero_env.demos.config import RenderConfig
+from libero_env.demos.contents import LOW_DIM_KEYS
+from libero_env.demos.curate import find_demo_files
+from libero_env.demos.observe import recorded_task
+from libero_env.demos.rendering import rerender
+from libero_env.demos.replay import rerun_actions
+from libero_env.errors import LiberoError
+from libero_env.storage import atomic_path
+from libero_env.tasks import read_task
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """Record demonstrations by hand. An episode ends when its goal has held for ten steps.
+
+    Attributes:
+        directory: Folder of the files.
+        robots: Panda is the only robot.
+        config: No effect: the benchmark has one arm.
+        arm: No effect: the benchmark has one arm.
+        camera: Camera that is shown.
+        controller: OSC_POSE is the only controller.
+        num_demonstration: Demonstrations in the file.
+        size: Size of the recorded pictures, pixels.
+        seed: Seed of the initial states.
+        screen: Where it is shown.
+        device: Input device.
+        pos_sensitivity: Factor on translations.
+        rot_sensitivity: Factor on rotations.
+        vendor_id: USB vendor of the 3D mouse.
+        product_id: USB product of the 3D mouse.
+    """
+
+    directory: Path = Path("demonstration_data")
+    robots: tuple[str, ...] = ("Panda",)
+    config: str = "single-arm-opposed"
+    arm: str = "right"
+    camera: str = "agentview"
+    controller: str = "OSC_POSE"
+    num_demonstration: Positive = 50
+    size: Side = 128
+    seed: Seed = 0
+    screen: Literal["auto", "window", "terminal"] = "auto"
+    device: Literal["keyboard", "spacemouse"] = "keyboard"
+    pos_sensitivity: Sensitivity = 1.0
+    rot_sensitivity: Sensitivity = 1.0
+    vendor_id: UsbId = 9583
+    product_id: UsbId = 50741
+
+    def collect(self, bddl: Path) -> int:
+        """Record into `<directory>/<problem>_<task>/demo.hdf5`; return 1 where the user stopped early."""
+        for flag, value, valid in (
+            ("--robots", " ".join(self.robots), "Panda"),
+            ("--controller", self.controller, "OSC_POSE"),
+        ):
+            if value != valid:
+                raise LiberoError(f"{flag} {value}: demonstrations are recorded with {valid} only")
+        task = read_task(bddl)
+        out = self.directory / f"{task.problem.name.lower()}_{task.name}" / "demo.hdf5"
+        out.parent.mkdir(parents=True, exist_ok=True)
+        return teleop(
+            TeleopRequest(
+                bddl=bddl,
+                out=out,
+                n=self.num_demonstration,
+                size=(self.size, self.size),
+                seed=self.seed,
+                camera=self.camera,
+                screen=self.screen,
+                device=self.device,
+                pos_sensitivity=self.pos_sensitivity,
+                rot_sensitivity=self.rot_sensitivity,
+                vendor_id=self.vendor_id,
+                product_id=self.product_id,
+            )
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingOfFile(Recording):
+    """Record demonstrations of a task file by hand. An episode ends when its goal has held for ten steps.
+
+    Attributes:
+        bddl_file: Task file.
+    """
+
+    bddl_file: Path
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordingOfTask(Recording):
+    """Record demonstrations of a task of LIBERO-100 by hand; the task is given by its number.
+
+    Attributes:
+        task_id: 0 to 99; 90 to 99 are libero_10.
+    """
+
+    task_id: int
+
+
+@script()
+def collect_demonstration(request: RecordingOfFile) -> int:
+    """Record demonstrations of a task file."""
+    return request.collect(request.bddl_file)
+
+
+@script()
+def libero_100_collect_demonstrations(request: RecordingOfTask) -> int:
+    """Record demonstrations of a task of LIBERO-100; raise a LiberoError if there is no such task."""
+    suite = get_benchmark("libero_100")()
+    if request.task_id not in range(suite.n_tasks):
+        raise LiberoError(f"--task-id {request.task_id}: LIBERO-100 has 0 to {suite.n_tasks - 1}")
+    return request.collect(Path(suite.get_task_bddl_file_path(request.task_id)))
+
+
+@script()
+def create_dataset(
+    *,
+    demo_file: Path,
+    use_actions: bool = False,
+    use_camera_obs: bool = False,
+    dataset_path: Path = Path("datasets"),
+    dataset_name: str = "",
+    no_proprio: bool = False,
+    use_depth: bool = False,
+    size: Side = 128,
+) -> None:
+    """Make a data set of collected demonstrations: pictures and proprioception of each state; print what it holds.
+
+    Args:
+        demo_file: File with states and actions (demo.hdf5).
+        use_actions: Replay the actions instead of the states.
+        use_camera_obs: Draw the pictures of the cameras.
+        dataset_path: Folder.
+        dataset_name: File in the folder (default: SUITE/TASK_demo.hdf5).
+        no_proprio: Leave out joints, gripper and end effector.
+        use_depth: Draw depth, too.
+        size: Size of the pictures, pixels.
+    """
+    task = recorded_task(demo_file)
+    name = dataset_name or f"{task.suite}/{task.name}_demo.hdf5"
+    target = dataset_path / (name if name.endswith(".hdf5") else f"{name}.hdf5")
+    modalities = ("rgb", "depth") if use_depth else ("rgb",)
+    config = RenderConfig(RenderConfig().cameras if use_camera_obs else (), (size, size), modalities)
+    if use_actions:
+        with tempfile.TemporaryDirectory() as folder:
+            rerender(rerun_actions(demo_file, Path(folder) / "rerun.hdf5"), target, config)
+    else:
+        rerender(demo_file, target, config)
+    if no_proprio:
+        _drop_proprioception(target)
+    print(target)
+    dataset_info(str(target))
+
+
+def _drop_proprioception(file: Path) -> None:
+    """Remove everything but pictures and states from a file, in one step."""
+    with atomic_path(file, fsync=True) as copy:
+        shutil.copyfile(file, copy)
+        with h5py.File(copy, "r+") as handle:
+            for demo in handle["data"].values():
+                for key in [key for key in LOW_DIM_KEYS if key in demo["obs"]]:
+                    del demo["obs"][key]
+                if "robot_states" in demo:
+                    del demo["robot_states"]
+
+
+@script()
+def get_dataset_info(*, dataset: str, filter_key: str | None = None, verbose: bool = False) -> int:
+    """Print what a demonstration file holds: lengths, range of actions, instruction, and observations.
+
+    Args:
+        dataset: HDF5 file.
+        filter_key: Name of a subset in `mask`.
+        verbose: Print the arrays of each demonstration, too.
+    """
+    info = dataset_info(dataset, filter_key)
+    if verbose:
+        for name, arrays in info["structure"].items():
+            print(name)
+            for key, shape in arrays.items():
+                print(f"    {key}: {shape}")
+    within = info["action_min"] >= -1.0 and info["action_max"] <= 1.0
+    if not within:
+        print("actions are not in [-1, 1]")
+    return int(not within)
+
+
+@script()
+def check_dataset_integrity(paths: Positional[tuple[Path, ...]] = (), *, num_demos: int = 50) -> int:
+    """Check that demonstration files are complete: every array is read; shapes, ranges and counts are compared.
+
+    Args:
+        paths: Files or folders (default: the folder of the data sets).
+        num_demos: Demonstrations expected in each file.
+    """
+    files = find_demo_files(list(paths) or [datasets_folder()])
+    broken = check_files(files, num_demos)
+    print(f"{len(files) - broken} of {len(files)} files are complete")
+    return int(broken > 0)
+
+
+@script()
+def download_libero_datasets(
+    *,
+    download_dir: Path | None = None,
+    datasets: Literal["all", "libero_object", "libero_goal", "libero_spatial", "libero_100"] = "all",
+    use_huggingface: bool = False,
+) -> int:
+    """Download the demonstrations that people recorded for the benchmark; files that exist are kept.
+
+    Args:
+        download_dir: Folder (default: that of get_libero_path('datasets')).
+        datasets: Data set.
+        use_huggingface: Download verified files of the Hub, not archives.
+    """
+    folder = download_dir or datasets_folder()
+    libero_dataset_download(datasets, folder, use_huggingface=use_huggingface)
+    complete = check_libero_dataset(folder)
+    return int(datasets == "all" and not complete)
