@@ -399,9 +399,11 @@ def _annotations(kind: Any) -> Mapping[str, Any]:
 def _type_at(kind: Any, path: Sequence[Key]) -> Any:
     """Return the annotation at a path of a type; None where it is not known."""
     for key in path:
-        kind = next((one for one in (kind, *get_args(kind)) if _annotations(one)), kind)
-        if fields := _annotations(kind):
-            kind = fields.get(str(key))
+        fields = _annotations(next((one for one in (kind, *get_args(kind)) if _annotations(one)), None))
+        if fields and isinstance(key, str):
+            kind = fields.get(key)
         else:  # of a list or mapping: the type of its values
-            kind = next((one for one in reversed(get_args(kind)) if one is not NoneType), None)
+            kind = next(
+                (one for one in reversed(get_args(kind)) if isinstance(one, type) or get_args(one)), None
+            )
     return kind

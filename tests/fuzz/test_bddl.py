@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from libero_env.design.lint.checks import lint_text
 from libero_env.envs.env import LiberoEnv
+from libero_env.errors import BDDLError
 from libero_env.tasks import bddl, get_task
 from libero_env.tasks.problem import differences
 from libero_env.tasks.task import Task
@@ -115,7 +116,12 @@ def changed_bddl(draw, texts=(*TEXTS, SMALL, SMALL)):
 @examples(short=150, long=10000)
 def test_any_text_is_parsed_or_refused_with_a_line(text):
     def attempt():
-        problem = bddl.parse(text, "fuzz.bddl")
+        try:
+            problem = bddl.parse(text, "fuzz.bddl")
+        except BDDLError as error:
+            where = re.match(r"fuzz\.bddl:(\d+): .", str(error))
+            assert where and 1 <= int(where[1]) <= text.count("\n") + 1, error
+            raise
         assert differences(bddl.parse(bddl.write(problem)), problem) == []
 
     survive("BDDL, parser", attempt)

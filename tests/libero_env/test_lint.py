@@ -41,23 +41,11 @@ FAULTS = [
     ("plate_1 - plate", "plate_1 - plat", "unknown-category", "error", "did you mean plate"),
     ("main_table - table", "main_table - tabel", "unknown-category", "error", "did you mean .*table"),
     ("(On plate_1 main", "(Onto plate_1 main", "unknown-predicate", "error", "On"),
-    ("(On plate_1 main_table_plate_region)", "(On plate_1)", "arity", "error", "On takes 2"),
-    (GOAL, "(And (In akita_black_bowl_1 plate_1))", "kind", "error", "a region there"),
-    ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table)", "kind", "error", "main_table is a workspace"),
     ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table_plat_region)", "unknown-name", "error",
      "did you mean main_table_plate_region"),
     ("    (On plate_1 main_table_plate_region)\n", "", "not-placed", "error", r"\(On plate_1 REGION\)"),
     ("    (On flat_stove_1 main_table_stove_region)\n", "", "not-placed", "warning", "centre of the workspace"),
-    ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table_plate_region) (On plate_1 flat_stove_1)",
-     "placed-twice", "error", "plate_1 is placed 2 times"),
     ("(On flat_stove_1 main_table_stove_region)", "(On flat_stove_1 plate_1)", "kind", "error", "workspace"),
-    (GOAL, "(And)", "empty-goal", "error", "always true"),
-    (GOAL, "(ForAll (?x - milk) (In ?x wooden_cabinet_1_top_region))", "empty-goal", "error", "no object is a milk"),
-    (" (:ranges ((0.04 -0.03 0.060000000000000005 -0.01)))", "", "region-ranges", "error", "no extent"),
-    ("(top_region (:target wooden_cabinet_1))", "(top_region (:target wooden_cabinet_1) (:ranges ((0 0 1 1))))",
-     "region-ranges", "error", "workspace only"),
-    ("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.06 -0.03 0.04 -0.01)", "syntax", "error",
-     "swapped corners.*X0 <= X1"),
     ("(-0.060000000000000005 0.12000000000000001 -0.04 0.14)", "(0.04 -0.03 0.060000000000000005 -0.01)",
      "duplicate-region", "warning", "same region as main_table_plate_region"),
     ("    akita_black_bowl_1\n    wooden_cabinet_1_top_region", "    akita_bowl_1", "unknown-name", "warning",
@@ -142,15 +130,7 @@ def test_the_dimensions_of_the_arm_are_those_of_its_model():
 
     model = build_scene(get_task("libero_object/0").problem).model
     data = mujoco.MjData(model)
-    data.qpos[:7] = [
-        0,
-        0,
-        0,
-        -lint_scene._MAX_BEND,
-        0,
-        1.0,
-        0,
-    ]  # any bend of the elbow, by the law of cosines
+    data.qpos[[3, 5]] = -lint_scene._MAX_BEND, 1.0  # any bend of the elbow, by the law of cosines
     mujoco.mj_kinematics(model, data)
     shoulder, wrist, hand = data.xanchor[1], data.xanchor[5], data.xanchor[6]
     assert shoulder[2] == pytest.approx(lint_scene._SHOULDER, abs=1e-3)
