@@ -6,7 +6,7 @@ Statistics can be added over episodes; those of images follow from the histogram
 import io
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -328,40 +328,33 @@ def import_arrow() -> tuple[ModuleType, ModuleType]:
     return pyarrow, pyarrow.parquet
 
 
-def chunk_and_file(file: int) -> dict[str, int]:
-    """Return the indices of the n-th file, for the patterns of paths above."""
-    return {"chunk_index": file // FILES_PER_CHUNK, "file_index": file % FILES_PER_CHUNK}
-
-
-class ParquetTable:
-    """Writes the Parquet files of the data, one row group per episode.
+class _GrowingFile:
+    """A file that episodes are appended to, and that is continued in another one when it is large.
 
     Args:
         root: Folder of the data set.
-        limit_mb: Size from which a table is continued in another file, [MiB].
+        pattern: Path of a file in it, with chunk and index.
+        limit_mb: Size from which a file is continued in another one, [MiB].
     """
 
-    def __init__(self, root: Path, limit_mb: float):
-        self._limit_mb = limit_mb
-        self._pa, self._pq = import_arrow()
-        self._root = root
-        self._writer: Any = None
-        self._file, self._bytes = 0, 0
+    def __init__(self, root: Path, pattern: str, limit_mb: float):
+        self._root, self._pattern, self._limit_mb = root, pattern, limit_mb
+        self._number, self._writer = 0, None
 
-    def add(self, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-        """Append an episode; return the metadata that tell where it is."""
-        table = self._pa.table(_arrays(self._pa, columns))
-        if self._bytes > self._limit_mb * 2**20:
+    def _place(self, size: int) -> tuple[Path, dict[str, int]]:
+        """Return the path of the file that the next episode is in, and its indices for the table of episodes.
+
+        Args:
+            size: Size of the open file, bytes.
+        """
+        if size > self._limit_mb * 2**20:
             self.close()
-            self._file, self._bytes = self._file + 1, 0
-        place = chunk_and_file(self._file)
-        if self._writer is None:
-            path = self._root / DATA_PATH.format(**place)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._writer = self._pq.ParquetWriter(path, table.schema, compression="snappy")
-        self._writer.write_table(table)
-        self._bytes += table.nbytes
-        return {f"data/{key}": value for key, value in place.items()}
+            self._number += 1
+        chunk, index = divmod(self._number, FILES_PER_CHUNK)
+        place = {"chunk_index": chunk, "file_index": index}
+        path = self._root / self._pattern.format(**place)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path, place
 
     def close(self) -> None:
         """Close the open file. Idempotent."""
@@ -370,48 +363,54 @@ class ParquetTable:
             self._writer = None
 
 
-@dataclass
-class CameraVideo:
+class ParquetTable(_GrowingFile):
+    """Writes the Parquet files of the data, one row group per episode."""
+
+    _writer: Any  # a ParquetWriter
+
+    def __init__(self, root: Path, limit_mb: float):
+        super().__init__(root, DATA_PATH, limit_mb)
+        self._pa, self._pq = import_arrow()
+        self._bytes = 0
+
+    def add(self, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        """Append an episode; return the metadata that tell where it is."""
+        table = self._pa.table(_arrays(self._pa, columns))
+        path, place = self._place(self._bytes)
+        if self._writer is None:
+            self._writer = self._pq.ParquetWriter(path, table.schema, compression="snappy")
+            self._bytes = 0
+        self._writer.write_table(table)
+        self._bytes += table.nbytes
+        return {f"data/{key}": value for key, value in place.items()}
+
+
+class CameraVideo(_GrowingFile):
     """Writes the MP4 files of a camera.
 
-    Attributes:
+    Args:
         root: Folder of the data set.
         key: Feature of the camera.
-        limit_mb: Size from which a video is continued in another file, [MiB].
+        limit_mb: As for `ParquetTable`.
         fps: Frames per second.
         codec: How frames are encoded.
-        file: Number of the file that is being written.
-        writer: The open file.
     """
 
-    root: Path
-    key: str
-    limit_mb: float
-    fps: int
-    codec: Codec = H264
-    file: int = 0
-    writer: Mp4Writer | None = field(default=None, repr=False)
+    _writer: Mp4Writer | None
+
+    def __init__(self, root: Path, key: str, limit_mb: float, fps: int, codec: Codec):
+        super().__init__(root, VIDEO_PATH.replace("{video_key}", key), limit_mb)
+        self._key, self._fps, self._codec = key, fps, codec
 
     def add(self, frames: np.ndarray) -> dict[str, Any]:
         """Append an episode; return the metadata that tell where it is."""
-        if self.writer is not None and self.writer.path.stat().st_size > self.limit_mb * 2**20:
-            self.close()
-            self.file += 1
-        place = chunk_and_file(self.file)
-        if self.writer is None:
-            path = self.root / VIDEO_PATH.format(video_key=self.key, **place)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self.writer = Mp4Writer(path, self.fps, self.codec)
-        first = self.writer.frames
-        self.writer.add(frames)
-        times = {"from_timestamp": first / self.fps, "to_timestamp": self.writer.frames / self.fps}
-        return {f"videos/{self.key}/{name}": value for name, value in {**place, **times}.items()}
-
-    def close(self) -> None:
-        """Close the open file. Idempotent."""
-        if self.writer is not None:
-            self.writer.close()
-            self.writer = None
+        path, place = self._place(self._writer.path.stat().st_size if self._writer is not None else 0)
+        if self._writer is None:
+            self._writer = Mp4Writer(path, self._fps, self._codec)
+        first = self._writer.frames
+        self._writer.add(frames)
+        times = {"from_timestamp": first / self._fps, "to_timestamp": self._writer.frames / self._fps}
+        return {f"videos/{self._key}/{name}": value for name, value in {**place, **times}.items()}
 
 
 def _arrays(pa: ModuleType, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:

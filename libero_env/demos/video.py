@@ -140,9 +140,15 @@ def check_video_path(path: Path) -> None:
         raise LiberoError(f"{path}: videos are .mp4, .webp or .gif")
     if path.suffix == ".mp4":
         import_av()
-    try:
+    with _errors_named(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
+
+
+@contextmanager
+def _errors_named(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:  # those of FFmpeg too
         raise LiberoError(
             f"{path} cannot be written ({error.strerror or error}); choose another folder"
         ) from error
@@ -155,19 +161,14 @@ def write_video(path: Path, frames: np.ndarray, fps: int) -> Path:
         LiberoError: The path has another suffix or cannot be written, or PyAV is not installed.
     """
     check_video_path(path)
-    try:
-        with atomic_path(path) as temporary:
-            if path.suffix == ".mp4":
-                with Mp4Writer(temporary, fps) as video:
-                    video.add(frames)
-            else:
-                images = [Image.fromarray(frame) for frame in frames]
-                form, duration = path.suffix[1:], round(1000 / fps)
-                images[0].save(
-                    temporary, form, save_all=True, append_images=images[1:], duration=duration, loop=0
-                )
-    except OSError as error:  # those of FFmpeg too
-        raise LiberoError(
-            f"{path} cannot be written ({error.strerror or error}); choose another folder"
-        ) from error
+    with _errors_named(path), atomic_path(path) as temporary:
+        if path.suffix == ".mp4":
+            with Mp4Writer(temporary, fps) as video:
+                video.add(frames)
+        else:
+            images = [Image.fromarray(frame) for frame in frames]
+            form, duration = path.suffix[1:], round(1000 / fps)
+            images[0].save(
+                temporary, form, save_all=True, append_images=images[1:], duration=duration, loop=0
+            )
     return path

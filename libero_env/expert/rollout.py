@@ -60,7 +60,7 @@ def run_experts(
         One attempt for each expert, in order.
     """
     noise = noise or [None] * len(experts)
-    recordings = [_Recording() for _ in experts]
+    states, executed, chosen = ([[] for _ in experts] for _ in range(3))  # of each simulation, step by step
     success = np.zeros(len(experts), bool)
     for _ in range(max_steps):
         running = map(int, np.flatnonzero(env.running[: len(experts)]))
@@ -71,36 +71,23 @@ def run_experts(
         for i in live:
             action, own_noise = experts[i].act(env.views[i]), noise[i]
             actions[i] = action if own_noise is None else own_noise.apply(action, experts[i].noise_scale)
-            recordings[i].states.append(env.simulations.physics_state(i))
-            recordings[i].actions.append(actions[i].copy())
-            recordings[i].expert_actions.append(action)
+            states[i].append(env.simulations.physics_state(i))
+            executed[i].append(actions[i].copy())
+            chosen[i].append(action)
         success = env.step(actions)[-1]["success"][: len(experts)]
-    for i, recording in enumerate(recordings):
-        recording.states.append(env.simulations.physics_state(i))
-    fixtures = env.simulations.fixtures
     return [
-        recordings[i].attempt(expert, bool(success[i]), fixtures[i].copy())
+        Attempt(
+            success=bool(success[i]),
+            states=np.array([*states[i], env.simulations.physics_state(i)]),
+            actions=np.array(executed[i]),
+            expert_actions=np.array(chosen[i]),
+            retries=expert.retries,
+            reason="" if success[i] else expert.failure_reason or _last_phase(expert, len(executed[i])),
+            fixtures=env.simulations.fixtures[i].copy(),
+        )
         for i, expert in enumerate(experts)
     ]
 
 
-@dataclass
-class _Recording:
-    """What an attempt consists of so far."""
-
-    states: list[np.ndarray] = field(default_factory=list)
-    actions: list[np.ndarray] = field(default_factory=list)
-    expert_actions: list[np.ndarray] = field(default_factory=list)
-
-    def attempt(self, expert: Expert, success: bool, fixtures: np.ndarray) -> Attempt:
-        """Return the attempt at its end."""
-        reason = f"in phase {expert.phase} after {len(self.actions)} steps, {expert.retries} retries"
-        return Attempt(
-            success=success,
-            states=np.array(self.states),
-            actions=np.array(self.actions),
-            expert_actions=np.array(self.expert_actions),
-            retries=expert.retries,
-            reason="" if success else expert.failure_reason or reason,
-            fixtures=fixtures,
-        )
+def _last_phase(expert: Expert, steps: int) -> str:
+    return f"in phase {expert.phase} after {steps} steps, {expert.retries} retries"

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from typing import Protocol
 
 import numpy as np
 
@@ -33,30 +32,15 @@ _MOUSE_RANGE = 350.0  # [raw units] reading at full deflection
 _TAP_STEPS = 2  # [control steps] during which a key acts whose release is not reported
 
 
-class Device(Protocol):
-    """Input device of the user.
-
-    Attributes:
-        command: `RESET` or `QUIT` if the user gave that command since it was last set to None.
-    """
-
-    command: str | None
-
-    def action(self) -> np.ndarray:
-        """Return the action for the next control step, (7,)."""
-        ...
-
-    def restart(self) -> None:
-        """Prepare for a new episode: no key is pressed, the gripper is open."""
-        ...
-
-
 class Keyboard:
     """Turns key events into actions; the keys and their effect are those of robosuite's keyboard device.
 
     Args:
         pos_sensitivity: Factor on translations.
         rot_sensitivity: Factor on rotations.
+
+    Attributes:
+        command: `RESET` or `QUIT` if the user gave that command since it was last set to None.
     """
 
     def __init__(self, pos_sensitivity: float = 1.0, rot_sensitivity: float = 1.0):
@@ -65,7 +49,7 @@ class Keyboard:
         self.restart()
 
     def restart(self) -> None:
-        """See `Device`."""
+        """Prepare for a new episode: no key is pressed, the gripper is open."""
         self.steps: dict[str, float] = {}  # pressed key -> control steps during which it still acts
         self.closed = False
 
@@ -91,7 +75,7 @@ class Keyboard:
             self.steps[key.lower()] = 1
 
     def action(self) -> np.ndarray:
-        """See `Device`."""
+        """Return the action for the next control step, (7,)."""
         motion = np.zeros(6)
         for key in self.steps:
             index, sign = MOTIONS[key]
@@ -117,7 +101,7 @@ class SpaceMouse(Keyboard):
         self.mouse_gains = np.repeat(gains, 3)
 
     def restart(self) -> None:
-        """See `Device`."""
+        """Prepare for a new episode."""
         super().restart()
         self.deflection, self.button = np.zeros(6), False
 
@@ -143,7 +127,7 @@ class SpaceMouse(Keyboard):
             self.deflection[3:] = scaled[1], scaled[0], -scaled[2]
 
     def action(self) -> np.ndarray:
-        """See `Device`."""
+        """Return the action for the next control step, (7,)."""
         action = super().action()
         action[:6] = np.clip(action[:6] + self.deflection * self.mouse_gains, -1.0, 1.0)
         action[6] = 1.0 if self.button or self.closed else -1.0

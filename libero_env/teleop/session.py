@@ -17,7 +17,7 @@ from libero_env.demos.read import Episode
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import Task
-from libero_env.teleop.devices import QUIT, Device
+from libero_env.teleop.devices import QUIT, Keyboard
 
 HOLD_STEPS = 10  # [control steps] during which the goal must hold, as in the original
 GENERATOR = "teleoperation"
@@ -75,7 +75,7 @@ class Teleop:
     """
 
     def __init__(
-        self, task: Task, device: Device, screen: Screen, *, seed: int = 0, hold_steps: int = HOLD_STEPS
+        self, task: Task, device: Keyboard, screen: Screen, *, seed: int = 0, hold_steps: int = HOLD_STEPS
     ):
         self.task, self.device, self.screen = task, device, screen
         self.seed, self.hold_steps = seed, hold_steps
