@@ -151,7 +151,7 @@ def find_demo_files(paths: list[Path]) -> list[Path]:
     """
     paths = paths or [demos_dir()]
     groups = [[path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")) for path in paths]
-    files = [file for group in groups for file in group if file in paths or _is_whole(file)]
+    files = [file for group in groups for file in group if file in paths or not _is_part(file)]
     if not files:
         where = ", ".join(map(str, paths))
         raise DemoError(
@@ -160,9 +160,9 @@ def find_demo_files(paths: list[Path]) -> list[Path]:
     return files
 
 
-def _is_whole(file: Path) -> bool:
-    """Return whether a file is neither a part of an unfinished recording nor a link to another file."""
-    return not file.is_symlink() and file.parent.suffix != ".parts"
+def _is_part(file: Path) -> bool:
+    """Return whether a file is a part of an unfinished recording, or a link to another file."""
+    return file.is_symlink() or file.parent.suffix == ".parts"
 
 
 def describe(file: Path) -> str:

@@ -75,8 +75,11 @@ class DemoRecorder:
         """
         placed: list[int] = []
         unplaced, experts, noises = [], [], []
+        variation, name = self.config.variation, zlib.crc32(self.task.name.encode())
+        style = None if variation.style else MotionStyle()  # None: the expert samples one
         for k, failures in numbers[: self.config.batch]:
-            start_seed, style_seed, noise_seed = self._seeds(k, failures)
+            seeds = np.random.SeedSequence([self.config.seed, name, k, failures])
+            start_seed, style_seed, noise_seed = seeds.spawn(3)
             try:
                 self._place(len(placed), k, start_seed)
             except PlacementError as error:
@@ -84,8 +87,11 @@ class DemoRecorder:
                 unplaced.append((k, Attempt(False, empty, empty, empty, 0, f"placement: {error}")))
                 continue
             placed.append(k)
-            experts.append(self._expert(style_seed))
-            noises.append(self._noise(noise_seed))
+            rng = np.random.default_rng(style_seed)
+            experts.append(Expert(self.task, rng, shapes=self.shapes, style=style))
+            rng = np.random.default_rng(noise_seed)
+            noise = ActionNoise(rng, variation.noise, variation.push_rate)
+            noises.append(noise if self.config.disturb else None)
         attempts = run_experts(self.env, experts, noises, max_steps=MAX_STEPS)
         return unplaced + list(zip(placed, attempts, strict=True))
 
@@ -118,16 +124,6 @@ class DemoRecorder:
         self.env.close()
         self.renderer.close()
 
-    def _expert(self, seed: np.random.SeedSequence) -> Expert:
-        style = None if self.config.variation.style else MotionStyle()  # None: the expert samples one
-        return Expert(self.task, np.random.default_rng(seed), shapes=self.shapes, style=style)
-
-    def _noise(self, seed: np.random.SeedSequence) -> ActionNoise | None:
-        if not self.config.disturb:
-            return None
-        variation = self.config.variation
-        return ActionNoise(np.random.default_rng(seed), variation.noise, variation.push_rate)
-
     def _place(self, slot: int, k: int, seed: np.random.SeedSequence) -> None:
         """Put one simulation at the start of demonstration k; the others stay as they are."""
         mask = np.arange(self.config.batch) == slot
@@ -136,11 +132,6 @@ class DemoRecorder:
         else:
             number = int(seed.generate_state(1)[0])
             self.env.reset(seed=[number if chosen else None for chosen in mask], options={"reset_mask": mask})
-
-    def _seeds(self, k: int, failures: int) -> list[np.random.SeedSequence]:
-        """Return the seeds of start, motion style and action noise."""
-        name = zlib.crc32(self.task.name.encode())
-        return np.random.SeedSequence([self.config.seed, name, k, failures]).spawn(3)
 
 
 class RecorderCache:

@@ -29,7 +29,6 @@ from libero_env.envs.config import Assets, Drawing, Size
 from libero_env.errors import DemoError
 from libero_env.parallel import progress_bar
 from libero_env.sim.observations import image_name
-from libero_env.sim.scene import Scene
 from libero_env.validation import checked
 
 Steps = Annotated[int, Field(ge=0)]
@@ -103,7 +102,8 @@ def replay(
 
 def _replay_episode(renderer: StateRenderer, episode: Episode, by: str, keys: list[str]) -> ReplayResult:
     env, states, nq = renderer.env, episode.states, renderer.scene.model.nq
-    objects = _object_positions(renderer.scene)
+    free = renderer.scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    objects = renderer.scene.model.jnt_qposadr[free][:, None] + np.arange(3)  # addresses of positions, (n, 3)
     obs = env.set_state(states[0])
     drift, arm_drift, frames, terminated = [], [], [], False
     for t, action in enumerate(episode.actions):
@@ -258,9 +258,3 @@ def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regen
         fixtures=env.simulations.fixtures[0].copy(),
         name=episode.name,
     )
-
-
-def _object_positions(scene: Scene) -> np.ndarray:
-    """Return the addresses in qpos of the positions of free bodies, (n, 3)."""
-    free = scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-    return scene.model.jnt_qposadr[free][:, None] + np.arange(3)

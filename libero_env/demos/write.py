@@ -200,7 +200,9 @@ class DemoWriter:
             group.attrs["fixtures"] = episode.fixtures
 
     def _write_observations(self, group: h5py.Group, obs: Mapping[str, np.ndarray], steps: int) -> None:
-        for key, values in _with_ee_states(obs).items():
+        if "ee_pos" in obs and "ee_ori" in obs:
+            obs = {**obs, "ee_states": np.concatenate([obs["ee_pos"], obs["ee_ori"]], axis=1)}
+        for key, values in obs.items():
             if is_image(key):
                 group.create_dataset(
                     key,
@@ -266,12 +268,6 @@ def _check_values(episode: Episode, where: str) -> None:
     for key, values in {**arrays, "robot_states": episode.robot_states, **episode.obs}.items():
         if values is not None and (fault := value_fault(key, np.asarray(values))):
             raise DemoError(f"{where}/{key} {fault}; it is not written")
-
-
-def _with_ee_states(obs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    if "ee_pos" in obs and "ee_ori" in obs:
-        return {**obs, "ee_states": np.concatenate([obs["ee_pos"], obs["ee_ori"]], axis=1)}
-    return dict(obs)
 
 
 def _plain(value: Any) -> Any:

@@ -159,7 +159,10 @@ def record_session(
     try:
         while len(recorded) < n and (episode := teleop.episode(len(recorded), n)) is not None:
             number = max(recorded, default=-1) + 1
-            writer.write(number, _with_observations(episode, renderer))
+            assert episode.fixtures is not None  # `Teleop` records them
+            obs, robot_states = renderer.render_states(episode.states, episode.fixtures)
+            attrs = {"model_file": renderer.model_xml(episode.fixtures)}
+            writer.write(number, replace(episode, obs=obs, robot_states=robot_states, attrs=attrs))
             recorded.add(number)
             report(f"demonstration {number}: {len(episode)} steps")
     finally:
@@ -167,10 +170,3 @@ def record_session(
     if recorded:
         writer.finish()
     return len(recorded)
-
-
-def _with_observations(episode: Episode, renderer: StateRenderer) -> Episode:
-    assert episode.fixtures is not None  # `Teleop` records them
-    obs, robot_states = renderer.render_states(episode.states, episode.fixtures)
-    attrs = {"model_file": renderer.model_xml(episode.fixtures)}
-    return replace(episode, obs=obs, robot_states=robot_states, attrs=attrs)

@@ -94,7 +94,11 @@ class PickPlace(Skill):
             self._plan = None
         if self._plan is not None:
             return True
-        if self._is_moving(pose) and self._waiting_steps < MAX_WAITING_STEPS:
+        previous, self._previous_pose = self._previous_pose, pose
+        moves = previous is not None and has_moved(
+            previous, pose, 0.001, 0.015
+        )  # as falling and rocking ones do
+        if moves and self._waiting_steps < MAX_WAITING_STEPS:
             self._waiting_steps += 1
             return False
         self._waiting_steps = 0
@@ -107,11 +111,6 @@ class PickPlace(Skill):
         height = (self.shapes.cloud(view, self._object) - grasp.pos_world) @ -grasp.mat[:, 2]
         self._clear_distance = float(height.max()) + GRIPPER.tip_below
         return True
-
-    def _is_moving(self, pose: Pose) -> bool:
-        """Return whether the object has moved since the last step, as falling and rocking ones do."""
-        previous, self._previous_pose = self._previous_pose, pose
-        return previous is not None and has_moved(previous, pose, 0.001, 0.015)
 
     def _enter(self, phase: str) -> None:
         super()._enter(phase)
