@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from study import Planned, planned
+from study import REFERENCES, Planned, planned
 
 from libero_env.text import duration, quantity
 from lifelong.results.log import ResultLog
@@ -18,6 +18,12 @@ from lifelong.results.records import LossRecord
 from lifelong.results.relearning import Savings, by_measure, read_relearning, savings
 
 HERE = Path(__file__).parent
+# the first head of every table: the runs of a study were made in two versions of models and demonstrations
+HEADS = {
+    "libero_object": "algorithm (seeds 1, 2: older models and demonstrations than 3 to 5)",
+    "libero_goal": "algorithm (seed 1, and er's seed 2: older models and demonstrations than the others)",
+    "pretrained6": "algorithm (seed 1, and iscil's seed 2: older models and demonstrations than the others)",
+}
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "fwt": "FWT", "nbt": "NBT", "auc": "AUC"}
 
 
@@ -28,30 +34,32 @@ def table(heads: list[str], rows: list[list[str]], align: str = "---:|") -> list
 
 
 def metric(cell: dict) -> str:
-    """Mean over seeds, and its interval over seeds and starts; a dash where nothing is defined."""
+    """Mean over seeds, and its interval; a dash where nothing is defined."""
     if cell["mean"] is None:
         return "–"
+    if cell["low"] is None:
+        return f"{cell['mean']:z.2f}"
     return f"{cell['mean']:z.2f} [{cell['low']:z.2f}, {cell['high']:z.2f}]"
 
 
 def tables(study: str, found: dict) -> Iterator[tuple[str, list[str]]]:
-    """Metrics, costs, and pairs that differ significantly; best AUC first."""
-    measured = {label: group["metrics"] for label, group in found["groups"].items()}
-    yield "metrics", metrics(measured)
-    yield "pairs", pairs(by_auc(measured), found["differences"])
+    """Metrics, costs, and the planned pairs; best AUC first."""
+    head, measured = HEADS[study], {label: group["metrics"] for label, group in found["groups"].items()}
+    yield "metrics", metrics(head, measured)
+    yield "pairs", pairs(head, by_auc(measured), found["differences"])
     if later := found["after_base_stage"]:
-        yield "later tasks", metrics(later["metrics"])
-        yield "pairs of later tasks", pairs(by_auc(later["metrics"]), later["differences"])
+        yield "later tasks", metrics(head, later["metrics"])
+        yield "pairs of later tasks", pairs(head, by_auc(later["metrics"]), later["differences"])
     training = training_seconds(study)
     rows = [[label, training[label], *costs(found["groups"][label]["costs"])] for label in by_auc(measured)]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
 
 
-def metrics(measured: dict[str, dict]) -> list[str]:
+def metrics(head: str, measured: dict[str, dict]) -> list[str]:
     """Lines of the table of metrics, by label."""
     rows = [[label, *(metric(measured[label][name]) for name in COLUMNS)] for label in by_auc(measured)]
-    return table(["algorithm", *COLUMNS.values()], rows)
+    return table([head, *COLUMNS.values()], rows)
 
 
 def by_auc(measured: dict[str, dict]) -> list[str]:
@@ -59,29 +67,44 @@ def by_auc(measured: dict[str, dict]) -> list[str]:
     return sorted(measured, key=lambda label: -(measured[label]["auc"]["mean"] or 0))
 
 
-def pairs(labels: list[str], differences: list[dict]) -> list[str]:
-    """Which algorithms have a larger AUC than which, with 95 % confidence in all pairs together, and which are left."""
-    better: dict[str, list[str]] = {label: [] for label in labels}
-    open_: dict[str, list[str]] = {label: [] for label in labels}
+def pairs(head: str, labels: list[str], differences: list[dict]) -> list[str]:
+    """Each algorithm's AUC less that of each reference, and of the first one with every seed, in points."""
+    found = {}
     for pair in differences:
-        (a, b), auc = (pair["of"], pair["less"]), pair["metrics"]["auc"]
-        if auc["adjusted"] is None:  # undefined, or of methods with one seed each
-            continue
-        if auc["significant"]:
-            winner, loser = (a, b) if auc["value"] > 0 else (b, a)
-            better[winner].append(loser)
-        else:
-            seeds = f" ({auc['seeds']})" if auc["seeds"] else ""
-            open_[a].append(b + seeds)
-            open_[b].append(a + seeds)
+        auc = pair["metrics"]["auc"]
+        found[pair["of"], pair["less"]] = auc
+        found.setdefault((pair["less"], pair["of"]), _turned(auc))
+    references = [name for name in REFERENCES if any(less == name for _, less in found)]
+    rows = []
+    for label in labels:
+        cells = [found.get((label, name)) for name in references]
+        if any(cell and cell["value"] is not None for cell in cells):
+            rows.append([label, *(_difference(cell) for cell in cells), _by_seed(cells[0])])
+    heads = [head, *(f"AUC less {name}" for name in references), f"less {references[0]}, each seed"]
+    return table(heads, rows)
 
-    def ordered(names: list[str]) -> str:
-        return ", ".join(sorted(names, key=lambda name: labels.index(name.split(" ")[0]))) or "–"
 
-    heads = ["algorithm", "larger AUC than", "no significant difference from (seeds needed)"]
-    rows = [[label, ordered(better[label]), ordered(open_[label])] for label in labels]
-    rows = [row for row in rows if row[1:] != ["–", "–"]]
-    return table(heads, rows, "---|") if rows else ["No pair is tested: there is one seed."]
+def _turned(cell: dict) -> dict:
+    """The same pair the other way round."""
+    ends = {"low": cell["high"], "high": cell["low"]}
+    turned = {k: None if v is None else -v for k, v in {"value": cell["value"], **ends}.items()}
+    return {**cell, **turned, "by_seed": [-v for v in cell["by_seed"]]}
+
+
+def _difference(cell: dict | None) -> str:
+    """A difference in points with its interval; bold if significant, with ≈ if equivalent, else seeds needed."""
+    if cell is None or cell["value"] is None:
+        return "–"
+    text = f"{100 * cell['value']:+.1f}"
+    text = f"**{text}**" if cell["significant"] else text
+    if cell["low"] is not None:
+        text += f" [{100 * cell['low']:z.1f}, {100 * cell['high']:z.1f}]"
+    text += " ≈" if cell["equivalent"] else ""
+    return text + (f" ({cell['seeds']})" if cell["seeds"] and not cell["significant"] else "")
+
+
+def _by_seed(cell: dict | None) -> str:
+    return ", ".join(f"{100 * v:+.1f}" for v in cell["by_seed"]) if cell else "–"
 
 
 def costs(values: dict) -> list[str]:

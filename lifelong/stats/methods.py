@@ -292,7 +292,7 @@ def _differences(
             "value": d.estimate.value,
             "low": float(np.maximum(d.estimate.low, low - high)),
             "high": float(np.minimum(d.estimate.high, high - low)),
-            "by_seed": by_seed,
+            "by_seed": by_seed if np.isfinite(d.estimate.value) else [],
             "p_value": d.p_value,
             "adjusted": p,
             "significant": p < ALPHA,
