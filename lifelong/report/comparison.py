@@ -129,9 +129,9 @@ def _list(names: Sequence[str], most: int) -> str:
 
 def _named(pair: str, m: Mapping[str, Any], seeds: int | None = None) -> str:
     """Return a pair with its difference in percentage points, its interval, and how many seeds would show it."""
-    text = f"{100 * m['value']:+.1f}"
+    text = f"{100 * m['value']:+z.1f}"
     if _known(m["low"]):
-        text += f" [{100 * m['low']:.1f}, {100 * m['high']:.1f}]"
+        text += f" [{100 * m['low']:z.1f}, {100 * m['high']:z.1f}]"
     return f"{pair} ({text.replace('-', '−')}{f'; {seeds} seeds needed' if seeds else ''})"
 
 

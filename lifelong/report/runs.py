@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from libero_env.text import flatten
 from lifelong.errors import LifelongError, ResultsError
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import few_of, resume_notes
@@ -17,6 +18,8 @@ from lifelong.results.results import Results
 from lifelong.stats.metrics import Metrics, lifelong_metrics
 
 _BASICS = ("algo", "benchmark", "policy", "preset")
+# of keys that change no result
+_IGNORED = ("benchmark.order", "data.memory", "eval.reuse", "eval.transfer", "eval.shift")
 # sections of the config
 _COMPARED = ("algo", "policy", "train", "data", "eval", "language", "benchmark", "stream", "pretrain")
 
@@ -174,37 +177,21 @@ def _few(names: Sequence[str], most: int = 4) -> str:
 
 
 def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
+    """Return what two runs of one method have in common: names and settings, without seeds, orders and places."""
     record = run.record
-    basic = {n: getattr(record, n) for n in _BASICS}
-    flat = {k: v for k, v in _flatten(run.config).items() if k.split(".")[0] in _COMPARED}
-    flat = {
-        k.removesuffix("._target_"): str(v).rpartition(".")[2] if k.endswith("._target_") else v
-        for k, v in flat.items()  # a component goes by the name of its class
-    }
-    if "eval.backend" in flat:  # device and memory aside
-        flat["eval.backend"] = record.backend
-    ignored = (
-        "seed",
-        "_partial_",
-        "dir",
-        "path",
-        "benchmark.order",
-        "data.memory",
-        "eval.reuse",
-        "eval.transfer",
-        "eval.shift",
-    )
-    flat = {k: v for k, v in flat.items() if "." in k and not k.endswith(ignored)}
+    settings: dict[str, Any] = {}
+    for key, value in flatten({k: v for k, v in run.config.items() if k in _COMPARED}).items():
+        section, _, name = key.rpartition(".")
+        if key in _IGNORED or name in ("_partial_", "seed", "dir", "path") or not section:
+            continue
+        if name == "_target_":  # a component goes by the name of its class
+            key, value = f"{section}.", str(value).rpartition(".")[2]
+        settings[key] = value if isinstance(value, str | int | float | bool | None) else str(value)
+    if "eval.backend" in settings:  # device and memory aside
+        settings["eval.backend"] = record.backend
     if init_from := run.config.get("init_from"):  # each seed may start from a run of the same seed
-        flat["init_from"] = re.sub(r"seed\d+", "seed", str(init_from))
-    return tuple((basic | dict(sorted(flat.items()))).items())
-
-
-def _flatten(value: Any, prefix: str = "") -> dict[str, Any]:
-    if isinstance(value, dict):
-        parts = (_flatten(v, f"{prefix}.{k}" if prefix else str(k)) for k, v in value.items())
-        return {k: v for part in parts for k, v in part.items()}
-    return {prefix: value if isinstance(value, str | int | float | bool | None) else str(value)}
+        settings["init_from"] = re.sub(r"seed\d+", "seed", str(init_from))
+    return tuple(({n: getattr(record, n) for n in _BASICS} | dict(sorted(settings.items()))).items())
 
 
 def _load_config(path: Path) -> tuple[dict[str, Any], str, list[str]]:

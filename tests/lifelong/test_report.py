@@ -461,12 +461,14 @@ def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Pat
         make_run(tmp_path / "b", "ewc", 2, tasks=2, strength=10),
         make_run(tmp_path / "c", "ewc", 1, tasks=2, strength=500),
         make_run(tmp_path / "d", "er", 1, tasks=2, budget=7),
+        make_run(tmp_path / "e", "er", 1, tasks=2, budget=7, drop_path=0.1),
     ]
     groups = group_runs([load_run(r) for r in runs])
     assert [(g.label, len(g.runs)) for g in groups] == [
         ("ewc (strength 10)", 2),
         ("ewc (strength 500)", 1),
         ("er", 1),
+        ("er (drop_path 0.1)", 1),
     ]
 
 
