@@ -97,6 +97,7 @@ def start_record(*, config: Mapping[str, Any], group_sizes: Sequence[int] = (), 
         facts: Other fields of `RunRecord`; lists become tuples.
     """
     equal = len(set(group_sizes)) < 2
+    fields: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in facts.items()}
     return RunRecord(
         config_digest=config_digest(config),
         versions=installed_versions(),
@@ -105,7 +106,7 @@ def start_record(*, config: Mapping[str, Any], group_sizes: Sequence[int] = (), 
         started=utc_now(),
         group_size=group_sizes[0] if group_sizes and equal else 1,
         group_sizes=() if equal else tuple(group_sizes),
-        **{name: tuple(value) if isinstance(value, list) else value for name, value in facts.items()},
+        **fields,
     )
 
 

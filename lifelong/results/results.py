@@ -173,8 +173,8 @@ class Results:
         for group in self.run.groups:
             row, curve = group[-1], self._group_curves.get(group[-1])
             ended = self.task_end(row) is not None and self.run.cells == "all"
-            for task in group if curve is not None else ():
-                if (row, task) in cells or ended:
+            for task in group:
+                if curve is not None and ((row, task) in cells or ended):
                     best[row, task] = self._curve_points[task][int(curve.epochs[curve.best])]
         return {"matrix": _matrix(size, best | cells), "curve": _matrix(size, cells | best)}
 

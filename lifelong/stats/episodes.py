@@ -7,13 +7,13 @@ were evaluated; how much training again would change needs several runs of each.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special, stats
 
-from lifelong.stats.intervals import Estimate, Floats
+from lifelong.stats.intervals import UNKNOWN, Estimate, Floats
 
 ALPHA = 0.05
 DRAWS = 9999
@@ -119,7 +119,8 @@ def difference(pairs: Pairs, *, draws: int = DRAWS, seed: int = SEED) -> Differe
 
     Args:
         pairs: The outcomes, at least one pair.
-        draws: Number of draws of each bootstrap and of the permutation test.
+        draws: Number of draws of each bootstrap and of the permutation test; 0 for no bootstrap, of policies with one
+            run each.
         seed: Seed of these.
 
     Raises:
@@ -128,17 +129,18 @@ def difference(pairs: Pairs, *, draws: int = DRAWS, seed: int = SEED) -> Differe
     if len(pairs) == 0:
         raise ValueError("no pairs: the policies were not evaluated in the same starts")
     counts = count(pairs) if pairs.single else None
+    value = float(pairs.differences.mean())
     return Difference(
         pairs=len(pairs),
         first=float(pairs.first.mean()),
         second=float(pairs.second.mean()),
-        value=float(pairs.differences.mean()),
+        value=value,
         counts=counts,
         test="McNemar, exact" if counts else "sign flips of each start's difference",
         p_value=mcnemar_exact(counts) if counts else sign_flip_test(pairs.differences, draws, seed),
         score=score_interval(counts) if counts else None,
-        bootstrap=bootstrap_starts(pairs, draws=draws, seed=seed),
-        over_tasks=bootstrap_tasks(pairs, draws=draws, seed=seed),
+        bootstrap=bootstrap_starts(pairs, draws=draws, seed=seed) if draws else replace(UNKNOWN, value=value),
+        over_tasks=bootstrap_tasks(pairs, draws=draws, seed=seed) if draws else None,
         by_chance=chance_difference(counts) if counts else None,
     )
 

@@ -281,7 +281,9 @@ def _differences(
             difference = paired_difference(np.array(by_seed), margin)
         else:
             by_seed = []
-            difference = welch_difference(*(np.array(list(v.values())) for v in (first, second)), margin)
+            difference = welch_difference(
+                np.array(list(first.values())), np.array(list(second.values())), margin
+            )
         rows.append((difference, by_seed))
     adjusted = holm([d.p_value for d, _ in rows])
     equivalent = holm([d.equivalence for d, _ in rows])
