@@ -264,10 +264,8 @@ def steps_until(
             Algorithm(),
             settings=constant,
             seed=seed,
-            device=device_of(policy),
             augment=augment,
             on_epoch=measure,
-            label=f"task {trial.task + 1}",
         )
     return steps, errors
 

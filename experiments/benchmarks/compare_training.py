@@ -67,7 +67,7 @@ def measure_here(path: Path, precision: str, args: argparse.Namespace) -> dict[s
     optimizer = torch.optim.AdamW(policy.parameters(), lr=settings.lr)
     augment = build(config.augmentation)
     plain, whole = (
-        Step(policy, Sequential(), optimizer, settings, torch.device("cpu"), augmentation, Ranks())
+        Step(policy, Sequential(), optimizer, settings, augmentation, Ranks())
         for augmentation in (None, augment)
     )
 

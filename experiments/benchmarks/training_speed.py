@@ -29,7 +29,6 @@ from lifelong.policies import Policy
 from lifelong.seeding import generator
 from lifelong.settings import build
 from lifelong.training.costs import step_costs
-from lifelong.training.distributed import Ranks
 from lifelong.training.precision import keep_freed_memory
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
@@ -96,7 +95,7 @@ def make_step(job: Job, policy: Policy) -> Step:
     variant = {name: value for name, value in VARIANTS[job.variant].items() if name != "channels_last"}
     settings = FitSettings(batch_size=job.batch, **variant)
     optimizer = torch.optim.AdamW(policy.parameters(), lr=settings.lr)
-    return Step(policy, Sequential(), optimizer, settings, torch.device(job.device), None, Ranks())
+    return Step(policy, Sequential(), optimizer, settings)
 
 
 def measure(job: Job) -> dict[str, float | str]:

@@ -94,6 +94,7 @@ class Algorithm:
             augmentation.
         state_form: Form of what the class's own `state_dict` returns, see `lifelong.checkpoints.check`. A state from a
             file is checked by it before `load_state_dict` gets it; without one it is not checked.
+        acts_by_weights: Whether `policy_for` changes values of the policy's parameters and buffers only.
         tuned: Settings that decide what is kept and what is learned, with the values that `libero tune` tries; the
             first is the one it varies unasked. They do not act before the `end_task` of the first task.
         plain_start: Whether the first task is learned as by fine-tuning, with no state before its `end_task`;
@@ -102,6 +103,7 @@ class Algorithm:
 
     augment: Augmentation | None = None
     state_form: ClassVar[Any] = {}
+    acts_by_weights: ClassVar[bool] = False
     tuned: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     plain_start: ClassVar[bool] = False
 
@@ -192,10 +194,9 @@ class Algorithm:
     def acting_state(self, task_index: int, policy: Policy) -> Any:
         """Return what decides how the policy acts on a task besides the tensors of `policy_for`.
 
-        Rollouts whose tensors, acting state and starts are those of earlier ones are not run again. By default nothing
-        else decides where `policy_for` is as here and no layer has hooks, and otherwise everything in `state_dict`,
-        which is always right. An algorithm whose `policy_for` changes values of the policy's parameters and buffers
-        only returns nothing, so that what is frozen is measured once.
+        Rollouts whose tensors, acting state and starts are those of earlier ones are not run again, so that what is
+        frozen is measured once. By default nothing else decides with `acts_by_weights`, or where `policy_for` is as
+        here and no layer has hooks; otherwise everything in `state_dict`, which is always right.
 
         Args:
             task_index: Position of the task in the sequence.
@@ -206,7 +207,7 @@ class Algorithm:
         """
         hooked = any(module._forward_hooks or module._forward_pre_hooks for module in policy.modules())
         plain = type(self).policy_for is Algorithm.policy_for and not hooked
-        return {} if plain else self.state_dict()
+        return {} if plain or self.acts_by_weights else self.state_dict()
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that later tasks depend on: nested dictionaries of tensors, numbers and strings."""

@@ -110,7 +110,7 @@ class DMPEL(RoutedExperts):
         if draws is None:
             return
         self.library.add(task_index, weights_of(layers), self.rank, draws, count=self.experts)
-        count, groups = self.experts * len(self.library.pairs), len(_groups(layers))
+        count, groups = self.experts * len(self.library), len(_groups(layers))
         router = SigmoidRouter.new(queries.shape[1], self.hidden, groups, count, self.top_k, draws)
         self.router = router.to(queries.device)
 
@@ -184,7 +184,8 @@ class DMPEL(RoutedExperts):
             return
         queries = torch.cat([m["queries"] for m in self._memory.values()])
         count = self.router.bias.shape[1]
-        then = torch.cat([_padded(m["coefficients"], count) for m in self._memory.values()])
+        stored = [m["coefficients"] for m in self._memory.values()]
+        then = torch.cat([functional.pad(c, (0, count - c.shape[-1])) for c in stored])
         optimizer = torch.optim.AdamW(self.router.parameters(), lr=self.recall_lr)
         for _ in range(self.recall_steps):
             optimizer.zero_grad()
@@ -200,7 +201,7 @@ class DMPEL(RoutedExperts):
         def add(name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
             if self._now is None or not (counting := self._counting[groups[name]]):
                 return None
-            pairs = [of_task[name] for of_task in self.library.pairs.values()]
+            pairs = [of_task[name] for of_task in self.library.values()]
             rank = pairs[0]["a"].shape[0] // self.experts
             of_tasks = self._now[:, groups[name]].unflatten(1, (-1, self.experts))  # (B, tasks, experts)
             weights = self.scale * of_tasks[:, counting].flatten(1).repeat_interleave(rank, dim=1)
@@ -219,7 +220,7 @@ class DMPEL(RoutedExperts):
     def state_dict(self) -> dict[str, Any]:
         """Return experts, router, stored contexts, and those of the present task's windows."""
         router = {} if self.router is None else {n: p.detach() for n, p in self.router.named_parameters()}
-        kept = {"memory": _copied(self._memory), "episodes": dict(self.episodes)}
+        kept = {"memory": dict(self._memory), "episodes": dict(self.episodes)}
         return {**self._place(), "library": self.library.state(), "router": router, **kept}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
@@ -231,7 +232,7 @@ class DMPEL(RoutedExperts):
         self.router = SigmoidRouter(state["router"], top_k=self.top_k) if state["router"] else None
         _check_shapes(state, self.router)
         self._load_place(state)
-        self._memory, self.episodes = _copied(state["memory"]), dict(state["episodes"])
+        self._memory, self.episodes = dict(state["memory"]), dict(state["episodes"])
         self.library.load(state["library"])
 
 
@@ -282,12 +283,3 @@ class _Routed(Policy):
 def _groups(layers: Mapping[str, nn.Module]) -> list[str]:
     """Return the groups: layers below the same attribute of the policy (`encoders`, `transformer`, `head`)."""
     return sorted({name.partition(".")[0] for name in layers})
-
-
-def _padded(coefficients: Tensor, experts: int) -> Tensor:
-    """Pad coefficients (n, G, N then) with zeros for the experts that came later."""
-    return functional.pad(coefficients, (0, experts - coefficients.shape[-1]))
-
-
-def _copied(tables: Mapping[int, Mapping[str, Tensor]]) -> dict[int, dict[str, Tensor]]:
-    return {task: dict(table) for task, table in tables.items()}

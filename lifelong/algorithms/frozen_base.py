@@ -48,10 +48,6 @@ class FrozenBase(Algorithm):
         if self.library:
             freeze_statistics(policy)
 
-    def sizes(self) -> dict[int, int]:
-        """Return the number of parameters of each task's experts."""
-        return self.library.sizes()
-
     def _place(self) -> dict[str, int]:
         """Return the place in the sequence of tasks, for `state_dict`."""
         return {"task_index": self.task_index, "base_left": self._base_left, "seed": self._seed}

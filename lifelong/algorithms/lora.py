@@ -33,6 +33,7 @@ class LoRA(FrozenBase):
     because a base that has learned one task has no general features. There is no dropout before A.
     """
 
+    acts_by_weights = True
     state_form = {
         **FrozenBase.place_form,
         "base_last": int,
@@ -128,21 +129,12 @@ class LoRA(FrozenBase):
             return
         present = {n: p.detach().clone() for n, p in policy.named_parameters() if n in self.base}
         stage = min(learned)  # index of the last task of a stage
-        sums = {name: self._sum(name, pair) for name, pair in self.library.pairs.get(stage, {}).items()}
+        sums = {name: self._sum(name, pair) for name, pair in self.library.get(stage, {}).items()}
         put_weights(policy, self.base | sums | self._kept.get(stage, {}))
         try:
             yield policy
         finally:
             put_weights(policy, present)
-
-    def acting_state(self, task_index: int, policy: Policy) -> dict[str, Any]:
-        """Return nothing: a task's policy is its weights."""
-        return {}
-
-    def sizes(self) -> dict[int, int]:
-        """Return the number of parameters learned by each task with an adapter, its own copies included."""
-        small = sum(p.numel() for n, p in self.base.items() if matches(n, self.own))
-        return {task: small + size for task, size in super().sizes().items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the base, and every task's A, B and own copies."""
@@ -164,7 +156,7 @@ class LoRA(FrozenBase):
 
     def _present(self) -> Mapping[str, Mapping[str, nn.Parameter]]:
         """Return the present task's pairs; none while the base is learned."""
-        return self.library.pairs.get(self.task_index, {})
+        return self.library.get(self.task_index, {})
 
     def _choose(self, policy: Policy) -> list[str]:
         """Return the names of all parameters that tasks may change."""

@@ -72,7 +72,7 @@ class OMLA(LoRA):
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Begin as LoRA does, and put the task's adapter where the prior is; the first adapter's start is the prior."""
         super().begin_task(task_index, dataset, policy)
-        pairs = self.library.pairs.get(task_index)
+        pairs = self.library.get(task_index)
         if pairs is None or not self.prior_rate:
             return
         if self._prior is None:
@@ -94,7 +94,7 @@ class OMLA(LoRA):
         super().end_task(task_index, dataset, policy, generator)
         if self._prior is None:
             return
-        learned, kept = self.library.pairs[task_index], self._kept[task_index]
+        learned, kept = self.library[task_index], self._kept[task_index]
         self._prior = {
             "pairs": {
                 name: {k: torch.lerp(t, learned[name][k].detach(), self.prior_rate) for k, t in pair.items()}

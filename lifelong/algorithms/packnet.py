@@ -37,6 +37,7 @@ class PackNet(Algorithm):
     takes one epoch more and keeps the one with the best success of every fifth.
     """
 
+    acts_by_weights = True
     state_form = {"task_index": int, "pruned": bool, "owner": Weights()}
 
     def __init__(
@@ -147,10 +148,6 @@ class PackNet(Algorithm):
                 for name, p in policy.named_parameters():
                     if name in whole:
                         p.copy_(whole[name])
-
-    def acting_state(self, task_index: int, policy: Policy) -> dict[str, Any]:
-        """Return nothing: a task's policy is its weights."""
-        return {}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the owners of all weights, and the position in the task."""

@@ -21,6 +21,7 @@ class SingleTask(Algorithm):
     checkpoint.
     """
 
+    acts_by_weights = True
     state_form = {"initial": (None, Weights(complete=True)), "learned": {int: Weights(complete=True)}}
 
     def __init__(self) -> None:
@@ -51,10 +52,6 @@ class SingleTask(Algorithm):
             yield policy
         finally:
             policy.load_state_dict(present)
-
-    def acting_state(self, task_index: int, policy: Policy) -> dict[str, Any]:
-        """Return nothing: a task's policy is its weights."""
-        return {}
 
     def state_dict(self) -> dict[str, Any]:
         """Return the initial weights and those of every learned task."""

@@ -23,7 +23,7 @@ from lifelong.results.run_directory import RunDirectory, read_saved_config
 from lifelong.settings import BenchmarkSettings, Configuration
 from lifelong.streams import Stages, StreamSettings, learning_stages
 from lifelong.training.distributed import Ranks
-from lifelong.training.memory import Need, check_memory, policy_bytes
+from lifelong.training.memory import check_memory, policy_bytes
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def restore(
     instructions = tuple(t.language for t in (*before, *learned))
     spec = data.spec(language.embed(instructions).shape[1])
     weights = policy_bytes(config, spec)
-    check_memory([Need(f"the policy's weights ({path / 'config.yaml'})", weights or 0)])
+    check_memory({f"the policy's weights ({path / 'config.yaml'})": weights or 0})
     policy, algorithm = config.build("policy", spec=spec).to(where), config.build("algo")
     state = RunDirectory(path).checkpoints.load_task(checkpoint, where)
     if state["task"] not in range(len(tasks)):

@@ -24,27 +24,14 @@ _WITH_STATISTICS = (nn.modules.batchnorm._BatchNorm, nn.modules.instancenorm._In
 _MARK = "_has_experts"  # attribute of a policy with experts; copies of it have them too
 
 
-class ExpertLibrary:
-    """Low-rank pairs of every task, by layer; each pair is A (r, inputs) and B (out, r), both trainable.
+class ExpertLibrary(dict[int, dict[str, dict[str, nn.Parameter]]]):
+    """Task -> name of the layer or weight -> a low-rank pair `a` (r, inputs) and `b` (out, r), both trainable.
 
     Attributes:
-        pairs: Task -> name of the layer or weight -> `a` and `b`.
         form: Form of `state`, see `lifelong.checkpoints.check`.
     """
 
     form: ClassVar[Any] = {int: {str: {"a": Tensor, "b": Tensor}}}
-
-    def __init__(self) -> None:
-        self.pairs: dict[int, dict[str, dict[str, nn.Parameter]]] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self.pairs)
-
-    def __contains__(self, task: int) -> bool:
-        return task in self.pairs
-
-    def __getitem__(self, task: int) -> dict[str, dict[str, nn.Parameter]]:
-        return self.pairs[task]
 
     def add(
         self,
@@ -66,36 +53,31 @@ class ExpertLibrary:
             count: Number of experts in a pair, one below the other.
             start: Task whose pairs are copied instead; None, or a task without any: none.
         """
-        if start in self.pairs:
-            copied = {
-                n: {k: nn.Parameter(p.detach().clone()) for k, p in pair.items()}
-                for n, pair in self.pairs[start].items()
+        if start in self:
+            copied = self[start].items()  # type: ignore[index]
+            self[task] = {
+                n: {k: nn.Parameter(p.detach().clone()) for k, p in pair.items()} for n, pair in copied
             }
-            self.pairs[task] = copied
             return
-        self.pairs[task] = {}
+        self[task] = {}
         for name, weight in weights.items():
             out, inputs = weight.flatten(1).shape
             ranks = count * min(rank, out, inputs)
             a = (
                 torch.rand(ranks, inputs, generator=draws) * 2 - 1
-            ) / inputs**0.5  # as PyTorch's linear layers
+            ) / inputs**0.5  # as a linear layer of PyTorch
             b = torch.zeros(out, ranks)  # so that B A is zero at first (Hu et al. 2022, section 4.1)
-            self.pairs[task][name] = {k: nn.Parameter(t.to(weight.device)) for k, t in (("a", a), ("b", b))}
+            self[task][name] = {k: nn.Parameter(t.to(weight.device)) for k, t in (("a", a), ("b", b))}
 
     def parameters(self, task: int) -> list[nn.Parameter]:
         """Return a task's A and B."""
-        return [p for pair in self.pairs[task].values() for p in pair.values()]
-
-    def sizes(self) -> dict[int, int]:
-        """Return the number of parameters of each task's pairs."""
-        return {task: sum(p.numel() for p in self.parameters(task)) for task in self.pairs}
+        return [p for pair in self[task].values() for p in pair.values()]
 
     def state(self) -> dict[int, dict[str, dict[str, Tensor]]]:
         """Return all pairs as tensors."""
         return {
             task: {name: {k: p.detach() for k, p in pair.items()} for name, pair in of_task.items()}
-            for task, of_task in self.pairs.items()
+            for task, of_task in self.items()
         }
 
     def load(self, state: Mapping[int, Mapping[str, Pair]]) -> None:
@@ -107,10 +89,9 @@ class ExpertLibrary:
         for name, pair in ((n, pair) for of_task in state.values() for n, pair in of_task.items()):
             if not (pair["a"].dim() == pair["b"].dim() == 2 and len(pair["a"]) == pair["b"].shape[1]):
                 raise CheckpointError(f"A and B of the experts of {name} do not go together")
-        self.pairs = {
-            task: {name: {k: nn.Parameter(t) for k, t in pair.items()} for name, pair in of_task.items()}
-            for task, of_task in state.items()
-        }
+        self.clear()
+        for task, of_task in state.items():
+            self[task] = {n: {k: nn.Parameter(t) for k, t in pair.items()} for n, pair in of_task.items()}
 
 
 class Attachment:

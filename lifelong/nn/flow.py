@@ -111,10 +111,6 @@ class FlowHead(ActionHead):
             x = x + self.velocity(x, time, params["latent"], params["slots"]) / self.steps
         return x
 
-    def mode(self, params: dict[str, Tensor]) -> Tensor:
-        """Return the first action of the chunk from zero noise: the exact mean where actions are Gaussian."""
-        return self.mean(params)
-
     def mean(self, params: dict[str, Tensor]) -> Tensor:
         """Return the first action of the chunk from zero noise, (..., A), with gradients through all steps.
 

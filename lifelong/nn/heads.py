@@ -35,9 +35,9 @@ class ActionHead(nn.Module, ABC):
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
         """Return the loss of each action, (..., A) -> (...)."""
 
-    @abstractmethod
     def mode(self, params: dict[str, Tensor]) -> Tensor:
-        """Return the most likely action, (..., A)."""
+        """Return the most likely action, (..., A); by default the mean."""
+        return self.mean(params)
 
     @abstractmethod
     def mean(self, params: dict[str, Tensor]) -> Tensor:
@@ -240,10 +240,6 @@ class DeterministicHead(ActionHead):
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
         """Return the absolute error, mean over the action's dimensions, (..., A) -> (...)."""
         return (actions.float() - params["means"]).abs().mean(-1)
-
-    def mode(self, params: dict[str, Tensor]) -> Tensor:
-        """Return the action, (..., A)."""
-        return params["means"]
 
     def mean(self, params: dict[str, Tensor]) -> Tensor:
         """Return the action, (..., A)."""

@@ -213,12 +213,10 @@ class TaskSequence:
                 statistics_first=context.fit.statistics_first and not phase.number,
             ),
             seed=(context.seed, FIT, phase.task, phase.number),
-            device=context.device,
             augment=context.augment,
             on_epoch=lambda end: context.ranks.broadcast(self._after_epoch, phase, end),
             resume=resume,
-            label=f"task {phase.task + 1} {phase.kind.name}",
-            progress=bool(context.progress),
+            progress=f"task {phase.task + 1} {phase.kind.name}" if context.progress else None,
             ranks=context.ranks,
         )
         if phase.selects_best:

@@ -16,7 +16,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import check, load_weights
 from lifelong.data.windows import WindowDataset, batches_in_order
 from lifelong.errors import CheckpointError, TrainingError
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of
 from lifelong.seeding import generator, seeded
 from lifelong.training.distributed import Ranks
 from lifelong.training.settings import FitSettings
@@ -64,12 +64,10 @@ def fit(
     *,
     settings: FitSettings,
     seed: Sequence[int],
-    device: torch.device | str = "cpu",
     augment: BatchAugmentation | None = None,
     on_epoch: Callable[[EpochEnd], None] = lambda end: None,
     resume: dict[str, Any] | None = None,
-    label: str = "",
-    progress: bool = False,
+    progress: str | None = None,
     ranks: Ranks = Ranks(),  # noqa: B008 - frozen
     step: TrainStep | None = None,
     load: Callable[[Sequence[Tensor]], Iterable[Batch]] | None = None,
@@ -88,12 +86,10 @@ def fit(
             the algorithm's state.
         settings: Epochs, batch size and optimiser.
         seed: Integers that identify this call within the run.
-        device: Device of the policy.
         augment: Augmentation of each mixed batch, with the epoch's generator.
         on_epoch: Function called at the end of each epoch, at epoch 0 too, and again for the epoch resumed from.
         resume: State from `EpochEnd.state` to continue from.
-        label: Text before the progress bar.
-        progress: Whether to show a progress bar with the remaining time.
+        progress: Text before a progress bar with the remaining time; None for no bar.
         ranks: Rank of this process among those that train together.
         step: Function that moves the weights once, given a batch, the epoch's generator and the learning rate, and
             returns the loss and the penalty. Default: `Step` with AdamW.
@@ -106,9 +102,9 @@ def fit(
     """
     if not len(dataset):
         raise TrainingError("the dataset has no windows: check that its demonstrations are not empty")
-    device, size = torch.device(device), settings.batch_size
+    device, size = device_of(policy), settings.batch_size
     optimizer = _make_optimizer(algorithm.trained(policy), settings, policy)
-    default_step = Step(policy, algorithm, optimizer, settings, device, augment, ranks)
+    default_step = Step(policy, algorithm, optimizer, settings, augment, ranks)
     step, load = step or default_step, load or partial(batches_in_order, dataset)
     steps, windows = _epoch_size(len(dataset), settings)
     first, loss, penalty = 0, math.nan, 0.0
@@ -116,10 +112,10 @@ def fit(
         first, loss, penalty = _load(policy, optimizer, resume)
     elif settings.statistics_first:
         with seeded(*seed, 0, 2, device=device):
-            _adapt_statistics(policy, dataset, algorithm, size, device, augment, generator(*seed, 0, 3))
+            _adapt_statistics(policy, dataset, algorithm, size, augment, generator(*seed, 0, 3))
     own_draws = () if ranks.first else (ranks.rank,)  # dropout differs between ranks
     on_epoch(EpochEnd(first, loss, penalty, 0.0, policy, optimizer))
-    make_bar = partial(tqdm, desc=label, disable=not progress, unit="step", leave=False)
+    make_bar = partial(tqdm, desc=progress, disable=progress is None, unit="step", leave=False)
     with make_bar(total=settings.epochs * steps, initial=first * steps) as bar:
         for epoch in range(first, settings.epochs):
             began, draws = time.perf_counter(), generator(*seed, epoch, 0)
@@ -190,7 +186,6 @@ def _adapt_statistics(
     dataset: WindowDataset,
     algorithm: Algorithm,
     size: int,
-    device: torch.device,
     augment: BatchAugmentation | None,
     draws: torch.Generator,
 ) -> None:
@@ -200,7 +195,7 @@ def _adapt_statistics(
         return
     for indices in torch.randperm(len(dataset), generator=draws).split(size):
         batch = dataset.batch(indices)
-        policy.loss((batch if augment is None else augment(batch, draws)).to(device))
+        policy.loss((batch if augment is None else augment(batch, draws)).to(device_of(policy)))
 
 
 def _shuffled_indices(windows: int, count: int, draws: torch.Generator) -> Tensor:

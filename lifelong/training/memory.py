@@ -6,12 +6,12 @@ where `data.memory` keeps them in memory (`FRAMES` of each); the images of the e
 Activations, the simulator and copies come on top.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import torch
 
 from libero_env.memory import memory_limit
+from libero_env.text import show_bytes
 from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError
 from lifelong.settings import Configuration
@@ -19,19 +19,6 @@ from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 
 FRAMES = 20  # of a demonstration; fewer than any task takes
-
-
-@dataclass(frozen=True)
-class Need:
-    """Memory that something needs at least.
-
-    Attributes:
-        what: What needs it, with the keys on which it depends.
-        nbytes: Number of bytes.
-    """
-
-    what: str
-    nbytes: int
 
 
 def policy_bytes(config: Configuration, spec: PolicySpec) -> int | None:
@@ -60,14 +47,9 @@ def policy_bytes(config: Configuration, spec: PolicySpec) -> int | None:
 
 
 def training_needs(
-    data: DataSettings,
-    fit: FitSettings,
-    weights: int | None,
-    demos: int,
-    episodes: int,
-    replayed: float,
-) -> list[Need]:
-    """Return what training and evaluation need at least.
+    data: DataSettings, fit: FitSettings, weights: int | None, demos: int, episodes: int, replayed: float
+) -> dict[str, int]:
+    """Return the number of bytes that training and evaluation need at least, by what needs them.
 
     Args:
         data: Images and windows.
@@ -78,45 +60,37 @@ def training_needs(
         replayed: Windows that the algorithm adds for each of the batch.
     """
     pixels = len(data.views) * data.image_size**2 * 3
-    windows = int(fit.batch_size * (1 + replayed))
-    images = windows * data.seq_len * pixels
+    images = int(fit.batch_size * (1 + replayed)) * data.seq_len * pixels
     if weights is not None:
         images += 2 * (images // fit.accumulate)
-    shape = f"data.image_size={data.image_size}"
-    needs = [
-        Need(f"a batch (train.batch_size={fit.batch_size}, data.seq_len={data.seq_len}, {shape})", images),
-        Need(f"the images of {episodes} episodes ({shape})", episodes * pixels),
-    ]
+    size = f"data.image_size={data.image_size}"
+    needs = {
+        f"a batch (train.batch_size={fit.batch_size}, data.seq_len={data.seq_len}, {size})": images,
+        f"the images of {episodes} episodes ({size})": episodes * pixels,
+    }
     if weights is not None:
-        needs.append(Need("the policy's weights, their gradients and Adam's moments (policy)", 4 * weights))
+        needs["the policy's weights, their gradients and Adam's moments (policy)"] = 4 * weights
     if data.memory in ("host", "pinned", "device"):
-        frames = demos * FRAMES * pixels
-        needs.append(Need(f"demonstrations (data.demos={demos}, data.memory={data.memory}, {shape})", frames))
+        where = f"demonstrations (data.demos={demos}, data.memory={data.memory}, {size})"
+        needs[where] = demos * FRAMES * pixels
     return needs
 
 
-def check_memory(needs: Sequence[Need], available: int | None = None) -> None:
+def check_memory(needs: Mapping[str, int], available: int | None = None) -> None:
     """Refuse what this machine's memory cannot hold.
 
     Args:
-        needs: What is needed at the same time.
+        needs: Number of bytes that are needed at the same time, by what needs them.
         available: Number of bytes that there are. None: of this machine.
 
     Raises:
-        ConfigError: It does not fit; the message has the estimate of each part.
+        ConfigError: It does not fit; the message has the estimate of the largest parts.
     """
-    total, available = sum(need.nbytes for need in needs), memory_limit() if available is None else available
+    total, available = sum(needs.values()), memory_limit() if available is None else available
     if total > available:
-        parts = [need for need in sorted(needs, key=lambda n: -n.nbytes) if need.nbytes * 20 >= total]
-        listed = ", ".join(f"{_amount(need.nbytes)} for {need.what}" for need in parts)
+        parts = [what for what in sorted(needs, key=lambda w: -needs[w]) if needs[what] * 20 >= total]
+        listed = ", ".join(f"{show_bytes(needs[what])} for {what}" for what in parts)
         raise ConfigError(
-            f"this needs at least {_amount(total)} of memory, and there are {_amount(available)}: {listed}. "
+            f"this needs at least {show_bytes(total)} of memory, and there are {show_bytes(available)}: {listed}. "
             "Lower one of these"
         )
-
-
-def _amount(nbytes: int) -> str:
-    amount, units = float(nbytes), ["bytes", "KiB", "MiB", "GiB", "TiB", "PiB", "EiB"]
-    while amount >= 1024 and len(units) > 1:
-        amount, units = amount / 1024, units[1:]
-    return f"{amount:.3g} {units[0]}" if amount < 1e4 else f"{amount:.0e} {units[0]}"

@@ -4,17 +4,14 @@ import ctypes
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
-from typing import Any
 
 import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from lifelong.errors import ConfigError, TrainingError
-
-COMPILE_MODES = ("off", "default", "reduce-overhead")
 
 _CUBLAS = "CUBLAS_WORKSPACE_CONFIG"
 _PROBE = """
@@ -101,19 +98,6 @@ def deterministic(on: bool) -> Iterator[None]:
             os.environ.pop(_CUBLAS, None)
 
 
-def compiled(function: Callable[..., Any], mode: str) -> Callable[..., Any]:
-    """Return a function compiled by `torch.compile`. A module it is a method of keeps its names and weights.
-
-    Args:
-        function: Function to compile, at its first call with arguments of each type and shape.
-        mode: `off`: the function unchanged; `default`; `reduce-overhead`: on a GPU as CUDA graphs, which save
-            kernel launches. The output of such a function is overwritten by its next call.
-    """
-    if mode == "off":
-        return function
-    return torch.compile(function, mode=None if mode == "default" else mode)
-
-
 def check_compiler(device: torch.device) -> None:
     """Compile a small function, so that a missing compiler is reported before a run starts.
 
@@ -124,7 +108,7 @@ def check_compiler(device: torch.device) -> None:
         ConfigError: Compilation does not work on this machine.
     """
     try:
-        torch.compile(_small_function)(torch.ones(64, device=device))
+        torch.compile(lambda x: (x.sin() + 1).sum())(torch.ones(64, device=device))
     except (RuntimeError, ImportError, OSError) as error:
         needed = "Triton and a C compiler" if device.type == "cuda" else "a C++ compiler such as g++"
         reason = next((line for line in reversed(str(error).strip().splitlines()) if line.strip()), "")
@@ -150,7 +134,3 @@ def keep_freed_memory() -> bool:
     except (AttributeError, OSError, TypeError):  # not glibc
         return False
     return all(mallopt(*pair) for pair in ((mmap_max, 0), (trim_threshold, 2**31 - 1), (top_pad, 2**28)))
-
-
-def _small_function(x: torch.Tensor) -> torch.Tensor:
-    return (x.sin() + 1).sum()

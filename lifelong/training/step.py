@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm
 from lifelong.errors import ConfigError
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, device_of
 from lifelong.training.distributed import Ranks
-from lifelong.training.precision import autocast, compiled
+from lifelong.training.precision import autocast
 from lifelong.training.settings import FitSettings
 from lifelong.types import Batch
 
@@ -32,7 +32,6 @@ class Step:
         algorithm: Algorithm whose hooks are called; see `lifelong.algorithms.base`.
         optimizer: Optimiser of the parameters that the algorithm trains.
         settings: Number of micro-batches, precision, compilation and gradient clipping.
-        device: Device of the policy.
         augment: Augmentation of the mixed batch.
         ranks: Rank of this process among those that train together.
         loss_scale: Factor of the gradients before they are clipped.
@@ -45,7 +44,6 @@ class Step:
     algorithm: Algorithm
     optimizer: torch.optim.Optimizer
     settings: FitSettings
-    device: torch.device
     augment: BatchAugmentation | None = None
     ranks: Ranks = Ranks()
     loss_scale: float = 1.0
@@ -133,12 +131,20 @@ class Step:
         return autocast(self.device, self.settings.precision)
 
     @cached_property
+    def device(self) -> torch.device:
+        """Device of the policy."""
+        return device_of(self.policy)
+
+    @cached_property
     def _optimized(self) -> list[Tensor]:
         return [p for group in self.optimizer.param_groups for p in group["params"]]
 
     @cached_property
     def _loss(self) -> Callable[[Batch], Tensor]:
-        return compiled(self.policy.loss, self.settings.compile)
+        mode = self.settings.compile
+        if mode == "off":
+            return self.policy.loss
+        return torch.compile(self.policy.loss, mode=None if mode == "default" else mode)
 
     @property
     def _uses_cuda_graphs(self) -> bool:

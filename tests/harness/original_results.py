@@ -40,7 +40,7 @@ def one_step(policy: Policy, batch: Batch, algorithm: Algorithm) -> float:
         weight_decay=settings.weight_decay,
     )
     algorithm.mode_train(policy)
-    loss, _ = Step(policy, algorithm, optimizer, settings, torch.device("cpu"))(batch, generator(0))
+    loss, _ = Step(policy, algorithm, optimizer, settings)(batch, generator(0))
     return loss.item()
 
 

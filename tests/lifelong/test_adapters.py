@@ -147,12 +147,13 @@ def test_later_tasks_are_learned_on_a_frozen_base(make, kind):
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
 def test_adapters_grow_by_the_same_number_with_each_task(make):
-    policy, algorithm = make_policy(), make()
+    policy, algorithm, sizes = make_policy(), make(), []
     for task in range(4):
         learn_small(algorithm, policy, task)
-        assert list(algorithm.sizes()) == list(range(1, task + 1))
-    assert len(set(algorithm.sizes().values())) == 1 or isinstance(algorithm, CLARE)
-    assert 0 < algorithm.sizes()[1] < sum(p.numel() for p in policy.parameters())
+        assert list(algorithm.library) == list(range(1, task + 1))
+        sizes += [sum(p.numel() for p in algorithm.library.parameters(task))] if task else []
+    assert len(set(sizes)) == 1 or isinstance(algorithm, CLARE)
+    assert 0 < sizes[0] < sum(p.numel() for p in policy.parameters())
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)

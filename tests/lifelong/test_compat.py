@@ -183,9 +183,7 @@ def test_packnet_zeroes_frozen_gradients_after_they_are_clipped_as_the_original_
     optimizer = torch.optim.SGD(algorithm.trained(policy), lr=0.0)
     settings = FitSettings(grad_clip=1e-3, precision="fp32")
     algorithm.mode_train(policy)
-    Step(policy, algorithm, optimizer, settings, torch.device("cpu"))(
-        Windows(1).batch(torch.arange(8)), generator(0)
-    )
+    Step(policy, algorithm, optimizer, settings)(Windows(1).batch(torch.arange(8)), generator(0))
     left = torch.stack([p.grad.norm() for p in policy.parameters() if p.grad is not None]).norm().item()
     assert left == pytest.approx(1e-3, rel=1e-3) if compat == "none" else 0 < left < 0.99e-3
     owned = algorithm.state_dict()["owner"]["head.weight"] == 1

@@ -211,7 +211,7 @@ def test_iscil_starts_from_the_base_where_that_is_nearest():
 
 def test_policies_that_iscil_cannot_embed_are_named():
     algorithm = iscil(base_tasks=0)
-    algorithm.library.pairs[0] = {}
+    algorithm.library[0] = {}
     with pytest.raises(ConfigError, match="DeepPolicy has no encode"), algorithm.policy_for(0, DeepPolicy()):
         pass
 

@@ -17,7 +17,7 @@ from lifelong.errors import ConfigError
 from lifelong.results.run_directory import RunDirectory
 from lifelong.settings import GROUPS, Configuration, build, plain_data
 from lifelong.training.distributed import Ranks
-from lifelong.training.memory import Need, check_memory, policy_bytes, training_needs
+from lifelong.training.memory import check_memory, policy_bytes, training_needs
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 from tests.harness.configs import composed
@@ -210,17 +210,17 @@ def test_measuring_a_policy_draws_nothing(whole):
 def test_memory_that_there_is_not_is_refused_with_the_estimate():
     data = DataSettings(50, 128, 10, ["agentview_rgb"], [], memory="host")
     needs = training_needs(data, FitSettings(batch_size=64), 1 << 20, demos=50, episodes=20, replayed=0.0)
-    assert {need.nbytes for need in needs} == {
+    assert set(needs.values()) == {
         3 * 64 * 10 * 128 * 128 * 3,  # a byte, and two in half precision
         20 * 128 * 128 * 3,
         4 << 20,
         50 * 20 * 128 * 128 * 3,
     }
     check_memory(needs, available=1 << 40)
-    with pytest.raises(ConfigError, match=r"at least .* of memory, and there are 1 MiB: 90 MiB for a batch"):
+    with pytest.raises(
+        ConfigError, match=r"at least .* of memory, and there are 1\.0 MB: 94\.4 MB for a batch"
+    ):
         check_memory(needs, available=1 << 20)
-    with pytest.raises(ConfigError, match=r"this needs at least 9e.11 EiB"):
-        check_memory([Need("much", 10**30)])
 
 
 def test_the_estimate_counts_demonstrations_only_where_they_are_in_memory():

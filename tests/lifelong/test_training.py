@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import nn
 
+from libero_env.errors import InvalidInputError
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, Sequential
 from lifelong.data import fake_batch
@@ -15,7 +16,7 @@ from lifelong.errors import ConfigError, TrainingError
 from lifelong.seeding import generator
 from lifelong.training.distributed import Ranks
 from lifelong.training.fit import fit, learning_rate
-from lifelong.training.precision import check_compiler, compiled, deterministic
+from lifelong.training.precision import check_compiler, deterministic
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 from lifelong.types import Batch, PolicySpec
@@ -163,7 +164,7 @@ def test_user_defined_step_and_loader_run_in_the_same_loop():
 
     def own_step(one, scale):
         optimizer = torch.optim.SGD(one.parameters(), lr=0.1 / scale)
-        step = Step(one, Sequential(), optimizer, settings, torch.device("cpu"), loss_scale=scale)
+        step = Step(one, Sequential(), optimizer, settings, loss_scale=scale)
 
         def call(batch, draws, lr):
             rates.append(lr)
@@ -224,7 +225,7 @@ def test_an_empty_dataset_is_an_error():
     [("epochs", 0), ("batch_size", 0), ("precision", "fp8"), ("accumulate", 0), ("compile", "max-autotune")],
 )
 def test_invalid_settings_are_named(key, value):
-    with pytest.raises(ConfigError, match=key):
+    with pytest.raises(InvalidInputError, match=key):
         FitSettings(**{key: value})
 
 
@@ -315,8 +316,7 @@ def test_a_policys_loss_can_be_compiled_and_is_the_same(name, traced):
     torch.manual_seed(0)
     policy = POLICIES[name]().train()
     batch = fake_batch(SMALL, 3, generator(0))
-    assert torch.equal(compiled(policy.loss, "default")(batch), policy.loss(batch))
-    assert [mode for _, mode in traced] == [None]
+    assert torch.equal(torch.compile(policy.loss)(batch), policy.loss(batch))
 
 
 def test_compiled_training_keeps_names_and_numbers(traced):
@@ -361,7 +361,6 @@ def test_compiled_training_on_a_gpu(mode, parts):
             Sequential(),
             settings=settings,
             seed=(1,),
-            device="cuda",
             on_epoch=ends.append,
         )
         losses.append([end.loss for end in ends[1:]])

@@ -17,7 +17,6 @@ from libero._adapters.lookup import lookup
 from libero.lifelong.metric import evaluate_success, mean_loss
 from libero.lifelong.models import get_policy_class
 from libero.lifelong.utils import (
-    available_device,
     create_experiment_dir,
     safe_device,
     torch_load_model,
@@ -139,8 +138,8 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
     def observe(self, data: Mapping[str, Any]) -> float:
         """Make one step of the optimiser on a batch; return the loss."""
         settings = FitSettings(grad_clip=self.cfg.train.grad_clip or 0.0, precision="fp32")
-        device, batch = available_device(self.cfg.device), cast(Any, DictBatch(dict(data)))
-        step = Step(self.policy, self.hooks, self.optimizer, settings, device, loss_scale=self.loss_scale)
+        batch = cast(Any, DictBatch(dict(data)))
+        step = Step(self.policy, self.hooks, self.optimizer, settings, loss_scale=self.loss_scale)
         loss, _ = step(batch, self.draws, None)
         return loss.item()
 
@@ -262,7 +261,6 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
                 self.hooks,
                 settings=FitSettings(epochs=epochs, batch_size=train.batch_size),
                 seed=(self.cfg.seed, self.current_task + 1, phase),
-                device=available_device(self.cfg.device),
                 on_epoch=end_epoch,
                 step=step,
                 load=windows.load,
