@@ -337,6 +337,7 @@ _WORDS = {
     **dict.fromkeys(("dict_type", "mapping_type", "model_type"), "keys with values"),
     **dict.fromkeys(("dataclass_type", "dataclass_exact_type"), "keys with values"),
     "python_tuple_type": "a tuple",
+    "sequence_str": "a list",
     "float_type": "a number",
     "finite_number": "a finite number",
     "bool_type": "true or false",

@@ -68,7 +68,7 @@ def _words(goal: Iterable[str], names: Mapping[str, str]) -> str:
     for atom in goal:
         if len(words := atom.strip("() ").split()) < 2:
             raise InvalidInputError(
-                f"--goal {atom!r:.80} is no atom; expected such as 'On red_coffee_mug_1 plate_1'"
+                f"--goal {atom!r:.80} is not an atom; expected such as 'On red_coffee_mug_1 plate_1'"
             )
         predicate, *args = words
         plain = [names.get(arg, arg).replace("_", " ").replace(" 1", "") for arg in args]

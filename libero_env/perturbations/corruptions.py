@@ -138,8 +138,8 @@ def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
 def _enlarged(image: np.ndarray, factor: float) -> np.ndarray:
     """Return the middle of an image (H, W, 3), enlarged to its size."""
     sides = np.array(image.shape[:2])
-    kept = np.ceil(sides / factor).astype(int)
-    (top, left), (height, width) = (sides - kept) // 2, kept
+    inner = np.ceil(sides / factor).astype(int)
+    (top, left), (height, width) = (sides - inner) // 2, inner
     large = ndimage.zoom(image[top : top + height, left : left + width], (factor, factor, 1), order=1)
     (top, left), (height, width) = (large.shape[:2] - sides) // 2, sides
     return large[top : top + height, left : left + width]
@@ -177,12 +177,12 @@ def _around(sums: np.ndarray, roughness: float, rng: np.random.Generator) -> np.
 def _small_integers(rng: np.random.Generator, below: int, count: int) -> np.ndarray:
     """Return integers from 0, as `RandomState.randint` draws them: words whose low bits are too large are left out."""
     mask = (1 << (below - 1).bit_length()) - 1
-    found, missing = [], count
+    accepted, missing = [], count
     while missing:
         words = rng.integers(1 << 32, size=missing, dtype=np.uint32) & mask
-        found.append(words[words < below])
-        missing -= len(found[-1])
-    return np.concatenate(found).astype(np.int64)
+        accepted.append(words[words < below])
+        missing -= len(accepted[-1])
+    return np.concatenate(accepted).astype(np.int64)
 
 
 @compiled

@@ -27,10 +27,10 @@ def other_goals(task: Task) -> list[Task]:
     Raises:
         InvalidInputError: There is none.
     """
-    found = list(_of_same_scene(task)) or list(_of_other_objects(task)) or list(_of_other_places(task))
-    if not found:
+    goals = list(_of_same_scene(task)) or list(_of_other_objects(task)) or list(_of_other_places(task))
+    if not goals:
         raise InvalidInputError(f"{task.id} has no other goal: no task of the benchmark begins as it does")
-    return found
+    return goals
 
 
 def _of_same_scene(task: Task) -> Iterator[Task]:
@@ -65,12 +65,12 @@ def _of_other_objects(task: Task) -> Iterator[Task]:
     categories = list(problem.objects.values())
     for name, category in problem.objects.items():
         alone = categories.count(category) == 1 and category in names
-        if own is None or not alone or name in atom.args or not any(own in t for t in _told(task)):
+        if own is None or not alone or name in atom.args or not any(own in t for t in _instructions(task)):
             continue
         if any(arg.startswith(name) for arg in atom.args):  # it is where the object belongs
             continue
         changed = And((Atom(atom.predicate, (name, *atom.args[1:])),))
-        language, bddl_language = (text.replace(own, names[category]) for text in _told(task))
+        language, bddl_language = (text.replace(own, names[category]) for text in _instructions(task))
         interest = entities_in_goal(changed, problem.regions, problem.objects, problem.fixtures)
         own_problem = replace(problem, goal=changed, language=bddl_language, obj_of_interest=tuple(interest))
         yield replace(task, language=language, bddl_language=bddl_language, problem=own_problem)
@@ -88,10 +88,10 @@ def _of_other_places(task: Task) -> Iterator[Task]:
         words = _PLACES.get((problem.fixtures.get(region.target, ""), region.name))
         if words is None or start.startswith(region.target):
             continue
-        if not all(text.endswith(_ON_PLATE) for text in _told(task)):
+        if not all(text.endswith(_ON_PLATE) for text in _instructions(task)):
             continue
         changed = And((Atom("On", (carried, region.address)),))
-        language, bddl_language = (text.removesuffix(_ON_PLATE) + words for text in _told(task))
+        language, bddl_language = (text.removesuffix(_ON_PLATE) + words for text in _instructions(task))
         own = replace(problem, goal=changed, language=bddl_language, obj_of_interest=(carried, region.target))
         yield replace(task, language=language, bddl_language=bddl_language, problem=own)
 
@@ -102,7 +102,7 @@ def is_named(category: str, text: str) -> bool:
     return name in text if name else bool({*category.split("_")} & {*text.split()})
 
 
-def _told(task: Task) -> tuple[str, str]:
+def _instructions(task: Task) -> tuple[str, str]:
     return task.language, task.bddl_language
 
 
@@ -123,7 +123,7 @@ def _scene_of(problem: Problem) -> tuple[object, ...]:
 
 @cache
 def _by_scene() -> dict[tuple[object, ...], list[Task]]:
-    found: dict[tuple[object, ...], list[Task]] = {}
+    tasks: dict[tuple[object, ...], list[Task]] = {}
     for task in dict.fromkeys(task for name in suite_names() for task in get_suite(name).tasks):
-        found.setdefault(_scene_of(task.problem), []).append(task)
-    return found
+        tasks.setdefault(_scene_of(task.problem), []).append(task)
+    return tasks

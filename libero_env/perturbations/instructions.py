@@ -15,7 +15,7 @@ import numpy as np
 from libero_env.storage import read_yaml
 
 _CANDIDATES = 400
-_KEPT = re.compile(
+_UNSPLIT = re.compile(
     r"yellow and white|plate and the ramekin|both .+? and .+? (?=in |on )|and (?:place|put) it"
 )
 
@@ -73,30 +73,30 @@ def _reworded(sentence: str, rng: np.random.Generator) -> str:
 
 def split_clauses(sentence: str) -> list[str]:
     """Return the clauses of a sentence, which `and` joins."""
-    kept = _KEPT.sub(lambda found: found[0].replace(" and ", " & ").replace("and p", "& p"), sentence)
-    return [clause.replace("&", "and") for clause in kept.split(" and ")]
+    joined = _UNSPLIT.sub(lambda match: match[0].replace(" and ", " & ").replace("and p", "& p"), sentence)
+    return [clause.replace("&", "and") for clause in joined.split(" and ")]
 
 
 def _say(clause: str, boldness: float, rng: np.random.Generator) -> str:
     """Return a clause in other words."""
     wording = _wording()
     for name, pattern in _patterns().items():
-        if found := pattern.match(clause):
-            parts = found.groupdict()
+        if match := pattern.match(clause):
+            parts = match.groupdict()
             named = {key: _rename(text, boldness, rng) for key, text in parts.items() if key != "r"}
             if relation := parts.get("r"):
                 named["r"] = _pick(wording["relations"][relation], boldness, rng)
                 named["at"] = _pick(wording["places"][relation], boldness, rng)
-            ways = [_own_way(found), *wording["clauses"][name]["ways"]]
+            ways = [_own_way(match), *wording["clauses"][name]["ways"]]
             return _pick(ways, boldness, rng).format(**named)
     return _rename(clause, boldness, rng)
 
 
-def _own_way(found: re.Match[str]) -> str:
+def _own_way(match: re.Match[str]) -> str:
     """Return the way in which a clause is said, with its things and relation left open."""
-    way = found.string
-    for key in sorted(found.groupdict(), key=found.start, reverse=True):
-        way = f"{way[: found.start(key)]}{{{key}}}{way[found.end(key) :]}"
+    way = match.string
+    for key in sorted(match.groupdict(), key=match.start, reverse=True):
+        way = f"{way[: match.start(key)]}{{{key}}}{way[match.end(key) :]}"
     return way
 
 

@@ -37,8 +37,10 @@ def _objects(share: float, rng: np.random.Generator, task: Task, scene: Scene) -
     }
     free = _unnamed(task, scene)
     roots = carried(problem)
-    told = f"{task.language} {task.bddl_language}".lower()
-    alone = [n for n in roots if not roots[n] and n not in used and not is_named(problem.objects[n], told)]
+    instructions = f"{task.language} {task.bddl_language}".lower()
+    alone = [
+        n for n in roots if not roots[n] and n not in used and not is_named(problem.objects[n], instructions)
+    ]
     chosen = [alone[i] for i in rng.permutation(len(alone))][: max(1, round(share * len(alone)))]
     others = {name: free[i] for name, i in zip(chosen, rng.permutation(len(free)), strict=False)}
     if not others:
@@ -141,11 +143,11 @@ def _groups(problem: Problem) -> list[list[str]]:
     ):
         return [list(roots)]
     on_table = any(_is_place(problem, name) for atom in atoms for name in atom.args[1:])
-    kept = {name for atom in atoms for name in _objects_of(problem, atom.args[1:])}
+    fixed = {name for atom in atoms for name in _objects_of(problem, atom.args[1:])}
     if on_table:  # such as `to the right of the plate`: what is named beside it is a landmark
         words = set(problem.language.lower().split())
-        kept |= {n for n, c in problem.objects.items() if words & set(c.split("_")) and n not in taken}
-    return [[name] for name in roots if name not in kept]
+        fixed |= {n for n, c in problem.objects.items() if words & set(c.split("_")) and n not in taken}
+    return [[name] for name in roots if name not in fixed]
 
 
 def _is_place(problem: Problem, name: str) -> bool:

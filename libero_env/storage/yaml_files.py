@@ -69,10 +69,10 @@ def read_yaml_file(path: str | Path) -> YamlFile:
     """
     path = Path(path)
     try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):  # a pipe has no end, and a device no size
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):  # a pipe has no end, and a device no size
             raise InvalidInputError(f"{path} is a folder, a pipe or a device; expected a YAML file")
-        if found.st_size > MAX_YAML_BYTES:
+        if status.st_size > MAX_YAML_BYTES:
             raise InvalidInputError(
                 f"{path} is larger than {MAX_YAML_BYTES >> 20} MiB; expected a short YAML file"
             )

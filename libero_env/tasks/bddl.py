@@ -225,7 +225,7 @@ class _Reader:
 
     def names(self, section: List) -> dict[str, str]:
         """Return {a_1: a, a_2: a, b_1: b} for `a_1 a_2 - a  b_1 - b`."""
-        found: dict[str, str] = {}
+        categories: dict[str, str] = {}
         waiting: list[tuple[str, int]] = []
         items = iter(section.items[1:])
         for item in items:
@@ -238,24 +238,24 @@ class _Reader:
                     item.line, "a - without names before it or a category after it", "NAME NAME - CATEGORY"
                 )
             for name, line in waiting:
-                if name in found:
+                if name in categories:
                     self.fail(line, f"{name} is declared twice", "each name declared once")
-                found[name] = self.word(category)
+                categories[name] = self.word(category)
             waiting = []
         if waiting:
             name, line = waiting[0]
             self.fail(line, f"{name} has no category", "NAME NAME - CATEGORY")
-        return found
+        return categories
 
     def regions(self, nodes: tuple[Word | List, ...]) -> tuple[Region, ...]:
         """Return the regions of the section `:regions`."""
-        found: dict[str, Region] = {}
+        regions: dict[str, Region] = {}
         for node in nodes:
             region = self.region(node)
-            if region.address in found:
+            if region.address in regions:
                 self.fail(node.line, f"{region.address} is declared twice", "each region of a target once")
-            found[region.address] = region
-        return tuple(found.values())
+            regions[region.address] = region
+        return tuple(regions.values())
 
     def region(self, node: Word | List) -> Region:
         """Return the region of one entry of `:regions`."""

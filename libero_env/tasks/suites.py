@@ -142,8 +142,8 @@ def get_task(key: str) -> Task:
             f"(`libero tasks list {key}`)"
         )
     for mark in "/-":
-        suite_name, found, index = key.rpartition(mark)
-        if found and (mark == "/" or index.isdecimal() or is_suite(suite_name)):
+        suite_name, has_mark, index = key.rpartition(mark)
+        if has_mark and (mark == "/" or index.isdecimal() or is_suite(suite_name)):
             suite = get_suite(suite_name)
             if not index.isdecimal() or len(index) > 9 or int(index) >= len(suite):
                 raise UnknownNameError(f"index of {suite_name}", index, range(len(suite)))

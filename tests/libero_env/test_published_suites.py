@@ -244,7 +244,7 @@ def test_files_that_are_not_theirs_are_refused(plus, tmp_path, monkeypatch):
         ("libero_task_map = [1]\n", "not a dictionary"),
         ("libero_task_map = {'libero_goal': [1]}\n", "no suite libero_goal"),
         ("libero_task_map = {'libero_goal': ['fly_light_1']}\n", "not a task of libero_goal"),
-        (f"libero_task_map = {{'libero_goal': ['{BASE}_snow_1']}}\n", "no id of LIBERO-Plus"),
+        (f"libero_task_map = {{'libero_goal': ['{BASE}_snow_1']}}\n", "not an id of LIBERO-Plus"),
         (f"libero_task_map = {{'libero_goal': ['{BASE}_level1_sample1']}}\n", "does not exist"),
     ):
         folder = tmp_path / what.replace(" ", "_")

@@ -148,7 +148,7 @@ def test_a_template_is_a_task_whatever_the_language_is(tmp_path, capsys):
     assert "is not the name of a task" in capsys.readouterr().err
     assert not list(tmp_path.rglob("*.yaml"))
     assert main(["tasks", "new", "x", "--goal", "On", "--out", str(tmp_path)]) == 2
-    assert "--goal 'On' is no atom" in capsys.readouterr().err
+    assert "--goal 'On' is not an atom" in capsys.readouterr().err
 
 
 OBJECT = (

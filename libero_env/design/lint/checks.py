@@ -94,8 +94,8 @@ def lint_text(
 
 def _syntax(error: BDDLError, file: str) -> Finding:
     """Return the finding of an error of the parser."""
-    found = re.fullmatch(r"(\d+): (.*?)(?:; expected (.*))?", str(error).removeprefix(f"{file}:"), re.DOTALL)
-    line, what, expected = found.groups() if found else (1, str(error), None)
+    parts = re.fullmatch(r"(\d+): (.*?)(?:; expected (.*))?", str(error).removeprefix(f"{file}:"), re.DOTALL)
+    line, what, expected = parts.groups() if parts else (1, str(error), None)
     return Finding(
         file, int(line), "error", "syntax", what, f"write {expected}" if expected else "fix the file"
     )

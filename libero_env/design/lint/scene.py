@@ -130,7 +130,7 @@ def _corners(region: Region, workspace: Workspace) -> np.ndarray:
 
 def _surfaces(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the top surfaces of the workspace: centre (2,) and half extents (2,) in the world frame, [m]."""
-    model, data, found = scene.model, mujoco.MjData(scene.model), []
+    model, data, surfaces = scene.model, mujoco.MjData(scene.model), []
     data.qpos[:] = initial_qpos(scene)
     mujoco.mj_kinematics(model, data)
     for geom in scene.collision_geoms[scene.workspace_name]:
@@ -138,8 +138,8 @@ def _surfaces(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
         if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
             half = np.abs(data.geom_xmat[geom].reshape(3, 3)) @ model.geom_aabb[geom, 3:]
         if abs(centre[2] + half[2] - scene.workspace.surface_height) < _LEVEL_TOLERANCE:
-            found.append((centre[:2].copy(), half[:2]))
-    return found
+            surfaces.append((centre[:2].copy(), half[:2]))
+    return surfaces
 
 
 def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None:

