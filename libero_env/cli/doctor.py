@@ -39,7 +39,7 @@ _PROBE = """
 import json, sys, time
 import mujoco, numpy
 from libero_env.errors import RenderError
-from libero_env.sim.render import Renderer, RenderTarget, choose_backend
+from libero_env.sim.render import Renderer, RenderTarget, renderer_name
 model = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><light pos='0 0 2'/><geom type='plane' size='1 1 1' group='1'/>"
     "<camera name='above' pos='0 0 2'/></worldbody></mujoco>")
@@ -47,18 +47,13 @@ data = mujoco.MjData(model)
 mujoco.mj_forward(model, data)
 picture = numpy.zeros((128, 128, 3), numpy.uint8)
 try:
-    found = {"backend": choose_backend()}
+    found = dict(zip(("backend", "device"), renderer_name()))
     with Renderer(model, 128, 128) as renderer:
         target = RenderTarget(renderer.camera_id("above"), picture)
         renderer.render(data, [target])
         start = time.perf_counter()
         renderer.render(data, [target])
         found["milliseconds"] = 1e3 * (time.perf_counter() - start)
-        try:
-            from OpenGL.GL import GL_RENDERER, glGetString
-            found["device"] = glGetString(GL_RENDERER).decode()
-        except Exception:
-            found["device"] = "unknown device"
     if not picture.any():
         found = {"error": found["backend"] + " renders black images"}
 except RenderError as error:

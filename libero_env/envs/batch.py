@@ -47,6 +47,13 @@ class LiberoVectorEnv(gymnasium.vector.VectorEnv):
 
     metadata = {"render_modes": [], "render_fps": CONTROL_HZ, "autoreset_mode": AutoresetMode.DISABLED}
 
+    _running: np.ndarray
+
+    @property
+    def running(self) -> np.ndarray:
+        """Whether each environment is in an episode, (num_envs,) bool."""
+        return self._running.copy()
+
     def render(self) -> NoReturn:
         """Raise: `render_cameras` or `call` return images of vector environments."""
         self.require_open()
@@ -165,11 +172,6 @@ class BatchEnv(LiberoVectorEnv):
     def atoms(self) -> tuple[str, ...]:
         """Atoms of the goal, in the order of `progress` in infos, such as `(On plate_1 stove_1)`."""
         return tuple(map(str, self.goals.atoms))
-
-    @property
-    def running(self) -> np.ndarray:
-        """Whether each simulation is in an episode, (num_envs,) bool."""
-        return self._running.copy()
 
     @cached_property
     def init_states(self) -> InitialStates:

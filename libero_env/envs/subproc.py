@@ -133,11 +133,6 @@ class SubprocEnv(LiberoVectorEnv):
         self._success = np.zeros(self.num_envs, bool)
         self._progress: list[dict[str, bool]] = [{} for _ in specs]
 
-    @property
-    def running(self) -> np.ndarray:
-        """Whether each environment is in an episode, (num_envs,) bool."""
-        return self._running.copy()
-
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

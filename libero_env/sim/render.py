@@ -84,18 +84,6 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
     raise RenderError(f"no OpenGL backend works here ({'; '.join(failures)}). Remedy: {REMEDY}")
 
 
-@lru_cache(maxsize=1)
-def choose_backend() -> str:
-    """Return the name of the backend that works here; a small context is opened to find out.
-
-    Raises:
-        RenderError: No backend works here.
-    """
-    name, context = open_context(64, 64)
-    context.free()
-    return name
-
-
 def _forget_platform(platform: str | None) -> None:
     """Undo what a backend that failed has left behind: PyOpenGL keeps the platform with which it was first imported."""
     os.environ.pop("PYOPENGL_PLATFORM", None)

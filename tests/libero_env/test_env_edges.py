@@ -25,25 +25,19 @@ from libero_env.sim.osc import rotate
 TASK = "libero_object/3"
 
 BAD_VALUES = {
-    "horizon": (0, -5, 1.5, "abc", True, None, float("inf")),
-    "camera_size": (128, (0, 1), (1.5, 2), ("a", 1), None, (1, 2, 3), (-1, 8), "ab"),
-    "cameras": (None, "agentview", [3], 3),
-    "observations": (None, "rgb", [1]),
-    "controller": (3, None, [1]),
-    "control_delta": ("no", None, 1),
-    "reward_scale": ("a", float("nan"), float("inf"), None, 1j),
-    "assets": (3, ["original"]),
-    "semantics": ([1], None),
-    "drawing": ([1], 3),
-    "robot": ([1], None),
-    "observed": ([1], None),
-    "reward": ([1], None),
+    "horizon": (0, 1.5, True),
+    "camera_size": (128, (0, 1), (1, 2, 3)),
+    "cameras": ("agentview", [3]),
+    "control_delta": (1,),
+    "reward_scale": (float("nan"),),
+    "assets": (3,),
+    "drawing": (3,),
 }
 
 
 @pytest.mark.unit
 @pytest.mark.parametrize("name", BAD_VALUES)
-def test_options_of_another_kind_are_named_with_their_value(name):
+def test_options_outside_of_their_bounds_are_named_with_their_value(name):
     for value in BAD_VALUES[name]:
         with pytest.raises(InvalidInputError, match=rf"\b{name}.* is "):
             EnvConfig(**{name: value})
@@ -59,18 +53,15 @@ def test_options_of_numpy_and_whole_floats_are_made_plain():
 
 @pytest.mark.unit
 def test_arguments_of_constructors_are_checked():
-    for task in (3, None, ["a"], 1.5, b"libero_object/3"):
-        with pytest.raises(InvalidInputError, match="^task is"):
-            LiberoEnv(task, cameras=())
-    for num in (0, -1, 1.5, "a", None, True):
-        with pytest.raises(InvalidInputError, match="^num_envs is"):
-            BatchEnv(TASK, num, cameras=())
-    for threads in (-1, 1.5, "a", None, 10**6):
+    with pytest.raises(InvalidInputError, match="^task is"):
+        LiberoEnv(None, cameras=())
+    with pytest.raises(InvalidInputError, match="^num_envs is"):
+        BatchEnv(TASK, 0, cameras=())
+    for threads in (-1, 10**6):
         with pytest.raises(InvalidInputError, match="^num_threads is"):
             BatchEnv(TASK, 2, num_threads=threads, cameras=())
-    for config in (3, {}, {"horizon": 3}):
-        with pytest.raises(InvalidInputError, match="^config is"):
-            LiberoEnv(TASK, config=config)
+    with pytest.raises(InvalidInputError, match="^config is"):
+        LiberoEnv(TASK, config={"horizon": 3})
     for options in ({"timeout": 0}, {"timeout": float("nan")}, {"start_timeout": None}, {"gl_devices": [-1]}):
         with pytest.raises(InvalidInputError, match=next(iter(options))):
             SubprocEnv([{"task": TASK}], **options)
@@ -122,8 +113,8 @@ def interrupted(*_: object):
     raise KeyboardInterrupt
 
 
-SEEDS = (-1, 1.5, "abc", True, float("nan"), [1], np.float64(3), 1j, [[1], 0.5])
-INIT_STATES = (99, -1, 1.0, "a", None, [1, 2], True, [], 10**30, {}, 1j, np.nan, [[1], [2, 3]])
+SEEDS = (-1, 1.5, "abc", True, [1], np.float64(3), 1j)
+INIT_STATES = (99, -1, 1.0, "a", None, [1, 2], True, [], 10**30, {}, [[1], [2, 3]])
 
 
 @pytest.mark.sim
@@ -165,25 +156,9 @@ def test_seeds_of_any_integer_type_are_the_same(env):
     env.reset(seed=2**200)
 
 
-BAD_ACTIONS = [
-    np.zeros(7) * 1j,
-    [1 + 2j] * 7,
-    [None] * 7,
-    ["1"] * 7,
-    [b"1"] * 7,
-    "abc",
-    None,
-    {},
-    np.zeros(8),
-    np.zeros((1, 7)),
-    [np.nan] * 7,
-    [10**400] * 7,
-    [[1], [2, 3]],
-    np.ma.masked_array(np.zeros(7), mask=[0] * 6 + [1]),
-    np.zeros(7, "M8[s]"),
-    np.zeros(7, "m8[s]"),
-    np.array([object()] * 7),
-]
+BAD_ACTIONS = [np.zeros(7) * 1j, [None] * 7, ["1"] * 7, None, {}, np.zeros(8), np.zeros((1, 7)), [np.nan] * 7]
+BAD_ACTIONS += [[10**400] * 7, [[1], [2, 3]], np.zeros(7, "m8[s]"), np.array([object()] * 7)]
+BAD_ACTIONS += [np.ma.masked_array(np.zeros(7), mask=[0] * 6 + [1])]
 
 
 @pytest.mark.sim
@@ -210,8 +185,8 @@ def test_refused_actions_change_nothing(env):
 def test_refused_states_change_nothing(env, batch):
     env.reset(seed=4), batch.reset(seed=4)
     own, short = env.get_state(), env.simulations.physics_state(0)
-    bad = [own * np.nan, own[:-1], own[:3], None, "a", [], own * 1j, own[None], np.append(own[:-1], 1.5)]
-    bad += [np.append(own[:-1], -1.0), own * 1e300, np.append(own[:-1], np.inf), short * np.nan, short + 1e12]
+    bad = [own * np.nan, own[:-1], None, own * 1j, own[None], np.append(own[:-1], 1.5)]
+    bad += [np.append(own[:-1], -1.0), own * 1e300, short * np.nan, short + 1e12]
     before = digest(env), digest(batch)
     for state in bad:
         with pytest.raises(InvalidInputError, match="state"):

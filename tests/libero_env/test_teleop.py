@@ -12,7 +12,7 @@ from libero_env.cli import main as cli
 from libero_env.demos.read import read_demos
 from libero_env.demos.replay import replay
 from libero_env.errors import LiberoError, RenderError
-from libero_env.sim.render import choose_backend
+from libero_env.sim.render import renderer_name
 from libero_env.tasks import get_task
 from libero_env.teleop import screens as teleop_screens
 from libero_env.teleop.devices import GRIPPER, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse
@@ -207,7 +207,7 @@ def test_restarting_drops_the_episode_and_stopping_ends_the_session(session):
 
 @pytest.mark.sim
 def test_recorded_episodes_are_demonstrations(session, tmp_path):
-    choose_backend()
+    renderer_name()
     file, lines = tmp_path / "by_hand.hdf5", []
     assert record_session(session(), file, 1, size=(16, 16), report=lines.append) == 1
     assert record_session(session(), file, 2, size=(16, 16), report=lines.append) == 2
