@@ -2,11 +2,12 @@
 
 import shutil
 import tempfile
-from dataclasses import dataclass
+from dataclasses import fields
 from pathlib import Path
 from typing import Literal
 
 import h5py
+from pydantic.dataclasses import dataclass
 
 from libero.libero.benchmark import get_benchmark
 from libero.libero.utils.dataset_utils import get_dataset_info as dataset_info
@@ -17,8 +18,8 @@ from libero.libero.utils.download_utils import (
 )
 from libero.scripts.command import script
 from libero_env.cli.demos import check_files
-from libero_env.cli.options import Positional, Positive, Seed, Side
-from libero_env.cli.teleop import Sensitivity, TeleopRequest, UsbId, teleop
+from libero_env.cli.options import Positional, Positive, Side
+from libero_env.cli.teleop import InputOptions, TeleopRequest, teleop
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import LOW_DIM_KEYS
 from libero_env.demos.curate import find_demo_files
@@ -31,7 +32,7 @@ from libero_env.tasks import read_task
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recording:
+class Recording(InputOptions):
     """Record demonstrations by hand. An episode ends when its goal has held for ten steps.
 
     Attributes:
@@ -39,34 +40,18 @@ class Recording:
         robots: Panda is the only robot.
         config: No effect: the benchmark has one arm.
         arm: No effect: the benchmark has one arm.
-        camera: Camera that is shown.
         controller: OSC_POSE is the only controller.
         num_demonstration: Demonstrations in the file.
         size: Size of the recorded pictures, pixels.
-        seed: Seed of the initial states.
-        screen: Where it is shown.
-        device: Input device.
-        pos_sensitivity: Factor on translations.
-        rot_sensitivity: Factor on rotations.
-        vendor_id: USB vendor of the 3D mouse.
-        product_id: USB product of the 3D mouse.
     """
 
     directory: Path = Path("demonstration_data")
     robots: tuple[str, ...] = ("Panda",)
     config: str = "single-arm-opposed"
     arm: str = "right"
-    camera: str = "agentview"
     controller: str = "OSC_POSE"
     num_demonstration: Positive = 50
     size: Side = 128
-    seed: Seed = 0
-    screen: Literal["auto", "window", "terminal"] = "auto"
-    device: Literal["keyboard", "spacemouse"] = "keyboard"
-    pos_sensitivity: Sensitivity = 1.0
-    rot_sensitivity: Sensitivity = 1.0
-    vendor_id: UsbId = 9583
-    product_id: UsbId = 50741
 
     def collect(self, bddl: Path) -> int:
         """Record into `<directory>/<problem>_<task>/demo.hdf5`; return 1 where the user stopped early."""
@@ -79,22 +64,9 @@ class Recording:
         task = read_task(bddl)
         out = self.directory / f"{task.problem.name.lower()}_{task.name}" / "demo.hdf5"
         out.parent.mkdir(parents=True, exist_ok=True)
-        return teleop(
-            TeleopRequest(
-                bddl=bddl,
-                out=out,
-                n=self.num_demonstration,
-                size=(self.size, self.size),
-                seed=self.seed,
-                camera=self.camera,
-                screen=self.screen,
-                device=self.device,
-                pos_sensitivity=self.pos_sensitivity,
-                rot_sensitivity=self.rot_sensitivity,
-                vendor_id=self.vendor_id,
-                product_id=self.product_id,
-            )
-        )
+        options = {one.name: getattr(self, one.name) for one in fields(InputOptions)}
+        size = (self.size, self.size)
+        return teleop(TeleopRequest(bddl=bddl, out=out, n=self.num_demonstration, size=size, **options))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,15 +13,10 @@ UsbId = Annotated[int, Field(ge=0, le=0xFFFF)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class TeleopRequest:
-    """Record demonstrations by hand; what the file has is kept.
+class InputOptions:
+    """How a user sees and moves the robot.
 
     Attributes:
-        task: Such as libero_goal/3.
-        bddl: A user-defined task file, instead of a task.
-        out: Demonstration file (default: TASK_demo.hdf5 here).
-        n: Demonstrations that the file shall have.
-        size: Size of the images, 128 or 120x160.
         seed: Seed of the starts.
         camera: Camera shown while recording.
         screen: Where it is shown.
@@ -32,11 +27,6 @@ class TeleopRequest:
         product_id: USB product of the 3D mouse.
     """
 
-    task: Positional[str | None] = None
-    bddl: FilePath | None = None
-    out: FilePath | None = None
-    n: Positive = 1
-    size: Size = (128, 128)
     seed: Seed = 0
     camera: str = "agentview"
     screen: Literal["auto", "window", "terminal"] = "auto"
@@ -45,6 +35,25 @@ class TeleopRequest:
     rot_sensitivity: Sensitivity = 1.0
     vendor_id: UsbId = 9583
     product_id: UsbId = 50741
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeleopRequest(InputOptions):
+    """Record demonstrations by hand; what the file has is kept.
+
+    Attributes:
+        task: Such as libero_goal/3.
+        bddl: A user-defined task file, instead of a task.
+        out: Demonstration file (default: TASK_demo.hdf5 here).
+        n: Demonstrations that the file shall have.
+        size: Size of the images, 128 or 120x160.
+    """
+
+    task: Positional[str | None] = None
+    bddl: FilePath | None = None
+    out: FilePath | None = None
+    n: Positive = 1
+    size: Size = (128, 128)
 
 
 def teleop(request: TeleopRequest) -> int:
