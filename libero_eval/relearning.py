@@ -324,7 +324,7 @@ def _windows(
     tasks, counts = [run.tasks[task]], [learned_from + settings.demos_held_out]
     recorded = find_demos(tasks, counts, data, None)
     (path,) = perturb_demos(recorded, tasks, counts, [run.perturbations(task)], data, None)
-    languages, read = run.embed(run.learned_task(task))[None], replace(data, memory="host", backend="native")
+    languages, read = run.embed(run.learned_task(task))[None], replace(data, memory="host")
 
     def windows(count: int) -> TaskWindows:
         return DemoDatasets([path], [count], run.policy.spec, languages, read, run.device)[0]
