@@ -95,16 +95,7 @@ def open_url(
     check_url(url)
     head = {"User-Agent": "libero", "Accept-Encoding": "identity", **(headers or {})}
     request = urllib.request.Request(url, headers=head, method=method)
-    opener = urllib.request.OpenerDirector()
-    for handler in (
-        urllib.request.ProxyHandler(),
-        urllib.request.HTTPDefaultErrorHandler(),
-        urllib.request.HTTPErrorProcessor(),
-        _Redirects(),
-        _Http(),
-        _Https(),
-    ):
-        opener.add_handler(handler)
+    opener = urllib.request.build_opener(_Redirects, _Http, _Https)
     response: http.client.HTTPResponse = opener.open(request, timeout=TIMEOUT)
     return response
 

@@ -78,10 +78,7 @@ def examine(file: Path, *, threshold: float = NOOP_THRESHOLD) -> DemoStats:
 
 def _faults(episode: Episode, shapes: dict[str, tuple[int, ...]]) -> Iterator[str]:
     """Yield what is wrong with an episode; `shapes` are those of the first ones, and new keys are added to them."""
-    arrays = {"actions": episode.actions, "states": episode.states}
-    for key in ("expert_actions", "robot_states"):
-        arrays |= {} if (values := getattr(episode, key)) is None else {key: values}
-    arrays |= {f"obs/{key}": values for key, values in episode.obs.items()}
+    arrays = episode.arrays | {f"obs/{key}": values for key, values in episode.obs.items()}
     for key, values in arrays.items():
         if fault := value_fault(key.removeprefix("obs/"), values):
             yield f"/{key} {fault}"

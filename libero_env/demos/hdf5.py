@@ -6,6 +6,7 @@ it is read. What the HDF5 library says about damage arrives as `BrokenDemoError`
 """
 
 import errno
+import math
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -98,7 +99,7 @@ def check_dataset(dataset: h5py.Dataset, where: str) -> int:
         plist, stored = dataset.id.get_create_plist(), dataset.id.get_storage_size()
         filters = {plist.get_filter(i)[0] for i in range(plist.get_nfilters())}
         item = dataset.id.get_type().get_size()
-        size, chunk = item * _product(dataset.shape or (0,)), item * _product(dataset.chunks or (0,))
+        size, chunk = item * math.prod(dataset.shape or (0,)), item * math.prod(dataset.chunks or (0,))
     if unknown := sorted(filters - _FILTERS):
         raise BrokenDemoError(
             f"{where} is compressed by filter {unknown[0]}, which HDF5 does not have itself; convert the file with "
@@ -284,13 +285,6 @@ def _heap_ends(content: mmap, start: int) -> bool:
 
 def _number(content: mmap, at: int, size: int = 8) -> int:
     return int.from_bytes(content[at : at + size], "little")
-
-
-def _product(shape: tuple[int, ...]) -> int:
-    total = 1  # of Python's integers, which do not overflow
-    for count in shape:
-        total *= count
-    return total
 
 
 def _reason(error: Exception) -> str:

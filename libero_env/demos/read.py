@@ -88,6 +88,12 @@ class Episode:
         """Actions to learn, (T, 7): those of the expert where they differ from the executed ones."""
         return self.actions if self.expert_actions is None else self.expert_actions
 
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Arrays that it has beside observations, by their names in files."""
+        names = ("actions", "expert_actions", "states", "robot_states")
+        return {name: values for name in names if (values := getattr(self, name)) is not None}
+
     def aligned(self) -> "Episode":
         """Return the episode with each action paired with the observation before it.
 

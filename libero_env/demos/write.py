@@ -62,14 +62,12 @@ class DemoWriter:
     Args:
         path: File to write.
         header: Attributes of the group `data`; `make_header` makes those of the original.
-        compression: "gzip" (level 1 with the shuffle filter; every HDF5 reader has it), "lzf" or None.
     """
 
-    def __init__(self, path: str | Path, header: Mapping[str, Any], *, compression: str | None = "gzip"):
+    def __init__(self, path: str | Path, header: Mapping[str, Any]):
         self.path = Path(path)
         self.parts = self.path.with_name(self.path.name + ".parts")
         self.header = dict(header)
-        self.compression = compression
 
     def recorded(self) -> set[int]:
         """Return the numbers of the demonstrations that are complete on disk, in the file or among the parts.
@@ -160,9 +158,8 @@ class DemoWriter:
             names = demo_names(handle, file)
             for name in names:
                 group = handle["data"][name]
-                check_demo(
-                    group, f"{file}: {name}", group.get("obs", ()) if isinstance(group, h5py.Group) else ()
-                )
+                keys = group.get("obs", ()) if isinstance(group, h5py.Group) else ()
+                check_demo(group, f"{file}: {name}", keys)
             self._check_header(file, file_attributes(handle, file))
         for name in names:
             if name not in seen:
@@ -182,15 +179,10 @@ class DemoWriter:
         steps = len(episode)
         ends = np.zeros(steps, np.uint8)
         ends[-1] = episode.success
-        put = group.create_dataset
-        put("actions", data=np.asarray(episode.actions, np.float64))
-        if episode.expert_actions is not None:
-            put("expert_actions", data=np.asarray(episode.expert_actions, np.float64))
-        put("states", data=np.asarray(episode.states, np.float64))
-        if episode.robot_states is not None:
-            put("robot_states", data=np.asarray(episode.robot_states, np.float64))
-        put("rewards", data=ends)
-        put("dones", data=ends)
+        for name, values in episode.arrays.items():
+            group.create_dataset(name, data=np.asarray(values, np.float64))
+        for name in ("rewards", "dones"):
+            group.create_dataset(name, data=ends)
         self._write_observations(group.create_group("obs"), episode.obs, steps)
         group.attrs["num_samples"] = steps
         group.attrs["init_state"] = np.asarray(episode.states[0], np.float64)
@@ -208,9 +200,9 @@ class DemoWriter:
                     key,
                     data=values[:, ::-1],
                     chunks=(min(FRAMES_PER_CHUNK, steps), *values.shape[1:]),
-                    compression=self.compression,
-                    compression_opts=1 if self.compression == "gzip" else None,
-                    shuffle=self.compression is not None and values.dtype != np.uint8,
+                    compression="gzip",  # every reader of HDF5 has it
+                    compression_opts=1,
+                    shuffle=values.dtype != np.uint8,
                 )
             elif key in LOW_DIM_KEYS:
                 group.create_dataset(key, data=np.asarray(values, np.float64))
@@ -264,9 +256,8 @@ def _write_counts(data: h5py.Group) -> None:
 
 
 def _check_values(episode: Episode, where: str) -> None:
-    arrays = {"actions": episode.actions, "expert_actions": episode.expert_actions, "states": episode.states}
-    for key, values in {**arrays, "robot_states": episode.robot_states, **episode.obs}.items():
-        if values is not None and (fault := value_fault(key, np.asarray(values))):
+    for key, values in {**episode.arrays, **episode.obs}.items():
+        if fault := value_fault(key, np.asarray(values)):
             raise DemoError(f"{where}/{key} {fault}; it is not written")
 
 

@@ -54,7 +54,7 @@ def tiny(*overrides: str) -> Config:
 def write_demos(path: Path, lengths: tuple[int, ...] = (5, 4), seed: int = 0) -> Path:
     """Write demonstrations of noise with the given lengths."""
     rng = np.random.default_rng(seed)
-    writer = DemoWriter(path, {"pairing": "aligned"}, compression=None)
+    writer = DemoWriter(path, {"pairing": "aligned"})
     for index, steps in enumerate(lengths):
         obs = {
             "agentview_rgb": rng.integers(0, 255, (steps, SIZE, SIZE, 3), np.uint8),

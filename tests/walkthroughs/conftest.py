@@ -58,7 +58,7 @@ def write_noise(path: Path) -> None:
     }
     sizes = {"joint_states": 7, "gripper_states": 2, "ee_pos": 3, "ee_ori": 3}
     readings = {key: rng.normal(size=(STEPS, size)) for key, size in sizes.items()}
-    writer = DemoWriter(path, {"pairing": "aligned"}, compression=None)
+    writer = DemoWriter(path, {"pairing": "aligned"})
     writer.write(
         0, Episode(rng.uniform(-1, 1, (STEPS, 7)), np.zeros((STEPS, 5)), None, {**pictures, **readings})
     )

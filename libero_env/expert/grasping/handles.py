@@ -16,6 +16,9 @@ MAX_KNOB_RADIUS = 0.08  # [m] from the axis; a wider part swings like a door
 _FINE_RADIUS, _RADIUS = 0.11, 0.32  # [m] around a handle: with dense points, and at all
 _MIN_GAP = 0.0055  # [m] without points behind the bar of a handle
 
+_body_points = lru_cache(maxsize=512)(body_points)
+_subtree_points = lru_cache(maxsize=64)(surface_points)
+
 
 @dataclass(frozen=True)
 class Part:
@@ -220,16 +223,6 @@ def nearby_points(
 def hinge_rotation(axis: np.ndarray, angle: float) -> np.ndarray:
     """Return the rotation (3, 3) by an angle, [rad], about a unit axis (3,), computed as MuJoCo does."""
     return quat_to_mat(quat_from_axis_angle(axis, angle))
-
-
-@lru_cache(maxsize=512)
-def _body_points(model: mujoco.MjModel, body: int, spacing: float) -> np.ndarray:
-    return body_points(model, body, spacing)
-
-
-@lru_cache(maxsize=64)
-def _subtree_points(model: mujoco.MjModel, body: int, spacing: float) -> np.ndarray:
-    return surface_points(model, body, spacing)
 
 
 def _body_pose(view: StateView, body: int) -> Pose:
