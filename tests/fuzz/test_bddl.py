@@ -30,48 +30,16 @@ SMALL = """(define (problem LIBERO_Floor_Manipulation) (:domain robosuite) (:lan
 NUMBER = re.compile(r"[-+]?\d[\w.+-]*")
 TOKEN = re.compile(r"[()]|[^\s()]+|\s+")
 EXTREMES = (
-    "0",
-    "1",
-    "-1",
-    "5",
-    "100",
-    "1e5",
-    "1e308",
-    "-1e308",
-    "1e-300",
-    "pi",
-    "-pi/2",
-    "nan",
-    "1e999",
-    "x",
+    *("0", "1", "-1", "5", "100", "1e5", "1e308", "-1e308", "1e-300", "pi", "-pi/2", "nan"),
+    *("1e999", "x"),
 )
 NAMES = (
-    "robot0_base",
-    "robot",
-    "world",
-    "ee",
-    "table",
-    "floor",
-    "plate_1_lid",
-    "milk_1",
-    "basket_1_main",
-    "a/b",
-    "?x",
+    *("robot0_base", "robot", "world", "ee", "table", "floor", "plate_1_lid", "milk_1"),
+    *("basket_1_main", "a/b", "?x"),
 )
 PREDICATES = (
-    "On",
-    "In",
-    "Stack",
-    "Up",
-    "Open",
-    "Close",
-    "Turnon",
-    "Turnoff",
-    "Incontact",
-    "True",
-    "Near",
-    "And",
-    "Or",
+    *("On", "In", "Stack", "Up", "Open", "Close", "Turnon", "Turnoff", "Incontact", "True", "Near"),
+    *("And", "Or"),
 )
 
 

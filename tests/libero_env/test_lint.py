@@ -220,11 +220,6 @@ def test_linting_texts_needs_no_torch():
         "import sys, libero_env.design.lint.checks, libero_env.design.certify\n"
         "print('torch' in sys.modules, 'matplotlib' in sys.modules)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=Path(__file__).parents[2],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command, folder = [sys.executable, "-c", code], Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["False", "False"]

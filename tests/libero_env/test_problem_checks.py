@@ -75,17 +75,8 @@ FAULTS = [  # old, new, line, message
     ("(:target wooden_cabinet_1)", "(:target wooden_cabinet_1) (:rgba (0 0 1 1))", 0, ""),
 ]  # fmt: skip
 NAMES = (
-    "robot0_base",
-    "robot",
-    "world",
-    "gripper0",
-    "mount0_x",
-    "ee",
-    "a/b",
-    "../x",
-    "x" * 200,
-    "-x",
-    "a\u202eb",
+    *("robot0_base", "robot", "world", "gripper0", "mount0_x", "ee", "a/b", "../x", "x" * 200),
+    *("-x", "a\u202eb"),
 )
 
 
