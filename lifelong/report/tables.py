@@ -46,7 +46,7 @@ def page_template(name: str, package: str = "lifelong.report") -> jinja2.Templat
     """Return a template of a package, with the filter `percent`; an undefined name is an error.
 
     Args:
-        name: File of the template; it may include those of `lifelong.report`.
+        name: File of the template, which extends `base.html` of `lifelong.report`.
         package: Package whose folder holds it.
     """
     environment = jinja2.Environment(
