@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from typing import Any
 
@@ -44,7 +44,10 @@ def call_limited(function: Callable[..., Any], *args: Any, about: str) -> Any:
 
 @contextmanager
 def limited_process() -> Iterator[None]:
-    """Use the same process for all calls in the block: starting one takes most of a second."""
+    """Use the same process for all calls in the block, or that of a block around it: it starts in most of a second."""
+    if _current.get() is not None:
+        yield
+        return
     process = _Process()
     token = _current.set(process)
     try:
@@ -137,4 +140,5 @@ def _limit_memory() -> None:
     except ImportError:  # Windows
         return
     _, most = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY if most < 0 else min(MEMORY, most), most))
+    with suppress(ValueError, OSError):  # macOS does not limit it
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY if most < 0 else min(MEMORY, most), most))

@@ -13,6 +13,7 @@ from PIL import Image
 
 from libero_env.design.objects import add_object
 from libero_env.errors import LiberoError
+from libero_env.limited import limited_process
 from libero_env.objects import catalog, folder, get_object
 from libero_env.objects.mjcf import read_mjcf
 
@@ -22,6 +23,13 @@ BOX = '<geom type="box" size=".02 .02 .02" mass=".1"/>'
 MESH = '<geom type="mesh" mesh="m"/>'
 PAINT = '<material name="p" texture="t"/>'
 PAINTED = '<geom type="box" size=".02 .02 .02" mass=".1" material="p"/>'
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_process():
+    """All files are read in the same process with limits."""
+    with limited_process():
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -16,6 +16,7 @@ from libero_env.design.objects.collision import boxes_of, collision_pieces, is_c
 from libero_env.design.objects.mesh_file import bounds, read_mesh
 from libero_env.design.objects.mesh_object import DENSITY, Options, merge_vertices
 from libero_env.errors import LiberoError
+from libero_env.limited import limited_process
 from libero_env.objects import catalog, folder, get_object, object_names
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
@@ -36,6 +37,13 @@ ORIGINAL = """<mujoco><worldbody><body>
   <body name="object"><geom type="box" size="0.02 0.02 0.03" mass="0.05" group="0"/>
     <geom type="box" size="0.02 0.02 0.03" rgba="0.9 0.1 0.1 1" group="1" contype="0" conaffinity="0"/></body>
   <site name="bottom_site" pos="0 0 -0.03"/></body></worldbody></mujoco>"""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_process():
+    """All files are read in the same process with limits."""
+    with limited_process():
+        yield
 
 
 @pytest.fixture(autouse=True)

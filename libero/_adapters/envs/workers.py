@@ -17,6 +17,8 @@ from gymnasium.vector import utils
 from libero_env.envs.worker import CallHost, Shared, Worker, shut_down, wait_for
 from libero_env.errors import ClosedEnvironmentError, LiberoError
 
+CALL_TIMEOUT = 600.0  # [s] for a call, unless told otherwise; making an environment may take minutes
+
 
 class Layout(NamedTuple):
     """Shape and type of an array in shared memory."""
@@ -73,9 +75,6 @@ def arrays_of(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
         for key, value in observation.items()
         if isinstance(value, np.ndarray) and not value.dtype.hasobject
     }
-
-
-CALL_TIMEOUT = 600.0  # [s] for a call, unless told otherwise; making an environment may take minutes
 
 
 class WorkerError(LiberoError, RuntimeError):
