@@ -64,7 +64,7 @@ def read_config() -> dict[str, str]:
     Keys that this package does not use may have any value.
 
     Raises:
-        LiberoError: The file is not valid YAML, has no keys, or a value that is no text.
+        LiberoError: The file is not valid YAML, has no keys, or a value that is not a text.
     """
     path = config_file()
     if not path.is_file():

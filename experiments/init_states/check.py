@@ -12,7 +12,7 @@ import numpy as np
 
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.init_states.pickles import read_states
-from libero_env.init_states.placement import start_faults
+from libero_env.init_states.placement import start_errors
 from libero_env.init_states.store import load_init_states
 from libero_env.sim.engine import make_simulations
 from libero_env.sim.predicates import evaluate
@@ -96,7 +96,7 @@ def check(scene: Scene, rows: np.ndarray, *, own: bool, threads: int) -> tuple[d
 def faults_of(views: list[StateView], own: bool) -> list[str]:
     """Own states must be as the init atoms say; of the original's only the goal is asked."""
     if own:
-        return [fault for view in views for fault in start_faults(view)]
+        return [fault for view in views for fault in start_errors(view)]
     return ["the goal holds already" for view in views if evaluate(view.scene.problem.goal, view)]
 
 

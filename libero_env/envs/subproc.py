@@ -69,7 +69,7 @@ class SubprocEnv(LiberoVectorEnv):
         start_timeout: Largest time that workers may take to start and to build their scenes, s.
         gl_devices: Indices of the GPUs to render on, assigned in turn (`MUJOCO_EGL_DEVICE_ID`); by default the driver
             chooses.
-        config: Configuration of all environments of `specs` that are no functions.
+        config: Configuration of all environments of `specs` that are not functions.
         **options: Fields of `EnvConfig` of these environments; arguments in `specs` take precedence.
 
     Attributes:
@@ -113,7 +113,7 @@ class SubprocEnv(LiberoVectorEnv):
         for spec in specs:
             if not (callable(spec) or isinstance(spec, Mapping)):
                 raise InvalidInputError(
-                    f"{shown(spec)} describes no environment; expected a dictionary or a function"
+                    f"{shown(spec)} is not an environment; expected a dictionary or a function"
                 )
         common = {"config": EnvConfig.from_options(config, options)}
         factories = [spec if callable(spec) else _factory({**common, **spec}) for spec in specs]

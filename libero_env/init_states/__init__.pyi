@@ -1,4 +1,4 @@
-from .placement import sample_settled, settle, start_faults
+from .placement import sample_settled, settle, start_errors
 from .store import (
     NUM_INIT_STATES,
     cache_init_states,
@@ -16,6 +16,6 @@ __all__ = [
     "sample_settled",
     "settle",
     "shipped_path",
-    "start_faults",
+    "start_errors",
     "write_suite",
 ]

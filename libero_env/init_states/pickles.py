@@ -180,13 +180,13 @@ class _Machine:
             case "REDUCE":
                 name, args = self._take(2)
                 if not isinstance(name, Name) or not isinstance(args, tuple):
-                    raise StateFileError("the pickle calls what is no function")
+                    raise StateFileError("the pickle calls what is not a function")
                 self._stack.append(Call(name.text, args))
             case "BUILD":
                 state = self.pop()
                 call = self._stack[-1]
                 if not isinstance(call, Call) or call.state is not None or not isinstance(state, tuple):
-                    raise StateFileError("the pickle changes what is no array")
+                    raise StateFileError("the pickle changes what is not an array")
                 call.state = state
             case _:
                 raise StateFileError(f"the pickle has the operation {operation}, which arrays do not need")
@@ -335,7 +335,7 @@ def _pair(found: object, what: str = "(states, size)") -> tuple[int, int]:
             return rows, columns
         case (int(columns),):
             return 1, columns
-    raise StateFileError(f"expected an array (states, size) of numbers; {what} are no two numbers")
+    raise StateFileError(f"expected an array (states, size) of numbers; {what} are not two numbers")
 
 
 def _check_shape(shape: tuple[int, int]) -> None:
@@ -375,7 +375,7 @@ def _bytes(found: object) -> bytes | bytearray:
             try:
                 return text.encode("latin1")
             except UnicodeEncodeError:
-                raise StateFileError("numbers that are no bytes") from None
+                raise StateFileError("numbers that are not bytes") from None
     raise StateFileError("an array of other values than numbers")
 
 
@@ -387,7 +387,7 @@ def _storage(key: object, parts: _Parts) -> np.ndarray:
                 raise StateFileError("a tensor of a big-endian machine; save it again as a NumPy array")
             content = parts.read(f"data/{part}")
             if len(content) % _STORAGES[kind].itemsize:
-                raise StateFileError(f"{len(content)} bytes are no numbers of {kind}")
+                raise StateFileError(f"{len(content)} bytes are not numbers of {kind}")
             return np.frombuffer(content, _STORAGES[kind])
     raise StateFileError("a tensor of other values than numbers, or outside of the file")
 

@@ -332,7 +332,7 @@ def sample_settled(
             reason = str(error)
             continue
         simulations.reset([i], qpos[None], np.zeros((1, simulations.model.nv)))
-        if not (reason := "; ".join(start_faults(view))):
+        if not (reason := "; ".join(start_errors(view))):
             return Start(qpos, start.fixtures)
     raise PlacementError(
         f"{scene.problem.language!r}: none of {samples} sampled starts agrees with the task: {reason}"
@@ -353,8 +353,8 @@ def sample_states(scene: Scene, generators: Sequence[np.random.Generator]) -> In
     return np.stack([np.concatenate([[0.0], s.qpos, speed, s.fixtures.ravel()]) for s in starts])
 
 
-def start_faults(view: StateView) -> list[str]:
-    """Return the reasons why a state is no valid start: init atoms that are false, a goal that is true."""
+def start_errors(view: StateView) -> list[str]:
+    """Return the reasons why a state is not a valid start: init atoms that are false, a goal that is true."""
     faults = []
     for atom in view.scene.problem.init:
         if atom.args[0] in view.scene.fixtures:

@@ -1,1 +1,1 @@
-"""Simulation of one compiled scene: stepping, control, state, truth of goals, rewards, observations, images."""
+"""Simulation of one compiled scene: stepping, control, state, goals, rewards, observations, images."""

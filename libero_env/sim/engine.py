@@ -1,4 +1,4 @@
-"""What works by the means of a backend: simulations of a model, the truth of goals in them, and their observer."""
+"""What works by the means of a backend: simulations of a model, goals in them, and their observer."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -16,16 +16,16 @@ from libero_env.tasks.problem import And, Atom, Expression
 
 
 class Goals(Protocol):
-    """The truth of one goal in simulations of its scene.
+    """Whether one goal holds in simulations of its scene.
 
     Attributes:
-        atoms: Atoms whose truth `check` returns.
+        atoms: Atoms that `check` evaluates.
     """
 
     atoms: tuple[Atom, ...]
 
     def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return whether the goal is reached in simulations, (k,) bool, and the truth of its atoms, (k, natoms)."""
+        """Return whether the goal is reached in simulations, (k,) bool, and which atoms hold, (k, natoms)."""
 
 
 class ViewedGoals:
@@ -44,16 +44,16 @@ class ViewedGoals:
         self._is_conjunction = all(part in self.atoms for part in parts)  # no atom is evaluated twice then
 
     def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return whether the goal is reached in simulations, (k,) bool, and the truth of its atoms, (k, natoms)."""
-        reached, truths = np.zeros(len(ids), bool), np.zeros((len(ids), len(self.atoms)), bool)
+        """Return whether the goal is reached in simulations, (k,) bool, and which atoms hold, (k, natoms)."""
+        reached, held = np.zeros(len(ids), bool), np.zeros((len(ids), len(self.atoms)), bool)
         for k, i in enumerate(ids):
             view = self._views[i]
-            truths[k] = [evaluate(atom, view, self._semantics) for atom in self.atoms]
+            held[k] = [evaluate(atom, view, self._semantics) for atom in self.atoms]
             if self._is_conjunction:
-                reached[k] = truths[k].all()
+                reached[k] = held[k].all()
             else:
                 reached[k] = evaluate(self._goal, view, self._semantics)
-        return reached, truths
+        return reached, held
 
 
 def make_simulations(
@@ -92,11 +92,11 @@ def make_goals(
     semantics: str,
     simulations: Simulations,
 ) -> Goals:
-    """Return the truth of a goal in simulations, by the means of their backend.
+    """Return a goal in simulations, evaluated by the means of their backend.
 
     Args:
         goal: The goal.
-        atoms: Atoms whose truth `check` returns, such as `Scene.goal_atoms`.
+        atoms: Atoms that `check` evaluates, such as `Scene.goal_atoms`.
         views: State view of each simulation.
         semantics: Semantics of the predicates, `original` or `strict`.
         simulations: The simulations.

@@ -1,4 +1,4 @@
-"""Rewards, from the truth of the goal and of its atoms.
+"""Rewards, from whether the goal holds and which of its atoms do.
 
 `sparse`: 1 in the step that reaches the goal, else 0. `staged`: with n atoms of which k are true, and progress s
 towards the first that is false,
@@ -47,7 +47,7 @@ class Reward:
             raise UnknownNameError("reward", self.kind, REWARDS)
 
     def __call__(
-        self, view: StateView, success: bool, atoms: Sequence[Atom] = (), truth: Sequence[bool] = ()
+        self, view: StateView, success: bool, atoms: Sequence[Atom] = (), held: Sequence[bool] = ()
     ) -> float:
         """Return the reward of a state.
 
@@ -55,16 +55,16 @@ class Reward:
             view: State.
             success: Whether the goal is true.
             atoms: Atoms of the goal.
-            truth: Truth of each atom.
+            held: Whether each atom holds.
         """
         if success or self.kind == "sparse":
             return self.scale * float(success)
-        return self.scale * staged_reward(view, atoms, truth)
+        return self.scale * staged_reward(view, atoms, held)
 
 
-def staged_reward(view: StateView, atoms: Sequence[Atom], truth: Sequence[bool]) -> float:
+def staged_reward(view: StateView, atoms: Sequence[Atom], held: Sequence[bool]) -> float:
     """Return the staged reward of a state that does not reach the goal, in [0, 0.99]."""
-    missing = [atom for atom, is_true in zip(atoms, truth, strict=True) if not is_true]
+    missing = [atom for atom, holds in zip(atoms, held, strict=True) if not holds]
     progress = atom_progress(view, missing[0]) if missing else 0.0
     return min((len(atoms) - len(missing) + progress) / max(len(atoms), 1), _BEST_WITHOUT_SUCCESS)
 

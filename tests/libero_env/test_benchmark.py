@@ -7,7 +7,7 @@ import pytest
 
 from libero_env.assets.pack import select_pack
 from libero_env.init_states.pickles import read_states
-from libero_env.init_states.placement import start_faults
+from libero_env.init_states.placement import start_errors
 from libero_env.init_states.store import load_init_states
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import build_scene
@@ -77,11 +77,11 @@ def test_init_states_are_at_rest_in_the_regions_of_the_task(key):
     view = StateView(scene, simulations)
     for i in np.random.default_rng(TASKS.index(key)).choice(50, 2, replace=False):
         simulations.reset([0], qpos[[i]], qvel[[i]], fixtures=fixtures[[i]])
-        assert start_faults(view) == []
+        assert start_errors(view) == []
         before = {name: view.body_pos(name) for name in scene.objects}
         idle(simulations)
         assert max(moved(view, before).values()) < STILL
-        assert start_faults(view) == []
+        assert start_errors(view) == []
 
 
 @pytest.mark.parametrize("key", TASKS)

@@ -11,7 +11,7 @@ from libero_env.assets.arena import Workspace
 from libero_env.assets.pack import BUILTIN, Pack
 from libero_env.design.lint.report import Report
 from libero_env.errors import LiberoError, PlacementError
-from libero_env.init_states.placement import sample_start, settle, start_faults
+from libero_env.init_states.placement import sample_start, settle, start_errors
 from libero_env.init_states.store import load_init_states
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.predicates import evaluate
@@ -153,7 +153,7 @@ def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None
             except PlacementError as error:
                 faults["placement", str(error)] += 1
                 continue
-            faults.update(("start", fault) for fault in start_faults(view))
+            faults.update(("start", fault) for fault in start_errors(view))
             if not checked:
                 _check_parts(report, scene, view)
                 _check_goal_reach(report, scene, view)
