@@ -36,7 +36,7 @@ class RunContext:
         eval: Settings of evaluation.
         augment: Augmentation of training batches.
         stream: Settings of the order in which data arrive.
-        group_size: Number of tasks learned together as one step of the sequence, after the base stage.
+        group_sizes: Number of tasks in each group that is one step of the sequence.
         envs: Environments by (position of the task, number of simulations).
         directory: Directory of checkpoints and records.
         tracker: Mirror of the metrics to Weights & Biases.
@@ -58,7 +58,7 @@ class RunContext:
     eval: EvalSettings
     augment: BatchAugmentation | None
     stream: StreamSettings
-    group_size: int
+    group_sizes: tuple[int, ...]
     envs: EnvPool
     directory: RunDirectory
     tracker: Tracker
@@ -79,8 +79,3 @@ class RunContext:
         """Instruction of each task, in the words that its perturbations give it."""
         pairs = zip(self.tasks, self.perturbed, strict=True)
         return tuple(reword_task(task, found).language for task, found in pairs)
-
-    @property
-    def group_sizes(self) -> tuple[int, ...]:
-        """Number of tasks in each group that is one step of the sequence."""
-        return self.stream.group_sizes(len(self.tasks), self.group_size)

@@ -1,4 +1,4 @@
-"""A run: build everything from the configuration, learn the task sequence, write the results."""
+"""A run, step by step: build everything from the configuration, learn the task sequence, write the results."""
 
 import os
 import sys
@@ -16,10 +16,9 @@ from libero_env.assets.pack import select_pack
 from libero_env.demos.read import demo_origin
 from libero_env.envs.batch import BatchEnv
 from libero_env.memory import memory_limit
-from libero_env.perturbations import Perturbation, format_perturbations, reword_task
+from libero_env.perturbations import Perturbation, format_perturbations
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
-from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
 from lifelong.data.demonstrations import (
@@ -29,14 +28,14 @@ from lifelong.data.demonstrations import (
     find_demos,
     perturb_demos,
 )
-from lifelong.data.settings import CAMERAS, DataSettings
+from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError
 from lifelong.evaluation.environment_record import renderer_name_or_none
-from lifelong.evaluation.environments import EnvPool
+from lifelong.evaluation.environments import EnvPool, run_environment
 from lifelong.evaluation.held_out import HeldOutShift, held_out_shift
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
-from lifelong.pretraining import policy_at_start, pretraining_context, pretraining_directory
+from lifelong.pretraining import policy_at_start, pretraining_context
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import (
@@ -48,11 +47,11 @@ from lifelong.results.provenance import (
     utc_now,
 )
 from lifelong.results.records import DemonstrationsRecord, PhaseRecord, RunEndRecord, RunRecord
-from lifelong.results.run_directory import RunDirectory
+from lifelong.results.run_directory import RunDirectory, config_digest
 from lifelong.results.summary import write_summary
 from lifelong.sequence import TaskSequence, is_measured
-from lifelong.settings import BenchmarkSettings, Configuration, PretrainSettings, RunSettings, plain_data
-from lifelong.streams import StreamSettings
+from lifelong.settings import Configuration, RunSettings, plain_data
+from lifelong.streams import plan_tasks
 from lifelong.training.distributed import Ranks
 from lifelong.training.memory import check_memory, policy_bytes, training_needs
 from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory
@@ -78,130 +77,44 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
         LiberoError: The configuration, the data or the directory is invalid.
     """
     plain = _with_drawing(plain_data(config))
-    checked = Configuration(plain)
-    settings = checked.settings()
-    path = Path(settings.runs_dir) / _run_name(names, settings)
-    _check_writable(path)
-    _set_threads(settings, path)
+    configuration = Configuration(plain)
+    settings = configuration.settings()
+    directory = RunDirectory(Path(settings.runs_dir) / _run_name(names, settings))
+    _check_writable(directory.path)
+    _set_threads(settings, directory.path)
     keep_freed_memory()
     with deterministic(settings.deterministic):
         # before anything is written: an invalid configuration leaves no trace
-        context, pretraining = _build_contexts(checked, names, settings, ranks)
-        directory = context.directory
-        with _opened(context, plain, settings.resume):
-            finished = ranks.broadcast(_is_finished, context)
-            if finished and ranks.first:
-                print(
-                    f"{directory.path} is finished; its report is written again (resume=false repeats the run)"
-                )
-            if not finished:
+        context, pretraining = _build_contexts(configuration, settings, directory, ranks)
+        with _held(context, plain, settings.resume):
+            if not ranks.broadcast(_is_finished, context):
                 if ranks.first:
                     _note_single_frames(context.policy, names["policy"])
                     context.tracker.start(_run_name(names, settings), str(directory.path), plain)
                     _record_start(context, names, plain)
                 _run_sequence(context, pretraining, plain)
+            elif ranks.first:
+                print(
+                    f"{directory.path} is finished; its report is written again (resume=false repeats the run)"
+                )
             if ranks.first:
                 context.tracker.finish()
                 _write_results(directory, plain)
     return directory.path
 
 
-def _note_single_frames(policy: Policy, name: str) -> None:
-    """Say where a policy that uses its history is given windows of one frame, as by the preset `laptop`."""
-    if policy.uses_history and policy.spec.seq_len == 1:
-        print(
-            f"note: policy={name} learns and acts on single frames, as data.seq_len=1; "
-            "data.seq_len=10 gives it the last ten, as in the paper",
-            file=sys.stderr,
-        )
+def _with_drawing(config: dict[str, Any]) -> dict[str, Any]:
+    """Return a configuration that names how images are drawn, so that the saved one does."""
+    data = config.get("data")
+    if not isinstance(data, dict) or data.get("drawing") is not None:
+        return config
+    return {**config, "data": {**data, "drawing": default_drawing(select_pack())}}
 
 
-def _is_finished(context: RunContext) -> bool:
-    """Return whether nothing is left to do, also where lines of the records are broken."""
-    results = context.directory.log.read()
-    complete = not results.problems and context.shift is None
-    return results.finished and (complete or is_measured(context, results))
-
-
-def _set_threads(settings: RunSettings, directory: Path) -> None:
-    """Give PyTorch its threads; a resumed run has those that it was started with, on which its bits depend."""
-    threads = settings.threads
-    if not threads and settings.resume:
-        results = ResultLog(directory / "results.jsonl").read()
-        threads = 0 if results.finished else recorded_threads(results) or 0
-        if threads not in (0, torch.get_num_threads()):
-            print(f"threads={threads}, as when this run was started: its bits depend on their number")
-    if threads:
-        torch.set_num_threads(threads)
-
-
-def _build_contexts(
-    config: Configuration, names: Mapping[str, str], settings: RunSettings, ranks: Ranks
-) -> tuple[RunContext, RunContext | None]:
-    """Return the context of the run, and that of the pretraining before it if there is any."""
-    benchmark: BenchmarkSettings = config.build("benchmark")
-    tasks, device = benchmark.sequence(), ranks.device(settings.device)
-    stream: StreamSettings = config.build("stream")
-    data: DataSettings = config.build("data")
-    check_folder(data)
-    pretrain: PretrainSettings = config.build("pretrain")
-    first = pretrain.sequence()
-    groups = stream.group_sizes(len(tasks), benchmark.group_size)
-    demos, algorithm = stream.demos(data.demos, len(tasks), groups[0]), config.build("algo")
-    fit: FitSettings = config.build("train")
-    evaluation: EvalSettings = config.build("eval")
-    augment, tracker = config.build("augmentation"), config.build("wandb")
-    perturb = stream.perturbations(groups)
-    said = tuple(reword_task(task, found).language for task, found in zip(tasks, perturb, strict=True))
-    _check_memory(config, data, fit, evaluation, algorithm, max(demos) * (1 + data.copies), device)
-    if fit.compile != "off":
-        check_compiler(device)
-    known = [*(task.language for task in first), *said]
-    languages = ranks.broadcast(lambda: config.build("language").embed(known))
-    shift = ranks.broadcast(
-        lambda: held_out_shift(
-            evaluation.shift_perturbations(),
-            tasks,
-            perturb,
-            languages[len(first) :],
-            data,
-            lambda words: config.build("language").embed([*known, *words])[len(known) :],
-        )
-    )
-    spec = data.spec(languages.shape[1])
-    progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
-    context = RunContext(
-        tasks=tasks,
-        languages=languages[len(first) :],
-        demos=demos,
-        data=data,
-        policy=policy_at_start(config, spec, settings.seed, settings.init_from).to(device),
-        algorithm=algorithm,
-        fit=fit,
-        eval=evaluation,
-        augment=augment,
-        stream=stream,
-        group_size=benchmark.group_size,
-        envs=EnvPool(
-            partial(_make_env, tasks, spec, evaluation, data, perturb=perturb, shift=shift),
-            evaluation.open_environments,
-        ),
-        directory=RunDirectory(Path(settings.runs_dir) / _run_name(names, settings)),
-        tracker=tracker,
-        seed=settings.seed,
-        device=device,
-        progress=progress if ranks.first else False,
-        ranks=ranks,
-        perturb=perturb if stream.perturb else (),
-        shift=shift,
-    )
-    if not first:
-        return context, None
-    folder = Path(settings.runs_dir) / "pretrain" / str(pretrain.suite)
-    directory = pretraining_directory(folder, _pretraining_config(config.values))
-    return context, pretraining_context(
-        context, tasks=first, languages=languages[: len(first)], settings=pretrain, directory=directory
-    )
+def _run_name(names: Mapping[str, str], settings: RunSettings) -> str:
+    """Return the run's directory below `runs_dir`, which is also its name in W&B."""
+    words = [names["policy"], f"seed{settings.seed}", *([str(settings.run_id)] if settings.run_id else [])]
+    return f"{names['benchmark']}/{names['algo']}/{'_'.join(words)}"
 
 
 def _check_writable(directory: Path) -> None:
@@ -217,44 +130,91 @@ def _check_writable(directory: Path) -> None:
         raise ConfigError(f"runs_dir: nothing can be written into {nearest}, in which {directory} is made")
 
 
-def _run_name(names: Mapping[str, str], settings: RunSettings) -> str:
-    """Return the run's directory below `runs_dir`, which is also its name in W&B."""
-    words = [names["policy"], f"seed{settings.seed}", *([str(settings.run_id)] if settings.run_id else [])]
-    return f"{names['benchmark']}/{names['algo']}/{'_'.join(words)}"
+def _set_threads(settings: RunSettings, directory: Path) -> None:
+    """Give PyTorch its threads; a resumed run has those that it was started with, on which its bits depend."""
+    threads = settings.threads
+    if not threads and settings.resume:
+        results = ResultLog(directory / "results.jsonl").read()
+        threads = 0 if results.finished else recorded_threads(results) or 0
+        if threads not in (0, torch.get_num_threads()):
+            print(f"threads={threads}, as when this run was started: its bits depend on their number")
+    if threads:
+        torch.set_num_threads(threads)
 
 
-def _with_drawing(config: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration that names how images are drawn, so that the saved one does."""
-    data = config.get("data")
-    if not isinstance(data, dict) or data.get("drawing") is not None:
-        return config
-    return {**config, "data": {**data, "drawing": default_drawing(select_pack())}}
+def _build_contexts(
+    config: Configuration, settings: RunSettings, directory: RunDirectory, ranks: Ranks
+) -> tuple[RunContext, RunContext | None]:
+    """Return the context of the run, and that of the pretraining before it if there is any."""
+    plan, device = plan_tasks(config), ranks.device(settings.device)
+    data: DataSettings = config.build("data")
+    check_folder(data)
+    fit: FitSettings = config.build("train")
+    evaluation: EvalSettings = config.build("eval")
+    algorithm, augment, tracker = config.build("algo"), config.build("augmentation"), config.build("wandb")
+    demos = plan.stream.demos(data.demos, len(plan.tasks), plan.group_sizes[0])
 
-
-def _check_memory(
-    config: Configuration,
-    data: DataSettings,
-    fit: FitSettings,
-    evaluation: EvalSettings,
-    algorithm: Algorithm,
-    demos: int,
-    device: torch.device,
-) -> None:
-    """Refuse what cannot fit into memory, and sizes of a policy that do not work together."""
+    # what cannot fit into memory is refused, and sizes of a policy that do not work together
     weights = policy_bytes(config, data.spec(EXAMPLE_DIM))
     episodes = max(evaluation.episodes, evaluation.curve_episodes)
     replayed = algorithm.ratio if isinstance(algorithm, Rehearsal) else 0.0
-    needs = training_needs(data, fit, weights, demos, episodes, replayed)
-    available = None if device.type != "cuda" else torch.cuda.get_device_properties(device).total_memory
-    check_memory(needs, memory_limit() + (available or 0))
+    needs = training_needs(data, fit, weights, max(demos) * (1 + data.copies), episodes, replayed)
+    on_gpu = torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else 0
+    check_memory(needs, memory_limit() + on_gpu)
+    if fit.compile != "off":
+        check_compiler(device)
 
-
-def _pretraining_config(plain: Any) -> dict[str, Any]:
-    return {key: plain[key] for key in PRETRAIN_KEYS}
+    first, said = len(plan.before), list(plan.instructions)
+    languages = ranks.broadcast(lambda: config.build("language").embed(said))
+    shift = ranks.broadcast(
+        lambda: held_out_shift(
+            evaluation.shift_perturbations(),
+            plan.tasks,
+            plan.perturb,
+            languages[first:],
+            data,
+            lambda words: config.build("language").embed([*said, *words])[len(said) :],
+        )
+    )
+    spec = data.spec(languages.shape[1])
+    make = partial(_make_env, plan.tasks, spec, evaluation, data, perturb=plan.perturb, shift=shift)
+    progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
+    context = RunContext(
+        tasks=plan.tasks,
+        languages=languages[first:],
+        demos=demos,
+        data=data,
+        policy=policy_at_start(config, spec, settings.seed, settings.init_from).to(device),
+        algorithm=algorithm,
+        fit=fit,
+        eval=evaluation,
+        augment=augment,
+        stream=plan.stream,
+        group_sizes=plan.group_sizes,
+        envs=EnvPool(make, evaluation.open_environments),
+        directory=directory,
+        tracker=tracker,
+        seed=settings.seed,
+        device=device,
+        progress=progress if ranks.first else False,
+        ranks=ranks,
+        perturb=plan.perturb if plan.stream.perturb else (),
+        shift=shift,
+    )
+    if not first:
+        return context, None
+    pretrain = config.build("pretrain")
+    folder = Path(settings.runs_dir) / "pretrain" / str(pretrain.suite)
+    folder /= config_digest(
+        {key: config.values[key] for key in PRETRAIN_KEYS}
+    )  # equal ones are shared by runs
+    return context, pretraining_context(
+        context, plan.before, languages[:first], pretrain, RunDirectory(folder)
+    )
 
 
 def _make_env(
-    tasks: tuple[Task, ...],
+    tasks: Sequence[Task],
     spec: PolicySpec,
     settings: EvalSettings,
     data: DataSettings,
@@ -266,23 +226,37 @@ def _make_env(
     """Return the environment of a key: position of the task, number of simulations, and the shift if there is one."""
     task, simulations, *shifted = key
     perturb = shift.perturb if shifted and shift is not None else perturb
-    return BatchEnv(
+    return run_environment(
         tasks[task],
         simulations,
-        num_threads=settings.sim_threads,
-        cameras=tuple(CAMERAS[view] for view in spec.views),
-        camera_size=spec.image_size,
-        horizon=settings.horizon + settings.settle_steps,
+        spec,
+        settings,
         drawing=data.drawing,
         robot=data.robot,
-        backend=settings.backend,
         perturb=perturb[task] if perturb else (),
     )
 
 
-def _opened(context: RunContext, plain: Mapping[str, Any], resume: bool) -> AbstractContextManager[Any]:
+def _held(context: RunContext, plain: Mapping[str, Any], resume: bool) -> AbstractContextManager[Any]:
     """Return the context manager that holds the directory's lock, on the first rank."""
     return context.directory.opened(plain, resume) if context.ranks.first else nullcontext()
+
+
+def _is_finished(context: RunContext) -> bool:
+    """Return whether nothing is left to do, also where lines of the records are broken."""
+    results = context.directory.log.read()
+    complete = not results.problems and context.shift is None
+    return results.finished and (complete or is_measured(context, results))
+
+
+def _note_single_frames(policy: Policy, name: str) -> None:
+    """Say where a policy that uses its history is given windows of one frame, as by the preset `laptop`."""
+    if policy.uses_history and policy.spec.seq_len == 1:
+        print(
+            f"note: policy={name} learns and acts on single frames, as data.seq_len=1; "
+            "data.seq_len=10 gives it the last ten, as in the paper",
+            file=sys.stderr,
+        )
 
 
 def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> None:
@@ -367,8 +341,8 @@ def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mappin
     if pretraining is None:
         return
     ranks, directory, began = context.ranks, pretraining.directory, time.perf_counter()
-    config, suite = _pretraining_config(plain), str(plain["pretrain"]["suite"])
-    with _opened(pretraining, config, resume=True):
+    config, suite = {key: plain[key] for key in PRETRAIN_KEYS}, str(plain["pretrain"]["suite"])
+    with _held(pretraining, config, resume=True):
         done = ranks.broadcast(lambda: directory.log.read().finished)
         if not done and ranks.first:
             count = len(pretraining.tasks)

@@ -1,9 +1,8 @@
 """What a policy knows before the first task: the weights of another run, or a suite learned jointly."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from torch import Tensor
 
@@ -15,7 +14,6 @@ from lifelong.errors import CheckpointError, ConfigError
 from lifelong.evaluation.restore import read_config, restore
 from lifelong.policies.base import Policy
 from lifelong.results.log import ResultLog
-from lifelong.results.provenance import config_digest
 from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import INIT, seeded
 from lifelong.settings import Configuration, PretrainSettings
@@ -60,7 +58,7 @@ def initial_policy(run: Path, *, weights: Path | None = None, allow: Sequence[st
     """
     loaded, config = restore(run, device="cpu", allow=allow), read_config(run / "config.yaml", allow)
     before = weights or config.values.get("init_from")
-    if before is None and "pretrain" in config.values and config.build("pretrain").sequence():
+    if before is None and config.build("pretrain").sequence():
         raise ConfigError(
             f"{run} began with pretrained weights; name them with --initial, such as a folder in runs/pretrain"
         )
@@ -104,7 +102,6 @@ def _last_checkpoint(run: Path) -> Path:
 
 def pretraining_context(
     context: RunContext,
-    *,
     tasks: tuple[Task, ...],
     languages: Tensor,
     settings: PretrainSettings,
@@ -132,17 +129,7 @@ def pretraining_context(
         stream=StreamSettings(),
         perturb=(),
         shift=None,
-        group_size=1,
+        group_sizes=(1,) * len(tasks),
         directory=directory,
         tracker=Tracker(),
     )
-
-
-def pretraining_directory(folder: Path, config: Mapping[str, Any]) -> RunDirectory:
-    """Return the directory of a pretraining.
-
-    Args:
-        folder: Folder of all pretrainings on the suite.
-        config: The part of the run's configuration that affects the pretraining.
-    """
-    return RunDirectory(folder / config_digest(config))

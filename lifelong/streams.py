@@ -12,13 +12,15 @@ from typing import Annotated
 import torch
 from pydantic import Field
 
-from libero_env.perturbations import Perturbation
+from libero_env.perturbations import Perturbation, reword_task
+from libero_env.tasks import Task
 from libero_env.validation import checked
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.settings import PerturbSetting, read_perturbations
 from lifelong.data.windows import StageWindows, TaskWindows, WindowSubset
 from lifelong.errors import ConfigError
 from lifelong.seeding import BLUR, generator
+from lifelong.settings import Configuration
 from lifelong.types import Count, Natural
 
 Stages = tuple[tuple[int, ...], ...]
@@ -130,6 +132,44 @@ class StreamSettings:
                     f"stream.demos_later lists {len(counts)} tasks; {rest} come after the first stage"
                 )
         return (*[full] * first, *counts)
+
+
+@dataclass(frozen=True)
+class TaskPlan:
+    """The tasks of a run.
+
+    Attributes:
+        before: Tasks of the pretraining.
+        tasks: The K tasks in learning order, without perturbations.
+        stream: Settings of the order in which data arrive.
+        group_sizes: Number of tasks in each group that is learned together.
+        perturb: Perturbations under which each task is learned and evaluated.
+    """
+
+    before: tuple[Task, ...]
+    tasks: tuple[Task, ...]
+    stream: StreamSettings
+    group_sizes: tuple[int, ...]
+    perturb: tuple[tuple[Perturbation, ...], ...]
+
+    @property
+    def instructions(self) -> tuple[str, ...]:
+        """Instructions that are embedded together: those of the pretraining, then those of the run, reworded."""
+        learned = (reword_task(task, some) for task, some in zip(self.tasks, self.perturb, strict=True))
+        return tuple(task.language for task in (*self.before, *learned))
+
+
+def plan_tasks(config: Configuration) -> TaskPlan:
+    """Return the tasks of a run's configuration.
+
+    Raises:
+        ConfigError: They cannot be divided into groups as the configuration says.
+        UnknownNameError: A suite, an order or a task does not exist.
+    """
+    benchmark, stream = config.build("benchmark"), config.build("stream")
+    tasks, before = benchmark.sequence(), config.build("pretrain").sequence()
+    groups = stream.group_sizes(len(tasks), benchmark.group_size)
+    return TaskPlan(before, tasks, stream, groups, stream.perturbations(groups))
 
 
 def learning_stages(algorithm: Algorithm, sizes: Sequence[int]) -> Stages:

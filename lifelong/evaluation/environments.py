@@ -1,10 +1,17 @@
 """Environments of an evaluation: the interface that rollouts use, and a pool of open environments."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
+
+from libero_env.envs.batch import BatchEnv
+from libero_env.perturbations import Perturbation
+from libero_env.tasks import Task
+from lifelong.data.settings import CAMERAS
+from lifelong.evaluation.settings import EvalSettings
+from lifelong.types import PolicySpec
 
 Obs = Mapping[str, np.ndarray]  # name -> (B, ...)
 
@@ -57,3 +64,40 @@ class EnvPool:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def run_environment(
+    task: Task,
+    simulations: int,
+    spec: PolicySpec,
+    settings: EvalSettings,
+    *,
+    drawing: str | None,
+    robot: str,
+    perturb: Sequence[Perturbation] = (),
+    horizon: int | None = None,
+) -> BatchEnv:
+    """Return an environment in which a run's policy acts.
+
+    Args:
+        task: Task.
+        simulations: Number of episodes that run side by side.
+        spec: What the policy observes.
+        settings: Back end, threads and horizon.
+        drawing: How images are drawn; None for the default of the models.
+        robot: Model of the arm.
+        perturb: Perturbations of the task.
+        horizon: Maximum number of the policy's control steps; None for that of the settings.
+    """
+    return BatchEnv(
+        task,
+        simulations,
+        num_threads=settings.sim_threads,
+        cameras=tuple(CAMERAS[view] for view in spec.views),
+        camera_size=spec.image_size,
+        horizon=(settings.horizon if horizon is None else horizon) + settings.settle_steps,
+        drawing=drawing,
+        robot=robot,
+        backend=settings.backend,
+        perturb=tuple(perturb),
+    )

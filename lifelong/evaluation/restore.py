@@ -14,14 +14,15 @@ from libero_env.perturbations import Perturbation, reword_task
 from libero_env.tasks import Task
 from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm, load_algorithm
-from lifelong.data.settings import CAMERAS, DataSettings
+from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, LifelongError
+from lifelong.evaluation.environments import run_environment
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory, read_saved_config
-from lifelong.settings import BenchmarkSettings, Configuration
-from lifelong.streams import Stages, StreamSettings, learning_stages
+from lifelong.settings import Configuration
+from lifelong.streams import Stages, learning_stages, plan_tasks
 from lifelong.training.distributed import Ranks
 from lifelong.training.memory import check_memory, policy_bytes
 
@@ -110,18 +111,15 @@ class LoadedRun:
             simulations: Number of episodes that run side by side.
             horizon: Maximum number of control steps of the policy.
         """
-        spec = self.policy.spec
-        return BatchEnv(
+        return run_environment(
             self.tasks[position],
             simulations,
-            num_threads=self.eval.sim_threads,
-            cameras=tuple(CAMERAS[view] for view in spec.views),
-            camera_size=spec.image_size,
-            horizon=horizon + self.eval.settle_steps,
+            self.policy.spec,
+            self.eval,
             drawing=self.drawing,
             robot=self.robot,
-            backend=self.eval.backend,
             perturb=self.perturbations(position),
+            horizon=horizon,
         )
 
     @contextmanager
@@ -155,16 +153,9 @@ def restore(
     path, checkpoint, after = _find(source, after)
     config = read_config(path / "config.yaml", allow)
     where = Ranks().device(device)
-    benchmark: BenchmarkSettings = config.build("benchmark")
-    tasks = benchmark.sequence()
-    stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
+    plan, language = plan_tasks(config), config.build("language")
     data: DataSettings = config.build("data")
-    language = config.build("language")
-    before: tuple[Task, ...] = config.build("pretrain").sequence() if "pretrain" in config.values else ()
-    groups = stream.group_sizes(len(tasks), benchmark.group_size)
-    perturb = stream.perturbations(groups) if stream.perturb else ()
-    learned = tuple(reword_task(*pair) for pair in zip(tasks, perturb, strict=True)) if perturb else tasks
-    instructions = tuple(t.language for t in (*before, *learned))
+    tasks, instructions = plan.tasks, plan.instructions
     spec = data.spec(language.embed(instructions).shape[1])
     weights = policy_bytes(config, spec)
     check_memory({f"the policy's weights ({path / 'config.yaml'})": weights or 0})
@@ -190,9 +181,9 @@ def restore(
         language=language,
         instructions=instructions,
         robot=data.robot,
-        group_sizes=groups,
+        group_sizes=plan.group_sizes,
         drawing=data.drawing,
-        perturb=perturb,
+        perturb=plan.perturb if plan.stream.perturb else (),
     )
 
 

@@ -11,29 +11,18 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
 from typing import Any
 
-import torch
-from torch import Tensor
-
-from lifelong import checkpoints
-from lifelong.algorithms.base import load_algorithm
 from lifelong.context import RunContext
 from lifelong.data.windows import TaskWindows
-from lifelong.errors import CheckpointError, DamagedCheckpointError
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.seeding import END_TASK, FIT, generator, seeded
 from lifelong.sequence.measuring import Evaluator
+from lifelong.sequence.recovery import Recovery, say
 from lifelong.sequence.stages import TrainingPhase, lacks_row, mean_rate, missing_points, training_phases
 from lifelong.streams import StageData, learning_stages
 from lifelong.training import costs
 from lifelong.training.fit import EpochEnd, fit
-
-State = dict[str, Any]  # of a checkpoint
-
-SAVE_EVERY = 60.0  # [s] between two saves during training, besides those at points of the learning curve
 
 
 class TaskSequence:
@@ -58,7 +47,7 @@ class TaskSequence:
         self.data = StageData(datasets, self.stages, context.stream, context.seed)
         self.evaluator = Evaluator(context, self.stages)
         self._reached = -1  # number of the stage after which the policy is; -1: before the first
-        self._saved = time.monotonic()
+        self.recovery = Recovery(context, self.data)
         context.algorithm.set_augmentation(context.augment)
 
     def run(self, *, evaluate: bool = True) -> None:
@@ -74,9 +63,9 @@ class TaskSequence:
             if ranks.broadcast(self._to_learn, number):
                 self._learn_stage(number)
             if evaluate and ranks.broadcast(self._to_evaluate, stage):
-                self._restore(number)
+                self._bring_to(number)
                 ranks.broadcast(self._evaluate_seen_tasks, stage)
-        self._restore(len(self.stages) - 1)
+        self._bring_to(len(self.stages) - 1)
 
     def _to_learn(self, number: int) -> bool:
         """Return whether a stage is to be learned: it is new, or points of its learning curve are lost."""
@@ -85,68 +74,35 @@ class TaskSequence:
             return True
         stage = self.stages[number]
         if lost := missing_points(self.context, stage, self.log.read()):
-            self._log(
+            say(
+                self.context,
                 f"{self.log.path} lacks points of the learning curve of task {stage[-1] + 1} (epochs "
-                f"{', '.join(map(str, lost[:5]))}): it is learned again to measure them"
+                f"{', '.join(map(str, lost[:5]))}): it is learned again to measure them",
             )
         return bool(lost)
 
     def _to_evaluate(self, stage: Sequence[int]) -> bool:
         return lacks_row(self.context, stage, self.log.read())
 
-    def _restore(self, number: int) -> None:
-        """Bring the policy and the algorithm to where they were after a stage, or before the first one (-1)."""
-        if self._reached == number:
-            return
-        path = self.checkpoints.task_path(self.stages[number][-1])
-        state = self._load(path, partial(self.checkpoints.load_task, path))
-        if state is None:
+    def _bring_to(self, number: int) -> None:
+        """Bring the policy and the algorithm to where they were after a stage."""
+        if self._reached != number and not self.recovery.load_stage(self.stages[number]):
             self._learn_stage(number)
-            return
-        self._load_state(state, path)
         self._reached = number
-
-    def _load(self, path: Path, load: Callable[[torch.device], State]) -> State | None:
-        """Return the state in a checkpoint on all ranks; see `_load_intact`."""
-        found: list[State | None] = []
-
-        def look() -> bool:
-            found.append(self._load_intact(path, load))
-            return found[0] is not None
-
-        there = self.context.ranks.broadcast(look)
-        return found[0] if found else load(self.context.device) if there else None
-
-    def _load_intact(self, path: Path, load: Callable[[torch.device], State]) -> State | None:
-        """Return the state in a checkpoint; None where there is none, or a damaged one, which is set aside."""
-        if not path.exists():
-            return None
-        try:
-            return load(self.context.device)
-        except DamagedCheckpointError as error:
-            name = self.checkpoints.set_aside(path).name
-            self._log(f"{error}; it is kept as {name}, and the run goes on from what was saved before it")
-            return None
-
-    def _load_state(self, state: State, path: Path) -> None:
-        policy, algorithm = self.context.policy, self.context.algorithm
-        if state.get("policy") is not None:
-            checkpoints.load_weights(policy, state["policy"], path)
-        load_algorithm(algorithm, state["algorithm"], self.data, policy, path)
 
     def _learn_stage(self, number: int) -> None:
         """Train on a stage, from its start or from its saved progress, and write its checkpoint."""
         context, stage = self.context, self.stages[number]
-        task, phases, saved = stage[-1], training_phases(context, stage), self._progress(stage)
+        task, phases, saved = stage[-1], training_phases(context, stage), self.recovery.load_progress(stage)
         if saved is None and number:
-            self._restore(number - 1)
+            self._bring_to(number - 1)
         elif saved is None:
             self.prepare()
         dataset = self.data[task]
         title = f"Task {task + 1}/{len(context.tasks)}: {context.instructions[task]}"
         if len(stage) > 1:
             title = f"Tasks {stage[0] + 1}-{task + 1}/{len(context.tasks)}: together"
-        self._log(f"{title} ({len(dataset)} windows)")
+        say(self.context, f"{title} ({len(dataset)} windows)")
         context.ranks.barrier()  # all have read the saved progress
         costs.reset_peak(context.device)
         if saved is None:
@@ -155,47 +111,11 @@ class TaskSequence:
         first, resume = (0, None) if saved is None else (saved["phase"], saved["fit"])
         for phase in phases[first:]:
             self._train(phase, dataset, resume if phase.number == first else None)
-            context.ranks.broadcast(self._save_progress, task, phase.number + 1)
+            context.ranks.broadcast(self.recovery.save_progress, task, phase.number + 1)
         context.ranks.broadcast(self._end_task, task, dataset)
         if not context.ranks.first:
-            path = self.checkpoints.task_path(task)
-            self._load_state(self.checkpoints.load_task(path, context.device), path)
+            self.recovery.apply_stage(stage)
         self._reached = number
-
-    def _progress(self, stage: Sequence[int]) -> State | None:
-        """Load the latest saved progress on a stage that training can go on from, and return it; None without any."""
-        for path in (self.checkpoints.progress_path, self.checkpoints.previous_path):
-            state = self._load(path, partial(self.checkpoints.load_progress, path))
-            if state is not None and self.context.ranks.broadcast(self._is_usable, state, stage):
-                self._load_state(state, path)
-                return state
-            if state is not None and state["task"] == stage[-1]:
-                self._log(f"{path} is not used: records or weights that go with it are lost")
-        return None
-
-    def _is_usable(self, state: State, stage: Sequence[int]) -> bool:
-        """Return whether what comes after a saved progress needs nothing that is lost.
-
-        It may need the points of the learning curve before it, and the weights of the best of them.
-        """
-        phases, fit, results = training_phases(self.context, stage), state["fit"], self.log.read()
-        if state["task"] != stage[-1] or not 0 <= state["phase"] <= len(phases):
-            return False
-        if any(phase.missing_points(results) for phase in phases[: state["phase"]]):
-            return False
-        if fit is None or state["phase"] == len(phases):
-            return fit is None
-        phase = phases[state["phase"]]
-        if not 0 <= fit["epoch"] <= phase.epochs or phase.missing_points(results, before=fit["epoch"]):
-            return False
-        best = (
-            phase.best_epoch(results, phase.epochs) if phase.selects_best and phase.points(results) else None
-        )
-        if best is None or best >= fit["epoch"]:  # not reached yet: its weights will be saved
-            return True
-        path = self.checkpoints.best_path
-        kept = self._load_intact(path, self.checkpoints.load_best)
-        return kept is not None and (kept["task"], kept["epoch"]) == (stage[-1], best)
 
     def _train(self, phase: TrainingPhase, dataset: TaskWindows, resume: dict[str, Any] | None) -> None:
         """Train for one phase, from its first step or a saved epoch, and load the weights that are kept."""
@@ -220,7 +140,7 @@ class TaskSequence:
             ranks=context.ranks,
         )
         if phase.selects_best:
-            self._load_best(phase)
+            self.recovery.load_best(phase)
         context.algorithm.end_phase(phase.kind, context.policy)
 
     def _after_epoch(self, phase: TrainingPhase, end: EpochEnd) -> None:
@@ -236,47 +156,15 @@ class TaskSequence:
             )
             self.log.append(CostRecord(task=task, costs=spent))
         due = end.epoch in context.eval.curve_epochs(phase.epochs)
-        if due or time.monotonic() - self._saved > SAVE_EVERY:
-            self._save_progress(task, phase.number, end.state())
+        if due or self.recovery.is_due():
+            self.recovery.save_progress(task, phase.number, end.state())
         if not (due and phase.kind.measures_transfer):
             return
         success = mean_rate([self.evaluator.evaluate("curve", task, member, epoch) for member in phase.stage])
         loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
-        self._log(f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
+        say(self.context, f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
         if phase.selects_best and phase.best_epoch(self.log.read(), end.epoch) == end.epoch:
-            weights, own = context.policy.state_dict(), self._algorithm_parameters()
-            self.checkpoints.save_best(task, end.epoch, weights, own)
-
-    def _algorithm_parameters(self) -> list[Tensor]:
-        """Return the parameters that are trained besides those of the policy."""
-        of_policy = {id(p) for p in self.context.policy.parameters()}
-        return [p for p in self.context.algorithm.trained(self.context.policy) if id(p) not in of_policy]
-
-    def _load_best(self, phase: TrainingPhase) -> None:
-        """Load the weights of the phase's best epoch."""
-        context, path = self.context, self.checkpoints.best_path
-        best = context.ranks.broadcast(lambda: phase.best_epoch(self.log.read(), phase.epochs))
-        state = self.checkpoints.load_best(context.device)
-        if (state["task"], state["epoch"]) != (phase.task, best):
-            raise CheckpointError(
-                f"{path} is of task {state['task']}, epoch {state['epoch']}; expected task {phase.task}, "
-                f"epoch {best}. Run the same command again: the task is learned from its start"
-            )
-        checkpoints.load_weights(context.policy, state["policy"], path)
-        own = self._algorithm_parameters()
-        if [p.shape for p in own] != [kept.shape for kept in state["own"]]:
-            raise CheckpointError(f"{path} has other parameters of the algorithm than this run")
-        with torch.no_grad():
-            for parameter, kept in zip(own, state["own"], strict=True):
-                parameter.copy_(kept)
-
-    def _save_progress(self, task: int, phase: int, fit_state: dict[str, Any] | None = None) -> None:
-        """Save the progress on a task: inside a phase, or before it."""
-        algorithm = self.context.algorithm.state_dict()
-        state = {"task": task, "phase": phase, "fit": fit_state, "algorithm": algorithm}
-        state["policy"] = None if fit_state is not None else self.context.policy.state_dict()
-        self.checkpoints.save_progress(state)
-        self._saved = time.monotonic()
+            self.recovery.save_best(phase, end)
 
     def _end_task(self, task: int, dataset: TaskWindows) -> None:
         """Let the algorithm end the task, record the costs, and write the task's checkpoint."""
@@ -315,7 +203,7 @@ class TaskSequence:
         told = f"success {new:.0%} on it, {mean:.0%} over {len(row)} so far" if row else "not measured"
         if under and self.context.shift:
             told += f", {mean_rate(under):.0%} over {len(under)} under {self.context.shift.text}"
-        self._log(f"  learned: {told}{self._eta(task)}")
+        say(self.context, f"  learned: {told}{self._eta(task)}")
 
     def _eta(self, task: int) -> str:
         """Return an estimate of the remaining time, from the time that training and evaluation took so far."""
@@ -330,7 +218,3 @@ class TaskSequence:
         rows = [self.context.eval.row(stage, count) for stage in self.stages if stage[-1] > task]
         seconds = remaining * training / learned + sum(map(len, rows)) * sum(cells) / max(1, len(cells))
         return f"; about {max(1, round(seconds / 60))} min left"
-
-    def _log(self, text: str) -> None:
-        if self.context.ranks.first:
-            print(text, flush=True)

@@ -98,7 +98,7 @@ def run_context(path, algo: str, tasks: int = TASKS) -> RunContext:
         eval=EvalSettings(episodes=3, curve_episodes=2, every=1, horizon=6, settle_steps=1, precision="fp32"),
         augment=None,
         stream=StreamSettings(),
-        group_size=1,
+        group_sizes=(1,) * tasks,
         directory=RunDirectory(path),
         tracker=Tracker(),
         seed=1,

@@ -40,7 +40,7 @@ def context(path: Path, algorithm) -> RunContext:
         found.directory.log.append(record((2, 1, 1)))
     fit = replace(found.fit, epochs=1, steps_per_epoch=1, batch_size=4)
     measured = replace(found.eval, episodes=1, curve_episodes=1, horizon=2)
-    return replace(found, algorithm=algorithm, fit=fit, eval=measured, stream=STREAM)
+    return replace(found, algorithm=algorithm, fit=fit, eval=measured, group_sizes=STREAM.group_sizes(4))
 
 
 def algorithm(name: str):

@@ -17,7 +17,7 @@ from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
 from lifelong.context import RunContext
 from lifelong.data.memory import ReplayMemory
 from lifelong.errors import CheckpointError, ConfigError
-from lifelong.pretraining import load_initial_weights, pretraining_context, pretraining_directory
+from lifelong.pretraining import load_initial_weights, pretraining_context
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record, utc_now
@@ -199,12 +199,12 @@ def four(path: Path, algorithm, **changes) -> RunContext:
         tasks="abcd",
         instructions="abcd",
         config={},
-        group_sizes=changes.get("stream", context.stream).group_sizes(4, changes.get("group_size", 2)),
+        group_sizes=changes.get("group_sizes", (2, 2)),
     )
     if not context.directory.log.read().records:
         context.directory.log.append(record)
     fit = replace(context.fit, epochs=1, steps_per_epoch=2)
-    return replace(context, algorithm=algorithm, fit=fit, **({"group_size": 2} | changes))
+    return replace(context, algorithm=algorithm, fit=fit, **({"group_sizes": (2, 2)} | changes))
 
 
 def kept(path: Path) -> tuple[dict, dict]:
@@ -310,7 +310,7 @@ def test_metrics_count_a_group_as_one_task(tmp_path) -> None:
 
 
 def test_without_groups_nothing_changes(tmp_path) -> None:
-    sequence(p := four(tmp_path, Sequential(), group_size=1)).run()
+    sequence(p := four(tmp_path, Sequential(), group_sizes=(1, 1, 1, 1))).run()
     results = p.directory.log.read()
     scores = results.scores()
     rates, episodes = results.success_matrix()
@@ -350,15 +350,6 @@ def test_pretraining_is_joint_without_evaluation_and_done_once(tmp_path, monkeyp
     again = run_context(tmp_path / "d", "sequential")
     before(again, tmp_path / "whole")
     assert_same(dict(again.policy.state_dict()), dict(trained))
-
-
-def test_an_equal_pretraining_is_reused(tmp_path) -> None:
-    config = {"pretrain": {"suite": "libero_90"}, "policy": {"width": 16}, "seed": 1, "device": "cpu"}
-    path = pretraining_directory(tmp_path, config).path
-    assert (
-        path.parent == tmp_path and pretraining_directory(tmp_path, config | {"device": "cuda"}).path == path
-    )
-    assert pretraining_directory(tmp_path, config | {"seed": 2}).path != path
 
 
 def test_a_policy_may_start_from_a_finished_runs_weights(tmp_path) -> None:
