@@ -65,7 +65,7 @@ def test_runs_of_different_ones_are_not_compared():
 
 def test_the_record_of_a_run_names_it():
     facts = {"algo": "er", "benchmark": "b", "policy": "p", "seed": 0, "preset": "", "tasks": ["t"]}
-    facts |= {"instructions": ["do"], "config": ""}
+    facts |= {"instructions": ["do"], "config": {}}
     assert start_record(**facts).backend == "mujoco"
     assert start_record(**facts, backend="warp").backend == "warp"
 

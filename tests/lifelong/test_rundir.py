@@ -8,6 +8,7 @@ import pytest
 
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.results.run_directory import RunDirectory
+from lifelong.settings import build
 from lifelong.tracking import Tracker
 
 CONFIG = {"seed": 1, "train": {"lr": 0.1, "epochs": 3}, "device": "cpu", "runs_dir": "a"}
@@ -88,4 +89,4 @@ def test_the_tracker_is_silent_by_default_and_names_its_modes():
     tracker.log({"loss": 1.0})
     tracker.finish()
     with pytest.raises(ConfigError, match="'disabled', 'offline' or 'online'"):
-        Tracker(mode="on")
+        build({"_target_": "lifelong.tracking.Tracker", "mode": "on"})
