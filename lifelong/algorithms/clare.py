@@ -158,19 +158,19 @@ class CLARE(RoutedExperts):
         self, dataset: TaskWindows, policy: Policy, draws: torch.Generator, task: int | None = None
     ) -> Samples:
         """Return inputs of the layers on some of a task's windows, with its adapters or, without it, chosen ones."""
-        found: dict[str, list[Tensor]] = {}
+        inputs: dict[str, list[Tensor]] = {}
         device = device_of(policy)
         chosen = torch.randperm(len(dataset), generator=draws)[: self.windows]
 
         def added(name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
-            found.setdefault(name, []).append(_samples(layer, x)[: max(1, _ROWS * _CHUNK // len(chosen))])
+            inputs.setdefault(name, []).append(_samples(layer, x)[: max(1, _ROWS * _CHUNK // len(chosen))])
             return self._added(name, layer, x)
 
         layers = adaptable_modules(policy, self.adapted)
         with in_mode(policy, training=False), self._using(task, policy, layers, added):
             for part in chosen.split(_CHUNK):
                 policy.predict(dataset.batch(part).to(device))
-        return {name: torch.cat(parts) for name, parts in found.items()}
+        return {name: torch.cat(parts) for name, parts in inputs.items()}
 
     def state_dict(self) -> dict[str, Any]:
         """Return all adapters and autoencoders, and which belong together."""

@@ -66,14 +66,14 @@ class DERpp(Rehearsal):
 
     def stored_outputs(self, batch: Batch) -> dict[str, Tensor]:
         """Return the policy's answers on windows of the memory at the end of their tasks, each (B, T, ...)."""
-        found: dict[str, Tensor] = {}
+        outputs: dict[str, Tensor] = {}
         for task, kept in self._kept.items():
             mine = batch.task_ids == task
             rows = (batch.window_ids[mine, None].to(kept.device) == kept).int().argmax(1)
             for name, values in self._outputs[task].items():
-                part = found.setdefault(name, batch.actions.new_empty(len(batch), *values.shape[1:]))
+                part = outputs.setdefault(name, batch.actions.new_empty(len(batch), *values.shape[1:]))
                 part[mine] = values[rows].to(part)
-        return found
+        return outputs
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator

@@ -11,7 +11,7 @@ from lifelong.algorithms.frozen_base import FrozenBase
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
-from lifelong.nn.experts import ExpertLibrary, Pair, check_matches, matches
+from lifelong.nn.experts import ExpertLibrary, Pair, matches, matching
 from lifelong.policies.base import Policy
 from lifelong.types import Natural, NonNegative, Width
 
@@ -162,9 +162,8 @@ class LoRA(FrozenBase):
         """Return the names of all parameters that tasks may change."""
         learned = {n: p for n, p in policy.named_parameters() if p.requires_grad}
         matrices = [n for n, p in learned.items() if p.dim() >= 2 and not matches(n, self.own)]
-        found = [n for n in matrices if matches(n, self.adapted)]
-        check_matches(found, self.adapted, matrices, "matrix")
-        return [n for n in learned if n in found or matches(n, self.own)]
+        adapted = matching(matrices, self.adapted, "matrix")
+        return [n for n in learned if n in adapted or matches(n, self.own)]
 
     @torch.no_grad()
     def _sum(self, name: str, pair: Pair) -> Tensor:

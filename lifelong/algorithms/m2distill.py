@@ -87,8 +87,8 @@ class M2Distill(Rehearsal):
         student = with_features(policy)
         observation = self.distilled.to(device_of(student)).observation
         self.distilled = None
-        found = distances(student, self.teacher.like(student), observation)
-        return torch.stack([getattr(self, name) * distance for name, distance in found.items()]).sum()
+        parts = distances(student, self.teacher.like(student), observation)
+        return torch.stack([getattr(self, name) * distance for name, distance in parts.items()]).sum()
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
@@ -124,10 +124,10 @@ def distances(student: HistoryPolicy, teacher: HistoryPolicy, observation: Obser
         answers = teacher.head.answers(teacher.head(teacher.over_time(before)))
     features = student.encode(observation)
     params = student.head(student.over_time(features))
-    found = {"policy": student.head.divergence(answers, params).mean()}
+    parts = {"policy": student.head.divergence(answers, params).mean()}
     old, new = teacher.modalities(before), student.modalities(features)
     for name, part in new.items():
         kind = name if name in _NOT_IMAGES else "image"
         distance = (part.float() - old[name].float()).square().sum(-1).mean()
-        found[kind] = found[kind] + distance if kind in found else distance
-    return found
+        parts[kind] = parts[kind] + distance if kind in parts else distance
+    return parts

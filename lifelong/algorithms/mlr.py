@@ -248,11 +248,11 @@ def similar_pairs(instructions: Tensor, images: Tensor) -> list[tuple[int, int]]
     """
     pairs = list(combinations(range(len(instructions)), 2))
     half = math.ceil(len(pairs) / 2)
-    found = set(range(len(pairs)))
+    similar = set(range(len(pairs)))
     for directions in (instructions, images):
         cosines = torch.stack([directions[i] @ directions[j] for i, j in pairs])
-        found &= set(cosines.topk(half).indices.tolist())
-    return [pairs[k] for k in sorted(found)]
+        similar &= set(cosines.topk(half).indices.tolist())
+    return [pairs[k] for k in sorted(similar)]
 
 
 def adjust(z: Tensor, own: Tensor, near: Tensor, margin: float) -> Tensor:

@@ -98,7 +98,7 @@ class CompressedWindows:
         """Decode frames (n,), -> (n, V, H, W, C) uint8.
 
         Raises:
-            DataError: A file is no WebP picture of the views' size.
+            DataError: A file is not a WebP picture of the views' size.
         """
         out = np.empty((len(frames), self.views * self.height, self.width, 3), np.uint8)
         codes = self.codes.numpy()
@@ -263,10 +263,10 @@ def _decode(code: bytes, shape: tuple[int, ...]) -> np.ndarray:
         with Image.open(io.BytesIO(code), formats=["WEBP"]) as picture:
             if (picture.height, picture.width, 3) == shape:
                 return np.asarray(picture.convert("RGB"))
-            found = f"{picture.width} x {picture.height} pixels"
+            content = f"{picture.width} x {picture.height} pixels"
     except (OSError, ValueError) as error:
-        found = f"no picture ({error})"
-    raise DataError(f"a frame in the memory has {found}; expected {shape[1]} x {shape[0]} pixels")
+        content = f"no readable picture ({error})"
+    raise DataError(f"a frame in the memory has {content}; expected {shape[1]} x {shape[0]} pixels")
 
 
 def _are_below(indices: Tensor, size: int) -> bool:

@@ -40,7 +40,7 @@ def find_demos(
             required.
         DemoError: A file is broken, or demonstrations cannot be recorded.
     """
-    folder, found = check_folder(data), dict[str, Path]()
+    folder, files = check_folder(data), dict[str, Path]()
     for task, count in zip(tasks, counts, strict=True) if folder else ():
         file = Path(folder or "") / task.suite / f"{task.name}_demo.hdf5"
         if file.is_file():
@@ -49,9 +49,9 @@ def find_demos(
                 raise DataError(
                     f"{file} has {available} demonstrations and {count} are required; use data.demos={available}"
                 )
-            found[task.id] = file
+            files[task.id] = file
     for count in sorted(set(counts), reverse=True):
-        missing = [t for t, n in zip(tasks, counts, strict=True) if n == count and t.id not in found]
+        missing = [t for t, n in zip(tasks, counts, strict=True) if n == count and t.id not in files]
         if not missing:
             continue
         paths = ensure_demos(
@@ -63,8 +63,8 @@ def find_demos(
             robot=data.robot,
             progress=progress,
         )
-        found |= zip([task.id for task in missing], paths, strict=True)
-    return [found[task.id] for task in tasks]
+        files |= zip([task.id for task in missing], paths, strict=True)
+    return [files[task.id] for task in tasks]
 
 
 def check_folder(data: DataSettings) -> Path | None:
@@ -109,8 +109,8 @@ def perturb_demos(
     """
     size = (data.image_size, data.image_size)
     jobs = [
-        RenderJob(path, task, n, RenderConfig(size=size, drawing=data.drawing, perturb=tuple(found)))
-        for path, task, n, found in zip(paths, tasks, counts, perturb, strict=True)
+        RenderJob(path, task, n, RenderConfig(size=size, drawing=data.drawing, perturb=tuple(of_task)))
+        for path, task, n, of_task in zip(paths, tasks, counts, perturb, strict=True)
     ]
     return ensure_rendered(jobs, progress=progress)
 
@@ -136,13 +136,13 @@ def demo_copies(
     Raises:
         DemoError: A file is broken, or cannot be written.
     """
-    found: list[tuple[Path, ...]] = [()] * len(paths)
+    copies_of_each: list[tuple[Path, ...]] = [()] * len(paths)
     for number in range(data.copies):
         draws = [replace(one, seed=one.seed + number) for one in data.perturbations()]
         of_copy = [replace_perturbations(own, draws) for own in perturb]
         files = perturb_demos(paths, tasks, counts, of_copy, data, progress)
-        found = [(*copies, file) for copies, file in zip(found, files, strict=True)]
-    return found
+        copies_of_each = [(*copies, file) for copies, file in zip(copies_of_each, files, strict=True)]
+    return copies_of_each
 
 
 @dataclass(frozen=True)

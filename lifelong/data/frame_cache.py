@@ -99,11 +99,11 @@ class FrameFile:
         Raises:
             DataError: The file cannot be read, or is shorter than it was.
         """
-        found = torch.empty(len(frames), *self.shape[1:], dtype=torch.uint8) if out is None else out
-        places = found.view(len(frames), self._size).numpy()
+        rows = torch.empty(len(frames), *self.shape[1:], dtype=torch.uint8) if out is None else out
+        places = rows.view(len(frames), self._size).numpy()
         for start, first, count in _runs(frames):
             self._read(places[start : start + count], first)
-        return found
+        return rows
 
     def expect(self, frames: Tensor) -> None:
         """Let the system read frames ahead, while the caller does something else.
@@ -118,10 +118,10 @@ class FrameFile:
     def to(self, device: torch.device | str) -> Tensor:
         """Return all frames as a tensor on a device."""
         step = max(1, _READ_AT_ONCE // self._size)
-        found = torch.empty(self.shape, dtype=torch.uint8, device=device)
+        frames = torch.empty(self.shape, dtype=torch.uint8, device=device)
         for indices in torch.arange(len(self)).split(step):
-            found[indices[0] : indices[-1] + 1] = self.rows(indices).to(device)
-        return found
+            frames[indices[0] : indices[-1] + 1] = self.rows(indices).to(device)
+        return frames
 
     def _read(self, rows: np.ndarray, first: int) -> None:
         """Fill rows (n, bytes) with the frames from `first` on."""

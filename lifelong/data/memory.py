@@ -141,7 +141,7 @@ class ReplayMemory(TaskMemory[Tensor]):
         """
         for task, kept in state["indices"].items():
             if not task.isdecimal() or kept.dtype != torch.int64 or kept.dim() != 1 or (kept < 0).any():
-                raise DataError(f"the memory's windows of task {task!r} are no indices")
+                raise DataError(f"the memory's windows of task {task!r} are not indices")
         indices = {int(task): i.clone() for task, i in state["indices"].items()}
         absent = sorted(set(indices) - set(datasets))
         if absent:

@@ -116,7 +116,7 @@ def read_perturbations(
     """
     text = value if isinstance(value, str) else ",".join(f"{k}={v}" for k, v in (value or {}).items())
     try:
-        found = tuple(one for one in parse_perturbations(text, seed) if one.severity)
-        return rendered_perturbations(found) if rendered else found
+        perturbations = tuple(one for one in parse_perturbations(text, seed) if one.severity)
+        return rendered_perturbations(perturbations) if rendered else perturbations
     except LiberoError as error:
         raise ConfigError(f"{key} is {text!r}: {error}") from error

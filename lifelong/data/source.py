@@ -100,13 +100,13 @@ def check_fits(demo: Episode, spec: PolicySpec, source: str) -> None:
     for key, shape in expected.items():
         if key not in demo.obs:
             raise DataError(f"{where}/obs/{key} is missing; it has {', '.join(sorted(demo.obs))}")
-        found = demo.obs[key].shape
-        if found != (len(demo.actions), *shape):
+        actual = demo.obs[key].shape
+        if actual != (len(demo.actions), *shape):
             hint = ""
-            if key in spec.views and len(found) == 4:
-                hint = f". Set the policy's image_size to {list(found[1:3])}, or record at {list(shape[:2])}"
+            if key in spec.views and len(actual) == 4:
+                hint = f". Set the policy's image_size to {list(actual[1:3])}, or record at {list(shape[:2])}"
             raise DataError(
-                f"{where}/obs/{key} is {found}; the policy expects {(len(demo.actions), *shape)}{hint}"
+                f"{where}/obs/{key} is {actual}; the policy expects {(len(demo.actions), *shape)}{hint}"
             )
         if key in spec.views and demo.obs[key].dtype != np.uint8:
             raise DataError(f"{where}/obs/{key} is {demo.obs[key].dtype}; expected uint8 in 0..255")

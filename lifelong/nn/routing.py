@@ -111,8 +111,8 @@ def nearest_key(x: Tensor, prototypes: Mapping[int, Tensor]) -> Tensor:
 
 def groups_of_rows(keys: Tensor) -> list[tuple[int, Tensor | None]]:
     """Return the keys that occur among (B,) int64, each with its rows (n,) int64; None for all rows."""
-    found = keys.unique().tolist()
-    return [(key, None if len(found) == 1 else (keys == key).nonzero()[:, 0]) for key in found]
+    distinct = keys.unique().tolist()
+    return [(key, None if len(distinct) == 1 else (keys == key).nonzero()[:, 0]) for key in distinct]
 
 
 class Discriminator:
@@ -157,10 +157,10 @@ class Discriminator:
                 optimizer.zero_grad()
                 _errors(samples[rows], weights).mean().backward()
                 optimizer.step()
-        found = cls({n: w.detach() for n, w in weights.items()})
-        errors = found.errors(samples)
-        found.weights |= {"mean": errors.mean(), "std": errors.std(correction=0)}
-        return found
+        discriminator = cls({n: w.detach() for n, w in weights.items()})
+        errors = discriminator.errors(samples)
+        discriminator.weights |= {"mean": errors.mean(), "std": errors.std(correction=0)}
+        return discriminator
 
     def errors(self, samples: Tensor) -> Tensor:
         """Return the error of each sample (n, tokens, D), (n,) float32."""

@@ -122,7 +122,7 @@ class LeRobotPolicy(Policy):
         known = policy_class.config_class.__dataclass_fields__
         if unknown := sorted(set(settings) - set(known)):
             raise ConfigError(
-                f"policy.settings.{unknown[0]} is no setting of LeRobot's {self.type}; valid: {', '.join(known)}"
+                f"policy.settings.{unknown[0]} is not a setting of LeRobot's {self.type}; valid: {', '.join(known)}"
             )
         chosen = {**DEFAULTS.get(self.type, {}), **chunk, **settings}
         if "n_action_steps" in known:
@@ -136,15 +136,15 @@ class LeRobotPolicy(Policy):
     def _features(self) -> dict[str, dict[str, Any]]:
         types = lerobot_module("configs.types")
         feature, kind = types.PolicyFeature, types.FeatureType
-        found = {
+        inputs = {
             IMAGES.get(view, f"observation.images.{view}"): feature(kind.VISUAL, (3, *self.spec.image_size))
             for view in self.spec.views
         }
-        found[STATE] = feature(kind.STATE, (sum(self.spec.proprio.values()),))
+        inputs[STATE] = feature(kind.STATE, (sum(self.spec.proprio.values()),))
         if self.language:
-            found[EMBEDDING] = feature(kind.ENV, (self.spec.language_dim,))
+            inputs[EMBEDDING] = feature(kind.ENV, (self.spec.language_dim,))
         return {
-            "input_features": found,
+            "input_features": inputs,
             "output_features": {ACTION: feature(kind.ACTION, (self.spec.action_dim,))},
         }
 
@@ -154,8 +154,8 @@ class LeRobotPolicy(Policy):
         if self.when == "latest" or (self.when == "first" and int(self.met) == 1):
             readings, actions = _frames_of(dataset, tuple(self.spec.proprio))
             frames = torch.cat([readings, actions], dim=1).double()
-            found = (frames.mean(0), frames.std(0, unbiased=False), frames.amin(0), frames.amax(0))
-            self.moments.copy_(torch.stack(found).to(self.moments))
+            moments = (frames.mean(0), frames.std(0, unbiased=False), frames.amin(0), frames.amax(0))
+            self.moments.copy_(torch.stack(moments).to(self.moments))
 
     def _remember(self, embedding: Tensor, instruction: str) -> None:
         number, text = int(self.met), instruction.encode()
@@ -290,15 +290,15 @@ class LeRobotPolicy(Policy):
     def statistics(self) -> dict[str, dict[str, Tensor]]:
         """Return the statistics as LeRobot has them; of images those of ImageNet, its default."""
         colours = {name: torch.tensor(values).view(3, 1, 1) for name, values in _IMAGENET.items()}
-        found = {IMAGES.get(view, f"observation.images.{view}"): colours for view in self.spec.views}
+        statistics = {IMAGES.get(view, f"observation.images.{view}"): colours for view in self.spec.views}
         if self.when == "none" or not int(self.met):
-            return found
+            return statistics
         state, action = (
             self.moments.detach()
             .cpu()
             .split([self.moments.shape[1] - self.spec.action_dim, self.spec.action_dim], dim=1)
         )
-        return found | {
+        return statistics | {
             STATE: dict(zip(_KINDS, state, strict=True)),
             ACTION: dict(zip(_KINDS, action, strict=True)),
         }

@@ -143,10 +143,10 @@ def reset_peak(device: torch.device) -> None:
 def peak_costs(device: torch.device) -> dict[str, float]:
     """Return the peak memory of the process since its start, and of the GPU since `reset_peak`, [bytes]."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    found = {"peak_memory_bytes": float(peak if sys.platform == "darwin" else 1024 * peak)}
+    peaks = {"peak_memory_bytes": float(peak if sys.platform == "darwin" else 1024 * peak)}
     if device.type == "cuda":
-        found["peak_gpu_bytes"] = float(torch.cuda.max_memory_allocated(device))
-    return found
+        peaks["peak_gpu_bytes"] = float(torch.cuda.max_memory_allocated(device))
+    return peaks
 
 
 def _count_bytes(node: Any) -> int:

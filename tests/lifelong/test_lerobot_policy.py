@@ -201,7 +201,7 @@ def test_chunks_do_not_depend_on_what_else_is_simulated() -> None:
     [
         (
             {"settings": {"dim_modle": 3}},
-            "policy.settings.dim_modle is no setting of LeRobot's act; valid: .*dim_model",
+            "policy.settings.dim_modle is not a setting of LeRobot's act; valid: .*dim_model",
         ),
         ({"settings": {"vision_backbone": "vgg"}}, "LeRobot refuses its settings: .*vgg"),
         ({"settings": {"chunk_size": 4, "n_action_steps": 4}}, "set data.seq_len=4"),
