@@ -7,7 +7,7 @@ arithmetic with `pi`; nothing in a file is ever executed.
 """
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NoReturn
@@ -91,24 +91,23 @@ def read_text(path: str | Path) -> str:
         fail(str(path), line, f"the byte 0x{content[error.start]:02x}", "UTF-8 text")
 
 
-def parse_expression(text: str, known: Collection[str], file: str = "<string>", line: int = 1) -> Expression:
+def parse_expression(text: str, file: str = "<string>", line: int = 1) -> Expression:
     """Return the expression of an atom or goal, such as `On plate_1 stove_1` or `(Or (Open a) (Not (On b c)))`.
 
     Args:
         text: Text of the expression; the brackets of a single atom may be omitted.
-        known: Names that it may refer to.
         file: Name of the source for error messages.
         line: Line of the source that the text begins on, from 1.
 
     Raises:
         BDDLError: As in `parse`.
     """
-    return _Reader(file).expression(_one_list(text, file, line), set(known))
+    return _Reader(file).expression(_one_list(text, file, line))
 
 
-def parse_atom(text: str, known: Collection[str], file: str = "<string>", line: int = 1) -> Atom:
+def parse_atom(text: str, file: str = "<string>", line: int = 1) -> Atom:
     """Return the atom of a text such as `On plate_1 stove_1`; see `parse_expression`."""
-    return _Reader(file).atom(_one_list(text, file, line), set(known))
+    return _Reader(file).atom(_one_list(text, file, line))
 
 
 def _one_list(text: str, file: str, line: int) -> List:
@@ -195,26 +194,20 @@ class _Reader:
                     line, f"no ({needed} ...) section", f"all of {', '.join(SECTIONS)} but the optional ones"
                 )
         items = {key: section.items[1:] for key, section in sections.items()}
-        regions = self.regions(items.get(":regions", ()))
-        fixtures, objects = self.names(sections[":fixtures"]), self.names(sections[":objects"])
-        known = {*fixtures, *objects, *(region.address for region in regions)}
-        goal_line, goals = sections[":goal"].line, items[":goal"]
-        if len(goals) != 1:
-            self.fail(goal_line, f"{len(goals)} goals", "one, such as (And (On plate_1 stove_1))")
-        twice = sorted(fixtures.keys() & objects.keys())
-        if twice:
-            self.fail(sections[":objects"].line, f"{twice[0]} is a fixture too", "each name declared once")
+        if len(items[":goal"]) != 1:
+            what = f"{len(items[':goal'])} goals"
+            self.fail(sections[":goal"].line, what, "one, such as (And (On plate_1 stove_1))")
         return Problem(
             name=name,
             domain=" ".join(map(self.word, items.get(":domain", ()))) or "robosuite",
             language=" ".join(map(self.word, items[":language"])),
-            regions=regions,
-            fixtures=fixtures,
-            objects=objects,
+            regions=tuple(map(self.region, items.get(":regions", ()))),
+            fixtures=self.names(sections[":fixtures"]),
+            objects=self.names(sections[":objects"]),
             obj_of_interest=tuple(map(self.word, items.get(":obj_of_interest", ()))),
             scene_properties=dict(map(self.scene_property, items.get(":scene_properties", ()))),
-            init=tuple(self.atom(item, known) for item in items[":init"]),
-            goal=self.expression(goals[0], known),
+            init=tuple(map(self.atom, items[":init"])),
+            goal=self.expression(items[":goal"][0]),
         )
 
     def word(self, node: Word | List) -> str:
@@ -246,16 +239,6 @@ class _Reader:
             name, line = waiting[0]
             self.fail(line, f"{name} has no category", "NAME NAME - CATEGORY")
         return categories
-
-    def regions(self, nodes: tuple[Word | List, ...]) -> tuple[Region, ...]:
-        """Return the regions of the section `:regions`."""
-        regions: dict[str, Region] = {}
-        for node in nodes:
-            region = self.region(node)
-            if region.address in regions:
-                self.fail(node.line, f"{region.address} is declared twice", "each region of a target once")
-            regions[region.address] = region
-        return tuple(regions.values())
 
     def region(self, node: Word | List) -> Region:
         """Return the region of one entry of `:regions`."""
@@ -307,33 +290,29 @@ class _Reader:
             self.fail(node.line, f"not a scene property: {show(node)}", "(:floor STYLE) or (:wall STYLE)")
         return node.head[1:], " ".join(map(self.word, node.items[1:]))
 
-    def atom(self, node: Word | List, known: set[str]) -> Atom:
-        """Return the atom of a list, whose arguments must be in `known`."""
+    def atom(self, node: Word | List) -> Atom:
+        """Return the atom of a list."""
         if not isinstance(node, List) or len(node.items) < 2:
             self.fail(node.line, f"not an atom: {show(node)}", "(PREDICATE NAME ...)")
         predicate, *args = map(self.word, node.items)
         if not _PREDICATE.fullmatch(predicate):
             self.fail(node.line, f"{predicate} is not a predicate", "letters, such as On, In, Open or Turnon")
-        for name, item in zip(args, node.items[1:], strict=True):
-            if name not in known:
-                valid = ", ".join(sorted(known)) or "a name, but none is declared"
-                self.fail(item.line, f"{name} is not declared", f"one of {valid}")
         return Atom(predicate.capitalize(), tuple(args))
 
-    def expression(self, node: Word | List, known: set[str]) -> Expression:
-        """Return the expression of a list, whose names must be in `known`."""
+    def expression(self, node: Word | List) -> Expression:
+        """Return the expression of a list."""
         parts = node.items[1:] if isinstance(node, List) else ()
         head = node.head if isinstance(node, List) else ""
         if head in ("and", "or"):
-            return (And if head == "and" else Or)(tuple(self.expression(part, known) for part in parts))
+            return (And if head == "and" else Or)(tuple(map(self.expression, parts)))
         if head == "not" and len(parts) == 1:
-            return Not(self.expression(parts[0], known))
+            return Not(self.expression(parts[0]))
         if head == "forall" and len(parts) == 2 and isinstance(parts[0], List):
             variables = self.names(List((Word("forall", node.line), *parts[0].items), node.line))
-            return ForAll(tuple(variables.items()), self.expression(parts[1], known | variables.keys()))
+            return ForAll(tuple(variables.items()), self.expression(parts[1]))
         if head in ("not", "forall"):
             self.fail(node.line, show(node), "(Not EXPRESSION) or (ForAll (?x - CATEGORY) EXPRESSION)")
-        return self.atom(node, known)
+        return self.atom(node)
 
 
 class Lines:

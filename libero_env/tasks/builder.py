@@ -443,13 +443,12 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
         for name, keys in named.items()
         if keys is not None
     )
-    known = {*content.fixtures, *objects, *(region.address for region in regions)}
     parts: tuple[Expression, ...] = ()
     try:
-        init = tuple(bddl.parse_atom(atom, known, *trace.of(atom)) for atom in content.init)
+        init = tuple(bddl.parse_atom(atom, *trace.of(atom)) for atom in content.init)
         for text in content.goal:
             parse = bddl.parse_expression if text.startswith("(") else bddl.parse_atom
-            parts += (parse(text, known, *trace.of(text)),)
+            parts += (parse(text, *trace.of(text)),)
         goal = parts[0] if len(parts) == 1 and content.goal[0].startswith("(") else And(parts)
         interest = content.interest
         if interest is None:

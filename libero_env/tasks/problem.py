@@ -7,13 +7,14 @@ is checked when its scene is built.
 import inspect
 import re
 from collections import Counter
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, Field
 
 from libero_env.errors import InvalidInputError
+from libero_env.text import suggest
 from libero_env.validation import checked
 
 MAX_DEPTH = 64  # levels of a goal, and of brackets in a task file
@@ -412,7 +413,9 @@ def _region(problem: Problem, region: Region, is_used: bool, count: int) -> Iter
         yield "region-ranges", what, "no :ranges; the region is then the site of that name"
 
 
-def _atom(problem: Problem, atom: Atom, bound: Container[str] = ()) -> Iterator[tuple[str, str, str]]:
+def _atom(
+    problem: Problem, atom: Atom, bound: frozenset[str] = frozenset()
+) -> Iterator[tuple[str, str, str]]:
     """Check number and kinds of the arguments of an atom; what is yielded is as of `_region`."""
     kinds, count = KINDS.get(atom.predicate), len(atom.args)
     if kinds is not None and count != len(kinds):
@@ -421,7 +424,12 @@ def _atom(problem: Problem, atom: Atom, bound: Container[str] = ()) -> Iterator[
     for i, name in enumerate(atom.args):
         kind = "object" if name in bound else problem.kind_of(name)
         if kind is None:
-            yield "unknown-name", f": {name} is not declared", "a declared name"
+            declared = sorted(
+                {*problem.fixtures, *problem.objects, *(r.address for r in problem.regions), *bound}
+            )
+            near = suggest(name, declared)
+            valid = f"one of {', '.join(declared)}" if declared else "a declared name"
+            yield "unknown-name", f": {name} is not declared{near and '.'}{near}", valid
         elif kinds is not None and kind not in kinds[i]:
             yield (
                 "kind",

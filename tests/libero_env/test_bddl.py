@@ -96,7 +96,7 @@ def test_a_problem_travels_between_processes():
         (("(:target stove_1)", ""), 8, "region cook_region has no target; expected (:target NAME)"),
         (("plate_1 - plate", "pot_1 - plate"), 12, "pot_1 is declared twice"),
         (("pot_3 - moka_pot", "pot_3"), 13, "pot_3 has no category; expected NAME NAME - CATEGORY"),
-        (("plate_1 - plate", "table - plate"), 11, "table is a fixture too"),
+        (("plate_1 - plate", "table - plate"), 12, "table is a fixture too"),
         (("On pot_1 table_pot_region", "On pot_1 floor"), 16, "floor is not declared; expected one of "),
         (("(turnon stove_1)", "turnon"), 16, "not an atom: turnon; expected (PREDICATE NAME ...)"),
         (("(:language", "(:languish"), 5, "unknown section ':languish'; expected one of :domain, "),

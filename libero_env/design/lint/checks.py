@@ -1,6 +1,6 @@
 """Linter of task files: what is wrong or doubtful, where, and how to fix it.
 
-Names and atoms are checked here, the instruction in `lint.instruction`, what needs the simulator in `lint.scene`.
+Categories and places are checked here, the instruction in `lint.instruction`, what needs the simulator in `lint.scene`.
 """
 
 import re
@@ -17,7 +17,7 @@ from libero_env.sim.predicates import PREDICATES
 from libero_env.tasks import Task, bddl
 from libero_env.tasks.builder import FILE, language_from_name
 from libero_env.tasks.problem import Problem, ProblemError
-from libero_env.tasks.sexpr import List, Word, parse_tree
+from libero_env.tasks.sexpr import parse_tree
 
 __all__ = ["Finding", "lint_file", "lint_task", "lint_text"]
 
@@ -66,7 +66,6 @@ def lint_text(
     except BDDLError as error:
         return [_syntax(error, file)]
     report = Report(file, tree)
-    _check_declared(report, tree)
     try:
         problem = bddl.problem_of(tree, file)
     except ProblemError as error:
@@ -75,10 +74,7 @@ def lint_text(
         if any(one.rule == "size" for one in error.violations):
             return report.sorted()
     except BDDLError as error:
-        finding = _syntax(error, file)
-        if all(known.line != finding.line for known in report.findings):
-            report.findings.append(finding)
-        return report.sorted()
+        return [_syntax(error, file)]
     if task is None:
         name = Path(file).stem
         task = Task(FILE, 0, name, language_from_name(name), problem.language, problem)
@@ -99,36 +95,6 @@ def _syntax(error: BDDLError, file: str) -> Finding:
     return Finding(
         file, int(line), "error", "syntax", what, f"write {expected}" if expected else "fix the file"
     )
-
-
-def _check_declared(report: Report, tree: List) -> None:
-    """Report every name in an atom that is not declared; the parser stops at the first."""
-    lines = report.lines
-    known = {*lines.entities, *lines.regions}
-
-    def visit(node: Word | List, bound: frozenset[str]) -> None:
-        if not isinstance(node, List) or not node.items:
-            return
-        if node.head in ("and", "or", "not"):
-            for part in node.items[1:]:
-                visit(part, bound)
-        elif node.head == "forall" and len(node.items) == 3 and isinstance(node.items[1], List):
-            variables = {word.text for word in node.items[1].items if isinstance(word, Word)}
-            visit(node.items[2], bound | variables)
-        else:
-            for word in node.items[1:]:
-                if isinstance(word, Word) and word.text not in known | bound:
-                    report.error(
-                        word.line,
-                        "unknown-name",
-                        f"{word.text} is not declared",
-                        report.suggest(word.text, known),
-                    )
-
-    for section in tree.items:
-        if isinstance(section, List) and section.head in (":init", ":goal"):
-            for node in section.items[1:]:
-                visit(node, frozenset())
 
 
 def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
