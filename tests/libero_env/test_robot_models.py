@@ -87,13 +87,13 @@ def test_the_check_of_assets_reports_it(monkeypatch):
 @pytest.mark.parametrize(
     "command",
     [
-        "-m lifelong.cli tasks init-states libero_object",
-        "-m lifelong.cli tasks certify libero_object/0 --out {out}",
-        "-m lifelong.cli tasks certify libero_object/0 --jobs 2 --out {out}",
-        "-m lifelong.cli tasks preview libero_object/0 --out {out}/preview.png",
-        "-m lifelong.cli demos generate --benchmark libero_object --n 1 --workers 1",
-        "-m lifelong.cli demos generate --benchmark libero_object --n 1 --workers 2",
-        "train.py preset=smoke hydra.run.dir={out}",
+        "-m libero_env.cli tasks init-states libero_object",
+        "-m libero_env.cli tasks certify libero_object/0 --out {out}",
+        "-m libero_env.cli tasks certify libero_object/0 --jobs 2 --out {out}",
+        "-m libero_env.cli tasks preview libero_object/0 --out {out}/preview.png",
+        "-m libero_env.cli demos generate --benchmark libero_object --n 1 --workers 1",
+        "-m libero_env.cli demos generate --benchmark libero_object --n 1 --workers 2",
+        "train.py preset=smoke runs_dir={out}",
     ],
 )
 def test_commands_end_with_one_line(command, no_robosuite, tmp_path):
