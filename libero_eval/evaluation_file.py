@@ -81,6 +81,11 @@ class TaskResult(Episodes):
         return cls(first.task, first.name, first.instruction, atoms=first.atoms, **rows)
 
     @property
+    def suite(self) -> str:
+        """Name of the task's suite."""
+        return self.task.partition("/")[0]
+
+    @property
     def success(self) -> Estimate:
         """Success rate with Wilson's interval."""
         wins, count = sum(self.successes), len(self.successes)
@@ -138,8 +143,8 @@ class EvaluationResult:
     @property
     def suites(self) -> dict[str, Estimate]:
         """Mean success over the tasks of each suite."""
-        names = dict.fromkeys(r.task.partition("/")[0] for r in self.tasks)
-        return {s: overall([r for r in self.tasks if r.task.startswith(s + "/")]) for s in names}
+        names = dict.fromkeys(task.suite for task in self.tasks)
+        return {name: overall([task for task in self.tasks if task.suite == name]) for name in names}
 
     @property
     def outcomes(self) -> str:

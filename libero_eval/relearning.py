@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -94,46 +95,28 @@ class Trial:
     limit: float
 
 
-@dataclass(frozen=True)
-class HeldOutError:
-    """The error of a policy on windows of held-out demonstrations, see `error_on`."""
+def failure_share(policy: Policy, run: LoadedRun, task: int, env: VectorEnv, episodes: int) -> float:
+    """Return the share of a policy's rollouts on a task of a run that fail, under the run's own protocol.
 
-    batch: Batch
-
-    def __call__(self, policy: Policy) -> float:
-        return error_on(policy, self.batch)
-
-
-@dataclass(frozen=True)
-class FailureShare:
-    """The share of a policy's rollouts on a task of a run that fail, under the run's own protocol.
-
-    Attributes:
+    Args:
+        policy: Policy; its mode is left as it is.
         run: The run.
         task: Position of the task.
         env: Environment of the task, with a simulation for each rollout.
         episodes: Number of rollouts, which start in the first initial states.
     """
-
-    run: LoadedRun
-    task: int
-    env: VectorEnv
-    episodes: int
-
-    def __call__(self, policy: Policy) -> float:
-        run = self.run
-        done = rollout(
-            policy,
-            self.env,
-            range(self.episodes),
-            language=run.embed(run.learned_task(self.task)),
-            horizon=run.eval.horizon,
-            settle_steps=run.eval.settle_steps,
-            seed=(run.seed, RELEARN, self.task),
-            device=run.device,
-            precision=run.eval.precision,
-        )
-        return 1 - done.rate
+    done = rollout(
+        policy,
+        env,
+        range(episodes),
+        language=run.embed(run.learned_task(task)),
+        horizon=run.eval.horizon,
+        settle_steps=run.eval.settle_steps,
+        seed=(run.seed, RELEARN, task),
+        device=run.device,
+        precision=run.eval.precision,
+    )
+    return 1 - done.rate
 
 
 def relearn(
@@ -175,7 +158,12 @@ def relearn(
         starts = [start for start in STARTS if not _recorded(log, task, start, settings, rate)]
         if not starts:
             continue
-        before = restore(run.path, after=_stage(run, task)[-1], device=device, allow=allow)
+        before = restore(
+            run.path,
+            after=next(stage for stage in run.stages if task in stage)[-1],
+            device=device,
+            allow=allow,
+        )
         training, held_out = _windows(run, task, settings, config)
         with _opened(run, task, held_out, settings.episodes) as measure:
             with before.acting(run.tasks[task]) as then:
@@ -302,16 +290,12 @@ def _chosen(run: LoadedRun, tasks: Sequence[int] | None) -> list[int]:
 def _recorded(log: ResultLog, task: int, start: str, settings: RelearnSettings, rate: float) -> bool:
     """Return whether a measurement is recorded that these settings would repeat."""
     wanted = task, start, settings.tolerance, settings.demos_held_out, settings.episodes, rate
-    for r in log.read().of(RelearnRecord):
-        same = (r.task, r.start, r.tolerance, r.held_out, r.episodes, r.rate) == wanted
-        grid = r.steps == tuple(range(0, r.steps[-1] + 1, settings.every))
-        if same and grid and (r.needed is not None or r.steps[-1] >= settings.steps):
-            return True
-    return False
-
-
-def _stage(run: LoadedRun, task: int) -> tuple[int, ...]:
-    return next(stage for stage in run.stages if task in stage)
+    return any(
+        (r.task, r.start, r.tolerance, r.held_out, r.episodes, r.rate) == wanted
+        and r.steps == tuple(range(0, r.steps[-1] + 1, settings.every))
+        and (r.needed is not None or r.steps[-1] >= settings.steps)
+        for r in log.read().of(RelearnRecord)
+    )
 
 
 def _windows(
@@ -341,7 +325,7 @@ def _windows(
 def _opened(run: LoadedRun, task: int, held_out: Batch | None, episodes: int) -> Iterator[Measure]:
     """Yield what measures a policy on a task: its error on held-out windows, or without any, its failed rollouts."""
     if held_out is not None:
-        yield HeldOutError(held_out)
+        yield partial(error_on, batch=held_out)
         return
     with closing(run.environment(task, episodes, run.eval.horizon)) as env:
-        yield FailureShare(run, task, env, episodes)
+        yield partial(failure_share, run=run, task=task, env=env, episodes=episodes)

@@ -225,27 +225,19 @@ def _interpolate(values: Tensor, rows: Tensor, cols: Tensor, size: tuple[int, in
 
 
 @dataclass
-class RecordingActor:
-    """An actor that records the observations it receives."""
+class RecordingActor(PolicyActor):
+    """A policy that records the observations it receives.
 
-    actor: PolicyActor
-    observations: list[Obs] = field(default_factory=list)
+    Attributes:
+        seen: Observations of each step.
+    """
 
-    @property
-    def action_dim(self) -> int:
-        return self.actor.action_dim
-
-    @property
-    def views(self) -> tuple[str, ...]:
-        return self.actor.views
-
-    def reset(self, num_envs: int) -> None:
-        self.observations.clear()
-        self.actor.reset(num_envs)
+    seen: list[Observation] = field(default_factory=list)
 
     def act(self, obs: Obs) -> np.ndarray:
-        self.observations.append({name: np.array(value) for name, value in obs.items()})
-        return self.actor.act(obs)
+        """Return the policy's actions; see `Actor`."""
+        self.seen.append(observe(obs, self.policy.spec, self.language, self.device))
+        return super().act(obs)
 
 
 def draw_saliency(
@@ -305,17 +297,13 @@ def draw_saliency(
     return path
 
 
-def _run_episode(
-    run: LoadedRun, task: int, start: int, horizon: int
-) -> tuple[list[dict[str, torch.Tensor]], bool]:
+def _run_episode(run: LoadedRun, task: int, start: int, horizon: int) -> tuple[list[dict[str, Tensor]], bool]:
     """Return the policy's observations at each step, (1, 1, ...) tensors by name, and the episode's success."""
-    spec, language = run.policy.spec, run.embed(run.learned_task(task))
+    language, draws = run.embed(run.learned_task(task)), [generator(run.seed, start)]
     with closing(run.environment(task, 1, horizon)) as env, run.acting(run.tasks[task]) as policy:
-        draws = [generator(run.seed, start)]
-        actor = RecordingActor(PolicyActor(policy, language, run.device, run.eval.precision, draws))
+        actor = RecordingActor(policy, language, run.device, run.eval.precision, draws)
         done = run_episodes(actor, env, [start], horizon=horizon, settle_steps=run.eval.settle_steps)
-    seen = [observe(obs, spec, language, run.device) for obs in actor.observations]
-    return [{"images": o.images, **o.proprio} for o in seen], done.episodes[0].success
+    return [{"images": o.images, **o.proprio} for o in actor.seen], done.episodes[0].success
 
 
 def _batch(window: dict[str, torch.Tensor], language: torch.Tensor, policy: Policy) -> Batch:

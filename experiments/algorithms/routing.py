@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from libero_eval.relearning import FailureShare
+from libero_eval.relearning import failure_share
 from lifelong.algorithms import CLARE
 from lifelong.evaluation.restore import LoadedRun, restore
 from lifelong.policies.base import Policy
@@ -46,7 +46,7 @@ class Watched(CLARE):
 def success(run: LoadedRun, policy: Policy, task: int) -> float:
     """Return the share of rollouts of a task that succeed."""
     with closing(run.environment(task, EPISODES, run.eval.horizon)) as env:
-        return 1 - FailureShare(run, task, env, EPISODES)(policy)
+        return 1 - failure_share(policy, run, task, env, EPISODES)
 
 
 def main() -> None:

@@ -140,7 +140,7 @@ def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--workers", type=int, default=3)
-    parser.add_argument("--policy", default="kills:make")
+    parser.add_argument("--policy", default="evaluations:make")
     parser.add_argument("--suite", nargs="+", default=["libero_goal/3", "libero_object/0"])
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--unit-starts", type=int, default=3)

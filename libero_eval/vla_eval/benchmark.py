@@ -13,7 +13,7 @@ import numpy as np
 
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.tasks import Task, get_suite
-from libero_eval.protocols.adapter import ProtocolAdapter
+from libero_eval.protocols.adapter import ProtocolAdapter, view_of
 from libero_eval.protocols.environment import OBSERVATIONS, ProtocolEnv, resolve_world, run_protocol
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
@@ -339,8 +339,7 @@ def _agreed(protocol: EvalProtocol, asked: dict[str, Any]) -> EvalProtocol:
 
 def _cameras(names: Sequence[str]) -> tuple[str, ...]:
     """Return the cameras of our observations."""
-    views = [name.removesuffix("_rgb") for name in names if name.endswith("_rgb")]
-    return tuple("robot0_eye_in_hand" if view == "eye_in_hand" else view for view in views)
+    return tuple(camera for camera in IMAGES if view_of(camera) in names)
 
 
 def _entries(names: Sequence[str]) -> tuple[str, ...]:

@@ -137,7 +137,7 @@ def total_rows(results: Sequence[TaskResult]) -> list[str]:
     suites: dict[str, list[TaskResult]] = {}
     kinds: dict[str, list[TaskResult]] = {}
     for result in results:
-        suites.setdefault(suite := result.task.partition("/")[0], []).append(result)
+        suites.setdefault(suite := result.suite, []).append(result)
         if suite.startswith(PLUS):
             kinds.setdefault(f"  {parse_plus_id(result.name).kind}", []).append(result)
     rows = {**(suites if len(suites) > 1 else {}), **(kinds if len(kinds) > 1 else {})}

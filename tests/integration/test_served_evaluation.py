@@ -247,10 +247,10 @@ def test_a_groot_server_under_a_protocol(card, tmp_path, capsys):
 def test_what_a_server_does_wrong_ends_the_evaluation(tmp_path, capsys):
     with policy_servers.openpi(lambda _: {}, {"server": "libero-lifelong", "format": 2}) as address:
         assert cli.main(["eval", address, *EPISODES, "--out", str(tmp_path / "out")]) == 2
-    assert "is of format 2; this version knows 1" in capsys.readouterr().err
+    assert "is of format 2; this version reads 1" in capsys.readouterr().err
     assert cli.main(["eval", "http://localhost:1", *EPISODES]) == 2
     assert "unknown kind of server 'http'. Valid: gr00t, vla-eval, ws, wss" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         cli.main(["eval", address, "--in-flight", "0"])
-    assert "--in-flight: 0 is not a whole number of at least 1" in capsys.readouterr().err
+    assert "--in-flight 0" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -4,6 +4,7 @@ import copy
 import inspect
 from contextlib import nullcontext
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,11 +14,10 @@ import torch
 from libero_eval import relearning
 from libero_eval.cli import runs
 from libero_eval.relearning import (
-    FailureShare,
-    HeldOutError,
     RelearnSettings,
     Trial,
     error_on,
+    failure_share,
     relearn,
     steps_until,
 )
@@ -55,7 +55,7 @@ def learned(found: Linear, task: int, steps: int = 120) -> Linear:
 
 def lesson(error: float, task: int = 0) -> Trial:
     """A task that counts as back at an error of at most 1.05 times the given one."""
-    return Trial(task, Windows(task), HeldOutError(held_out(task)), 1.05 * error)
+    return Trial(task, Windows(task), partial(error_on, batch=held_out(task)), 1.05 * error)
 
 
 def held_out(task: int = 0) -> Batch:
@@ -212,7 +212,7 @@ def test_rollouts_are_those_of_the_run(monkeypatch) -> None:
     )
     monkeypatch.setattr(relearning, "rollout", rollout)
     measured = policy()
-    assert FailureShare(run, 2, "env", 4)(measured) == 0.25
+    assert failure_share(measured, run, 2, "env", 4) == 0.25
     assert called.pop("policy") is measured
     assert (called["env"], called["states"], called["language"]) == ("env", [0, 1, 2, 3], "TASK 2")
     assert (called["horizon"], called["settle_steps"], called["precision"]) == (70, 3, "fp32")
