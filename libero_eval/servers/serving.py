@@ -155,17 +155,17 @@ class ServedPolicy:
         prompt, name = message.get("prompt"), message.get("task")
         if prompt is None and name is None and before is not None:
             return before
-        known = {task.id: task for task in self.run.tasks}
+        by_id = {task.id: task for task in self.run.tasks}
         if isinstance(name, str):
-            found = [known[name]] if name in known else [t for t in _tasks() if t.id == name]
+            tasks = [by_id[name]] if name in by_id else [t for t in _tasks() if t.id == name]
         else:
-            found = [t for t in self.run.tasks if t.language == prompt]
-            found = found or [t for t in _tasks() if t.language == prompt]
-        if len(found) == 1 and prompt in (None, found[0].language):
-            told = message.get("instruction")
-            return replace(found[0], language=told) if isinstance(told, str) else found[0]
-        if len(found) > 1:
-            ids = ", ".join(t.id for t in found)
+            tasks = [t for t in self.run.tasks if t.language == prompt]
+            tasks = tasks or [t for t in _tasks() if t.language == prompt]
+        if len(tasks) == 1 and prompt in (None, tasks[0].language):
+            words = message.get("instruction")
+            return replace(tasks[0], language=words) if isinstance(words, str) else tasks[0]
+        if len(tasks) > 1:
+            ids = ", ".join(t.id for t in tasks)
             raise PolicyError(
                 f"several tasks have the instruction {prompt!r}; send one of them as `task`: {ids}"
             )
@@ -191,14 +191,14 @@ class ServedPolicy:
                 f"this policy needs {', '.join(lacking)}, which observation/image, observation/wrist_image and "
                 f"observation/state do not hold; send {names}"
             )
-        found = {k: v for k, v in message.items() if not str(k).startswith(PREFIX)}
+        request = {k: v for k, v in message.items() if not str(k).startswith(PREFIX)}
         for view in spec.views:
             image = _checked(message, _OPENPI_IMAGES[view], (*spec.image_size, 3), False)[0]
-            found[PREFIX + view] = image[:, ::-1]
+            request[PREFIX + view] = image[:, ::-1]
         if spec.proprio:
             state = _checked(message, "state", (8,), False)[0]
-            found |= {PREFIX + name: state[_OPENPI_STATE[name]] for name in spec.proprio}
-        return found
+            request |= {PREFIX + name: state[_OPENPI_STATE[name]] for name in spec.proprio}
+        return request
 
 
 class Session:

@@ -14,7 +14,7 @@ import numpy as np
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.tasks import Task, get_suite
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
-from libero_eval.protocols.environment import OBSERVATIONS, ProtocolEnv, resolve_world, run_protocol
+from libero_eval.protocols.environment import ProtocolEnv, resolve_world, run_protocol
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from lifelong.errors import PolicyError
@@ -33,6 +33,7 @@ except ImportError:  # the classes can be imported but not made
 VERSION = "0.8.0"  # of vla-eval that the tests run
 ADJUSTABLE = ("vla-eval", "libero")  # protocols that leave some fields to what a policy asks for
 IMAGES = {"agentview": "agentview", "robot0_eye_in_hand": "wrist"}  # camera -> key
+ROTATIONS = {None: None, True: "axis_angle", False: "axis_angle_positive"}  # by quat_no_antipodal
 PREFIX = "observation/"
 logger = logging.getLogger(__name__)
 
@@ -122,7 +123,7 @@ class LiberoBenchmark(StepBenchmark):
             "world.delta": not absolute_action,
             "episode.settle_steps": num_steps_wait,
             "episode.horizon": max_steps,
-            "proprioception.rotation": _rotation(quat_no_antipodal),
+            "proprioception.rotation": ROTATIONS[quat_no_antipodal],
         }
         self.tasks = _tasks(suite, task_ids)
         chosen = load_protocol(card)
@@ -273,19 +274,14 @@ class LiberoBenchmark(StepBenchmark):
         """Return the simulation of a task; it is kept for all of the task's episodes."""
         if self._env is None or self._task is not task:
             self.cleanup()
-            self._task, native = task, self.observations
-            self._env = ProtocolEnv(
-                self.protocol,
-                task,
-                1,
-                cameras=_cameras(native) if native else None,
-                observations=_entries(native) if native else OBSERVATIONS,
-                assets=self.assets,
-                drawing=None if native else "protocol",
-            )
-            self._adapter = ProtocolAdapter(
-                self.protocol, self._env.task
-            )  # as the protocol's perturbations change it
+            options: dict[str, Any] = {"assets": self.assets}
+            if names := self.observations:
+                options["cameras"] = tuple(camera for camera in IMAGES if view_of(camera) in names)
+                options["observations"] = ("rgb", *(name for name in names if not name.endswith("_rgb")))
+                options["drawing"] = None
+            self._task, self._env = task, ProtocolEnv(self.protocol, task, 1, **options)
+            # the task as the protocol's perturbations change it
+            self._adapter = ProtocolAdapter(self.protocol, self._env.task)
         return self._env
 
     def _controller_state(self, obs: Obs) -> np.ndarray:
@@ -318,13 +314,6 @@ def _tasks(suite: str, ids: Sequence[int] | None) -> tuple[Task, ...]:
     return tuple(tasks[i] for i in ids)
 
 
-def _rotation(quat_no_antipodal: bool | None) -> str | None:
-    """Return a protocol's name of the convention of rotation vectors, None if none is asked for."""
-    if quat_no_antipodal is None:
-        return None
-    return "axis_angle" if quat_no_antipodal else "axis_angle_positive"
-
-
 def _agreed(protocol: EvalProtocol, asked: dict[str, Any]) -> EvalProtocol:
     """Return the protocol with what is asked for, if it leaves that open; otherwise check that it is the same."""
     if protocol.name not in ADJUSTABLE:
@@ -335,13 +324,3 @@ def _agreed(protocol: EvalProtocol, asked: dict[str, Any]) -> EvalProtocol:
     if asked.get("episode.settle_steps") == 0:
         asked["episode.settle_action"] = None
     return protocol.changed(asked)
-
-
-def _cameras(names: Sequence[str]) -> tuple[str, ...]:
-    """Return the cameras of our observations."""
-    return tuple(camera for camera in IMAGES if view_of(camera) in names)
-
-
-def _entries(names: Sequence[str]) -> tuple[str, ...]:
-    """Return arguments of `EnvConfig.observations` that give our observations."""
-    return ("rgb", *(name for name in names if not name.endswith("_rgb")))
