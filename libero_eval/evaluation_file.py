@@ -228,10 +228,10 @@ def overall(results: Sequence[TaskResult]) -> Estimate:
 
     The tasks are fixed, so the interval covers the chance in the episodes, not the choice of tasks.
     """
-    found = [r.success for r in results]
-    weights = np.full(len(found), 1 / max(1, len(found)))
+    rates = [r.success for r in results]
+    weights = np.full(len(rates), 1 / max(1, len(rates)))
     return combine_intervals(
-        weights, [e.value for e in found], [e.low for e in found], [e.high for e in found]
+        weights, [e.value for e in rates], [e.low for e in rates], [e.high for e in rates]
     )
 
 

@@ -101,7 +101,7 @@ class Comparison:
         controls: The same policy twice, if there is such a pair: what arises by chance alone.
         groups: Aggregates over runs; None unless each policy has at least two.
         notes: Remarks for the reader.
-        backend: Back end that simulated all of it.
+        backend: Backend that simulated all of it.
         alpha: Probability of a false difference in a family.
     """
 

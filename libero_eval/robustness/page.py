@@ -33,14 +33,14 @@ ALPHA = 0.05  # of the kinds together
 COLUMNS = 4
 
 
-def verdict(found: Robustness) -> str:
+def verdict(policy: Robustness) -> str:
     """Return two sentences on what the kinds take."""
-    axes = [axis for axis in found.axes if not math.isnan(axis.kept.value)]
+    axes = [axis for axis in policy.axes if not math.isnan(axis.kept.value)]
     if not axes:
         return "Without perturbation nothing succeeds, so there is nothing to lose."
-    lost = [axis for axis in axes if axis.kept.value < 1 and found.adjusted[axis.kind] <= ALPHA]
+    lost = [axis for axis in axes if axis.kept.value < 1 and policy.adjusted[axis.kind] <= ALPHA]
     halved = [axis.kind for axis in axes if math.isfinite(axis.half.value)]
-    text = f"{found.label} loses success to {len(lost)} of {len(axes)} kinds (p at most {ALPHA}, Holm)"
+    text = f"{policy.label} loses success to {len(lost)} of {len(axes)} kinds (p at most {ALPHA}, Holm)"
     text += f", most to {_listed([axis.kind for axis in lost[:3]])}. " if lost else ". "
     return text + (
         f"Half of it is lost to {_listed(halved)} within the measured severities."
@@ -49,14 +49,14 @@ def verdict(found: Robustness) -> str:
     )
 
 
-def render(found: Robustness) -> str:
+def render(policy: Robustness) -> str:
     """Return the tables as plain text for a terminal."""
-    severities = found.severities
+    severities = policy.severities
     rows: list[list[object]] = [
         ["kind", *(f"{s:g}" for s in severities), "area", "95 %", "kept", "half at", "Holm"]
     ]
-    for axis in found.axes:
-        successes = [found.at(axis, s) for s in severities]
+    for axis in policy.axes:
+        successes = [policy.at(axis, s) for s in severities]
         rows.append(
             [
                 axis.kind,
@@ -65,19 +65,19 @@ def render(found: Robustness) -> str:
                 interval_text(axis.area),
                 f"{100 * axis.kept.value:.0f}",
                 severity_text(axis.half.value),
-                p_text(found.adjusted[axis.kind]),
+                p_text(policy.adjusted[axis.kind]),
             ]
         )
     lines = [
-        f"{found.label}: success in percent by severity, 0 is without perturbation",
+        f"{policy.label}: success in percent by severity, 0 is without perturbation",
         text_table(rows),
         *(
             f"{name_of(pair.condition)}: {100 * pair.success.value:.0f}, expected {100 * pair.expected:.0f}, "
             f"excess {100 * pair.excess.value:+.0f} {interval_text(pair.excess)}".replace("+-", "-")
-            for pair in found.interactions
+            for pair in policy.interactions
         ),
     ]
-    return "\n".join([*lines, "", verdict(found)])
+    return "\n".join([*lines, "", verdict(policy)])
 
 
 def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
@@ -112,7 +112,7 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         curves=as_svg(curves_figure(axes, units)),
         radar=as_svg(radar_figure(axes)),
         interactions=[
-            {"label": policy.label, "name": name_of(pair.condition), "found": pair}
+            {"label": policy.label, "name": name_of(pair.condition), "pair": pair}
             for policy in policies
             for pair in policy.interactions
         ],
@@ -146,18 +146,18 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:-1]) + (" and " if len(names) > 1 else "") + names[-1]
 
 
-def _content(found: Robustness) -> dict[str, Any]:
-    outcomes = found.outcomes
+def _content(policy: Robustness) -> dict[str, Any]:
+    outcomes = policy.outcomes
     return {
-        "label": found.label,
+        "label": policy.label,
         "tasks": outcomes.tasks,
         "starts": outcomes.starts,
-        "success": asdict(found.base),
-        "axes": [{**asdict(axis), "adjusted": found.adjusted[axis.kind]} for axis in found.axes],
+        "success": asdict(policy.base),
+        "axes": [{**asdict(axis), "adjusted": policy.adjusted[axis.kind]} for axis in policy.axes],
         "interactions": [
-            {**asdict(pair), "condition": name_of(pair.condition)} for pair in found.interactions
+            {**asdict(pair), "condition": name_of(pair.condition)} for pair in policy.interactions
         ],
-        "redrawn": dict(found.redrawn),
+        "redrawn": dict(policy.redrawn),
         "outcomes": {
             name_of(condition): rows.astype(int).tolist()
             for condition, rows in zip(outcomes.conditions, outcomes.successes, strict=True)
@@ -182,8 +182,8 @@ def curves_figure(policies: Mapping[str, Sequence[Axis]], units: Mapping[str, st
         named = set[str]()  # policies that are in the legend
         for place, kind in enumerate(axis.kind for axis in first):
             axes = grid.flat[place]
-            for number, (label, found) in enumerate(policies.items()):
-                axis = next((a for a in found if a.kind == kind), None)
+            for number, (label, curves) in enumerate(policies.items()):
+                axis = next((a for a in curves if a.kind == kind), None)
                 if axis is not None:
                     _draw_axis(axes, axis, number, "" if label in named else shorten(label, 60))
                     named.add(label)
@@ -214,8 +214,8 @@ def radar_figure(policies: Mapping[str, Sequence[Axis]]) -> Figure:
         axes = figure.add_subplot(projection="polar")
         axes.set_theta_offset(np.pi / 2)  # type: ignore[attr-defined]  # of polar axes
         axes.set_theta_direction(-1)  # type: ignore[attr-defined]
-        for number, (label, found) in enumerate(policies.items()):
-            areas = {axis.kind: 100 * axis.area.value for axis in found}
+        for number, (label, curves) in enumerate(policies.items()):
+            areas = {axis.kind: 100 * axis.area.value for axis in curves}
             values = [areas.get(kind, np.nan) for kind in kinds]
             colour = LINE_COLOURS[number % len(LINE_COLOURS)]
             closed = [*values, values[0]], [*angles, angles[0]]

@@ -132,8 +132,8 @@ class Outcomes:
         wins = self.successes[self.conditions.index(condition)].sum(1)
         count = np.full(len(self.tasks), len(self.starts))
         low, high = wilson_interval(wins, count)
-        found = combine_intervals(np.full(len(wins), 1 / len(wins)), wins / count, low, high)
-        return Estimate(found.value, max(0.0, found.low), min(1.0, found.high))
+        mean = combine_intervals(np.full(len(wins), 1 / len(wins)), wins / count, low, high)
+        return Estimate(mean.value, max(0.0, mean.low), min(1.0, mean.high))
 
     def axes(self) -> tuple[Axis, ...]:
         """Return every kind that was run by itself, the most harmful first."""
@@ -226,8 +226,7 @@ class Robustness:
     @staticmethod
     def at(axis: Axis, severity: float) -> Estimate | None:
         """Return the success of a kind at a severity; None if it was not measured."""
-        found = dict(zip(axis.severities, axis.success, strict=True))
-        return found.get(severity)
+        return dict(zip(axis.severities, axis.success, strict=True)).get(severity)
 
 
 def name_of(condition: Condition) -> str:
@@ -269,8 +268,8 @@ def _exchange_test(outcomes: NDArray[np.bool_], weights: Floats) -> float:
     differing = outcomes[outcomes.any(1) & ~outcomes.all(1)].astype(float)  # others add nothing
     order = np.random.default_rng(SEED).random((DRAWS, *differing.shape)).argsort(-1)
     permuted = np.take_along_axis(np.broadcast_to(differing, order.shape), order, -1)
-    found, chance = differing.sum(0) @ contrast, permuted.sum(1) @ contrast
-    return float((1 + (abs(chance) >= abs(found) - 1e-9).sum()) / (1 + DRAWS))
+    observed, chance = differing.sum(0) @ contrast, permuted.sum(1) @ contrast
+    return float((1 + (abs(chance) >= abs(observed) - 1e-9).sum()) / (1 + DRAWS))
 
 
 def _share(part: float, whole: float) -> float:

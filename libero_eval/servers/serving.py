@@ -268,24 +268,24 @@ def _checked(message: Mapping[str, Any], name: str, shape: tuple[int, ...], rows
     value = np.asarray(message[key])
     expected = f"({'B, ' if rows else ''}{', '.join(map(str, shape))})"
     wanted = "u" if image else "fiu"
-    found = value if rows else value[None]
+    batch = value if rows else value[None]
     if value.dtype.kind not in wanted or (image and value.dtype != np.uint8):
         raise PolicyError(f"{key} has dtype {value.dtype}; valid: {'uint8' if image else 'floats'}")
-    if found.shape[1:] != shape or not len(found):
+    if batch.shape[1:] != shape or not len(batch):
         raise PolicyError(f"{key} has shape {value.shape}; this policy's is {expected}")
-    if not image and not np.isfinite(found).all():
+    if not image and not np.isfinite(batch).all():
         raise PolicyError(f"{key} has values that are not finite")
-    return found
+    return batch
 
 
 def _seeds(seeds: Any, count: int, rows: bool) -> list[tuple[int, ...]]:
     """Return the words of each row's seed: a list of integers, or one such list for each row."""
-    found = np.asarray(seeds if rows else [seeds])
-    if found.ndim != 2 or found.dtype.kind not in "iu" or len(found) != count or (found < 0).any():
+    words = np.asarray(seeds if rows else [seeds])
+    if words.ndim != 2 or words.dtype.kind not in "iu" or len(words) != count or (words < 0).any():
         raise PolicyError(
             f"seed is {seeds!r}; valid: integers from 0, as a list, or a list for each of {count} rows"
         )
-    return [tuple(map(int, words)) for words in found]
+    return [tuple(map(int, row)) for row in words]
 
 
 class PolicyServer:

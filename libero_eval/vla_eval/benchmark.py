@@ -90,7 +90,7 @@ class LiberoBenchmark(StepBenchmark):
 
     @classmethod
     def configure_render(cls, mode: str) -> dict[str, str]:
-        """Select the rendering back end, before a simulation exists; see vla-eval's `Benchmark`."""
+        """Select the rendering backend, before a simulation exists; see vla-eval's `Benchmark`."""
         from vla_eval.render import configure_mujoco_render
 
         return configure_mujoco_render(mode)

@@ -109,12 +109,12 @@ class RunServer(PredictModelServer):
         session = self._sessions.get(ctx.session_id)
         if session is None:
             raise PolicyError("an observation came before the start of an episode")
-        own = {key: value for key, value in obs.items() if key.startswith(PREFIX)}
-        if not own:
+        arrays = {key: value for key, value in obs.items() if key.startswith(PREFIX)}
+        if not arrays:
             raise PolicyError(
                 "the observations have no names of ours; the benchmark is libero_eval.vla_eval:LiberoBenchmark"
             )
-        answer = session.infer({**own, **self._begins.pop(ctx.session_id, {})})
+        answer = session.infer({**arrays, **self._begins.pop(ctx.session_id, {})})
         return {"actions": answer["actions"][0]}
 
 

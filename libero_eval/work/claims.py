@@ -104,9 +104,9 @@ class Claims:
 
     def release(self, claim: Claim) -> None:
         """Give a unit back. Nothing happens if another process has taken the claim over."""
-        found = self._read(claim.unit, 0.0)
-        if found is not None and found.claim == claim:
-            self._remove(found)
+        held = self._read(claim.unit, 0.0)
+        if held is not None and held.claim == claim:
+            self._remove(held)
 
     @contextmanager
     def keeping(self, claim: Claim, on_beat: Callable[[], None] = lambda: None) -> Iterator[None]:
@@ -120,8 +120,8 @@ class Claims:
 
         def beat() -> None:
             while not stop.wait(self._lease / BEATS):
-                found = self._read(claim.unit, 0.0)
-                if found is None or found.claim != claim:
+                held = self._read(claim.unit, 0.0)
+                if held is None or held.claim != claim:
                     return  # it was taken over
                 with suppress(OSError):  # a file server that is away for a moment
                     os.utime(self._path(claim.unit))
@@ -141,8 +141,8 @@ class Claims:
         """Return the claims that are not abandoned, by unit."""
         paths = list(self._folder.glob("*.json"))
         now = self._now() if paths else 0.0
-        found = [self._read(path.stem, now) for path in paths]
-        return {h.unit: h for h in found if h is not None and not h.is_abandoned(self._lease)}
+        claims = [self._read(path.stem, now) for path in paths]
+        return {h.unit: h for h in claims if h is not None and not h.is_abandoned(self._lease)}
 
     def _path(self, unit: str) -> Path:
         return self._folder / f"{unit}.json"

@@ -141,7 +141,7 @@ def total_rows(results: Sequence[TaskResult]) -> list[str]:
         if suite.startswith(PLUS):
             kinds.setdefault(f"  {parse_plus_id(result.name).kind}", []).append(result)
     rows = {**(suites if len(suites) > 1 else {}), **(kinds if len(kinds) > 1 else {})}
-    return [_total_row(name, found) for name, found in {**rows, "mean over tasks": results}.items()]
+    return [_total_row(name, tasks) for name, tasks in {**rows, "mean over tasks": results}.items()]
 
 
 def _total_row(name: str, results: Sequence[TaskResult]) -> str:
