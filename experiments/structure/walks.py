@@ -18,11 +18,16 @@ PACKAGES = ("libero_env", "lifelong", "libero_eval", "libero")
 
 # argv of the command; then file (its end) and name of the function at which the stack is read
 _RUN = """
-import runpy, sys
-ends, names = {ends!r}, {names!r}
+import runpy, sys, threading
+ends, names, through = {ends!r}, {names!r}, {through!r}
 def look(frame, event, argument):
     code = frame.f_code
     if event == "call" and code.co_name in names and code.co_filename.endswith(tuple(ends)):
+        above, files = frame, ""
+        while above is not None:
+            above, files = above.f_back, files + above.f_code.co_filename + " "
+        if through not in files:
+            return
         sys.setprofile(None)
         while frame is not None:
             print("STACK", frame.f_code.co_filename, frame.f_code.co_qualname, flush=True)
@@ -30,6 +35,7 @@ def look(frame, event, argument):
         import os
         os._exit(0)
 sys.setprofile(look)
+threading.setprofile(look)
 sys.argv = {argv!r}
 runpy.run_path({script!r}, run_name="__main__")
 """
@@ -45,6 +51,7 @@ class Walk:
         ends: Ends of the paths of files in which the last function may be.
         names: Names that it may have.
         script: What is run; "" for the `libero` command.
+        through: A file that must be on the stack.
     """
 
     what: str
@@ -52,6 +59,7 @@ class Walk:
     ends: tuple[str, ...]
     names: tuple[str, ...]
     script: str = ""
+    through: str = ""
 
 
 SMOKE = ("preset=smoke", "benchmark.tasks=[0,1]", "device=cpu")
@@ -64,16 +72,24 @@ WALKS = {
         "train.py",
     ),
     "ctrl": Walk(
-        "an action -> torques",
+        "an action -> the control law, which numba compiles",
         ("eval", "expert", "--suite", "libero_object/0", "--episodes", "1", "--horizon", "3"),
-        ("sim/osc.py",),
-        ("torques", "osc_torques", "__call__", "step"),
+        ("sim/simulation.py", "sim/back_ends.py"),
+        ("_substeps",),
+        through="envs/batch.py",
+    ),
+    "state": Walk(
+        "an initial state -> qpos",
+        ("eval", "expert", "--suite", "libero_object/0", "--episodes", "1", "--horizon", "3"),
+        ("sim/simulation.py", "sim/state.py", "sim/engine.py"),
+        ("_reset", "reset"),
+        through="envs/batch.py",
     ),
     "eval": Walk(
         "`libero eval` -> the record of an episode",
         ("eval", "expert", "--suite", "libero_object/0", "--episodes", "1", "--horizon", "3"),
-        ("evaluation_file.py", "work/folder.py", "results/records.py"),
-        ("write_unit", "publish", "write", "add", "save"),
+        ("evaluation_file.py", "work/store.py", "work/work_folder.py"),
+        ("write_unit", "publish", "add", "save"),
     ),
 }
 
@@ -82,7 +98,9 @@ def stack(walk: Walk, checkout: Path) -> list[str]:
     """Return the frames of the packages, from the command to the function, as `file name`."""
     entry = "libero_env/cli/__main__.py"
     script = str(checkout / (walk.script or entry))
-    code = _RUN.format(ends=walk.ends, names=walk.names, argv=[script, *walk.words], script=script)
+    code = _RUN.format(
+        ends=walk.ends, names=walk.names, through=walk.through, argv=[script, *walk.words], script=script
+    )
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(
             [sys.executable, "-c", code],
