@@ -67,9 +67,12 @@ def teleop(request: TeleopRequest) -> int:
     from libero_env.teleop.screens import MouseReader, open_screen
     from libero_env.teleop.session import Teleop, record_session
 
-    if (request.task is None) == (request.bddl is None):
+    if request.task is not None and request.bddl is None:
+        task = get_task(request.task)
+    elif request.bddl is not None and request.task is None:
+        task = read_task(request.bddl)
+    else:
         raise InvalidInputError("give a task, such as libero_goal/3, or --bddl FILE")
-    task = read_task(request.bddl) if request.bddl else get_task(request.task)
     out = request.out or Path(f"{task.name}_demo.hdf5")
     sensitivity = request.pos_sensitivity, request.rot_sensitivity
     device, reader = Keyboard(*sensitivity), None
