@@ -11,7 +11,6 @@ from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
 from lifelong.nn.experts import (
     Add,
-    ExpertLibrary,
     adaptable_modules,
     matrix_of,
 )
@@ -52,8 +51,7 @@ class CLARE(RoutedExperts):
 
     relu = True
     state_form = {
-        **RoutedExperts.place_form,
-        "library": ExpertLibrary.form,
+        **RoutedExperts.state_form,
         "discriminators": {int: {str: Discriminator.form}},
         "chosen": {int: {str: int}},
     }
@@ -176,7 +174,7 @@ class CLARE(RoutedExperts):
         """Return all adapters and autoencoders, and which belong together."""
         known = {task: {n: d.weights for n, d in of.items()} for task, of in self._discriminators.items()}
         chosen = {task: dict(of) for task, of in self._chosen.items()}
-        return {**self._place(), "library": self.library.state(), "discriminators": known, "chosen": chosen}
+        return {**super().state_dict(), "discriminators": known, "chosen": chosen}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -189,10 +187,9 @@ class CLARE(RoutedExperts):
         fits = all(name in library.get(task, {}) for task, name in used)
         if not fits or any(of.keys() != chosen.get(task, {}).keys() for task, of in known.items()):
             raise CheckpointError("the adapters and their autoencoders do not go together")
-        self._load_place(state)
+        super().load_state_dict(state, datasets)
         self._chosen = {task: dict(of) for task, of in chosen.items()}
         self._discriminators = {t: {n: Discriminator(w) for n, w in of.items()} for t, of in known.items()}
-        self.library.load(library)
 
 
 def _samples(layer: nn.Module, x: Tensor) -> Tensor:

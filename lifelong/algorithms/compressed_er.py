@@ -1,8 +1,10 @@
 """Experience replay from a memory of compressed frames."""
 
+import torch
+
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.compressed import COMPRESSED_FORM, CompressedMemory, Quality
-from lifelong.types import Count, NonNegative
+from lifelong.types import Batch, Count, NonNegative
 
 
 class CompressedER(Rehearsal):
@@ -34,3 +36,7 @@ class CompressedER(Rehearsal):
                 `CompressedMemory`.
         """
         super().__init__(CompressedMemory(budget, quality, keep_decoded), ratio)
+
+    def _drawn(self, batch: Batch, generator: torch.Generator) -> Batch:
+        """Return the windows on the device of the batch: those of the memory are on the CPU."""
+        return super()._drawn(batch, generator).to(batch.actions.device)

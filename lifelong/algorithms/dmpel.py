@@ -12,7 +12,7 @@ from torch.nn import functional
 from lifelong.algorithms.frozen_base import RoutedExperts
 from lifelong.data.windows import TaskWindows, of_episodes
 from lifelong.errors import CheckpointError
-from lifelong.nn.experts import ExpertLibrary, adapted_layers, expert_output, weights_of
+from lifelong.nn.experts import adapted_layers, expert_output, weights_of
 from lifelong.nn.routing import SigmoidRouter
 from lifelong.nn.tokens import standardise
 from lifelong.policies.base import Policy, device_of
@@ -52,8 +52,7 @@ class DMPEL(RoutedExperts):
     """
 
     state_form = {
-        **RoutedExperts.place_form,
-        "library": ExpertLibrary.form,
+        **RoutedExperts.state_form,
         "router": ({}, _ROUTER),
         "memory": {int: {"queries": Tensor, "coefficients": Tensor}},
         "episodes": ({}, {"queries": Tensor, "of_window": Tensor}),
@@ -221,7 +220,7 @@ class DMPEL(RoutedExperts):
         """Return experts, router, stored contexts, and those of the present task's windows."""
         router = {} if self.router is None else {n: p.detach() for n, p in self.router.named_parameters()}
         kept = {"memory": dict(self._memory), "episodes": dict(self.episodes)}
-        return {**self._place(), "library": self.library.state(), "router": router, **kept}
+        return {**super().state_dict(), "router": router, **kept}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -231,9 +230,8 @@ class DMPEL(RoutedExperts):
         """
         self.router = SigmoidRouter(state["router"], top_k=self.top_k) if state["router"] else None
         _check_shapes(state, self.router)
-        self._load_place(state)
+        super().load_state_dict(state, datasets)
         self._memory, self.episodes = dict(state["memory"]), dict(state["episodes"])
-        self.library.load(state["library"])
 
 
 def _check_shapes(state: Mapping[str, Any], router: SigmoidRouter | None) -> None:

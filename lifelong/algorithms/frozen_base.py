@@ -8,19 +8,16 @@ import torch
 from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm, Phase
+from lifelong.data.windows import TaskWindows
 from lifelong.errors import PolicyError
 from lifelong.nn.experts import Attachment, ExpertLibrary, expert_output, freeze_statistics
 from lifelong.policies.base import Policy
 
 
 class FrozenBase(Algorithm):
-    """The first tasks train the whole policy, which is frozen then; each later one has low-rank experts on it.
+    """The first tasks train the whole policy, which is frozen then; each later one has low-rank experts on it."""
 
-    Attributes:
-        place_form: Form of `_place`, part of `state_form`.
-    """
-
-    place_form: ClassVar[Mapping[str, Any]] = dict.fromkeys(("task_index", "base_left", "seed"), int)
+    state_form: ClassVar[Any] = dict.fromkeys(("task_index", "base_left", "seed"), int)
 
     def __init__(self, *, rank: int, alpha: float, adapted: Sequence[str], base_tasks: int):
         """Create the algorithm; see the subclasses for the arguments."""
@@ -48,12 +45,12 @@ class FrozenBase(Algorithm):
         if self.library:
             freeze_statistics(policy)
 
-    def _place(self) -> dict[str, int]:
-        """Return the place in the sequence of tasks, for `state_dict`."""
+    def state_dict(self) -> dict[str, Any]:
+        """Return the place in the sequence of tasks."""
         return {"task_index": self.task_index, "base_left": self._base_left, "seed": self._seed}
 
-    def _load_place(self, state: Mapping[str, Any]) -> None:
-        """Restore what `_place` returned."""
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
+        """Restore what `state_dict` returned."""
         self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
         self._seed = int(state["seed"])
 
@@ -65,6 +62,7 @@ class RoutedExperts(FrozenBase):
     the policy acts.
     """
 
+    state_form: ClassVar[Any] = {**FrozenBase.state_form, "library": ExpertLibrary.form}
     relu: ClassVar[bool] = False  # whether a ReLU lies between the A and the B of an expert
 
     def __init__(self, **settings: Any):
@@ -127,6 +125,15 @@ class RoutedExperts(FrozenBase):
                 yield
         finally:
             self._learning, self._now = learning, None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the place in the sequence of tasks, and all experts."""
+        return {**super().state_dict(), "library": self.library.state()}
+
+    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
+        """Restore what `state_dict` returned."""
+        super().load_state_dict(state, datasets)
+        self.library.load(state["library"])
 
     def _grouped_output(
         self, name: str, layer: nn.Module, x: Tensor, groups: Iterable[tuple[int, Tensor | None]]

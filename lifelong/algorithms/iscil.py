@@ -10,7 +10,6 @@ from lifelong.algorithms.frozen_base import RoutedExperts
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
 from lifelong.nn.experts import (
-    ExpertLibrary,
     adapted_layers,
     rows_per_sample,
     weights_of,
@@ -46,8 +45,7 @@ class IsCiL(RoutedExperts):
     """
 
     state_form = {
-        **RoutedExperts.place_form,
-        "library": ExpertLibrary.form,
+        **RoutedExperts.state_form,
         "prototypes": {int: Tensor},
     }
 
@@ -131,7 +129,7 @@ class IsCiL(RoutedExperts):
 
     def state_dict(self) -> dict[str, Any]:
         """Return all adapters and prototypes."""
-        return {**self._place(), "library": self.library.state(), "prototypes": dict(self._prototypes)}
+        return {**super().state_dict(), "prototypes": dict(self._prototypes)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -145,9 +143,8 @@ class IsCiL(RoutedExperts):
         fits &= state["library"].keys() <= prototypes.keys()
         if not fits or any(of_task.keys() != library[0].keys() for of_task in library):
             raise CheckpointError("the adapters and their prototypes do not go together")
-        self._load_place(state)
+        super().load_state_dict(state, datasets)
         self._prototypes = dict(prototypes)
-        self.library.load(state["library"])
 
 
 def _embedding(features: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ class LoRA(FrozenBase):
 
     acts_by_weights = True
     state_form = {
-        **FrozenBase.place_form,
+        **FrozenBase.state_form,
         "base_last": int,
         "base": Weights(),
         "pairs": ExpertLibrary.form,
@@ -139,7 +139,7 @@ class LoRA(FrozenBase):
     def state_dict(self) -> dict[str, Any]:
         """Return the base, and every task's A, B and own copies."""
         state = {"base": dict(self.base), "pairs": self.library.state(), "own": dict(self._kept)}
-        return {**self._place(), "base_last": self._base_last, **state}
+        return {**super().state_dict(), "base_last": self._base_last, **state}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -150,7 +150,7 @@ class LoRA(FrozenBase):
         self.library.load(state["pairs"])
         for of_task in state["pairs"].values():
             check_pairs(of_task, state["base"])
-        self._load_place(state)
+        super().load_state_dict(state, datasets)
         self._base_last = int(state["base_last"])
         self.base, self._kept = dict(state["base"]), dict(state["own"])
 

@@ -34,8 +34,7 @@ class Rehearsal(Algorithm):
 
     def _drawn(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return `ratio` times as many windows of earlier tasks as the batch has, at least one."""
-        drawn = self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
-        return drawn.to(batch.actions.device)
+        return self.memory.sample(max(1, round(self.ratio * len(batch))), generator)
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
