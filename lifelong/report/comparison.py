@@ -198,13 +198,8 @@ def costs_of(runs: Sequence[Run]) -> dict[str, float]:
 
     Costs that no run recorded are omitted.
     """
-    by_task: list[dict[str, float]] = []
-    last: list[dict[str, float]] = []
-    for run in runs:
-        tasks = [t for t in range(len(run.record.tasks)) if run.results.costs(t)]
-        rows = [run.results.costs(t) | _seconds(run, t) for t in tasks]
-        by_task += rows
-        last += rows[-1:]
+    tables = [list(run.results.costs_by_task().values()) for run in runs]
+    by_task, last = [row for rows in tables for row in rows], [row for rows in tables for row in rows[-1:]]
     reduced: dict[str, tuple[list[dict[str, float]], Callable[[Any], Any]]] = {
         "stored_bytes": (last, np.mean),
         "peak_gpu_bytes": (by_task, np.max),
@@ -217,10 +212,6 @@ def costs_of(runs: Sequence[Run]) -> dict[str, float]:
         values = [row[name] for row in rows if name in row]
         found[name] = float(reduce(values)) if values else float("nan")
     return found
-
-
-def _seconds(run: Run, task: int) -> dict[str, float]:
-    return {f"{name}_seconds": value for name, value in run.results.task_seconds(task).items()}
 
 
 def _mean(values: Sequence[float]) -> dict[str, float]:

@@ -91,15 +91,7 @@ def cost_table(rows: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, Any
 
 def task_costs(run: Run, labels: Sequence[str]) -> dict[str, Any] | None:
     """Return the costs of every task of a run, and their average."""
-    results = run.results
-    recorded = [task for task in range(len(labels)) if results.costs(task)]
-    rows = [
-        (
-            f"{t + 1}  {labels[t]}",
-            results.costs(t) | {f"{k}_seconds": v for k, v in results.task_seconds(t).items()},
-        )
-        for t in recorded
-    ]
+    rows = [(f"{t + 1}  {labels[t]}", costs) for t, costs in run.results.costs_by_task().items()]
     return cost_table([*rows, ("average; largest memory", costs_of([run]))]) if rows else None
 
 

@@ -208,12 +208,22 @@ class Results:
         """Return the costs of learning a task, by the names of `lifelong.training.costs`; empty if not recorded."""
         return {k: v for r in self.of(CostRecord) if r.task == task for k, v in r.costs.items()}
 
-    def task_seconds(self, task: int) -> dict[str, float]:
-        """Return the wall time of a task, [s]: of training on it, and of evaluation while and after learning it."""
-        return {
-            "training": sum(r.seconds for r in self.of(LossRecord) if r.task == task),
-            "evaluation": sum(r.seconds for r in self.of(EvalRecord) if r.learned == task),
+    def costs_by_task(self) -> dict[int, dict[str, float]]:
+        """Return the costs of each task that has any recorded, with its `training_seconds` and `evaluation_seconds`.
+
+        Evaluation is that while and after learning the task.
+        """
+        costs = {
+            task: self.costs(task) | {"training_seconds": 0.0, "evaluation_seconds": 0.0}
+            for task in sorted({r.task for r in self.of(CostRecord)})
         }
+        for r in self.of(LossRecord):
+            if r.task in costs:
+                costs[r.task]["training_seconds"] += r.seconds
+        for r in self.of(EvalRecord):
+            if r.learned in costs:
+                costs[r.learned]["evaluation_seconds"] += r.seconds
+        return costs
 
     def subgoals(self) -> Subgoals:
         """Return how often parts of the goals of the tasks learned so far were reached, and forgotten."""

@@ -99,12 +99,7 @@ def summarize(results: Results) -> dict[str, Any]:
         "best_epochs": {str(task): ends[task] for task in sorted(ends)},
         "subgoals": asdict(results.subgoals()),
         **({"shifts": shifts} if (shifts := shift_summary(results)) else {}),
-        "costs": {
-            str(task): results.costs(task)
-            | {f"{k}_seconds": v for k, v in results.task_seconds(task).items()}
-            for task in range(len(run.tasks))
-            if results.costs(task)
-        },
+        "costs": {str(task): costs for task, costs in results.costs_by_task().items()},
         "seconds_by_phase": results.seconds_by_phase(),
         "episodes": dict(zip(("run", "copied"), results.episodes(), strict=True)),
         "problems": list(results.problems),
