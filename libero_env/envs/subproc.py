@@ -23,7 +23,7 @@ from libero_env.envs.checks import (
     checked_indices,
 )
 from libero_env.envs.config import EnvConfig, show_options
-from libero_env.envs.worker import Failure, Worker, checked_space, open_libero, shut_down, wait_for
+from libero_env.envs.worker import Failure, Worker, open_libero, shut_down, wait_for
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.text import shown
 from libero_env.validation import validate
@@ -232,7 +232,12 @@ class SubprocEnv(LiberoVectorEnv):
         answers, failures = wait_for(dict(enumerate(self._workers)), self.start_timeout)
         if failures:
             raise WorkerError({i: f.reason for i, f in failures.items()}, self.tasks)
-        observed = [checked_space(answers[i][0], self.tasks[i]) for i in range(self.num_envs)]
+        observed = [answers[i][0] for i in range(self.num_envs)]
+        for task, space in zip(self.tasks, observed, strict=True):
+            if not (
+                isinstance(space, spaces.Dict) and all(isinstance(s, spaces.Box) for s in space.values())
+            ):
+                raise LiberoError(f"{task}: observations must be a dictionary of arrays, not {space}")
         first = answers[0][1]
         if different := [self.tasks[i] for i in range(self.num_envs) if answers[i][1] != first]:
             raise LiberoError(

@@ -384,14 +384,3 @@ def shut_down(workers: Sequence[Worker]) -> None:
         if not worker.pipe.closed:
             worker.kill()
         worker.free()
-
-
-def checked_space(space: spaces.Space, task: str) -> spaces.Dict:
-    """Return an observation space if it is a dictionary of boxes.
-
-    Raises:
-        LiberoError: It is not.
-    """
-    if not isinstance(space, spaces.Dict) or not all(isinstance(box, spaces.Box) for box in space.values()):
-        raise LiberoError(f"{task}: observations must be a dictionary of arrays to be shared, not {space}")
-    return space

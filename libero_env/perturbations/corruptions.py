@@ -14,7 +14,6 @@ Images of other sizes, for which that code ends with an error, have fog of their
 from collections.abc import Callable, Mapping
 
 import numpy as np
-from scipy import ndimage
 
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.parallel import compiled
@@ -132,11 +131,15 @@ def _levels(image: np.ndarray) -> np.ndarray:
 
 def _blurred(image: np.ndarray, sigma: float) -> np.ndarray:
     """Return an image (H, W, 3) float64 after a Gaussian filter whose edges repeat."""
+    from scipy import ndimage  # a second to import
+
     return ndimage.gaussian_filter(image, (sigma, sigma, 0), mode="nearest", truncate=_TRUNCATE)
 
 
 def _enlarged(image: np.ndarray, factor: float) -> np.ndarray:
     """Return the middle of an image (H, W, 3), enlarged to its size."""
+    from scipy import ndimage
+
     sides = np.array(image.shape[:2])
     inner = np.ceil(sides / factor).astype(int)
     (top, left), (height, width) = (sides - inner) // 2, inner
