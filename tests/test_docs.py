@@ -83,6 +83,6 @@ def test_what_is_named_exists(file):
 def test_tests_that_are_named_exist():
     pages = [*ROOT.glob("docs/*.md"), *ROOT.glob("experiments/*/README.md")]
     named = {m for page in pages for m in re.findall(r"(tests/[\w/]+\.py)::(\w+)", page.read_text())}
-    assert len(named) > 10
+    assert named
     for file, name in named:
         assert f"def {name}(" in (ROOT / file).read_text(), f"{file}::{name}"
