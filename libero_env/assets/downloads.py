@@ -19,7 +19,7 @@ from pydantic import Field
 
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.paths import cache_dir
-from libero_env.storage import atomic_write_text
+from libero_env.storage import write_json
 from libero_env.validation import validate
 
 REPO = "lerobot/libero-assets"  # a data set; CC BY 4.0
@@ -267,7 +267,7 @@ def download(dest: Path | None = None, revision: str = REVISION) -> Path:
     remote = download_files(REPO, revision, folder, replace=replace, remedy=remedy)
     files = {name: asdict(file) for name, file in remote.items()}
     record = {"repo": REPO, "revision": revision, "files": files}
-    atomic_write_text(folder / MANIFEST, json.dumps(record, indent=1))
+    write_json(folder / MANIFEST, record)
     return folder
 
 

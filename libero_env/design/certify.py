@@ -8,7 +8,7 @@ import hashlib
 import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from statistics import median
@@ -24,7 +24,7 @@ from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.rollout import run_experts
 from libero_env.parallel import progress_bar, run_each
 from libero_env.sim.scene import build_scene
-from libero_env.storage import atomic_write_text
+from libero_env.storage import write_json
 from libero_env.tasks import Task
 from libero_env.tasks.builder import FILE
 
@@ -201,7 +201,7 @@ def write_results(
     out.mkdir(parents=True, exist_ok=True)
     ending = "-disturbed" if disturb else ""
     written = [out / f"results{ending}.json", out / f"results{ending}.md"]
-    written[0].write_text(json.dumps(results(certificates, assets=assets, disturb=disturb), indent=1) + "\n")
+    write_json(written[0], results(certificates, assets=assets, disturb=disturb))
     written[1].write_text(markdown_table(certificates))
     suites: dict[str, list[Certificate]] = {}
     for certificate in certificates:
@@ -313,7 +313,7 @@ def _stored(path: Path, empty: Certificate) -> Certificate:
 
 
 def _store(path: Path, certificate: Certificate) -> None:
-    atomic_write_text(path, json.dumps(asdict(certificate), indent=1) + "\n")
+    write_json(path, certificate)
 
 
 def _label(certificate: Certificate) -> str:

@@ -7,7 +7,7 @@ Results are on disk after each task and perturbation, so that a stopped run resu
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
@@ -22,7 +22,7 @@ from libero_env.expert.rollout import run_experts
 from libero_env.parallel import progress_bar, run_each
 from libero_env.perturbations.perturbation import Perturbation
 from libero_env.perturbations.sampling import trying
-from libero_env.storage import atomic_write_text
+from libero_env.storage import write_json
 from libero_env.tasks import Task
 
 _FORMAT = 2  # of the files; those of another are made again
@@ -107,7 +107,7 @@ def certify_perturbed(
         for index, certificate in run_each(attempt_perturbed, arguments, jobs):
             k = left[index]
             found[k] = certificate
-            atomic_write_text(_path(out, *units[k]), json.dumps(asdict(certificate), indent=1) + "\n")
+            write_json(_path(out, *units[k]), certificate)
             bar.update()
     return [found[k] for k in range(len(units))]
 
