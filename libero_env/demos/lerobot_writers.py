@@ -339,7 +339,8 @@ class _GrowingFile:
 
     def __init__(self, root: Path, pattern: str, limit_mb: float):
         self._root, self._pattern, self._limit_mb = root, pattern, limit_mb
-        self._number, self._writer = 0, None
+        self._number = 0
+        self._writer: Any = None
 
     def _place(self, size: int) -> tuple[Path, dict[str, int]]:
         """Return the path of the file that the next episode is in, and its indices for the table of episodes.
@@ -365,8 +366,6 @@ class _GrowingFile:
 
 class ParquetTable(_GrowingFile):
     """Writes the Parquet files of the data, one row group per episode."""
-
-    _writer: Any  # a ParquetWriter
 
     def __init__(self, root: Path, limit_mb: float):
         super().__init__(root, DATA_PATH, limit_mb)
@@ -395,8 +394,6 @@ class CameraVideo(_GrowingFile):
         fps: Frames per second.
         codec: How frames are encoded.
     """
-
-    _writer: Mp4Writer | None
 
     def __init__(self, root: Path, key: str, limit_mb: float, fps: int, codec: Codec):
         super().__init__(root, VIDEO_PATH.replace("{video_key}", key), limit_mb)

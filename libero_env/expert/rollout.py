@@ -60,7 +60,9 @@ def run_experts(
         One attempt for each expert, in order.
     """
     noise = noise or [None] * len(experts)
-    states, executed, chosen = ([[] for _ in experts] for _ in range(3))  # of each simulation, step by step
+    states: list[list[np.ndarray]] = [[] for _ in experts]  # of each simulation, step by step
+    executed: list[list[np.ndarray]] = [[] for _ in experts]
+    chosen: list[list[np.ndarray]] = [[] for _ in experts]
     success = np.zeros(len(experts), bool)
     for _ in range(max_steps):
         running = map(int, np.flatnonzero(env.running[: len(experts)]))
