@@ -112,8 +112,10 @@ def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
         raise InvalidInputError("give one of --suite SUITE, --task TASK and --bddl FILE")
     if request.benchmark:
         tasks = get_suite(request.benchmark).tasks
+    elif request.task:
+        tasks = (get_task(request.task),)
     else:
-        tasks = (read_task(request.bddl) if request.bddl else get_task(request.task),)
+        tasks = (read_task(Path(str(request.bddl))),)
     shown = () if request.no_images else modalities(depth=request.depth, segmentation=request.segmentation)
     return [
         DemoConfig(

@@ -337,6 +337,8 @@ class _GrowingFile:
         limit_mb: Size from which a file is continued in another one, [MiB].
     """
 
+    _writer: Any
+
     def __init__(self, root: Path, pattern: str, limit_mb: float):
         self._root, self._pattern, self._limit_mb = root, pattern, limit_mb
         self._number = 0
