@@ -132,7 +132,7 @@ COMMANDS: dict[str, dict[str, Command]] = {
             "success of a policy on tasks; resumes where it was stopped",
         ),
         "robustness": Command(
-            "libero_eval.cli.robustness:robustness",
+            "libero_eval.cli.evaluate:robustness",
             "what perturbations do to a policy: success against severity, kind by kind",
         ),
         "compare": Command(

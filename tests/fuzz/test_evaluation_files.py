@@ -16,9 +16,9 @@ from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.exports import export_lerobot, export_vla_eval
 from libero_eval.judging.comparison import compare_groups, write_comparison
 from libero_eval.judging.page import render
+from libero_eval.plan import repeated
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
-from libero_eval.repeat import repeated
 from libero_eval.requests import EvalRequest
 from tests.harness.fuzz import examples, survive
 from tests.harness.mutations import changed_text, mutated

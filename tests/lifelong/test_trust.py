@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from libero_env.cli.main import main
-from libero_eval.repeat import repeated
+from libero_eval.plan import repeated
 from libero_eval.requests import EvalRequest
 from lifelong.errors import ConfigError
 from lifelong.evaluation.restore import restore
