@@ -338,8 +338,12 @@ def broken(tmp_path: Path, kind: str) -> Path:
     elif kind == "fbx":
         path = path.with_suffix(".fbx")
         path.write_text("")
-    elif kind == "large":
-        box(path)
+    elif kind in ("large", "address", "binary"):
+        path = box(path.with_suffix({"address": ".gltf", "binary": ".glb"}.get(kind, ".obj")))
+    if kind in ("address", "binary"):
+        asset = b'"generator":"https://github.com/mikedh/trimesh"}'
+        image = b'"generator":""},"images":[{"uri":7}]'
+        path.write_bytes(path.read_bytes().replace(asset, image.ljust(len(asset)), 1))
     return path
 
 
@@ -355,6 +359,8 @@ def broken(tmp_path: Path, kind: str) -> Path:
         ("xml", {}, "xml.xml:1: not valid XML"),
         ("two", {"size": 0.1}, "defines size itself"),
         ("fbx", {}, "unknown format '.fbx'; valid: .xml"),
+        ("address", {}, r"images\[0\].uri is 7; expected the name of a file"),
+        ("binary", {}, r"images\[0\].uri is 7"),
         ("large", {"size": 3.0}, "too large"),
         ("large", {"name": "milk"}, "--name my_milk"),
         ("large", {"name": "Red Cup"}, "lower-case letters"),

@@ -1,5 +1,6 @@
 """Reading of mesh files (OBJ, GLB, glTF, STL, PLY) as surfaces: upright, in metres, centred at the origin."""
 
+import json
 import shlex
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,6 +16,7 @@ from PIL import Image
 from libero_env.errors import InvalidInputError
 from libero_env.limited import call_limited
 from libero_env.objects.mjcf import check_size, file_inside
+from libero_env.text import shown
 
 FORMATS = (".obj", ".glb", ".gltf", ".stl", ".ply")
 MAX_FACES = 1_000_000
@@ -100,12 +102,24 @@ def load_surfaces(path: Path) -> list[Surface]:
     scene = trimesh.load(str(path), resolver=named, force="scene", process=False)
     if named.errors:  # trimesh omits materials and textures that it cannot read
         raise named.errors[0]
+    if path.suffix.lower() in _Y_UP:
+        _check_addresses(path)
     parts = [part for part in scene.dump() if len(getattr(part, "faces", ()))]
     if not parts:
         raise InvalidInputError(f"{path}: it contains no triangles; export the object as a mesh")
     if (count := sum(len(part.faces) for part in parts)) > MAX_FACES:
         raise InvalidInputError(f"{path}: it has {count} triangles; simplify it to {MAX_FACES} or fewer")
     return [_surface(part, path) for part in parts]
+
+
+def _check_addresses(path: Path) -> None:
+    """Raise an InvalidInputError if a picture of a glTF file has an address that is not text; trimesh omits it."""
+    data = path.read_bytes()
+    if data.startswith(b"glTF"):  # binary: the first chunk, whose length comes before it, is the JSON
+        data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    for i, image in enumerate(json.loads(data).get("images", ())):
+        if not isinstance(uri := image.get("uri", ""), str):
+            raise InvalidInputError(f"{path}: images[{i}].uri is {shown(uri)}; expected the name of a file")
 
 
 class _NamedFiles:
