@@ -10,7 +10,6 @@ the process that started the sweep reads them all. A sweep that is started again
 """
 
 import hashlib
-import json
 import math
 import os
 import re
@@ -24,8 +23,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from libero_env.parallel import is_running, process_start, this_machine
-from libero_env.storage import atomic_write_text
-from libero_env.text import json_safe
+from libero_env.storage import read_json, write_json
 from libero_env.validation import validate
 from lifelong.errors import ResultsError, RunLockedError
 from lifelong.results.provenance import utc_now
@@ -159,7 +157,7 @@ def begin_sweep(folder: Path, words: Sequence[str], planned: int | None) -> None
     content = {"words": list(words), "planned": planned, "started": utc_now()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        atomic_write_text(folder / SWEEP_FILE, json.dumps(content, indent=1) + "\n")
+        write_json(folder / SWEEP_FILE, content)
     except OSError as error:
         raise ResultsError(f"{folder}: the sweep cannot be kept there ({error})") from error
 
@@ -307,16 +305,13 @@ def _metrics(run: Path) -> dict[str, float | None]:
 def _write(file: Path, job: JobRecord) -> None:
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        atomic_write_text(file, json.dumps(json_safe(asdict(job)), indent=1, ensure_ascii=False) + "\n")
+        write_json(file, asdict(job))
     except OSError as error:
         raise ResultsError(f"{file}: the record of the job cannot be written ({error})") from error
 
 
 def _read_json(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise ResultsError(f"{file} cannot be read ({error}); remove it to run its job again") from error
+    content = read_json(file, ResultsError)
     if not isinstance(content, dict):
         raise ResultsError(f"{file} is no record of a sweep; remove it to run its job again")
     return content
