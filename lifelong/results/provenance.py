@@ -94,10 +94,11 @@ def start_record(*, config: Mapping[str, Any], group_sizes: Sequence[int] = (), 
     Args:
         config: Resolved configuration as plain data, whose digest is recorded.
         group_sizes: Number of tasks in each group that is one step of the sequence; () for one at a time.
-        facts: Other fields of `RunRecord`; lists become tuples.
+        facts: Other fields of `RunRecord`; tasks, instructions and perturbations may be any sequence.
     """
     equal = len(set(group_sizes)) < 2
-    fields: Any = {name: tuple(value) if isinstance(value, list) else value for name, value in facts.items()}
+    columns = ("tasks", "instructions", "perturbed")
+    fields: Any = {name: tuple(value) if name in columns else value for name, value in facts.items()}
     return RunRecord(
         config_digest=config_digest(config),
         versions=installed_versions(),
