@@ -52,7 +52,7 @@ def learn(path, algorithm, *, policy=None, tasks=TASKS, **settings):
     )
     if not context.directory.log.read().records:
         names = [task.name for task in context.tasks]
-        given = {"algo": "own", "benchmark": "b", "policy": "p", "preset": "", "config": ""}
+        given = {"algo": "own", "benchmark": "b", "policy": "p", "preset": "", "config": {}}
         start = start_record(**given, seed=1, tasks=names, instructions=names, cells=context.eval.cells)
         context.directory.log.append(start)
     sequence(context).run()
