@@ -1,14 +1,13 @@
 """`libero demos`: options take effect, and every tool runs on a recorded file."""
 
-import argparse
 from pathlib import Path
 
 import h5py
 import pytest
 
-from libero_env.cli import arguments
 from libero_env.cli import demos as cli_demos
 from libero_env.cli import main as cli
+from libero_env.cli.options import Size, parse
 from libero_env.demos.read import read_demos
 from libero_env.demos.record import RecordingReport
 from tests.harness.demos import wander
@@ -90,11 +89,15 @@ def test_failures_are_counted_by_kind():
     )
 
 
+def _size(*, size: Size = (1, 1)) -> tuple[int, int]:
+    return size
+
+
 def test_sizes_are_one_number_or_two():
-    assert arguments.size("64") == (64, 64) and arguments.size("48x64") == (48, 64)
+    assert [parse(_size, ["--size", text], "x")() for text in ("64", "48x64")] == [(64, 64), (48, 64)]
     for wrong in ("0", "1x2x3", "4x"):
-        with pytest.raises((argparse.ArgumentTypeError, ValueError)):
-            arguments.size(wrong)
+        with pytest.raises(SystemExit):
+            parse(_size, ["--size", wrong], "x")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import numpy as np
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.expert import Expert, Shapes
-from libero_env.expert.rollout import MAX_STEPS, run_experts
+from libero_env.expert.expert import MAX_STEPS, run_experts
 from libero_env.storage import atomic_write_npz
 from libero_env.tasks import Task, get_suite
 

@@ -1,6 +1,5 @@
 """`libero perturb`: what can be perturbed, what it looks like, and whether the expert solves it."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -82,7 +81,7 @@ def certify(
     from libero_env.design.certify_perturbed import certify_perturbed, shares_table
     from libero_env.perturbations import KINDS, Perturbation
     from libero_env.perturbations.sampling import attempts_file
-    from libero_env.storage import atomic_write_text
+    from libero_env.storage import read_json, write_json
 
     names = kinds or [name for name, kind in KINDS.items() if kind.physical]
     perturbations = [Perturbation(kind, s, seed) for kind in dict.fromkeys(names) for s in severities if s]
@@ -98,8 +97,8 @@ def certify(
     print(*shares_table(certificates, perturbations), sep="\n")
     if keep:
         named = {str(one): one for one in perturbations}
-        solved = json.loads(attempts_file().read_text(encoding="utf-8")) if attempts_file().is_file() else {}
+        solved = read_json(attempts_file())
         for certificate in certificates:
             solved |= certificate.attempts(named[certificate.perturbation])
-        atomic_write_text(attempts_file(), json.dumps(dict(sorted(solved.items())), indent=0) + "\n")
+        write_json(attempts_file(), dict(sorted(solved.items())))
         print(attempts_file())

@@ -13,7 +13,7 @@ from libero_env.demos.write import DemoWriter
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import PlacementError
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError
-from libero_env.expert.rollout import MAX_STEPS, Attempt, run_experts
+from libero_env.expert.expert import MAX_STEPS, Attempt, run_experts
 from libero_env.init_states.store import NUM_INIT_STATES
 
 MAX_ATTEMPTS = 10  # attempts at one demonstration

@@ -5,7 +5,6 @@ resumes. The result from an initial state depends on the task and its number alo
 """
 
 import hashlib
-import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -21,10 +20,10 @@ from libero_env.demos.config import GENERATOR
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import LiberoError, MissingPackageError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes
-from libero_env.expert.rollout import run_experts
+from libero_env.expert.expert import run_experts
 from libero_env.parallel import progress_bar, run_each
 from libero_env.sim.scene import build_scene
-from libero_env.storage import write_json
+from libero_env.storage import read_json, write_json
 from libero_env.tasks import Task
 from libero_env.tasks.builder import FILE
 
@@ -305,7 +304,7 @@ def _stored(path: Path, empty: Certificate) -> Certificate:
     if not path.is_file():
         return empty
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path)
         outcomes = tuple(Outcome(**row) for row in found["outcomes"])
     except (ValueError, KeyError, TypeError) as error:
         raise LiberoError(f"{path} is not a certificate ({error}); remove it, or run with --again") from error

@@ -5,7 +5,6 @@ Results are on disk after each task and perturbation, so that a stopped run resu
 """
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,11 +17,11 @@ from libero_env.design.certify import NO_HORIZON
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, LiberoError, PlacementError
 from libero_env.expert import Expert, Shapes
-from libero_env.expert.rollout import run_experts
+from libero_env.expert.expert import run_experts
 from libero_env.parallel import progress_bar, run_each
 from libero_env.perturbations.perturbation import Perturbation
 from libero_env.perturbations.sampling import trying
-from libero_env.storage import write_json
+from libero_env.storage import read_json, write_json
 from libero_env.tasks import Task
 
 _FORMAT = 2  # of the files; those of another are made again
@@ -208,7 +207,7 @@ def _stored(path: Path, digest: str) -> PerturbedCertificate | None:
     if not path.is_file():
         return None
     try:
-        found = PerturbedCertificate(**json.loads(path.read_text(encoding="utf-8")))
+        found = PerturbedCertificate(**read_json(path))
     except (ValueError, TypeError) as error:
         raise LiberoError(f"{path} is not a certificate ({error}); remove it, or run with --again") from error
     return found if found.digest == digest else None

@@ -10,7 +10,7 @@ from libero_env.demos.video import write_video
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import LiberoError
 from libero_env.expert import Expert
-from libero_env.expert.rollout import MAX_STEPS
+from libero_env.expert.expert import MAX_STEPS
 from libero_env.perturbations.perturbation import Perturbation
 from libero_env.sim.observations import image_name
 from libero_env.tasks.task import Task

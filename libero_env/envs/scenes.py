@@ -5,14 +5,19 @@ from functools import partial
 
 import numpy as np
 
+from libero_env.assets.arena import workspace_of_problem
 from libero_env.envs.config import EnvConfig
 from libero_env.errors import InvalidInputError
+from libero_env.perturbations.corruptions import CAMERA, Corruption
 from libero_env.perturbations.episodes import PerturbedEpisodes, needs_materials, scene_problem
+from libero_env.perturbations.kinds import Change
 from libero_env.perturbations.perturbation import Perturbation, perturb_task
-from libero_env.perturbations.published import published_changes, rest_of
+from libero_env.perturbations.starts import RobotJoints
+from libero_env.sim.appearance import Appearance, CameraView
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.tasks import Task, get_task
-from libero_env.tasks.published.suites import require_available
+from libero_env.tasks.published.plus import camera_pose, joint_pose
+from libero_env.tasks.published.suites import PublishedTask, require_available
 from libero_env.text import shown
 
 
@@ -59,8 +64,37 @@ def open_scenes(task: Task | str, config: EnvConfig, num: int) -> TaskScenes:
     )
     base_scene = compiled(base.problem)
     if not changes:
-        return TaskScenes(base, base_scene, base, base_scene, rest_of(base))
+        return TaskScenes(base, base_scene, base, base_scene, _rest_of(base))
     changed = perturb_task(base, (one for one in changes if isinstance(one, Perturbation)), base_scene)
     scene = compiled(scene_problem(changed, base))
     perturbed = PerturbedEpisodes(changes, base, base_scene, scene, num)
-    return TaskScenes(changed, scene, base, base_scene, rest_of(base), perturbed)
+    return TaskScenes(changed, scene, base, base_scene, _rest_of(base), perturbed)
+
+
+def published_changes(task: Task) -> tuple[Change, ...]:
+    """Return what the environment of a task changes beside the problem; nothing for most tasks.
+
+    Args:
+        task: Task; those of LIBERO-Plus change something.
+    """
+    if not isinstance(task, PublishedTask) or task.variant is None:
+        return ()
+    variant, workspace = task.variant, workspace_of_problem(task.problem.name).name
+    pose = camera_pose(workspace, variant.view)
+    view = CameraView(tuple(pose.pos.tolist()), tuple(pose.quat_wxyz.tolist()))
+    changes: list[Change] = [Appearance(cameras={CAMERA: view})]
+    if variant.pose and task.robot_state == "skipped":
+        changes.append(RobotJoints(tuple(joint_pose(variant.pose).tolist())))
+    if variant.noise is not None:
+        changes.append(Corruption(variant.noise.kind, variant.noise.severity))
+    return tuple(changes)
+
+
+def _rest_of(task: Task) -> np.ndarray:
+    """Return the joints that the controller takes for the arm's rest pose, (7,) [rad].
+
+    In LIBERO-Plus they are those of the variant, whether the arm starts there or not: its controller pulls towards
+    them in its null space, and its first goals are relative to them.
+    """
+    variant = task.variant if isinstance(task, PublishedTask) else None
+    return joint_pose(0 if variant is None else variant.pose)

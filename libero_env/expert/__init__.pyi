@@ -1,6 +1,5 @@
-from .expert import Expert
+from .expert import Attempt, Expert, run_experts
 from .planning.goal_plan import UnsupportedGoalError, plan_goal
-from .rollout import Attempt, run_experts
 from .shapes import Shapes
 from .skills.skill import Skill
 from .variation import ActionNoise, MotionStyle

@@ -12,12 +12,16 @@ Images of other sizes, for which that code ends with an error, have fog of their
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.parallel import compiled
+from libero_env.perturbations.kinds import Episode, ObservationFilter
 
+CAMERA = "agentview"  # the only camera that LIBERO-Plus changes
+_PICTURE = f"{CAMERA}_rgb"
 SEVERITIES = 10
 _MOTION = ((5, 2), (8, 3), (10, 4), (12, 5), (15, 6), (18, 8), (20, 10), (25, 12), (30, 15), (35, 20))
 _MOTION_DEGREES = 45.0
@@ -197,3 +201,26 @@ def _copy_neighbours(image: np.ndarray, shifts: np.ndarray, side: int, reach: in
             for channel in range(image.shape[2]):
                 image[row, column, channel] = image[row + shifts[k, 1], column + shifts[k, 0], channel]
             k += 1
+
+
+@dataclass(frozen=True)
+class Corruption(ObservationFilter):
+    """Noise on the pictures of `agentview`, sampled anew for each.
+
+    LIBERO-Plus' code leaves the first picture after an initial state is set without noise; here it has it too.
+
+    Attributes:
+        kind: `motion`, `gaussian`, `zoom`, `fog` or `glass`.
+        severity: Severity, 1 to 10.
+    """
+
+    kind: str
+    severity: int
+
+    def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
+        """Return the picture with noise."""
+        if name != _PICTURE:
+            return image
+        rng = episode.key.generator(episode.step)
+        upside_down = corrupt(image[::-1], self.kind, self.severity, rng)  # as theirs are
+        return upside_down[::-1]

@@ -6,7 +6,6 @@ task and start; `libero perturb certify --keep` writes it.
 """
 
 import hashlib
-import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
@@ -14,6 +13,8 @@ from importlib import resources
 from pathlib import Path
 
 import numpy as np
+
+from libero_env.storage import read_json
 
 _overlay: dict[str, int] = {}
 
@@ -71,8 +72,7 @@ def attempts_file() -> Path:
 
 @cache
 def _certified() -> Mapping[str, int]:
-    path = attempts_file()
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return read_json(attempts_file())
 
 
 def first_attempt(name: str) -> int:

@@ -4,7 +4,7 @@ import numpy as np
 
 from libero_env.demos.read import Episode
 from libero_env.demos.write import DemoWriter, make_header
-from libero_env.expert.rollout import Attempt
+from libero_env.expert.expert import Attempt
 
 STEPS = 12  # of an episode by `wander`
 

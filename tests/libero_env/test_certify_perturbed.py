@@ -66,6 +66,7 @@ def test_a_task_that_is_mostly_not_solved_is_drawn_again_as_a_whole(expert):
 
 
 def test_results_are_on_disk_and_are_not_run_again(expert, tmp_path, capsys, monkeypatch):
+    (tmp_path / "draws.json").write_text("{}")
     monkeypatch.setattr(sampling, "attempts_file", lambda: tmp_path / "draws.json")
     words = [
         "perturb",

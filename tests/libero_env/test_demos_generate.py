@@ -20,7 +20,7 @@ from libero_env.demos.record import DemoRecorder
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
-from libero_env.expert.rollout import run_experts
+from libero_env.expert.expert import run_experts
 from libero_env.tasks import get_task
 
 pytestmark = pytest.mark.sim

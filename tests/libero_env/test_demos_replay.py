@@ -18,7 +18,7 @@ from libero_env.demos.replay import replay
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
 from libero_env.expert import UnsupportedGoalError
-from libero_env.expert.rollout import Attempt
+from libero_env.expert.expert import Attempt
 from libero_env.tasks import get_task
 from tests.harness.demos import STEPS, wander
 

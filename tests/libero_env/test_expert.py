@@ -14,12 +14,18 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError, plan_goal
 from libero_env.expert.arm import GRIPPER, action_toward, downward, limit_elbow_extension
 from libero_env.expert.clearance import overhang
-from libero_env.expert.grasping.costs import finger_offset, grip_cost
-from libero_env.expert.grasping.grasps import Grasp, GraspError, choose_grasp, find_grasps
+from libero_env.expert.expert import run_experts
+from libero_env.expert.grasping.grasps import (
+    Grasp,
+    GraspError,
+    choose_grasp,
+    find_grasps,
+    finger_offset,
+    grip_cost,
+)
 from libero_env.expert.grasping.kernels import open_hand_collision_depth
 from libero_env.expert.planning.pick_plan import SEARCH, FailedAttempt
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
-from libero_env.expert.rollout import run_experts
 from libero_env.expert.skills.drop_into_container import DropIntoContainer
 from libero_env.expert.skills.pick_place import PickPlace
 from libero_env.expert.skills.transport import Move, Transport

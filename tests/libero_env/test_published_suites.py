@@ -12,6 +12,7 @@ from libero_env import BatchEnv, LiberoEnv
 from libero_env.assets.original import LIBERO_PRO, OriginalPack
 from libero_env.assets.pack import select_pack
 from libero_env.assets.published import installed_folder
+from libero_env.envs.scenes import published_changes
 from libero_env.errors import (
     BDDLError,
     InvalidInputError,
@@ -22,7 +23,6 @@ from libero_env.errors import (
 )
 from libero_env.init_states import store
 from libero_env.init_states.store import load_init_states, load_original_states
-from libero_env.perturbations.published import published_changes
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, is_suite, suite_names
 from libero_env.tasks.published import camera_pose, joint_pose, published_sizes

@@ -11,7 +11,7 @@ from libero_env.demos.generate import RecordingJob, demo_path, make_demos
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.expert import Expert, Shapes
-from libero_env.expert.rollout import MAX_STEPS
+from libero_env.expert.expert import MAX_STEPS
 from libero_env.sim import backend as backends
 from libero_env.sim.appearance import Appearance
 from libero_env.sim.backend import Backend

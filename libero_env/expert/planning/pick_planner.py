@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from libero_env.expert.arm import finger_axis
-from libero_env.expert.grasping.costs import HAND, collision_cost, grip_cost
-from libero_env.expert.grasping.grasps import Grasp, GraspError, find_grasps
+from libero_env.expert.grasping.grasps import HAND, Grasp, GraspError, collision_cost, find_grasps, grip_cost
 from libero_env.expert.planning.pick_plan import FLIPS, SEARCH, FailedAttempt, PickPlan, first_reachable
 from libero_env.expert.planning.place_poses import DOWN, Placement, PlacePose, find_place_poses
 from libero_env.expert.shapes import Shapes

@@ -5,7 +5,7 @@ import numpy as np
 from libero_env.errors import LiberoError
 from libero_env.expert.arm import CLOSE, GRIPPER, OPEN, lateral_ramp
 from libero_env.expert.clearance import hand_extent_below, obstacle_height
-from libero_env.expert.grasping.costs import finger_offset
+from libero_env.expert.grasping.grasps import finger_offset
 from libero_env.expert.grasping.kernels import open_hand_collision_depth
 from libero_env.expert.planning.pick_plan import FailedAttempt, PickPlan
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
