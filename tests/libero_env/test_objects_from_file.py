@@ -338,9 +338,15 @@ def broken(tmp_path: Path, kind: str) -> Path:
     elif kind == "fbx":
         path = path.with_suffix(".fbx")
         path.write_text("")
-    elif kind in ("large", "address", "binary"):
-        path = box(path.with_suffix({"address": ".gltf", "binary": ".glb"}.get(kind, ".obj")))
-    if kind in ("address", "binary"):
+    elif kind == "large":
+        box(path)
+    elif kind in ("address", "binary"):
+        path = box(path.with_suffix(".glb"))
+        if kind == "address":
+            files = trimesh.exchange.gltf.export_gltf(trimesh.load(path, force="scene"))
+            for name, content in files.items():
+                (tmp_path / name).write_bytes(content)
+            path = tmp_path / "model.gltf"
         asset = b'"generator":"https://github.com/mikedh/trimesh"}'
         image = b'"generator":""},"images":[{"uri":7}]'
         path.write_bytes(path.read_bytes().replace(asset, image.ljust(len(asset)), 1))
