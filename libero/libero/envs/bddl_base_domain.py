@@ -21,7 +21,7 @@ from libero.libero.envs import bddl_utils as BDDLUtils
 from libero.libero.envs.bddl_utils import task_file
 from libero.libero.envs.object_states import BaseObjectState, ObjectState, SiteObjectState
 from libero.libero.envs.predicates import eval_predicate_fn
-from libero.libero.envs.robots.single_arm import SingleArm, controller_of
+from libero.libero.envs.robots import SingleArm, controller_of
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
 from libero.libero.utils.utils import postprocess_model_xml
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, ROBOTS

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObject
-from libero.libero.envs.objects.site_object import SiteObject
+from libero.libero.envs.objects import SiteObject
 from libero_env.objects.builtin import builtin_names
 from libero_env.objects.model import ObjectModel
 from libero_env.sim.scene import Scene

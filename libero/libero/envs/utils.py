@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from libero.libero.envs.regions.samplers import MultiRegionRandomSampler  # noqa: F401
+from libero.libero.envs.regions import MultiRegionRandomSampler  # noqa: F401
 from libero.libero.utils.utils import postprocess_model_xml  # noqa: F401
 
 

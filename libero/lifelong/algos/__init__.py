@@ -1,9 +1,176 @@
-"""The original's lifelong-learning algorithms."""
+"""The original's lifelong-learning algorithms: those of `lifelong.algorithms` with its methods."""
 
-from libero.lifelong.algos.agem import AGEM
+import copy
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import ConcatDataset, Dataset
+
+from libero._adapters.lifelong.batches import DictWindows
+from libero._adapters.lookup import alias_modules
 from libero.lifelong.algos.base import REGISTERED_ALGOS, Sequential, get_algo_class, get_algo_list
-from libero.lifelong.algos.er import ER
-from libero.lifelong.algos.ewc import EWC
-from libero.lifelong.algos.multitask import Multitask
-from libero.lifelong.algos.packnet import PackNet
-from libero.lifelong.algos.single_task import SingleTask
+from libero.lifelong.metric import evaluate_multitask_training_success
+from lifelong import algorithms
+from lifelong.algorithms.importance import BatchFisher
+from lifelong.data.memory import ReplayMemory
+
+
+def cycle(dl: Iterable[Any]) -> Iterator[Any]:
+    """Yield the items of a loader, again and again."""
+    while True:
+        yield from dl
+
+
+def merge_datas(x: Any, y: Any) -> Any:
+    """Return two batches joined: dictionaries of tensors, whose first dimension is the batch."""
+    if isinstance(x, dict):
+        return type(x)((key, merge_datas(x[key], y[key])) for key in x)
+    return torch.cat([x, y], dim=0)
+
+
+class ER(Sequential):
+    """Joins to every batch as many windows of earlier tasks; see `lifelong.algorithms.ER`.
+
+    `lifelong.n_memories` windows of each task are kept, drawn uniformly (the original keeps the first of each file).
+    """
+
+    def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
+        """See `Sequential`."""
+        return algorithms.ER(memory=ReplayMemory(cfg.lifelong.n_memories))
+
+    def end_task(self, dataset: Dataset, task_id: int, benchmark: Any, env: Any = None) -> None:
+        """Add the task's windows to the memory, whose native budget is that of all tasks together."""
+        self.hooks.memory.budget = self.cfg.lifelong.n_memories * (task_id + 1)
+        super().end_task(dataset, task_id, benchmark, env)
+
+
+class AGEM(ER):
+    """Projects out of the gradient what would raise the loss on ER's memory; see `lifelong.algorithms.AGEM`."""
+
+    def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
+        """See `Sequential`."""
+        return algorithms.AGEM(memory=ReplayMemory(cfg.lifelong.n_memories))
+
+
+class EWC(Sequential):
+    """Pulls weights towards their values after earlier tasks; see `lifelong.algorithms.EWC`.
+
+    The Fisher information is the original's estimate from batches of all windows, which `lifelong.e_lambda` is for.
+    """
+
+    def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
+        """See `Sequential`."""
+        return algorithms.EWC(
+            strength=float(cfg.lifelong.e_lambda),
+            gamma=cfg.lifelong.gamma,
+            estimator=BatchFisher(windows=0, batch_size=cfg.train.batch_size),
+        )
+
+    def get_params(self) -> Tensor:
+        """Return all weights of the policy, (P,)."""
+        return torch.cat([p.reshape(-1) for p in self.policy.parameters()])
+
+    def get_grads(self) -> Tensor:
+        """Return the gradients of all weights, (P,); 0 where there is none."""
+        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.policy.parameters()]
+        return torch.cat([grad.reshape(-1) for grad in grads])
+
+    def penalty(self) -> Tensor:
+        """Return the penalty on the present weights, without the factor `lifelong.e_lambda`."""
+        found = self.hooks.penalty(self.policy)
+        return torch.zeros(()) if found is None else found / self.cfg.lifelong.e_lambda
+
+
+class PackNet(Sequential):
+    """Trains, prunes, and retrains the weights that the task keeps; see `lifelong.algorithms.PackNet`."""
+
+    def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
+        """See `Sequential`."""
+        return algorithms.PackNet(prune_perc=cfg.lifelong.prune_perc)
+
+    def end_task(self, dataset: Dataset, task_id: int, benchmark: Any, env: Any = None) -> None:
+        """Prune, and retrain for `post_prune_epochs`; the weights of the best of these epochs are kept."""
+        settings, (train, retrain) = self.cfg.lifelong, self.hooks.phases()
+        self.hooks.end_phase(train, self.policy)
+        self.hooks.begin_phase(retrain, self.policy)
+        if epochs := settings.post_prune_epochs:
+            self.make_optimizer(epochs)
+            path, measure = self.checkpoint(task_id), lambda _: self.measure_success(task_id, benchmark)
+            self.train_policy(dataset, epochs, settings.post_eval_every, path, measure, phase=1)
+        self.hooks.end_phase(retrain, self.policy)
+        self.hooks.end_task(task_id, DictWindows(dataset, task_id), self.policy, self.draws)
+
+    @property
+    def previous_masks(self) -> dict[str, Tensor]:
+        """Owner of each weight: 0 where it is free, k + 1 for task k."""
+        return dict(self.hooks.state_dict()["owner"])
+
+    def load_masks(self, masks: Mapping[str, Tensor], task_id: int) -> None:
+        """Load the masks of a checkpoint that was written after a task."""
+        self.hooks.load_state_dict({"task_index": task_id, "pruned": True, "owner": masks}, {})
+
+    def get_eval_algo(self, task_id: int) -> "PackNet":
+        """Return a copy whose policy has only the weights of the tasks up to this one."""
+        other = copy.copy(self)
+        other._modules = dict(self._modules)
+        with self.acting_on(task_id):
+            other.policy = copy.deepcopy(self.policy)
+        other.hooks = algorithms.Sequential()
+        other.eval()
+        return other
+
+
+class SingleTask(Sequential):
+    """Trains every task from the initial weights and acts with its own; see `lifelong.algorithms.SingleTask`."""
+
+    def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
+        """See `Sequential`."""
+        return algorithms.SingleTask()
+
+
+class Multitask(Sequential):
+    """Trains on the windows of all tasks, shuffled together."""
+
+    def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
+        """See `Sequential`."""
+        return algorithms.Multitask()
+
+    def learn_all_tasks(
+        self, datasets: Sequence[Dataset], benchmark: Any, result_summary: Mapping[str, Any]
+    ) -> tuple[float, float]:
+        """Train on all tasks; write `multitask_model.pth`, and `multitask_model_ep<n>.pth` at each evaluation.
+
+        With `lifelong.eval_in_train` the success on all tasks is measured at each evaluation and the best weights are
+        kept, else the last.
+
+        Returns:
+            Success (0 if it is not measured) and loss, as `learn_one_task` returns them.
+        """
+        self.start_task(-1)
+        tasks, every = list(range(benchmark.n_tasks)), self.cfg.eval.eval_every
+
+        def measure(number: int) -> float | None:
+            self.save(os.path.join(self.experiment_dir, f"multitask_model_ep{number * every}.pth"))
+            if not self.cfg.lifelong.eval_in_train:
+                return None
+            return float(np.mean(evaluate_multitask_training_success(self.cfg, self, benchmark, tasks)))
+
+        windows, path = ConcatDataset(datasets), os.path.join(self.experiment_dir, "multitask_model.pth")
+        curve = self.train_policy(windows, self.cfg.train.n_epochs, every, path, measure)
+        self.end_task(windows, 0, benchmark)
+        return curve.means()
+
+
+alias_modules(
+    __name__,
+    agem="AGEM",
+    er="ER cycle merge_datas",
+    ewc="EWC",
+    multitask="Multitask",
+    packnet="PackNet",
+    single_task="SingleTask",
+)

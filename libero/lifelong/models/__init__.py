@@ -1,6 +1,34 @@
-"""The original's policies: networks of `lifelong.policies` whose batches are dictionaries."""
+"""The original's policies, networks of `lifelong.policies` whose batches are dictionaries, and their modules."""
 
+from libero._adapters.lookup import alias_modules
 from libero.lifelong.models.base_policy import BasePolicy, get_policy_class, get_policy_list
-from libero.lifelong.models.bc_rnn_policy import BCRNNPolicy
-from libero.lifelong.models.bc_transformer_policy import BCTransformerPolicy
-from libero.lifelong.models.bc_vilt_policy import BCViLTPolicy
+from libero.lifelong.models.modules.extra_modules import ExtraModalities, ExtraModalityTokens
+from libero.lifelong.models.modules.language_modules import IdentityEncoder, MLPEncoder
+from libero.lifelong.models.modules.rgb_modules import (
+    PatchEncoder,
+    ResnetEncoder,
+    SpatialProjection,
+    SpatialSoftmax,
+)
+from libero.lifelong.models.modules.transformer_modules import (
+    Attention,
+    DropPath,
+    Norm,
+    SinusoidalPositionEncoding,
+    TransformerDecoder,
+    TransformerFeedForwardNN,
+)
+from libero.lifelong.models.native_policy import BCRNNPolicy, BCTransformerPolicy, BCViLTPolicy
+from libero.lifelong.models.policy_head import DeterministicHead, GMMHead
+from libero.lifelong.models.saliency import PerturbationAttention
+
+alias_modules(
+    __name__,
+    bc_rnn_policy="BCRNNPolicy ExtraModalities",
+    bc_transformer_policy="BCTransformerPolicy ExtraModalityTokens PerturbationAttention",
+    bc_vilt_policy="BCViLTPolicy ExtraModalityTokens",
+    policy="Attention BCRNNPolicy BCTransformerPolicy BCViLTPolicy BasePolicy DeterministicHead DropPath "
+    "ExtraModalities ExtraModalityTokens GMMHead IdentityEncoder MLPEncoder Norm PatchEncoder PerturbationAttention ResnetEncoder "
+    "SinusoidalPositionEncoding SpatialProjection SpatialSoftmax TransformerDecoder TransformerFeedForwardNN "
+    "get_policy_class get_policy_list",
+)

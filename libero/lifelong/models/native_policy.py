@@ -1,4 +1,4 @@
-"""Policies whose network is one of `lifelong.policies`, with the original's methods and configuration.
+"""The original's three policies: networks of `lifelong.policies` with its methods and configuration.
 
 Shape legend: B batch, T time, M tokens per time step, E token, A action.
 """
@@ -17,7 +17,7 @@ from libero._adapters.lifelong.config import plain
 from libero._adapters.lookup import lookup
 from libero.lifelong.models.base_policy import BasePolicy
 from libero.lifelong.models.modules.language_modules import ENCODERS, mlp
-from libero.lifelong.models.modules.rgb_modules import configure_resnet, resnet_arguments
+from libero.lifelong.models.modules.rgb_modules import configure_resnet, resnet_arguments, square
 from libero.lifelong.models.policy_head import HEADS, GMMHead, check_activation, wrap_head
 from lifelong.errors import PolicyError
 from lifelong.nn.transformer import sinusoidal_positions
@@ -25,62 +25,41 @@ from lifelong.policies import BCRNN, BCTransformer, BCViLT
 from lifelong.policies.history import HistoryPolicy
 from lifelong.settings import build
 
-# Flat key -> key of the component of the network. Keys that are not listed are those of the network itself.
-_RESNET = {
-    "image_width": "width",
-    "stage_blocks": "stage_blocks",
-    "stem_kernel": "stem_kernel",
-    "stem_stride": "stem_stride",
-    "stem_pool": "stem_pool",
-    "keypoints": "keypoints",
-    "keypoint_temperature": "temperature",
-    "readout": "readout",
-    "norm": "norm",
-}
-_PATCHES = {
-    "patch_width": "width",
-    "stem_kernel": "stem_kernel",
-    "stem_stride": "stem_stride",
-    "patch": "patch",
-    "norm": "norm",
-}
-_SPATIAL = {
-    "spatial_layers": "layers",
-    "spatial_heads": "heads",
-    "spatial_head_dim": "head_dim",
-    "spatial_mlp_dim": "mlp_dim",
-    "dropout": "dropout",
-}
-_TRANSFORMER = {key: key for key in ("layers", "heads", "head_dim", "mlp_dim", "dropout")}
-_LSTM = {"rnn_hidden": "hidden", "rnn_layers": "layers", "dropout": "dropout"}
-_TRUNK = {"head_hidden": "hidden", "head_layers": "layers"}
+State = tuple[Tensor, Tensor]  # of an LSTM
+Keys = dict[
+    str, str
+]  # flat key -> key of a component of the network; other flat keys are those of the network
+
+
+def _keys(same: str, **renamed: str) -> Keys:
+    """Return keys that are the same for the component, separated by blanks, and those that have another name there."""
+    return {**{key: key for key in same.split()}, **renamed}
+
+
+_RESNET = _keys(
+    "stage_blocks stem_kernel stem_stride stem_pool keypoints readout norm",
+    image_width="width",
+    keypoint_temperature="temperature",
+)
+_PATCHES = _keys("stem_kernel stem_stride patch norm", patch_width="width")
+_SPATIAL = _keys("dropout", **{f"spatial_{key}": key for key in ("layers", "heads", "head_dim", "mlp_dim")})
+_TRANSFORMER = _keys("layers heads head_dim mlp_dim dropout")
+_LSTM = _keys("dropout", rnn_hidden="hidden", rnn_layers="layers")
+_TRUNK = _keys("", head_hidden="hidden", head_layers="layers")
+_GMM = _keys("modes min_std low_eval_noise", head_norm="norm", **_TRUNK)
 _HEADS = {
-    "deterministic": ("DeterministicHead", {**_TRUNK, "head_norm": "norm"}),
-    "gmm": (
-        "GMMHead",
-        {
-            **_TRUNK,
-            "head_norm": "norm",
-            "modes": "modes",
-            "min_std": "min_std",
-            "low_eval_noise": "low_eval_noise",
-        },
-    ),
-    "flow": ("FlowHead", {**_TRUNK, "chunk": "chunk", "execute": "execute", "flow_steps": "steps"}),
+    "deterministic": ("DeterministicHead", _keys("", head_norm="norm", **_TRUNK)),
+    "gmm": ("GMMHead", _GMM),
+    "flow": ("FlowHead", _keys("chunk execute", flow_steps="steps", **_TRUNK)),
 }
-_COMPONENTS: dict[type[HistoryPolicy], dict[str, tuple[str, dict[str, str]]]] = {
-    BCTransformer: {
-        "encoder": ("ResNetFiLMEncoder", _RESNET),
-        "temporal": ("TemporalTransformer", _TRANSFORMER),
-    },
-    BCRNN: {
-        "encoder": ("ResNetFiLMEncoder", _RESNET),
-        "temporal": ("TemporalLSTM", _LSTM),
-    },
+_RESNET_FILM, _TEMPORAL = ("ResNetFiLMEncoder", _RESNET), ("TemporalTransformer", _TRANSFORMER)
+_COMPONENTS: dict[type[HistoryPolicy], dict[str, tuple[str, Keys]]] = {
+    BCTransformer: {"encoder": _RESNET_FILM, "temporal": _TEMPORAL},
+    BCRNN: {"encoder": _RESNET_FILM, "temporal": ("TemporalLSTM", _LSTM)},
     BCViLT: {
         "encoder": ("PatchEncoder", _PATCHES),
         "spatial": ("SpatialTransformer", _SPATIAL),
-        "temporal": ("TemporalTransformer", _TRANSFORMER),
+        "temporal": _TEMPORAL,
     },
 }
 
@@ -161,6 +140,85 @@ class NativePolicy(BasePolicy):
         """Append a frame to the history; return its latent (B, E)."""
         self.latent_queue = [*self.latent_queue, self.spatial_encode(data)][-self.max_seq_len :]
         return self.temporal_encode(torch.cat(self.latent_queue, dim=1))[:, -1]
+
+
+class BCRNNPolicy(NativePolicy):
+    """One vector of language, proprioception and cameras at each step, and an LSTM over time.
+
+    When acting its state is carried, and reset every `data.seq_len` steps, as windows in training begin without one.
+    """
+
+    kind = BCRNN
+    _state: State | None = None
+    _age = 0  # steps since the state was empty
+
+    def _arguments(self, policy: Any) -> dict[str, Any]:
+        if policy.get("rnn_bidirectional"):
+            raise PolicyError("rnn_bidirectional: a policy that acts cannot look ahead; set it to false")
+        if policy.get("extra_num_layers"):
+            raise PolicyError("extra_num_layers: this policy does not encode proprioception; set it to 0")
+        return {
+            "image_embed": policy.image_embed_size,
+            "text_embed": policy.text_embed_size,
+            "rnn_hidden": policy.rnn_hidden_size,
+            "rnn_layers": policy.rnn_num_layers,
+            "dropout": policy.rnn_dropout,
+            **resnet_sizes(policy),
+        }
+
+    def forward(
+        self, data: Mapping[str, Any], init_state: State | None = None, return_state: bool = False
+    ) -> Any:
+        """Return the distribution of actions (B, T, A) from a state, by default empty; and the state after it."""
+        latent, state = self.network.rnn(self.spatial_encode(data), init_state)
+        dist = self.policy_head(latent)
+        return (dist, state) if return_state else dist
+
+    def reset(self) -> None:
+        """See `BasePolicy`."""
+        super().reset()
+        self._state, self._age = None, 0
+
+    def _latest_latent(self, data: Mapping[str, Any]) -> Tensor:
+        if self._age == self.max_seq_len:
+            self.reset()
+        latent, self._state = self.network.rnn(self.spatial_encode(data), self._state)
+        self._age += 1
+        return latent[:, -1]
+
+
+class BCTransformerPolicy(NativePolicy):
+    """Tokens of language, proprioception and cameras at each step, and a transformer over time."""
+
+    kind = BCTransformer
+
+    def _arguments(self, policy: Any) -> dict[str, Any]:
+        size = policy.embed_size
+        return {"embed_dim": size, **resnet_sizes(policy), **temporal_sizes(policy, size)}
+
+
+class BCViLTPolicy(NativePolicy):
+    """A transformer over the patches of a frame, and one over time."""
+
+    kind = BCViLT
+
+    def _arguments(self, policy: Any) -> dict[str, Any]:
+        patches, size = policy.image_encoder, policy.embed_size
+        if patches.network != "PatchEncoder":
+            raise PolicyError(f"image_encoder is {patches.network}; this policy needs a PatchEncoder")
+        if policy.spatial_transformer_dropout != policy.transformer_dropout:
+            raise PolicyError("spatial_transformer_dropout and transformer_dropout must be equal")
+        token = policy.spatial_down_sample_embed_size if policy.spatial_down_sample else size
+        return {
+            "patch_embed": size,
+            "patch": square(patches.network_kwargs.patch_size),
+            "spatial_layers": policy.spatial_transformer_num_layers,
+            "spatial_heads": policy.spatial_transformer_num_heads,
+            "spatial_head_dim": policy.spatial_transformer_head_output_size,
+            "spatial_mlp_dim": policy.spatial_transformer_mlp_hidden_size,
+            "embed_dim": token,
+            **temporal_sizes(policy, token),
+        }
 
 
 def _node(kind: type[HistoryPolicy], arguments: dict[str, Any]) -> dict[str, Any]:

@@ -7,8 +7,18 @@ from typing import Any, ClassVar
 import mujoco
 
 from libero._adapters.envs.models import facade_pack
-from libero._adapters.lookup import alias_modules
+from libero._adapters.lookup import alias_modules, lookup
 from libero_env.assets.arena import load_workspace
+from libero_env.assets.original_arena import TEXTURES
+
+STYLE_KINDS = ("floor", "wall")
+STYLE_MAPPING = {kind: dict(TEXTURES[kind]) for kind in STYLE_KINDS}
+FLOOR_STYLE, WALL_STYLE = STYLE_MAPPING["floor"], STYLE_MAPPING["wall"]
+
+
+def get_texture_filename(type: str, style: str) -> str:
+    """Return the texture file of a style in the original; raise an UnknownNameError if there is none."""
+    return lookup(lookup(STYLE_MAPPING, "kind of style", type), f"{type} style", style)
 
 
 class Arena:
@@ -46,7 +56,7 @@ class WorkspaceArena(Arena):
     """The arena of one workspace.
 
     Args:
-        floor_style, wall_style: Names in `libero.libero.envs.arenas.style`.
+        floor_style, wall_style: Names in `FLOOR_STYLE` and `WALL_STYLE`.
         scene: Style of the whole scene, such as `warm`.
         kwargs: Other arguments of the original's classes, such as `table_full_size`, have no effect.
     """
@@ -94,4 +104,5 @@ alias_modules(
     living_room_arena="LivingRoomTableArena",
     study_arena="StudyTableArena",
     table_arena="TableArena",
+    style="STYLE_KINDS STYLE_MAPPING FLOOR_STYLE WALL_STYLE get_texture_filename",
 )

@@ -1,27 +1,138 @@
-"""Predicates on object states; their truth is that of `libero_env.sim.predicates`."""
+"""Predicates as callables of object states, by name; `libero_env.sim.predicates` decides whether they hold."""
 
-from libero.libero.envs.predicates.base_predicates import (
-    BinaryAtomic,
-    Close,
-    Expression,
-    FalsePredicateFn,
-    In,
-    InContactPredicateFn,
-    MultiarayAtomic,
-    On,
-    Open,
-    PrintJointState,
-    Stack,
-    TruePredicateFn,
-    TurnOff,
-    TurnOn,
-    UnaryAtomic,
-    Up,
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+from libero._adapters.lookup import alias_modules, lookup
+from libero_env.sim.predicates import evaluate
+from libero_env.tasks.problem import Atom
+
+
+class Expression(ABC):
+    """An expression that is true or false for object states."""
+
+    @abstractmethod
+    def __call__(self, *args: Any) -> bool:
+        """Return the truth for these object states."""
+
+
+class UnaryAtomic(Expression):
+    """A predicate of one object state."""
+
+
+class BinaryAtomic(Expression):
+    """A predicate of two object states."""
+
+
+class MultiarayAtomic(Expression):
+    """A predicate of any number of object states."""
+
+
+class _Native(Expression):
+    """A predicate of `libero_env`."""
+
+    predicate: ClassVar[str]
+
+    def __call__(self, *args: Any) -> bool:
+        """Return the truth for these object states."""
+        return evaluate(Atom(self.predicate, tuple(arg.object_name for arg in args)), args[0].env.view)
+
+
+class _StateMethod(UnaryAtomic):
+    """A predicate that is a method of the object state."""
+
+    method: ClassVar[str]
+
+    def __call__(self, *args: Any) -> bool:
+        """Return the truth for this object state."""
+        (state,) = args
+        return getattr(state, self.method)()
+
+
+class TruePredicateFn(MultiarayAtomic):
+    """Always true."""
+
+    def __call__(self, *args: Any) -> bool:
+        """Return True."""
+        return True
+
+
+class FalsePredicateFn(MultiarayAtomic):
+    """Never true."""
+
+    def __call__(self, *args: Any) -> bool:
+        """Return False."""
+        return False
+
+
+class PrintJointState(_Native, UnaryAtomic):
+    """Always true; prints the joint positions."""
+
+    predicate = "Printjointstate"
+
+    def __call__(self, *args: Any) -> bool:
+        """Print the joint positions and return True."""
+        print(args[0].get_joint_state())
+        return super().__call__(*args)
+
+
+def _predicate(name: str, bases: tuple[type, ...], doc: str, **attributes: str) -> Any:
+    """Return a class of predicates."""
+    return type(name, bases, {"__module__": __name__, "__doc__": doc, **attributes})
+
+
+_TWO = (_Native, BinaryAtomic)
+InContactPredicateFn = _predicate("InContactPredicateFn", _TWO, "The two touch.", predicate="Incontact")
+In = _predicate("In", _TWO, "The first is in the second, a region.", predicate="In")
+On = _predicate("On", _TWO, "The first is on the second.", predicate="On")
+Stack = _predicate("Stack", _TWO, "The first is on the second and inside it.", predicate="Stack")
+Up = _predicate("Up", (_Native, UnaryAtomic), "It is at least a metre above the floor.", predicate="Up")
+Open = _predicate("Open", (_StateMethod,), "Any joint is in the open range.", method="is_open")
+Close = _predicate("Close", (_StateMethod,), "All joints are in the closed range.", method="is_close")
+TurnOn = _predicate("TurnOn", (_StateMethod,), "Any joint is in the range of on.", method="turn_on")
+TurnOff = _predicate("TurnOff", (_StateMethod,), "All joints are in the range of off.", method="turn_off")
+
+_CLASSES = (
+    *(TruePredicateFn, FalsePredicateFn, In, On, Up, Stack, InContactPredicateFn, PrintJointState),
+    *(Open, Close, TurnOn, TurnOff),
 )
-from libero.libero.envs.predicates.registry import (
-    VALIDATE_PREDICATE_FN_DICT,
-    eval_predicate_fn,
-    get_predicate_fn,
-    get_predicate_fn_dict,
-    update_predicate_fn_dict,
+VALIDATE_PREDICATE_FN_DICT: dict[str, Callable[..., bool]] = {
+    cls.__name__.removesuffix("PredicateFn").lower(): cls() for cls in _CLASSES
+}
+
+
+def update_predicate_fn_dict(fn_key: str, fn_name: str | type | Callable[..., bool]) -> None:
+    """Add a predicate or replace one.
+
+    Args:
+        fn_key: Name in task files; case does not matter.
+        fn_name: Name of a class of this package, a class, or a callable of object states.
+    """
+    if isinstance(fn_name, str):
+        classes = {name: value for name, value in globals().items() if isinstance(value, type)}
+        fn_name = lookup(classes, "predicate class", fn_name)
+    predicate: Any = fn_name() if isinstance(fn_name, type) else fn_name
+    VALIDATE_PREDICATE_FN_DICT[fn_key.lower()] = predicate
+
+
+def get_predicate_fn_dict() -> dict[str, Callable[..., bool]]:
+    """Return all predicates by name."""
+    return VALIDATE_PREDICATE_FN_DICT
+
+
+def get_predicate_fn(predicate_fn_name: str) -> Callable[..., bool]:
+    """Return a predicate by its name, ignoring case; raise an UnknownNameError if there is none."""
+    return lookup(VALIDATE_PREDICATE_FN_DICT, "predicate", predicate_fn_name)
+
+
+def eval_predicate_fn(predicate_fn_name: str, *args: Any) -> bool:
+    """Return the truth of a predicate for object states."""
+    return get_predicate_fn(predicate_fn_name)(*args)
+
+
+alias_modules(
+    __name__,
+    base_predicates="Expression UnaryAtomic BinaryAtomic MultiarayAtomic TruePredicateFn FalsePredicateFn "
+    "InContactPredicateFn In On Up Stack PrintJointState Open Close TurnOn TurnOff",
 )

@@ -1,18 +1,240 @@
-"""Samplers of positions and of joint positions, by problem and region."""
+"""Samplers of placements, name -> (pos (3,) m, quat wxyz (4,), object), and of joint positions at the start.
+
+They are for clients that place objects themselves; the environments sample with `libero_env.init_states.placement`.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
 
 from libero._adapters.lookup import alias_modules, lookup
-from libero.libero.envs.regions.samplers import (
-    InSiteRegionRandomSampler,
-    Libero100TableRegionSampler,
-    MultiRegionRandomSampler,
-    ObjectBasedSampler,
-    ObjectPropertySampler,
-    OpenCloseSampler,
-    SiteRegionRandomSampler,
-    SiteSequentialCompositeSampler,
-    TableRegionSampler,
-    TurnOnOffSampler,
-)
+from libero_env.assets.arena import load_workspace
+from libero_env.errors import PlacementError, UnknownNameError
+
+Placements = dict[str, tuple[tuple[float, float, float], np.ndarray, Any]]
+_TRIES = 5000
+
+
+class MultiRegionRandomSampler:
+    """Samples placements in rectangles, of the x and y ranges of the same index, without overlap.
+
+    Args:
+        name: Name of the sampler in messages.
+        mujoco_objects: One or several objects with `name`, `bottom_offset`, `top_offset` and `horizontal_radius`.
+        x_ranges, y_ranges: Ranges (low, high) relative to `reference_pos`, m.
+        rotation: Rotation about `rotation_axis`, rad: a range (low, high), a number, or None for any.
+        ensure_object_boundary_in_range: Whether the whole object stays in the rectangle.
+        ensure_valid_placement: Whether objects do not overlap.
+        reference_pos: Origin in the world frame, (3,) m.
+        z_offset: Height above the origin, m.
+        rng: Generator of the placements.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        mujoco_objects: Any = None,
+        x_ranges: Sequence[Sequence[float]] | None = None,
+        y_ranges: Sequence[Sequence[float]] | None = None,
+        rotation: Any = None,
+        rotation_axis: str = "z",
+        ensure_object_boundary_in_range: bool = True,
+        ensure_valid_placement: bool = True,
+        reference_pos: Sequence[float] = (0.0, 0.0, 0.0),
+        z_offset: float = 0.0,
+        rng: np.random.Generator | None = None,
+    ):
+        self.name, self.rotation, self.rotation_axis = name, rotation, rotation_axis
+        self.x_ranges, self.y_ranges = x_ranges or [(0.0, 0.0)], y_ranges or [(0.0, 0.0)]
+        self.whole, self.apart = ensure_object_boundary_in_range, ensure_valid_placement
+        self.reference_pos, self.z_offset = np.asarray(reference_pos, np.float64), z_offset
+        self.rng = np.random.default_rng() if rng is None else rng
+        self.idx = 0  # of the rectangle that is sampled
+        self.mujoco_objects: list[Any] = []
+        self.add_objects(mujoco_objects if mujoco_objects is not None else ())
+
+    def add_objects(self, mujoco_objects: Any) -> None:
+        """Add objects to place."""
+        self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
+
+    def sample(self, fixtures: Any = None, reference: Any = None, on_top: bool = True) -> Placements:
+        """Return placements of all objects.
+
+        Args:
+            fixtures: Placements that exist already.
+            reference: Name of one of them, or a position (3,), m, as the origin instead of `reference_pos`.
+            on_top: Whether objects stand on the reference rather than at its height.
+
+        Raises:
+            PlacementError: No free placement was found in 5000 tries.
+        """
+        placed: Placements = dict(fixtures or {})
+        origin = self._origin(placed, reference, on_top)
+        found: Placements = {}
+        for item in self.mujoco_objects:
+            found[item.name] = placed[item.name] = self._place(item, origin, placed)
+        return found
+
+    def _origin(self, placed: Placements, reference: Any, on_top: bool) -> np.ndarray:
+        if reference is None:
+            return self.reference_pos
+        if not isinstance(reference, str):
+            return np.asarray(reference, np.float64)
+        if reference not in placed:
+            raise PlacementError(f"{self.name}: {reference!r} is not placed yet; placed: {', '.join(placed)}")
+        pos, _, item = placed[reference]
+        return np.asarray(pos) + (np.array([0.0, 0.0, item.top_offset[-1]]) if on_top else 0.0)
+
+    def _place(self, item: Any, origin: np.ndarray, placed: Placements) -> Any:
+        margin = item.horizontal_radius if self.whole else 0.0
+        for _ in range(_TRIES):
+            self.idx = int(self.rng.integers(len(self.x_ranges)))
+            xy = self._sample_x(margin), self._sample_y(margin)
+            pos = origin + (*xy, self.z_offset - item.bottom_offset[-1])
+            if not self.apart or all(self._clear(item, pos, other) for other in placed.values()):
+                return tuple(pos), self._sample_quat(), item
+        raise PlacementError(
+            f"{self.name}: no free placement for {item.name} in {_TRIES} tries. (1) Make the ranges larger, (2) use "
+            "fewer or smaller objects"
+        )
+
+    def _sample_x(self, object_horizontal_radius: float) -> float:
+        return self._draw(self.x_ranges[self.idx], object_horizontal_radius)
+
+    def _sample_y(self, object_horizontal_radius: float) -> float:
+        return self._draw(self.y_ranges[self.idx], object_horizontal_radius)
+
+    def _draw(self, limits: Sequence[float], margin: float) -> float:
+        low, high = min(limits) + margin, max(limits) - margin
+        return self.rng.uniform(low, high) if low <= high else (low + high) / 2
+
+    @staticmethod
+    def _clear(item: Any, pos: np.ndarray, other: Any) -> bool:
+        """Return whether the circles of the two do not overlap, or the one is above the other."""
+        other_pos, _, other_item = other
+        distance = np.hypot(*(pos[:2] - np.asarray(other_pos)[:2]))
+        apart = distance > item.horizontal_radius + other_item.horizontal_radius
+        return bool(apart or pos[2] + item.bottom_offset[-1] >= other_pos[2] + other_item.top_offset[-1])
+
+    def _sample_quat(self) -> np.ndarray:
+        if self.rotation is None:
+            angle = self.rng.uniform(0.0, 2 * np.pi)
+        else:
+            angle = self.rng.uniform(*self.rotation) if np.ndim(self.rotation) else float(self.rotation)
+        quat = np.zeros(4)
+        quat[0], quat[1 + "xyz".index(self.rotation_axis)] = np.cos(angle / 2), np.sin(angle / 2)
+        return quat
+
+
+class TableRegionSampler(MultiRegionRandomSampler):
+    """Samples placements on the table."""
+
+    category = "table"
+
+    def __init__(self, name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
+        kwargs.setdefault("reference_pos", load_workspace(self.category).offset)
+        super().__init__(name, mujoco_objects, *args, **{"rotation": (0.0, 0.0), **kwargs})
+
+
+class Libero100TableRegionSampler(TableRegionSampler):
+    """Samples placements on the tables of LIBERO-100."""
+
+    category = "kitchen_table"
+
+
+class ObjectBasedSampler(MultiRegionRandomSampler):
+    """Samples placements on another object: pass its name to `sample` as `reference`."""
+
+
+class SiteRegionRandomSampler(MultiRegionRandomSampler):
+    """Samples placements around a site: pass its position to `sample` as `reference`."""
+
+
+class InSiteRegionRandomSampler(SiteRegionRandomSampler):
+    """Samples placements in the box of a site; objects may extend beyond it."""
+
+    def __init__(self, name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
+        super().__init__(name, mujoco_objects, *args, **{"ensure_object_boundary_in_range": False, **kwargs})
+
+
+class SiteSequentialCompositeSampler:
+    """Runs samplers in turn; each gets the placements of those before it."""
+
+    def __init__(self, name: str):
+        self.name = name
+        self.samplers: dict[str, tuple[MultiRegionRandomSampler, dict[str, Any]]] = {}
+
+    def append_sampler(self, sampler: MultiRegionRandomSampler, sample_args: Any = None) -> None:
+        """Add a sampler at the end, with arguments for its `sample`."""
+        self.samplers[sampler.name] = sampler, dict(sample_args or {})
+
+    def sample(self, fixtures: Mapping[str, Any] | None = None, **_: Any) -> Placements:
+        """Return all placements."""
+        placed, found = dict(fixtures or {}), {}
+        for sampler, arguments in self.samplers.values():
+            new = sampler.sample(fixtures=placed, **arguments)
+            placed.update(new)
+            found.update(new)
+        return found
+
+
+class ObjectPropertySampler:
+    """Samples a joint position from a range.
+
+    Args:
+        name: Name of the sampler in messages.
+        state_type: State that the position stands for, such as `open`.
+        mujoco_objects: Object with the joint.
+        joint_ranges: Range (low, high), rad or m.
+        rng: Generator of the position.
+
+    Raises:
+        UnknownNameError: The sampler does not have the state.
+    """
+
+    states: Sequence[str] = ()
+
+    def __init__(
+        self,
+        name: str,
+        state_type: str,
+        mujoco_objects: Any = None,
+        joint_ranges: Sequence[float] = (0.0, 0.0),
+        rng: np.random.Generator | None = None,
+    ):
+        if self.states and state_type not in self.states:
+            raise UnknownNameError(f"state of {name}", state_type, self.states)
+        self.name, self.state_type = name, state_type
+        self.mujoco_objects: list[Any] = []
+        self.add_objects(() if mujoco_objects is None else mujoco_objects)
+        self.joint_ranges = tuple(joint_ranges)
+        self.rng = np.random.default_rng() if rng is None else rng
+
+    def add_objects(self, mujoco_objects: Any) -> None:
+        """Add objects with the joint."""
+        self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
+
+    def reset(self) -> None:
+        """Remove all objects."""
+        self.mujoco_objects = []
+
+    def sample(self) -> float:
+        """Return a position in the range."""
+        return float(self.rng.uniform(min(self.joint_ranges), max(self.joint_ranges)))
+
+
+class OpenCloseSampler(ObjectPropertySampler):
+    """Samples how far an object is open."""
+
+    states = ("open", "close")
+
+
+class TurnOnOffSampler(ObjectPropertySampler):
+    """Samples how far a knob is turned."""
+
+    states = ("turnon", "turnoff")
+
 
 _TABLES = {
     "libero_tabletop_manipulation": ("table", TableRegionSampler),
