@@ -1,11 +1,14 @@
 """Evaluate a stored policy: `python libero/lifelong/evaluate.py --benchmark libero_spatial --task_id 0 ...`."""
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
-from libero._adapters.lifelong.config import group_options
+from pydantic.dataclasses import dataclass
+
+from libero.scripts.command import script
+from libero_env.cli.options import parse
 
 benchmark_map = {f"libero_{name}": f"LIBERO_{name.upper()}" for name in ("10", "spatial", "object", "goal")}
 algo_map = {
@@ -22,42 +25,52 @@ policy_map = {
 }
 
 
-def parse_args(argv: Sequence[str] | None = None) -> argparse.Namespace:
-    """Parse the arguments, by default those of the command line."""
-    parser = argparse.ArgumentParser("lifelong.eval", description="Success of a stored policy on a task.")
-    parser.add_argument("--experiment_dir", default="experiments", help="folder of the runs")
-    parser.add_argument("--benchmark", required=True, help="name of the benchmark, such as libero_object")
-    parser.add_argument("--task_id", type=int, required=True, help="position of the task in the benchmark")
-    parser.add_argument("--algo", required=True, choices=group_options("lifelong"))
-    parser.add_argument("--policy", required=True, choices=group_options("policy"))
-    parser.add_argument("--seed", type=int, required=True)
-    parser.add_argument("--ep", type=int, help="epoch of a multitask run's checkpoint; default: the last")
-    parser.add_argument("--load_task", type=int, help="last task before the checkpoint; default: task_id")
-    parser.add_argument("--run", type=int, help="number of the run; default: the newest")
-    parser.add_argument("--device_id", type=int, default=0, help="number of the GPU, if there is one")
-    parser.add_argument("--n_eval", type=int, help="number of episodes; default: as in the run")
-    parser.add_argument("--max_steps", type=int, help="maximum steps of an episode; default: as in the run")
-    parser.add_argument("--save-videos", action="store_true")
-    return parser.parse_args(argv)
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Measure the success of a stored policy on a task.
 
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Evaluate the checkpoint that the arguments name.
-
-    Returns:
-        The exit status, see `libero_env.cli.ending`.
+    Attributes:
+        experiment_dir: Folder of the runs.
+        benchmark: Name of the benchmark, such as libero_object.
+        task_id: Position of the task in the benchmark.
+        algo: Algorithm of the run.
+        policy: Policy of the run.
+        seed: Seed of the run.
+        ep: Epoch of a multitask run's checkpoint (default: the last).
+        load_task: Last task before the checkpoint (default: task_id).
+        run: Number of the run (default: the newest).
+        device_id: Number of the GPU, if there is one.
+        n_eval: Number of episodes (default: as in the run).
+        max_steps: Maximum steps of an episode (default: as in the run).
+        save_videos: Write a video of each episode.
     """
-    from libero.lifelong.run_evaluation import evaluate
-    from libero_env.cli import ending
 
-    with ending.debugging(sys.argv[1:] if argv is None else argv) as words:
-        args = parse_args(words)
-        try:
-            with ending.interruptible():
-                evaluate(args)
-        except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - told by kind
-            return ending.report(error)
-    return 0
+    experiment_dir: Path = Path("experiments")
+    benchmark: str
+    task_id: int
+    algo: Literal["agem", "base", "er", "ewc", "multitask", "packnet", "single_task"]
+    policy: Literal["bc_rnn_policy", "bc_transformer_policy", "bc_vilt_policy"]
+    seed: int
+    ep: int | None = None
+    load_task: int | None = None
+    run: int | None = None
+    device_id: int = 0
+    n_eval: int | None = None
+    max_steps: int | None = None
+    save_videos: bool = False
+
+
+def parse_args(argv: Sequence[str] | None = None) -> Evaluation:
+    """Parse the arguments, by default those of the command line."""
+    return parse(Evaluation, sys.argv[1:] if argv is None else argv, "lifelong.eval")()
+
+
+@script("lifelong.eval")
+def main(request: Evaluation) -> None:
+    """Evaluate the checkpoint that the request names."""
+    from libero.lifelong.run_evaluation import evaluate
+
+    evaluate(request)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """Evaluation of a run's checkpoint on one task; the work of `evaluate.py`."""
 
-import argparse
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from libero.libero.benchmark import get_benchmark
 from libero.libero.utils.video_utils import VideoWriter
 from libero.lifelong.algos import PackNet, Sequential, get_algo_class
 from libero.lifelong.datasets import SequenceVLDataset, get_dataset
+from libero.lifelong.evaluate import Evaluation
 from libero.lifelong.metric import evaluate_loss, rollouts
 from libero.lifelong.run import fill_in
 from libero.lifelong.utils import control_seed, get_task_embs, latest_run, safe_device, torch_load_model
@@ -19,7 +19,7 @@ from lifelong.errors import CheckpointError
 from lifelong.stats.intervals import wilson_interval
 
 
-def evaluate(args: argparse.Namespace) -> dict[str, Any]:
+def evaluate(request: Evaluation) -> dict[str, Any]:
     """Measure loss and success of a checkpoint on a task; print them, and write them beside the checkpoint.
 
     Returns:
@@ -30,57 +30,60 @@ def evaluate(args: argparse.Namespace) -> dict[str, Any]:
         CheckpointError: There is no such run or checkpoint.
         LiberoError: There is no such benchmark or task.
     """
-    path = checkpoint_path(args)
-    control_seed(args.seed)
+    path = checkpoint_path(request)
+    control_seed(request.seed)
     weights, cfg, masks = torch_load_model(path)
     if cfg is None:
         raise CheckpointError(f"{path} holds no configuration: it was not written by a run")
-    cfg.device, cfg.experiment_dir = args.device_id, str(path.parent)
-    cfg.eval.n_eval, cfg.eval.max_steps = args.n_eval or cfg.eval.n_eval, args.max_steps or cfg.eval.max_steps
+    cfg.device, cfg.experiment_dir = request.device_id, str(path.parent)
+    cfg.eval.n_eval, cfg.eval.max_steps = (
+        request.n_eval or cfg.eval.n_eval,
+        request.max_steps or cfg.eval.max_steps,
+    )
     fill_in(cfg)
-    benchmark = get_benchmark(args.benchmark)(cfg.data.task_order_index)
-    task = benchmark.get_task(args.task_id)
+    benchmark = get_benchmark(request.benchmark)(cfg.data.task_order_index)
+    task = benchmark.get_task(request.task_id)
     benchmark.set_task_embs(get_task_embs(cfg, [t.language for t in benchmark.tasks]))
     algo = get_algo_class(cfg.lifelong.algo)(benchmark.n_tasks, cfg)
     algo.policy.load_state_dict(weights)
     if isinstance(algo, PackNet):
-        algo.load_masks(masks, args.task_id if args.load_task is None else args.load_task)
-        algo = algo.get_eval_algo(args.task_id // int(cfg.data.task_group_size))
+        algo.load_masks(masks, request.task_id if request.load_task is None else request.load_task)
+        algo = algo.get_eval_algo(request.task_id // int(cfg.data.task_group_size))
     algo = safe_device(algo, cfg.device)
-    emb, view = benchmark.get_task_emb(args.task_id), cfg.data.obs.modality.rgb[0]
-    loss = _loss(cfg, algo, benchmark, args.task_id)
-    folder = path.parent / f"{path.stem}_on{args.task_id}_videos"
-    with VideoWriter(folder, args.save_videos, single_video=False) as video:
+    emb, view = benchmark.get_task_emb(request.task_id), cfg.data.obs.modality.rgb[0]
+    loss = _loss(cfg, algo, benchmark, request.task_id)
+    folder = path.parent / f"{path.stem}_on{request.task_id}_videos"
+    with VideoWriter(folder, request.save_videos, single_video=False) as video:
 
         def record(start: int, obs: Any, over: np.ndarray) -> None:
             for i, done in enumerate(over):
                 video.append_obs({view: obs[view][i][::-1]}, bool(done), start + i, view)
 
-        states, on_step = range(cfg.eval.n_eval), record if args.save_videos else None
-        episodes = rollouts(cfg, algo, task, emb, args.task_id, states, on_step=on_step)
-    return _report(path, args.task_id, task.name, loss, [episode.success for episode in episodes])
+        states, on_step = range(cfg.eval.n_eval), record if request.save_videos else None
+        episodes = rollouts(cfg, algo, task, emb, request.task_id, states, on_step=on_step)
+    return _report(path, request.task_id, task.name, loss, [episode.success for episode in episodes])
 
 
-def checkpoint_path(args: argparse.Namespace) -> Path:
-    """Return the checkpoint that the arguments name.
+def checkpoint_path(request: Evaluation) -> Path:
+    """Return the checkpoint that a request names.
 
     Raises:
         CheckpointError: There is no such run or file.
     """
-    cfg = load_config(f"lifelong={args.algo}", f"policy={args.policy}")
-    name = f"{cfg.lifelong.algo}/{cfg.policy.policy_type}_seed{args.seed}"
-    found = sorted(p for p in Path(args.experiment_dir).glob(f"*/{name}") if p.is_dir())
-    roots = [p for p in found if p.parts[-3].lower() == args.benchmark.lower()]
+    cfg = load_config(f"lifelong={request.algo}", f"policy={request.policy}")
+    name = f"{cfg.lifelong.algo}/{cfg.policy.policy_type}_seed{request.seed}"
+    found = sorted(p for p in Path(request.experiment_dir).glob(f"*/{name}") if p.is_dir())
+    roots = [p for p in found if p.parts[-3].lower() == request.benchmark.lower()]
     if not roots:
         raise CheckpointError(
-            f"no run {args.benchmark}/{name} in {args.experiment_dir}; there is "
+            f"no run {request.benchmark}/{name} in {request.experiment_dir}; there is "
             f"{', '.join(map(str, found)) or 'none of this name'}"
         )
-    folder = roots[0] / f"run_{args.run:03d}" if args.run else latest_run(roots[0])
-    if args.algo == "multitask":
-        file = "multitask_model.pth" if args.ep is None else f"multitask_model_ep{args.ep}.pth"
+    folder = roots[0] / f"run_{request.run:03d}" if request.run else latest_run(roots[0])
+    if request.algo == "multitask":
+        file = "multitask_model.pth" if request.ep is None else f"multitask_model_ep{request.ep}.pth"
     else:
-        file = f"task{args.task_id if args.load_task is None else args.load_task}_model.pth"
+        file = f"task{request.task_id if request.load_task is None else request.load_task}_model.pth"
     path = Path(folder or roots[0], file)
     if not path.is_file():
         names = sorted(file.name for file in path.parent.glob("*_model*.pth"))

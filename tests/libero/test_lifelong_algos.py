@@ -11,11 +11,10 @@ from torch.utils.data import DataLoader
 
 from libero._adapters.lifelong.config import Config, plain
 from libero.lifelong import algos, metric, utils
-from libero.lifelong.algos import multitask
-from libero.lifelong.algos.er import cycle, merge_datas
+from libero.lifelong.algos import cycle, merge_datas
 from libero.lifelong.metric import evaluate_loss
+from libero.lifelong.models import ExtraModalityTokens
 from libero.lifelong.models.base_policy import BasePolicy, get_policy_class
-from libero.lifelong.models.bc_transformer_policy import ExtraModalityTokens
 from libero.lifelong.models.modules.language_modules import MLPEncoder
 from libero.lifelong.models.modules.rgb_modules import ResnetEncoder
 from libero.lifelong.models.modules.transformer_modules import SinusoidalPositionEncoding, TransformerDecoder
@@ -244,7 +243,7 @@ def test_single_task_keeps_one_policy_for_each_task(files, succeed):
 
 def test_multitask_learns_all_at_once(files, monkeypatch):
     rates = iter([[0.0, 0.0], [1.0, 0.5], [0.0, 0.5]])
-    monkeypatch.setattr(multitask, "evaluate_multitask_training_success", lambda *_: np.array(next(rates)))
+    monkeypatch.setattr(algos, "evaluate_multitask_training_success", lambda *_: np.array(next(rates)))
     algo, data, cfg = learner(files, "multitask", "lifelong.eval_in_train=true", "train.n_epochs=2")
     success, _ = algo.learn_all_tasks(data, Tasks(), {})
     assert success == pytest.approx((0 + 0.75 + 0.75) / 3)

@@ -90,11 +90,6 @@ def notes(cfg: Any) -> list[str]:
     return [f"{key}={values[key]} has no effect: {NO_EFFECT[key]}" for key in changed]
 
 
-def group_options(group: str) -> list[str]:
-    """Return the names of the files of a configuration group, which are its options."""
-    return sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
-
-
 def _wrap(value: Any) -> Any:
     if isinstance(value, Mapping) and not isinstance(value, Config):
         return Config(value)

@@ -28,7 +28,7 @@ alias_modules(
     bc_transformer_policy="BCTransformerPolicy ExtraModalityTokens PerturbationAttention",
     bc_vilt_policy="BCViLTPolicy ExtraModalityTokens",
     policy="Attention BCRNNPolicy BCTransformerPolicy BCViLTPolicy BasePolicy DeterministicHead DropPath "
-    "ExtraModalities ExtraModalityTokens GMMHead IdentityEncoder MLPEncoder Norm PatchEncoder PerturbationAttention ResnetEncoder "
-    "SinusoidalPositionEncoding SpatialProjection SpatialSoftmax TransformerDecoder TransformerFeedForwardNN "
-    "get_policy_class get_policy_list",
+    "ExtraModalities ExtraModalityTokens GMMHead IdentityEncoder MLPEncoder Norm PatchEncoder PerturbationAttention "
+    "ResnetEncoder SinusoidalPositionEncoding SpatialProjection SpatialSoftmax TransformerDecoder "
+    "TransformerFeedForwardNN get_policy_class get_policy_list",
 )
