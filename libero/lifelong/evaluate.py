@@ -11,13 +11,7 @@ from libero.scripts.command import script
 from libero_env.cli.options import parse
 
 benchmark_map = {f"libero_{name}": f"LIBERO_{name.upper()}" for name in ("10", "spatial", "object", "goal")}
-algo_map = {
-    "base": "Sequential",
-    "er": "ER",
-    "ewc": "EWC",
-    "packnet": "PackNet",
-    "multitask": "Multitask",
-}
+algo_map = {"base": "Sequential", "er": "ER", "ewc": "EWC", "packnet": "PackNet", "multitask": "Multitask"}
 policy_map = {
     "bc_rnn_policy": "BCRNNPolicy",
     "bc_transformer_policy": "BCTransformerPolicy",

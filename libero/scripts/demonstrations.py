@@ -11,11 +11,7 @@ from pydantic.dataclasses import dataclass
 
 from libero.libero.benchmark import get_benchmark
 from libero.libero.utils.dataset_utils import get_dataset_info as dataset_info
-from libero.libero.utils.download_utils import (
-    check_libero_dataset,
-    datasets_folder,
-    libero_dataset_download,
-)
+from libero.libero.utils.download_utils import check_libero_dataset, datasets_folder, libero_dataset_download
 from libero.scripts.command import script
 from libero_env.cli.demos import check_files
 from libero_env.cli.options import Positional, Positive, Side

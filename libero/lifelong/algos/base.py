@@ -16,12 +16,7 @@ from libero._adapters.lifelong.config import plain
 from libero._adapters.lookup import lookup
 from libero.lifelong.metric import evaluate_success, mean_loss
 from libero.lifelong.models import get_policy_class
-from libero.lifelong.utils import (
-    create_experiment_dir,
-    safe_device,
-    torch_load_model,
-    torch_save_model,
-)
+from libero.lifelong.utils import create_experiment_dir, safe_device, torch_load_model, torch_save_model
 from lifelong import algorithms
 from lifelong.errors import TrainingError
 from lifelong.seeding import generator
