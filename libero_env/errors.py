@@ -75,7 +75,22 @@ class BrokenFileError(LiberoError, ValueError):
 
 
 class BDDLError(LiberoError, ValueError):
-    """A task file that cannot be read; the message starts with file:line."""
+    """A task file that cannot be read; the message is `file:line: what; expected ...`.
+
+    Attributes:
+        what: What is wrong.
+        expected: What is valid; empty where `what` says it.
+        file: Name of the file; empty where the task is not from a file.
+        line: Line, from 1.
+    """
+
+    def __init__(self, what: str, expected: str = "", file: str = "", line: int = 1):
+        super().__init__(what, expected, file, line)
+        self.what, self.expected, self.file, self.line = what, expected, file, line
+
+    def __str__(self) -> str:
+        where = f"{self.file}:{self.line}: " if self.file else ""
+        return f"{where}{self.what}{'; expected ' if self.expected else ''}{self.expected}"
 
 
 class PlacementError(LiberoError):

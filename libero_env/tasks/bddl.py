@@ -50,7 +50,7 @@ def parse(text: str, file: str = "<string>") -> Problem:
     except ProblemError as error:
         first = error.violations[0]
         line = Lines(tree).of_part(first.section, first.part)
-        raise BDDLError(f"{file}:{line}: {first.what}; expected {first.expected}") from None
+        raise BDDLError(first.what, first.expected, file, line) from None
 
 
 def problem_of(tree: List, file: str) -> Problem:
@@ -67,7 +67,8 @@ def problem_of(tree: List, file: str) -> Problem:
     except InvalidInputError as error:  # of one field
         field, part, *_ = (*error.path, None, None)
         line = Lines(tree).of_part(_SECTIONS_OF.get(str(field), f":{field}"), part)
-        raise BDDLError(f"{file}:{line}: {str(error).removeprefix('Problem: ')}") from None
+        what, _, expected = str(error).removeprefix("Problem: ").partition("; expected ")
+        raise BDDLError(what, expected, file, line) from None
 
 
 def read(path: str | Path) -> Problem:
@@ -269,7 +270,8 @@ class _Reader:
         try:
             return Region(name=self.word(node.items[0]), **fields)
         except InvalidInputError as error:
-            raise BDDLError(f"{self.file}:{node.line}: {error}") from None
+            what, _, expected = str(error).partition("; expected ")
+            raise BDDLError(what, expected, self.file, node.line) from None
 
     def numbers(self, node: Word | List, count: int, head: str) -> tuple[float, ...]:
         """Return the `count` numbers of a list."""

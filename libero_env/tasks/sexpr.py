@@ -38,7 +38,7 @@ class List:
 
 def fail(file: str, line: int, what: str, expected: str) -> NoReturn:
     """Raise the error of a task file, in the common format."""
-    raise BDDLError(f"{file}:{line}: {what}; expected {expected}")
+    raise BDDLError(what, expected, file, line)
 
 
 def show(node: Word | List) -> str:

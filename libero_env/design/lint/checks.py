@@ -1,16 +1,15 @@
 """Linter of task files: what is wrong or doubtful, where, and how to fix it.
 
-Categories and places are checked here, the instruction in `lint.instruction`, what needs the simulator in `lint.scene`.
+What needs the simulator is in `lint.scene`.
 """
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from libero_env.assets.arena import WORKSPACES, workspace_of_problem
 from libero_env.assets.pack import Pack, select_pack
-from libero_env.design.lint.instruction import check_words
-from libero_env.design.lint.report import Finding, Report
+from libero_env.design.lint.report import Finding, Level, Report
 from libero_env.design.lint.scene import check_scene
 from libero_env.errors import BDDLError, UnknownNameError
 from libero_env.sim.predicates import PREDICATES
@@ -22,6 +21,14 @@ from libero_env.tasks.sexpr import parse_tree
 __all__ = ["Finding", "lint_file", "lint_task", "lint_text"]
 
 STARTS = 5  # initial states that are checked by default
+# words of categories that do not name the object
+_QUALITIES = {
+    *("and", "of", "the", "two", "new", "black", "white", "red", "yellow", "wooden", "flat", "short"),
+    *("glazed", "rim", "region", "side", "contain", "init"),
+}
+_ALSO = {"shelf": "cabinet", "cabinet": "drawer"}  # other words in common use
+_PARTS = {"drawer", "compartment", "layer", "side", "shelf", "region", "of"}  # of objects that have sides
+_SIDES = ({"top", "middle", "bottom"}, {"left", "right"}, {"front", "back"})
 
 
 def lint_task(task: Task, pack: Pack | None = None, *, starts: int = STARTS) -> list[Finding]:
@@ -82,7 +89,7 @@ def lint_text(
     _check_atoms(report, problem)
     _check_regions(report, problem)
     _check_places(report, problem)
-    check_words(report, task, pack)
+    _check_words(report, task, pack)
     if starts and not report.broken:
         check_scene(report, task, pack, starts)
     return report.sorted()
@@ -90,11 +97,8 @@ def lint_text(
 
 def _syntax(error: BDDLError, file: str) -> Finding:
     """Return the finding of an error of the parser."""
-    parts = re.fullmatch(r"(\d+): (.*?)(?:; expected (.*))?", str(error).removeprefix(f"{file}:"), re.DOTALL)
-    line, what, expected = parts.groups() if parts else (1, str(error), None)
-    return Finding(
-        file, int(line), "error", "syntax", what, f"write {expected}" if expected else "fix the file"
-    )
+    remedy = f"write {error.expected}" if error.expected else "fix the file"
+    return Finding(file, error.line, "error", "syntax", error.what, remedy)
 
 
 def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
@@ -104,38 +108,38 @@ def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
         if category not in categories and name not in workspaces:
             valid = categories | set(WORKSPACES) if name in problem.fixtures else categories
             what = f"{name}: no model of {category!r} exists"
-            report.error(report.lines.of(name), "unknown-category", what, report.suggest(category, valid))
+            remedy = report.suggest(category, valid)
+            report.add("error", report.lines.of(name), "unknown-category", what, remedy)
     at = report.lines.section(":fixtures")
     if len(workspaces) != 1:
         what = f"{len(workspaces)} workspaces among the fixtures"
-        report.error(at, "workspace", what, f"declare one of {', '.join(WORKSPACES)}")
+        report.add("error", at, "workspace", what, f"declare one of {', '.join(WORKSPACES)}")
         return
     try:
         expected = workspace_of_problem(problem.name).name
     except UnknownNameError as error:
-        report.warning(
-            1, "problem-name", f"no problem class is named {problem.name}", str(error).split("Valid: ")[-1]
-        )
+        what, remedy = f"no problem class is named {problem.name}", str(error).split("Valid: ")[-1]
+        report.add("warning", 1, "problem-name", what, remedy)
         return
     if expected != (own := problem.fixtures[workspaces[0]]):
         what = f"{problem.name} takes place on a {expected}, but the workspace is a {own}"
-        report.warning(1, "problem-name", what, "change one of them; only the workspace has an effect here")
+        remedy = "change one of them; only the workspace has an effect here"
+        report.add("warning", 1, "problem-name", what, remedy)
 
 
 def _check_atoms(report: Report, problem: Problem) -> None:
     """Check that predicates exist, and that fixtures stand in regions of the workspace."""
-    atoms = zip((*problem.init, *problem.goal.atoms()), (*report.lines.init, *report.lines.goal), strict=True)
-    for atom, line in atoms:
+    for atom, line in (*report.init(problem), *report.goal(problem)):
         if atom.predicate not in PREDICATES:
             what = f"the predicate of {atom} does not exist"
-            report.error(line, "unknown-predicate", what, report.suggest(atom.predicate, PREDICATES))
-    for atom, line in zip(problem.init, report.lines.init, strict=True):
-        if atom.args[0] in problem.fixtures and atom.predicate in ("On", "In"):
-            region = problem.region(atom.args[-1])
-            if region is None or not region.ranges:
-                what = f"{atom} does not place it: a fixture stands in a region of the workspace"
-                remedy = "name a region with :ranges whose target is the workspace"
-                report.error(line, "kind", what, remedy)
+            report.add("error", line, "unknown-predicate", what, report.suggest(atom.predicate, PREDICATES))
+    for atom, line in report.init(problem):
+        region = problem.region(atom.args[-1])
+        placed = atom.args[0] in problem.fixtures and atom.predicate in ("On", "In")
+        if placed and (region is None or not region.ranges):
+            what = f"{atom} does not place it: a fixture stands in a region of the workspace"
+            remedy = "name a region with :ranges whose target is the workspace"
+            report.add("error", line, "kind", what, remedy)
 
 
 def _check_regions(report: Report, problem: Problem) -> None:
@@ -147,16 +151,17 @@ def _check_regions(report: Report, problem: Problem) -> None:
         if address not in used | set(problem.obj_of_interest):
             is_known = region.target in report.lines.entities
             lost = "" if is_known else f", and its target {region.target} is not declared"
-            report.info(line, "unused-region", f"no atom names {address}{lost}", "remove it, or use it")
+            what = f"no atom names {address}{lost}"
+            report.add("info", line, "unused-region", what, "remove it, or use it")
         for x0, y0, x1, y1 in region.ranges:
             if address in goal and (x0 == x1 or y0 == y1):
                 what = f"{address}: the rectangle ({x0:g} {y0:g} {x1:g} {y1:g}) is empty"
-                report.error(line, "region-ranges", what, "write (X0 Y0 X1 Y1) with X0 < X1 and Y0 < Y1")
+                remedy = "write (X0 Y0 X1 Y1) with X0 < X1 and Y0 < Y1"
+                report.add("error", line, "region-ranges", what, remedy)
         key = (region.target, region.ranges, region.yaw)
         if region.ranges and address in used and (first := seen.setdefault(key, address)) != address:
-            report.warning(
-                line, "duplicate-region", f"{address} is the same region as {first}", "use one of the two"
-            )
+            what = f"{address} is the same region as {first}"
+            report.add("warning", line, "duplicate-region", what, "use one of the two")
 
 
 def _check_places(report: Report, problem: Problem) -> None:
@@ -164,15 +169,104 @@ def _check_places(report: Report, problem: Problem) -> None:
     placed = {atom.args[0] for atom in problem.init if atom.predicate in ("On", "In") and len(atom.args) == 2}
     for name in (*problem.objects, *problem.fixtures):
         if name not in placed and problem.kind_of(name) != "workspace":
-            add = report.error if name in problem.objects else report.warning
-            where = "" if name in problem.objects else "; it stands in the centre of the workspace"
+            is_object = name in problem.objects
+            where = "" if is_object else "; it stands in the centre of the workspace"
             remedy = f"add (On {name} REGION) to :init"
-            add(report.lines.of(name), "not-placed", f"no init atom places {name}{where}", remedy)
-    known: Iterable[str] = {*report.lines.entities, *report.lines.regions}
+            level: Level = "error" if is_object else "warning"
+            what = f"no init atom places {name}{where}"
+            report.add(level, report.lines.of(name), "not-placed", what, remedy)
+    declared = {*report.lines.entities, *report.lines.regions}
     for name in problem.obj_of_interest:
-        if name not in known:
+        if name not in declared:
             line = report.lines.section(":obj_of_interest")
-            report.warning(line, "unknown-name", f"{name} is not declared", report.suggest(name, known))
+            remedy = report.suggest(name, declared)
+            report.add("warning", line, "unknown-name", f"{name} is not declared", remedy)
     if not problem.obj_of_interest:
         what = "there is no object of interest"
-        report.info(1, "interest", what, "list the objects of the goal in :obj_of_interest")
+        report.add("info", 1, "interest", what, "list the objects of the goal in :obj_of_interest")
+
+
+def _check_words(report: Report, task: Task, pack: Pack) -> None:
+    """Check the instruction of the file, and that of the task's name where they differ."""
+    line = report.lines.section(":language")
+    texts = {task.bddl_language: ""}
+    if _words(task.language) != _words(task.bddl_language):
+        what = f"policies receive {task.language!r}, which is the task's name, and not {task.bddl_language!r}"
+        remedy = "use the instruction as the task's name, words joined by _"
+        report.add("info", line, "language", what, remedy)
+        if task.suite != "file":
+            texts[task.language] = " (of the task's name)"
+    if not _words(task.bddl_language):
+        report.add("error", line, "language", "the instruction is empty", "add it to :language")
+        return
+    for text, source in texts.items():
+        words = _words(text)
+        for what, remedy in (
+            *_unnamed(task.problem, words, source),
+            *_absent(task.problem, words, source, pack),
+            *_wrong_sides(task.problem, words, source),
+        ):
+            report.add("warning", line, "instruction", what, remedy)
+
+
+def _unnamed(problem: Problem, words: Sequence[str], source: str) -> Iterator[tuple[str, str]]:
+    """Yield what is in the goal and is not named by an instruction, each with a remedy."""
+    for atom in problem.goal.atoms():
+        for name in atom.args:
+            region = problem.region(name)
+            entity = region.target if region is not None else name
+            category = {**problem.objects, **problem.fixtures}.get(entity)
+            if category is None or category in WORKSPACES:
+                continue
+            tokens = [*_words_for(category), *(_tokens(region.name) if region is not None else ())]
+            if not any(_same(token, word) for token in tokens for word in words):
+                what = f"no word of the instruction{source} names {name} of the goal's {atom}"
+                yield what, f"name it {' '.join(_tokens(category))}, or fix the goal"
+
+
+def _absent(problem: Problem, words: Sequence[str], source: str, pack: Pack) -> Iterator[tuple[str, str]]:
+    """Yield what an instruction names and is not in the scene, each with a remedy."""
+    here = [t for c in (*problem.objects.values(), *problem.fixtures.values()) for t in _words_for(c)]
+    here += [token for region in problem.regions for token in _tokens(region.name)]
+    heads = {tokens[-1] for c in pack.categories() if (tokens := _tokens(c))}
+    for word, before in zip(words, ["", *words], strict=False):
+        is_there = any(_same(token, one) for token in here for one in (word, before))
+        if word in heads and not is_there:  # "cream cheese box" is not a box
+            what = f"the instruction{source} names a {word}, but there is none"
+            yield what, "add one to :objects or :fixtures, or change the instruction"
+
+
+def _wrong_sides(problem: Problem, words: Sequence[str], source: str) -> Iterator[tuple[str, str]]:
+    """Yield the sides that an instruction names where the goal is about others, each with a remedy."""
+    mentioned = {word for word, after in zip(words, [*words[1:], ""], strict=True) if after in _PARTS}
+    regions = [r for atom in problem.goal.atoms() for n in atom.args if (r := problem.region(n)) is not None]
+    for sides in _SIDES:
+        asked = {token for region in regions for token in _tokens(region.name)} & sides
+        named = mentioned & sides
+        if asked and named and not asked & named:
+            named_text, asked_text = (" and ".join(sorted(words)) for words in (named, asked))
+            yield f"the instruction{source} names {named_text}, but the goal {asked_text}", "fix one of them"
+
+
+def _words(text: str) -> list[str]:
+    return [_singular(word) for word in re.findall("[a-z]+", text.casefold())]
+
+
+def _tokens(name: str) -> list[str]:
+    """Return the words of a name that name the object: `white_yellow_mug` -> [mug]."""
+    return [word for word in _words(name) if word not in _QUALITIES]
+
+
+def _words_for(category: str) -> list[str]:
+    """Return the words that an instruction may use for an object of a category."""
+    return [name for token in _tokens(category) for name in (token, _ALSO.get(token, token))]
+
+
+def _singular(word: str) -> str:
+    return word[:-1] if word.endswith("s") and not word.endswith("ss") and len(word) > 3 else word
+
+
+def _same(token: str, word: str) -> bool:
+    """Return whether the words are equal or one is the end of the other: a frypan is a pan."""
+    short, long = sorted((token, word), key=len)
+    return token == word or (len(short) >= 3 and long.endswith(short))

@@ -1,12 +1,12 @@
 """Findings of the linter, and the lines of a task file that they refer to."""
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
 from libero_env.tasks.bddl import Lines
-from libero_env.tasks.problem import ProblemError
+from libero_env.tasks.problem import Atom, Problem, ProblemError
 from libero_env.tasks.sexpr import List
 
 Level = Literal["error", "warning", "info"]
@@ -49,23 +49,23 @@ class Report:
         self.file, self.lines = file, Lines(tree)
         self.findings: list[Finding] = []
 
-    def error(self, line: int, rule: str, what: str, remedy: str) -> None:
-        """Add a finding because of which the task does not work."""
-        self.findings.append(Finding(self.file, line, "error", rule, what, remedy))
+    def add(self, level: Level, line: int, rule: str, what: str, remedy: str) -> None:
+        """Add a finding; see `Finding`."""
+        self.findings.append(Finding(self.file, line, level, rule, what, remedy))
 
     def violations(self, error: ProblemError) -> None:
         """Add all that is wrong with a problem from which no scene can be built."""
         for one in error.violations:
             line = self.lines.of_part(one.section, one.part)
-            self.error(line, one.rule, one.what, f"expected {one.expected}")
+            self.add("error", line, one.rule, one.what, f"expected {one.expected}")
 
-    def warning(self, line: int, rule: str, what: str, remedy: str) -> None:
-        """Add a finding because of which the task probably does not work as intended."""
-        self.findings.append(Finding(self.file, line, "warning", rule, what, remedy))
+    def init(self, problem: Problem) -> Iterator[tuple[Atom, int]]:
+        """Yield the init atoms with their lines."""
+        yield from zip(problem.init, self.lines.init, strict=True)
 
-    def info(self, line: int, rule: str, what: str, remedy: str) -> None:
-        """Add a finding that is good to know."""
-        self.findings.append(Finding(self.file, line, "info", rule, what, remedy))
+    def goal(self, problem: Problem) -> Iterator[tuple[Atom, int]]:
+        """Yield the atoms of the goal with their lines."""
+        yield from zip(problem.goal.atoms(), self.lines.goal, strict=True)
 
     @property
     def broken(self) -> bool:

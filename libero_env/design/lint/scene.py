@@ -1,7 +1,6 @@
 """Checks that need the built scene: joints, reach, and initial states."""
 
 from collections import Counter
-from collections.abc import Iterator
 from math import hypot, sqrt
 
 import mujoco
@@ -9,7 +8,7 @@ import numpy as np
 
 from libero_env.assets.arena import Workspace
 from libero_env.assets.pack import BUILTIN, Pack
-from libero_env.design.lint.report import Report
+from libero_env.design.lint.report import Level, Report
 from libero_env.errors import LiberoError, PlacementError
 from libero_env.init_states.placement import sample_start, settle, start_errors
 from libero_env.init_states.store import load_init_states
@@ -60,7 +59,7 @@ def check_scene(report: Report, task: Task, pack: Pack, starts: int) -> None:
         report.violations(error)
         return
     except LiberoError as error:
-        report.error(1, "scene", f"the scene cannot be built: {error}", "fix what it names")
+        report.add("error", 1, "scene", f"the scene cannot be built: {error}", "fix what it names")
         return
     _check_joints(report, scene)
     _check_tables(report, scene)
@@ -70,16 +69,11 @@ def check_scene(report: Report, task: Task, pack: Pack, starts: int) -> None:
 
 def _check_joints(report: Report, scene: Scene) -> None:
     """Check that what is opened or turned on has a joint."""
-    for atom, line in _atoms(report, scene):
+    for atom, line in (*report.init(scene.problem), *report.goal(scene.problem)):
         owner = scene.owner(atom.args[0]) if atom.predicate.lower() in OPPOSITE_STATES else None
         if owner is not None and not scene.joints.get(atom.args[0]):
             remedy = "use an object with a joint, or a region on its moving part"
-            report.error(line, "no-joint", f"{atom}: it has no joint", remedy)
-
-
-def _atoms(report: Report, scene: Scene) -> Iterator[tuple[Atom, int]]:
-    yield from zip(scene.problem.init, report.lines.init, strict=True)
-    yield from zip(scene.problem.goal.atoms(), report.lines.goal, strict=True)
+            report.add("error", line, "no-joint", f"{atom}: it has no joint", remedy)
 
 
 def _check_tables(report: Report, scene: Scene) -> None:
@@ -97,7 +91,7 @@ def _check_tables(report: Report, scene: Scene) -> None:
         if not all(any((np.abs(xy - point) <= half).all() for point, half in surfaces) for xy in corners):
             what = f"{region.address} is not all on the {scene.workspace.name}"
             remedy = "move or shrink it; x points away from the robot, y to its left"
-            report.error(report.lines.of(region.address), "off-table", what, remedy)
+            report.add("error", report.lines.of(region.address), "off-table", what, remedy)
         _check_reach(report, scene, region, corners, region.address in goal or placed in goal)
 
 
@@ -109,17 +103,12 @@ def _check_reach(report: Report, scene: Scene, region: Region, corners: np.ndarr
     away = np.linalg.norm(np.concatenate([corners, middle]) - base, axis=1)
     if ((near <= away) & (away <= far)).all():
         return
-    add = (
-        report.info
-        if not needed
-        else report.error
-        if away.min() > furthest_reach(scene.workspace)
-        else report.warning
-    )
+    level: Level = "error" if away.min() > furthest_reach(scene.workspace) else "warning"
     x, y = base - np.array(scene.workspace.offset[:2])
     what = f"{region.address} is {away.min():.2f} to {away.max():.2f} m from the robot"
     remedy = f"a hand that points down reaches {near:.2f} to {far:.2f} m from ({x:g}, {y:g}), in the region's frame"
-    add(report.lines.of(region.address), "out-of-reach", what, remedy)
+    line = report.lines.of(region.address)
+    report.add(level if needed else "info", line, "out-of-reach", what, remedy)
 
 
 def _corners(region: Region, workspace: Workspace) -> np.ndarray:
@@ -159,7 +148,7 @@ def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None
                 _check_goal_reach(report, scene, view)
             checked = True
     except LiberoError as error:
-        report.error(report.lines.section(":init"), "start", str(error), "fix what it names")
+        report.add("error", report.lines.section(":init"), "start", str(error), "fix what it names")
     finally:
         simulations.close()
     for (rule, what), count in faults.items():
@@ -200,11 +189,11 @@ def _moving(scene: Scene, simulations: LoopSimulations) -> list[str]:
 
 def _report_start(report: Report, scene: Scene, rule: str, what: str, count: int, starts: int) -> None:
     """Report a fault of initial states: an error if all have it, a warning if only some have (they are resampled)."""
-    add = report.error if count == starts else report.warning
-    atoms = list(zip(scene.problem.init, report.lines.init, strict=True))
+    level: Level = "error" if count == starts else "warning"
+    atoms = list(report.init(scene.problem))
     line = next((at for atom, at in atoms if str(atom) in what), report.lines.section(":init"))
     if rule == "unstable-start":
-        add = report.warning
+        level = "warning"
         line = next((at for atom, at in atoms if atom.args[0] == what), line)
         what = (
             f"{what} moves by more than {1000 * _MAX_MOVE:.0f} mm in the first {_IDLE_STEPS / CONTROL_HZ:g} s"
@@ -213,11 +202,11 @@ def _report_start(report: Report, scene: Scene, rule: str, what: str, count: int
     elif rule == "placement":
         remedy = "see the message"
     elif "goal" in what:
-        add, rule, line = report.error, "goal-at-start", report.lines.section(":goal")
+        level, rule, line = "error", "goal-at-start", report.lines.section(":goal")
         remedy = "change the initial conditions so that the goal does not hold"
     else:
         remedy = "place it where it stays, or remove the atom"
-    add(line, rule, f"{what}, in {count} of {starts} starts", remedy)
+    report.add(level, line, rule, f"{what}, in {count} of {starts} starts", remedy)
 
 
 def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
@@ -227,15 +216,14 @@ def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
     for part in goal.parts:
         if isinstance(part, Atom) and evaluate(part, view):
             what = f"{part} holds from the beginning"
-            report.info(
-                report.lines.section(":goal"), "goal-at-start", what, "correct if it is intended to stay so"
-            )
+            remedy, line = "correct if it is intended to stay so", report.lines.section(":goal")
+            report.add("info", line, "goal-at-start", what, remedy)
 
 
 def _check_goal_reach(report: Report, scene: Scene, view: StateView) -> None:
     """Check that objects and regions of the goal are within the arm's length, in any orientation of the hand."""
     shoulder = np.array(scene.workspace.robot_base_pos) + (0.0, 0.0, _SHOULDER)
-    for atom, line in zip(scene.problem.goal.atoms(), report.lines.goal, strict=True):
+    for atom, line in report.goal(scene.problem):
         for name in atom.args:
             if name in scene.entities:
                 pos = view.body_pos(name)
@@ -245,4 +233,4 @@ def _check_goal_reach(report: Report, scene: Scene, view: StateView) -> None:
                 continue
             if (away := float(np.linalg.norm(pos - shoulder))) > _ARM_LENGTH:
                 what = f"{name} is {away:.2f} m from the arm's shoulder, which reaches {_ARM_LENGTH:.2f} m"
-                report.warning(line, "out-of-reach", what, "move it towards the robot")
+                report.add("warning", line, "out-of-reach", what, "move it towards the robot")

@@ -12,7 +12,7 @@ import ast
 import os
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib import metadata
@@ -168,18 +168,17 @@ class PublishedTask(Task):
         return 1 if self.has_own_start and self.variant is not None else super().num_starts
 
 
-def lacking(variant: PlusVariant | None, problem: Problem, known: Iterable[str]) -> str:
+def lacking(variant: PlusVariant | None, problem: Problem, categories: Iterable[str]) -> str:
     """Return what a variant needs that no distribution has; empty for nothing.
 
     Args:
         variant: Variant of LIBERO-Plus, or None.
         problem: Its problem.
-        known: Categories of objects that have a model.
+        categories: Those of objects that have a model.
     """
     if variant is not None and variant.scenery in _PICTURES:
         return _PICTURES[variant.scenery]
-    categories = {*problem.objects.values(), *problem.fixtures.values()}
-    missing = sorted(categories.difference(known))
+    missing = sorted({*problem.objects.values(), *problem.fixtures.values()}.difference(categories))
     return f"models of {', '.join(missing)}" if missing else ""
 
 
@@ -201,12 +200,39 @@ def require_available(tasks: Iterable[Task]) -> None:
     )
 
 
+@dataclass(frozen=True)
+class _Origin:
+    """Where a suite comes from.
+
+    Attributes:
+        source: Distribution that has its files.
+        base: Suite of LIBERO that it varies.
+        name: Its name in the distribution.
+        kind: Kind of all its changes; empty where each task has its own.
+    """
+
+    source: Distribution
+    base: str
+    name: str
+    kind: str = ""
+
+
+_SUITES = {
+    f"libero_plus_{base}{end}": _Origin(PLUS, f"libero_{base}", f"libero_{base}")
+    for base in _BASES
+    for end in ("", _SKIPPED)
+} | {
+    f"libero_pro_{base}_{kind}": _Origin(PRO, f"libero_{base}", f"libero_{base}_{end}", kind)
+    for base in _BASES
+    for kind, end in PRO_KINDS.items()
+}
+
+
 def published_sizes() -> dict[str, int]:
     """Return the suites whose files are here, without endings, with the number of their tasks."""
-    plus, pro = find_folder(PLUS), find_folder(PRO)
-    places = {name: (plus, _plus_base(name)) for name in _plus_names() if plus}
-    places |= {name: (pro, _pro_original(name)) for name in _pro_names() if pro}
-    sizes = {name: _their_map(folder).get(original) for name, (folder, original) in places.items() if folder}
+    folders = {source: find_folder(source) for source in (PLUS, PRO)}
+    maps = {source: _task_map(folder) for source, folder in folders.items() if folder}
+    sizes = {name: maps.get(origin.source, {}).get(origin.name) for name, origin in _SUITES.items()}
     return {name: len(tasks) for name, tasks in sizes.items() if isinstance(tasks, list)}
 
 
@@ -222,119 +248,78 @@ def published_suite(name: str) -> Suite:
         InvalidInputError: Its files are not as expected.
     """
     whole, colon, choice = name.partition(":")
-    known = (*_plus_names(), *_pro_names())
-    if whole not in known:
-        raise UnknownNameError("suite", whole, known)
-    is_plus = whole in _plus_names()
-    suite = _plus_suite(whole, require_folder(PLUS)) if is_plus else _pro_suite(whole, require_folder(PRO))
+    if whole not in _SUITES:
+        raise UnknownNameError("suite", whole, _SUITES)
+    source = _SUITES[whole].source
+    tasks = _tasks(whole, require_folder(source))
     if not colon:
-        return suite
-    valid = (*(KINDS if is_plus else ()), AVAILABLE)
+        return Suite(name, tasks)
+    valid = (*(KINDS if source is PLUS else ()), AVAILABLE)
     if choice not in valid:
         raise UnknownNameError(f"part of {whole}", choice, valid)
-    return Suite(name, tuple(task for task in suite.tasks if _is_chosen(task, choice)))
-
-
-def _is_chosen(task: Task, choice: str) -> bool:
-    assert isinstance(task, PublishedTask)
-    return not task.lacks if choice == AVAILABLE else task.kind == choice
-
-
-def _plus_names() -> tuple[str, ...]:
-    return tuple(f"libero_plus_{base}{end}" for base in _BASES for end in ("", _SKIPPED))
-
-
-def _pro_names() -> tuple[str, ...]:
-    return tuple(f"libero_pro_{base}_{kind}" for base in _BASES for kind in PRO_KINDS)
-
-
-def _plus_base(name: str) -> str:
-    """Return the suite of LIBERO that a suite of LIBERO-Plus varies, whose name it has there."""
-    return name.removesuffix(_SKIPPED).replace("libero_plus_", "libero_")
-
-
-def _pro_original(name: str) -> str:
-    """Return the name of a suite in LIBERO-PRO."""
-    base, _, kind = name.replace("libero_pro_", "libero_").rpartition("_")
-    return f"{base}_{PRO_KINDS[kind]}"
+    chosen = (task for task in tasks if (not task.lacks if choice == AVAILABLE else task.kind == choice))
+    return Suite(name, tuple(chosen))
 
 
 @cache
-def _plus_suite(name: str, folder: Path) -> Suite:
-    base_suite = _plus_base(name)
-    bases, known = _base_tasks(base_suite), _known_categories()
-    reading: RobotState = "skipped" if name.endswith(_SKIPPED) else "overwritten"
+def _tasks(suite: str, folder: Path) -> tuple[PublishedTask, ...]:
+    origin = _SUITES[suite]
+    names = _task_map(folder).get(origin.name)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InvalidInputError(f"{folder / _TASK_MAP} has no suite {origin.name}; is it another version?")
+    bases = {task.name: task for task in benchmark_suite(origin.base).tasks}
+    categories = frozenset((*object_names(), *WORKSPACES, *LIBERO_PRO))
     tasks = []
-    for index, variant in enumerate(map(parse_plus_id, _their_names(folder, base_suite))):
-        if variant.base not in bases:
-            raise InvalidInputError(
-                f"{folder / _TASK_MAP}: {variant.base!r:.80} is not a task of {base_suite}"
-            )
-        tasks.append(_plus_task(name, index, variant, bases[variant.base], folder, reading, known))
-    return Suite(name, tuple(tasks))
+    for index, name in enumerate(names):
+        variant = parse_plus_id(name) if origin.source is PLUS else None
+        base = variant.base if variant else name
+        if base not in bases:
+            raise InvalidInputError(f"{folder / _TASK_MAP}: {base!r:.80} is not a task of {origin.base}")
+        tasks.append(_task(suite, index, variant, bases[base], folder, categories))
+    return tuple(tasks)
 
 
-def _plus_task(
+def _task(
     suite: str,
     index: int,
-    variant: PlusVariant,
+    variant: PlusVariant | None,
     base: Task,
     folder: Path,
-    reading: RobotState,
-    known: Collection[str],
+    categories: Collection[str],
 ) -> PublishedTask:
-    file = folder / "bddl_files" / base.suite / f"{variant.file}.bddl"
-    own = variant.has_own_start
-    states = Path("libero_newobj", base.suite, variant.name) if own else Path(base.suite, base.name)
-    problem = _read(file) if own or variant.language is not None else base.problem
-    language = problem.language.lower() if variant.language is not None else base.language
+    """Return a task of a suite; `variant` is None in LIBERO-PRO."""
+    origin, states = _SUITES[suite], folder / "init_files"
+    if variant is not None:
+        name, kind = variant.name, variant.kind
+        file = folder / "bddl_files" / base.suite / f"{variant.file}.bddl"
+        is_moved, is_reworded = variant.has_own_start, variant.language is not None
+        problem = _read(file) if is_moved or is_reworded else base.problem
+        start = Path("libero_newobj", base.suite, name) if is_moved else Path(base.suite, base.name)
+        states_file = states / f"{start}.pruned_init"
+    else:
+        name, kind = f"{base.name}_{origin.kind}", origin.kind
+        file = folder / "bddl_files" / origin.name / f"{base.name}.bddl"
+        problem = _read(file)
+        is_moved, is_reworded = not _starts_alike(problem, base.problem), kind in _REWORDED
+        states_file = states / origin.name / f"{base.name}.pruned_init"
+        if not states_file.is_file():
+            states_file = states_file.with_name(f"{states_file.name}.npz")
     return PublishedTask(
         suite,
         index,
-        variant.name,
-        language,
+        name,
+        problem.language.lower() if is_reworded else base.language,
         problem.language,
         problem,
         base=base,
-        kind=variant.kind,
+        kind=kind,
         file=file,
-        states_file=folder / "init_files" / states.with_name(f"{states.name}.pruned_init"),
-        has_own_start=own,
+        states_file=states_file,
+        has_own_start=is_moved,
         variant=variant,
-        robot_state=reading,
-        lacks=lacking(variant, problem, known),
+        robot_state="skipped" if suite.endswith(_SKIPPED) else "overwritten",
+        lacks=lacking(variant, problem, categories),
     )
-
-
-@cache
-def _pro_suite(name: str, folder: Path) -> Suite:
-    base_suite, _, kind = name.replace("libero_pro_", "libero_").rpartition("_")
-    original = _pro_original(name)
-    bases, known = _base_tasks(base_suite), _known_categories()
-    tasks = []
-    for index, base_name in enumerate(_their_names(folder, original)):
-        if base_name not in bases:
-            raise InvalidInputError(f"{folder / _TASK_MAP}: {base_name!r:.80} is not a task of {base_suite}")
-        base, file = bases[base_name], folder / "bddl_files" / original / f"{base_name}.bddl"
-        problem = _read(file)
-        states = folder / "init_files" / original / f"{base_name}.pruned_init"
-        tasks.append(
-            PublishedTask(
-                name,
-                index,
-                f"{base_name}_{kind}",
-                problem.language.lower() if kind in _REWORDED else base.language,
-                problem.language,
-                problem,
-                base=base,
-                kind=kind,
-                file=file,
-                states_file=states if states.is_file() else states.with_name(f"{states.name}.npz"),
-                has_own_start=not _starts_alike(problem, base.problem),
-                lacks=lacking(None, problem, known),
-            )
-        )
-    return Suite(name, tuple(tasks))
 
 
 def _starts_alike(one: Problem, other: Problem) -> bool:
@@ -352,14 +337,6 @@ def _starts_alike(one: Problem, other: Problem) -> bool:
     )
 
 
-def _base_tasks(suite: str) -> dict[str, Task]:
-    return {task.name: task for task in benchmark_suite(suite).tasks}
-
-
-def _known_categories() -> frozenset[str]:
-    return frozenset((*object_names(), *WORKSPACES, *LIBERO_PRO))
-
-
 def _read(file: Path) -> Problem:
     """Return the problem of a task file; a problem class of a variant is read as the one that it varies.
 
@@ -372,16 +349,9 @@ def _read(file: Path) -> Problem:
     return bddl.parse(_PROBLEM.sub(r"\1", bddl.read_text(file)), str(file))
 
 
-def _their_names(folder: Path, suite: str) -> Sequence[str]:
-    """Return the names of the tasks of a suite in their order, from a Python file that is read and not run."""
-    names = _their_map(folder).get(suite)
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise InvalidInputError(f"{folder / _TASK_MAP} has no suite {suite}; is it another version?")
-    return names
-
-
 @cache
-def _their_map(folder: Path) -> dict[str, object]:
+def _task_map(folder: Path) -> dict[str, object]:
+    """Return suite -> names of its tasks in their order, from a Python file that is read and not run."""
     path = folder / _TASK_MAP
     try:
         tree = ast.parse(path.read_text(encoding="utf-8"))
