@@ -91,10 +91,6 @@ class WorkerError(LiberoError, RuntimeError):
         super().__init__(message)
         self.failed, self.results = dict(failed or {}), dict(results or {})
 
-    def __reduce__(self) -> tuple[type, tuple[Any, ...]]:
-        """Keep the attributes in a copy."""
-        return type(self), (*self.args, self.failed, self.results)
-
 
 class CloudpickleWrapper(utils.CloudpickleWrapper):
     """Factory that can be sent to another process, also a lambda."""

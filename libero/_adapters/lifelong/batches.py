@@ -39,7 +39,7 @@ class DictBatch:
 
     def join(self, other: "DictBatch") -> "DictBatch":
         """Return this batch followed by another, with the entries that both have."""
-        return DictBatch(_join(self.data, other.data))
+        return DictBatch(join_tensors(self.data, other.data))
 
 
 class DictWindows:
@@ -68,10 +68,11 @@ def map_tensors(node: Any, change: Callable[[Tensor], Tensor]) -> Any:
     return {k: map_tensors(v, change) for k, v in node.items()} if isinstance(node, dict) else node
 
 
-def _join(a: Any, b: Any) -> Any:
+def join_tensors(a: Any, b: Any) -> Any:
+    """Return nested dictionaries of tensors joined along the first dimension, with the entries that both have."""
     if isinstance(a, Tensor):
         return torch.cat([a, b.to(a.device)])
-    return {k: _join(v, b[k]) for k, v in a.items() if k in b} if isinstance(a, dict) else a
+    return {k: join_tensors(v, b[k]) for k, v in a.items() if k in b} if isinstance(a, dict) else a
 
 
 def policy_spec(cfg: Any, shape_meta: Mapping[str, Any], history: int) -> PolicySpec:

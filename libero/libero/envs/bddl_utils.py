@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,8 @@ _NO_YAW, _NO_COLOUR = [0, 0], [0, 0, 1, 0]
 
 
 def read_problem(problem_filename: str) -> Problem:
-    """Read a task file, see `task_file`, or take it from the cache; raise a BDDLError if it is not a task file."""
-    path = task_file(problem_filename)
-    stamp = Path(path).stat()
-    return _read(path, stamp.st_mtime_ns, stamp.st_size)
-
-
-@lru_cache(maxsize=256)
-def _read(path: str, *_: int) -> Problem:
-    return bddl.read(path)
+    """Read a task file, see `task_file`; raise a BDDLError if it is not a task file."""
+    return bddl.read(task_file(problem_filename))
 
 
 def get_problem_info(problem_filename: str) -> dict[str, str]:

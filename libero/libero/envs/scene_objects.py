@@ -65,7 +65,7 @@ class TaskModel:
         segments: `instance` and `class` -> number of each geom, (ngeom + 1,), from 1; 0 is everything else.
     """
 
-    def __init__(self, scene: Scene, model: mujoco.MjModel, xml: Callable[[], str] | None = None):
+    def __init__(self, scene: Scene, model: mujoco.MjModel, xml: Callable[[], str]):
         self.mujoco_model = model
         self._xml = xml
         bodies, robot = {name: scene.bodies[name] for name in scene.entities}, _robot_bodies(model)
@@ -85,7 +85,6 @@ class TaskModel:
 
     def get_xml(self) -> str:
         """Return the scene as MJCF."""
-        assert self._xml is not None, "made by an environment"
         return self._xml()
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
 from libero._adapters.lifelong.batches import DictWindows
+from libero._adapters.lifelong.batches import join_tensors as merge_datas
 from libero._adapters.lookup import alias_modules
 from libero.lifelong.algos.base import REGISTERED_ALGOS, Sequential, get_algo_class, get_algo_list
 from libero.lifelong.metric import evaluate_multitask_training_success
@@ -23,13 +24,6 @@ def cycle(dl: Iterable[Any]) -> Iterator[Any]:
     """Yield the items of a loader, again and again."""
     while True:
         yield from dl
-
-
-def merge_datas(x: Any, y: Any) -> Any:
-    """Return two batches joined: dictionaries of tensors, whose first dimension is the batch."""
-    if isinstance(x, dict):
-        return type(x)((key, merge_datas(x[key], y[key])) for key in x)
-    return torch.cat([x, y], dim=0)
 
 
 class ER(Sequential):
