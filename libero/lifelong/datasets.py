@@ -165,11 +165,8 @@ def _shapes(path: Path, keys: Sequence[str]) -> dict[str, tuple[int, ...]]:
     file = next(iter(demo_files(path)), path)
     with open_demo_file(file) as handle:
         names = demo_names(handle, file)
-        obs = handle["data"][names[0]].get("obs", {}) if names else {}
-        missing = [key for key in keys if key not in obs]
-        if missing:
-            raise DemoError(
-                f"{file}: {', '.join(missing)} missing from obs; it has {', '.join(obs) or 'nothing'}"
-            )
-        check_demo(handle["data"][names[0]], f"{file}: {names[0]}", keys)
-        return {key: tuple(obs[key].shape[1:]) for key in keys}
+        if not names:
+            raise DemoError(f"{file}: it has no demonstrations")
+        demo = handle["data"][names[0]]
+        check_demo(demo, f"{file}: {names[0]}", keys)
+        return {key: tuple(demo["obs"][key].shape[1:]) for key in keys}

@@ -84,11 +84,7 @@ class CustomObjects(MujocoXMLObject):
         assert os.path.isabs(custom_path), "Custom path must be an absolute path"
         assert custom_path.endswith(".xml"), "Custom path must be an xml file"
         super().__init__(
-            custom_path,
-            name=name,
-            joints=joints,
-            obj_type="all",
-            duplicate_collision_geoms=False,
+            custom_path, name=name, joints=joints, obj_type="all", duplicate_collision_geoms=False
         )
         self.category_name = "_".join(re.sub(r"([A-Z])", r" \1", self.__class__.__name__).split()).lower()
         self.object_properties = {"vis_site_names": {}}
@@ -105,11 +101,7 @@ def register_mugs():
                 name=name,
                 obj_name=obj_name,
             )
-            self.rotation = {
-                "x": (-np.pi / 2, -np.pi / 2),
-                "y": (-np.pi, -np.pi),
-                "z": (np.pi, np.pi),
-            }
+            self.rotation = {"x": (-np.pi / 2, -np.pi / 2), "y": (-np.pi, -np.pi), "z": (np.pi, np.pi)}
             self.rotation_axis = None
 
     @register_object

@@ -22,7 +22,7 @@ def test_refused_calls_change_nothing_and_closed_environments_say_so(suite):
     state = env.get_sim_state()
     for bad in (state * np.nan, state[:-1], "a", None, state * 1j, state + 1e12, [[1], [2, 3]]):
         for use in (env.set_state, env.set_init_state):
-            with pytest.raises(InvalidInputError, match="a state is"):
+            with pytest.raises(InvalidInputError, match="a state of"):
                 use(bad)
     for bad in (np.zeros(7) * 1j, ["1"] * 7, None, np.zeros(8), np.full(7, np.nan)):
         with pytest.raises(ActionError):

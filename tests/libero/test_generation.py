@@ -28,14 +28,8 @@ def demo_scene(registries):
     @register_mu(scene_type="kitchen")
     class KitchenDemoScene(InitialSceneTemplates):
         def __init__(self):
-            fixture_num_info = {
-                "kitchen_table": 1,
-                "wooden_cabinet": 1,
-            }
-            object_num_info = {
-                "akita_black_bowl": 1,
-                "plate": 1,
-            }
+            fixture_num_info = {"kitchen_table": 1, "wooden_cabinet": 1}
+            object_num_info = {"akita_black_bowl": 1, "plate": 1}
             super().__init__(
                 workspace_name="kitchen_table",
                 fixture_num_info=fixture_num_info,
@@ -176,9 +170,7 @@ def test_tasks_as_classes(tmp_path, monkeypatch):
 
         @property
         def goal(self):
-            return [
-                ("On", "akita_black_bowl_1", "plate_1"),
-            ]
+            return [("On", "akita_black_bowl_1", "plate_1")]
 
     task_info = KitchenDemoScenePutBowlOnPlate()
     bddl_file_path = generate_bddl_from_task_info(task_info, output_dir="./custom_pddl")
@@ -250,11 +242,7 @@ def test_the_originals_files_from_the_templates(shared):
 
 def test_functions_of_bddl_generation_utils(tmp_path, capsys):
     names = pieces.get_object_dict({"main_table": 1, "flat_stove": 1, "plate": 2})
-    assert names == {
-        "table": ["main_table"],
-        "flat_stove": ["flat_stove_1"],
-        "plate": ["plate_1", "plate_2"],
-    }
+    assert names == {"table": ["main_table"], "flat_stove": ["flat_stove_1"], "plate": ["plate_1", "plate_2"]}
     assert pieces.get_fixtures(names)["plate_2"] == pieces.get_objects(names)["plate_1"] == "plate"
     assert isinstance(names, pieces.ObjectDict)
     assert [pieces.object_naming_mapping(n) for n in ("main_table", "plate_2", "floor")] == [

@@ -226,9 +226,7 @@ def test_config_copy(tmp_path, capsys, monkeypatch):
 def test_download_libero_datasets(tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr(
-        demonstrations,
-        "libero_dataset_download",
-        lambda *args, **kwargs: asked.append((args, kwargs)),
+        demonstrations, "libero_dataset_download", lambda *args, **kwargs: asked.append((args, kwargs))
     )
     argv = ["--download-dir", str(tmp_path), "--datasets", "libero_goal", "--use-huggingface"]
     assert demonstrations.download_libero_datasets(argv) == 0

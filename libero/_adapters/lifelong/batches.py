@@ -79,13 +79,11 @@ def policy_spec(cfg: Any, shape_meta: Mapping[str, Any], history: int) -> Policy
     """Return the spec of a policy that keeps `history` frames when it acts; `data.use_*` select its inputs.
 
     Raises:
-        PolicyError: There is a depth image, or images differ in size.
+        PolicyError: There are no images, or they differ in size.
     """
     shapes = shape_meta["all_shapes"]
     views = [key for key in shapes if "rgb" in key and (cfg.data.use_eye_in_hand or "eye_in_hand" not in key)]
     sizes = {tuple(shapes[view])[1:] for view in views}
-    if any("depth" in key for key in shapes):
-        raise PolicyError("these policies take colour images only: leave data.obs.modality.depth empty")
     if len(sizes) != 1:
         raise PolicyError(
             f"a policy needs images of one size; {views or 'no views'} have sizes {sorted(sizes)}"

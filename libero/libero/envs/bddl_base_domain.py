@@ -26,7 +26,7 @@ from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_ob
 from libero.libero.utils.utils import postprocess_model_xml
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, ROBOTS
 from libero_env.demos.stored_model import compile_stored, model_xml, read_fixture_poses, spec_without_textures
-from libero_env.envs.checks import real_array
+from libero_env.envs.checks import checked_numbers
 from libero_env.errors import (
     ClosedEnvironmentError,
     DemoError,
@@ -271,16 +271,11 @@ class BDDLBaseDomain(RobosuiteMethods):
         nq, nv = self.scene.model.nq, self.scene.model.nv
         short = 1 + nq + nv
         whole = short + 7 * len(self.scene.fixtures)
-        try:
-            state = real_array(state).ravel()
-        except (TypeError, ValueError, OverflowError) as error:
+        state = checked_numbers(state, f"a state of {self.bddl_file_name}", ("any",)).ravel()
+        if state.size not in (short, whole) or (np.abs(state) > mujoco.mjMAXVAL).any():
             raise InvalidInputError(
-                f"{self.bddl_file_name}: a state is {short} finite numbers: {error}"
-            ) from None
-        if state.size not in (short, whole) or not (np.abs(state) <= mujoco.mjMAXVAL).all():
-            raise InvalidInputError(
-                f"{self.bddl_file_name}: a state is {short} finite numbers, or {whole} with the poses of the fixtures; "
-                f"got {state.size}. Is it a state of another task?"
+                f"a state of {self.bddl_file_name} is {short} numbers, or {whole} with the poses of the fixtures, up "
+                f"to {mujoco.mjMAXVAL:g}; got {state.size}. Is it a state of another task?"
             )
         self.simulations.fixtures[0] = self.simulations.read_fixtures()
         fixtures = state[short:].reshape(1, -1, 7) if state.size == whole else None

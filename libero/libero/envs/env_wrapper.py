@@ -1,6 +1,6 @@
 """Environments of a task file with robosuite's observations and the four-tuple of old Gym."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any
 
@@ -13,14 +13,8 @@ from libero.libero.envs.bddl_base_domain import TASK_MAPPING, BDDLBaseDomain
 from libero_env.errors import PlacementError
 
 _RESETS = 5
+_NOT_FORWARDED = ("self", "bddl_file_name", "controller", "kwargs")  # all others go to the domain as they are
 DEFAULT_CAMERAS = ("agentview", "robot0_eye_in_hand")
-# of arguments of the domain, where they differ from its own
-_DEFAULTS = {
-    "initialization_noise": None,
-    "camera_names": DEFAULT_CAMERAS,
-    "camera_heights": 128,
-    "camera_widths": 128,
-}
 
 
 class ControlEnv:
@@ -29,8 +23,8 @@ class ControlEnv:
     Args:
         bddl_file_name: Task file; for the tasks of the benchmark its name without a folder is enough.
         controller: Name of the controller, such as `OSC_POSE`, or its configuration.
-        kwargs: Further arguments of `BDDLBaseDomain`. By default the arm starts at its rest pose, and the cameras
-            agentview and robot0_eye_in_hand are drawn with 128 x 128 pixels.
+        camera_names, camera_heights, camera_widths: One value, or one for each camera.
+        kwargs: Further arguments of `BDDLBaseDomain`, which also describes the other parameters.
 
     Raises:
         BDDLError: The file is not a task file.
@@ -38,14 +32,41 @@ class ControlEnv:
     """
 
     def __init__(
-        self, bddl_file_name: str, robots: Any = ("Panda",), controller: Any = "OSC_POSE", **kwargs: Any
+        self,
+        bddl_file_name: str,
+        robots: Any = ("Panda",),
+        controller: str = "OSC_POSE",
+        gripper_types: Any = "default",
+        initialization_noise: Any = None,
+        use_camera_obs: bool = True,
+        has_renderer: bool = False,
+        has_offscreen_renderer: bool = True,
+        render_camera: str = "frontview",
+        render_collision_mesh: bool = False,
+        render_visual_mesh: bool = True,
+        render_gpu_device_id: int = -1,
+        control_freq: float = 20,
+        horizon: int = 1000,
+        ignore_done: bool = False,
+        hard_reset: bool = True,
+        camera_names: str | Sequence[str] = DEFAULT_CAMERAS,
+        camera_heights: int | Sequence[int] = 128,
+        camera_widths: int | Sequence[int] = 128,
+        camera_depths: bool | Sequence[bool] = False,
+        camera_segmentations: Any = None,
+        renderer: str = "mujoco",
+        renderer_config: Any = None,
+        **kwargs: Any,
     ):
+        given = {key: value for key, value in locals().items() if key not in _NOT_FORWARDED}
         info = BDDLUtils.get_problem_info(bddl_file_name)
         self.problem_name, self.domain_name = info["problem_name"], info["domain_name"]
         self.language_instruction = info["language_instruction"]
-        controller = {"type": controller} if isinstance(controller, str) else controller
         self.env: BDDLBaseDomain = lookup(TASK_MAPPING, "problem", self.problem_name)(
-            bddl_file_name, robots, controller, **{**_DEFAULTS, **kwargs}
+            bddl_file_name,
+            controller_configs={"type": controller} if isinstance(controller, str) else controller,
+            **given,
+            **kwargs,
         )
 
     obj_of_interest = property(attrgetter("env.obj_of_interest"), doc="Names of the objects of interest.")
@@ -123,7 +144,7 @@ class OffScreenRenderEnv(ControlEnv):
     """An environment that draws pictures without a window."""
 
     def __init__(self, **kwargs: Any):
-        super().__init__(**{**kwargs, "has_renderer": False})
+        super().__init__(**{**kwargs, "has_renderer": False, "has_offscreen_renderer": True})
 
 
 class DemoRenderEnv(OffScreenRenderEnv):
