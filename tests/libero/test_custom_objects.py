@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from libero._adapters.envs.models import model_of
-from libero.libero.envs import OffScreenRenderEnv
-from libero.libero.envs.base_object import MujocoXMLObject, register_object
+from libero.libero.envs import ControlEnv, OffScreenRenderEnv
+from libero.libero.envs.base_object import OBJECTS_DICT, MujocoXMLObject, register_object
 from libero.libero.envs.objects import ArticulatedObject, get_object_fn
 from libero.libero.utils.mu_utils import InitialSceneTemplates, register_mu
 from libero.libero.utils.object_utils import get_affordance_regions
@@ -311,3 +311,39 @@ def test_meshes_are_counted_once(assets):
     os.utime(file, (0, 0))
     assert (first, get_object("libero_mug").horizontal_radius) == (pytest.approx(0.03), pytest.approx(0.02))
     assert mujoco.MjModel.from_xml_string(get_object("libero_mug").spec.to_xml()).nmesh == 1
+
+
+BRICK = """
+<mujoco>
+  <worldbody><body>
+    <body name="object">
+      <geom type="box" size="0.02 0.02 0.03" density="500" group="0"/>
+      <geom type="box" size="0.02 0.02 0.03" rgba="0.9 0.1 0.1 1" group="1" contype="0" conaffinity="0"/>
+    </body>
+    <site name="bottom_site" pos="0 0 -0.03"/>
+    <site name="top_site" pos="0 0 0.03"/>
+    <site name="horizontal_radius_site" pos="0.03 0 0"/>
+  </body></worldbody>
+</mujoco>
+"""
+
+
+def test_an_object_from_an_mjcf_file(tmp_path, suite):
+    (tmp_path / "brick.xml").write_text(BRICK)
+
+    @register_object
+    class RedBrick(MujocoXMLObject):
+        def __init__(self, name="red_brick", obj_name="red_brick"):
+            joints = [{"type": "free", "damping": "0.001"}]
+            super().__init__(str(tmp_path / "brick.xml"), name=name, joints=joints)
+            self.rotation, self.rotation_axis = (0.0, 0.0), "z"
+
+    assert OBJECTS_DICT["red_brick"](name="red_brick_1").joints == ["red_brick_1_joint0"]
+    with open(suite.get_task_bddl_file_path(0)) as file:
+        text = file.read().replace("milk_1", "red_brick_1").replace("- milk", "- red_brick")
+    (tmp_path / "task.bddl").write_text(text)
+    env = ControlEnv(bddl_file_name=tmp_path / "task.bddl", use_camera_obs=False)
+    assert "red_brick_1_pos" in env.reset()
+    assert env.env.objects_dict["red_brick_1"].horizontal_radius == 0.03
+    assert env.sim.model.body_mass[env.sim.model.body_name2id("red_brick_1_main")] == pytest.approx(0.048)
+    env.close()

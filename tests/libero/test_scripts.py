@@ -350,7 +350,7 @@ def test_videos(tmp_path, recwarn):
 
 @pytest.mark.unit
 def test_small_functions():
-    from libero.libero.utils.time_utils import Timer
+    from libero.libero.utils import Timer
     from libero.libero.utils.utils import postprocess_model_xml, process_image_input, update_env_kwargs
 
     with Timer() as timer:
