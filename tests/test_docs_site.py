@@ -17,7 +17,7 @@ from types import ModuleType
 import pytest
 import yaml
 
-from libero._adapters.lifelong.config import load_config
+from libero._adapters.config import load_config
 from libero_env.cli.main import ALL, bind, find, load, main
 from libero_env.cli.options import options_of
 from libero_env.objects import catalog

@@ -1,1 +1,1 @@
-"""Parts of the facade that are no paths of the original."""
+"""Parts of the facade that are not paths of the original."""

@@ -41,7 +41,7 @@ def __getattr__(name: str) -> str:
 
 def get_default_path_dict(custom_location: str | os.PathLike | None = None) -> dict[str, str]:
     """Return key -> path: in a folder laid out like the original package, or by default in the cache folder."""
-    from libero._adapters.envs.files import generated_paths
+    from libero._adapters.files import generated_paths
 
     if custom_location is None:
         return {"benchmark_root": str(_HERE), **generated_paths()}
@@ -58,7 +58,7 @@ def get_path_dict() -> dict[str, str]:
 
 def get_libero_path(query_key: str) -> str:
     """Return one of the paths, and warn if it does not exist; raise an UnknownNameError if the key does not exist."""
-    from libero._adapters.envs.files import allow_arrays, ensure
+    from libero._adapters.files import allow_arrays, ensure
 
     if query_key not in _KEYS:
         raise UnknownNameError("path", query_key, _KEYS)

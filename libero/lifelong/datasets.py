@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset, Subset
 
-from libero._adapters.lifelong.batches import image_tensor
+from libero._adapters.batches import image_tensor
 from libero_env.demos.contents import check_demo, demo_names, subset_names
 from libero_env.demos.hdf5 import open_demo_file
 from libero_env.demos.read import demo_files, read_demos

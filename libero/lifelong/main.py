@@ -13,7 +13,7 @@ def main() -> int:
     """
     import hydra
 
-    from libero._adapters.lifelong.config import CONFIGS
+    from libero._adapters.config import CONFIGS
     from libero.lifelong.run import run
     from libero_env.cli import ending
     from libero_env.errors import LiberoError

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from libero._adapters.envs.files import generated_paths
-from libero._adapters.lifelong.batches import image_tensor, map_tensors
+from libero._adapters.batches import image_tensor, map_tensors
+from libero._adapters.files import generated_paths
 from libero.lifelong.utils import available_device, safe_device
 from libero_env.envs.batch import BatchEnv
 from libero_env.init_states.pickles import read_states

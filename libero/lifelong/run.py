@@ -18,8 +18,8 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from libero._adapters.lifelong.batches import DictWindows
-from libero._adapters.lifelong.config import Config, notes, plain
+from libero._adapters.batches import DictWindows
+from libero._adapters.config import Config, notes, plain
 from libero.libero import get_libero_path
 from libero.libero.benchmark import get_benchmark
 from libero.lifelong.algos import Multitask, Sequential, get_algo_class

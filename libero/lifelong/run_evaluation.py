@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from libero._adapters.lifelong.config import load_config
+from libero._adapters.config import load_config
 from libero.libero.benchmark import get_benchmark
 from libero.libero.utils.video_utils import VideoWriter
 from libero.lifelong.algos import PackNet, Sequential, get_algo_class

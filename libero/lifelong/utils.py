@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset, default_collate, random_split
 
-from libero._adapters.lifelong.config import Config, assign, plain
+from libero._adapters.config import Config, assign, plain
 from libero_env.storage import atomic_path
 from lifelong.errors import CheckpointError
 from lifelong.language import LanguageEncoder

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from libero._adapters.lifelong.config import Config, load_config
+from libero._adapters.config import Config, load_config
 from libero.libero.benchmark import Benchmark, get_benchmark
 from libero.lifelong.datasets import SequenceVLDataset, get_dataset
 from libero_env.demos.read import Episode

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero._adapters.envs.models import model_of
+from libero._adapters.models import model_of
 from libero.libero.envs import ControlEnv, OffScreenRenderEnv
 from libero.libero.envs.base_object import OBJECTS_DICT, MujocoXMLObject, register_object
 from libero.libero.envs.objects import ArticulatedObject, get_object_fn

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero._adapters.envs.robosuite_methods import Observable
+from libero._adapters.observations import Observable
 from libero.libero.envs import ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv
 from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, EpisodeOverError
 from libero_env.assets.robot import REST_QPOS

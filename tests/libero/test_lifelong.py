@@ -11,7 +11,7 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
-from libero._adapters.lifelong.config import Config, load_config
+from libero._adapters.config import Config, load_config
 from libero.lifelong import utils
 from libero.lifelong.datasets import (
     GroupedTaskDataset,
@@ -117,7 +117,7 @@ def test_filter_key_selects_demonstrations(file, tmp_path):
 def test_invalid_demonstrations_raise(file, tmp_path):
     with pytest.raises(LiberoError, match="libero demos generate"):
         get_dataset(tmp_path / "absent.hdf5", MODALITY)
-    with pytest.raises(LiberoError, match="frontview_rgb missing.*agentview_rgb"):
+    with pytest.raises(LiberoError, match="frontview_rgb is missing.*agentview_rgb"):
         get_dataset(file, {"rgb": ["frontview_rgb"], "low_dim": []})
 
 

@@ -9,7 +9,7 @@ from omegaconf import OmegaConf
 from torch import nn
 from torch.utils.data import DataLoader
 
-from libero._adapters.lifelong.config import Config, plain
+from libero._adapters.config import Config, plain
 from libero.lifelong import algos, metric, utils
 from libero.lifelong.algos import cycle, merge_datas
 from libero.lifelong.metric import evaluate_loss

@@ -11,7 +11,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import libero
-from libero._adapters.lifelong.config import CONFIGS, NO_EFFECT, Config, assign, load_config, notes, plain
+from libero._adapters.config import CONFIGS, NO_EFFECT, Config, assign, load_config, notes, plain
 from libero.lifelong.algos import get_algo_class
 from libero.lifelong.models import get_policy_class
 from libero.lifelong.models.modules import (
@@ -40,7 +40,7 @@ def words() -> set[str]:
     """All attributes and texts in the package, but for those of the list of keys without effect."""
     found = set()
     root = Path(libero.__file__).parent
-    for file in (*root.glob("lifelong/**/*.py"), *root.glob("_adapters/lifelong/**/*.py")):
+    for file in (*root.glob("lifelong/**/*.py"), *root.glob("_adapters/**/*.py")):
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.Attribute):
                 found.add(node.attr)

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 from torch.utils.data import DataLoader
 
-from libero._adapters.lifelong.config import load_config
+from libero._adapters.config import load_config
 from libero.lifelong import models
 from libero.lifelong.models import bc_rnn_policy, bc_transformer_policy
 from libero.lifelong.models.modules import data_augmentation as aug

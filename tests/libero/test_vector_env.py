@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from libero._adapters.envs.workers import WorkerError
+from libero._adapters.workers import WorkerError
 from libero.libero.envs import ControlEnv, DummyVectorEnv, SubprocVectorEnv
 from libero.libero.envs.venv import BaseVectorEnv, CloudpickleWrapper, EnvWorker, ShArray
 from libero_env.errors import LiberoError

@@ -9,8 +9,8 @@ import time
 
 import pytest
 
-from libero._adapters.envs import workers
-from libero._adapters.envs.workers import CALL_TIMEOUT, WorkerError
+from libero._adapters import workers
+from libero._adapters.workers import CALL_TIMEOUT, WorkerError
 from libero.libero.envs import DummyVectorEnv, SubprocVectorEnv
 from libero_env.errors import ClosedEnvironmentError, InvalidInputError
 

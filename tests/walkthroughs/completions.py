@@ -42,7 +42,7 @@ class Replay:
 
 def training_data(scope: Scope) -> Scope:
     """For `quick.4-3`: a loader of a few windows, and a configuration for a small policy."""
-    from libero._adapters.lifelong.config import load_config
+    from libero._adapters.config import load_config
 
     cfg = load_config(
         "device=cpu",

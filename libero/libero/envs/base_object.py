@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from libero._adapters.envs.models import STATES, accept_plain_files, assets_folder, facade_pack, model_of
 from libero._adapters.lookup import lookup
+from libero._adapters.models import STATES, accept_plain_files, assets_folder, facade_pack, model_of
 from libero_env.objects import ObjectModel, get_object
 from libero_env.objects import register_object as register_model
 from libero_env.objects.builtin import builtin_names
@@ -199,7 +199,7 @@ class MujocoXMLObject(BaseObject):
     """An object from an MJCF file, with the interface of robosuite's class of that name.
 
     Args:
-        fname: MJCF file, see `libero._adapters.envs.models`; `custom_path` is another name for it.
+        fname: MJCF file, see `libero._adapters.models`; `custom_path` is another name for it.
         name: Name of the instance.
         joints: Joints, `[{"type": "free", "damping": "0.0005"}]`; None for an object that does not move.
         obj_type: Accepted without effect.

@@ -12,11 +12,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from libero._adapters.envs.models import facade_pack
-from libero._adapters.envs.observations import Observer, cameras
-from libero._adapters.envs.robosuite_methods import RobosuiteMethods
-from libero._adapters.envs.sim import ClientSimulations, MjSim, Window
 from libero._adapters.lookup import lookup
+from libero._adapters.models import facade_pack
+from libero._adapters.observations import Observer, RobosuiteMethods, cameras
+from libero._adapters.sim import ClientSimulations, MjSim, Window
 from libero.libero.envs import bddl_utils as BDDLUtils
 from libero.libero.envs.bddl_utils import task_file
 from libero.libero.envs.object_states import BaseObjectState, ObjectState, SiteObjectState

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from libero._adapters.envs.files import suite_tasks
+from libero._adapters.files import suite_tasks
 from libero.libero import get_libero_path
 from libero_env.tasks import bddl
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem

@@ -12,7 +12,7 @@ import numpy as np
 from gymnasium import spaces
 from pydantic import Field
 
-from libero._adapters.envs.workers import (  # noqa: F401 - names of the original
+from libero._adapters.workers import (  # noqa: F401 - names of the original
     CloudpickleWrapper,
     DummyEnvWorker,
     EnvWorker,

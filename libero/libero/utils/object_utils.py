@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import mujoco
 
-from libero._adapters.envs.models import facade_pack
+from libero._adapters.models import facade_pack
 from libero_env.errors import LiberoError
 
 # Category -> names of its regions, where they differ from those of its model.

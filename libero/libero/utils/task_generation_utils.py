@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from libero._adapters.envs.models import facade_pack
 from libero._adapters.lookup import lookup
+from libero._adapters.models import facade_pack
 from libero.libero.envs.predicates import get_predicate_fn
 from libero.libero.utils.bddl_generation_utils import (
     get_goal_state,

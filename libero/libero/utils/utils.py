@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from libero._adapters.envs.models import assets_folder
+from libero._adapters.models import assets_folder
 from libero_env.assets.robot import robosuite_assets
 from libero_env.objects.xml_file import parse_xml_text
 

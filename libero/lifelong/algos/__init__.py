@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset
 
-from libero._adapters.lifelong.batches import DictWindows
-from libero._adapters.lifelong.batches import join_tensors as merge_datas
+from libero._adapters.batches import DictWindows
+from libero._adapters.batches import join_tensors as merge_datas
 from libero._adapters.lookup import alias_modules
 from libero.lifelong.algos.base import REGISTERED_ALGOS, Sequential, get_algo_class, get_algo_list
 from libero.lifelong.metric import evaluate_multitask_training_success

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
-from libero._adapters.lifelong.batches import DictBatch, DictWindows, map_tensors
-from libero._adapters.lifelong.config import plain
+from libero._adapters.batches import DictBatch, DictWindows, map_tensors
+from libero._adapters.config import plain
 from libero._adapters.lookup import lookup
 from libero.lifelong.metric import evaluate_success, mean_loss
 from libero.lifelong.models import get_policy_class

@@ -12,8 +12,8 @@ import torch
 from omegaconf import OmegaConf
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.batches import policy_spec, to_native
-from libero._adapters.lifelong.config import plain
+from libero._adapters.batches import policy_spec, to_native
+from libero._adapters.config import plain
 from libero._adapters.lookup import lookup
 from libero.lifelong.models.base_policy import BasePolicy
 from libero.lifelong.models.modules.language_modules import ENCODERS, mlp

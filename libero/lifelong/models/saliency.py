@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.batches import image_tensor, map_tensors, uint8_image
+from libero._adapters.batches import image_tensor, map_tensors, uint8_image
 from libero_eval.saliency import SaliencySettings, saliency
 from lifelong.types import Batch, Observation
 

@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import mujoco
 
-from libero._adapters.envs.models import facade_pack
 from libero._adapters.lookup import alias_modules, lookup
+from libero._adapters.models import facade_pack
 from libero_env.assets.arena import load_workspace
 from libero_env.assets.original_arena import TEXTURES
 

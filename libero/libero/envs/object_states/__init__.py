@@ -5,8 +5,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from libero._adapters.envs.sim import Domain
 from libero._adapters.lookup import alias_modules
+from libero._adapters.sim import Domain
 from libero_env.sim.predicates import evaluate
 from libero_env.tasks.problem import Atom
 

@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from libero._adapters.envs.sim import Domain
 from libero._adapters.lookup import alias_modules
+from libero._adapters.sim import Domain
 from libero_env.assets.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, OPEN_FINGERS, REST_QPOS
 from libero_env.envs.checks import checked_actions
 from libero_env.errors import LiberoError, UnknownNameError

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.batches import uint8_image
+from libero._adapters.batches import uint8_image
 from lifelong.nn.augmentation import Augmentation, ColorJitter, RandomShift
 
 

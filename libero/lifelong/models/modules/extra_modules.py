@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.batches import PROPRIO, proprio_input
+from libero._adapters.batches import PROPRIO, proprio_input
 from libero.lifelong.models.modules.language_modules import mlp
 from lifelong.errors import PolicyError
 

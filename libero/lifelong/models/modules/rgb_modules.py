@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from libero._adapters.lifelong.batches import uint8_image
+from libero._adapters.batches import uint8_image
 from lifelong.errors import PolicyError
 from lifelong.nn import vision
 

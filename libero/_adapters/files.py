@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from libero._adapters.envs.models import assets_folder
+from libero._adapters.models import assets_folder
 from libero_env.errors import LiberoError
 from libero_env.init_states.pickles import states_content
 from libero_env.init_states.store import packaged_states, shipped_path
@@ -38,7 +38,7 @@ def generated_paths() -> dict[str, str]:
         "bddl_files": str(root / f"bddl_files-{_tasks_digest()}"),
         "init_states": str(root / f"init_files-{_states_digest()}"),
         "datasets": str(demos_dir()),
-        "assets": str(assets_folder() or Path(__file__).parents[2] / "libero" / "assets"),
+        "assets": str(assets_folder() or Path(__file__).parents[1] / "libero" / "assets"),
     }
 
 

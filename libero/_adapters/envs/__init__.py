@@ -1,1 +1,0 @@
-"""Adapters between the original's environments and `libero_env`."""

@@ -1,1 +1,0 @@
-"""Adapters between the original's learning side and `lifelong`."""
