@@ -94,7 +94,8 @@ class Algorithm:
             augmentation.
         state_form: Form of what the class's own `state_dict` returns, see `lifelong.checkpoints.check`. A state from a
             file is checked by it before `load_state_dict` gets it; without one it is not checked.
-        acts_by_weights: Whether `policy_for` changes values of the policy's parameters and buffers only.
+        acts_by_weights: Whether `policy_for` of the same class changes values of the policy's parameters and buffers
+            only.
         tuned: Settings that decide what is kept and what is learned, with the values that `libero tune` tries; the
             first is the one it varies unasked. They do not act before the `end_task` of the first task.
         plain_start: Whether the first task is learned as by fine-tuning, with no state before its `end_task`;
@@ -207,7 +208,9 @@ class Algorithm:
         """
         hooked = any(module._forward_hooks or module._forward_pre_hooks for module in policy.modules())
         plain = type(self).policy_for is Algorithm.policy_for and not hooked
-        return {} if plain or self.acts_by_weights else self.state_dict()
+        owner = next(one for one in type(self).__mro__ if "policy_for" in vars(one))
+        by_weights = self.acts_by_weights and "acts_by_weights" in vars(owner)
+        return {} if plain or by_weights else self.state_dict()
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that later tasks depend on: nested dictionaries of tensors, numbers and strings."""

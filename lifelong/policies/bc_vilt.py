@@ -41,7 +41,7 @@ class BCViLT(HistoryPolicy):
         stochastic: See `HistoryPolicy`.
         normalise_proprio: Whether to bring readings to order one, see `ProprioScaling`.
         proprio_dropout: Chance that a modality is hidden in training, see `ProprioScaling`.
-        standardise_language: See `HistoryPolicy`.
+        standardise_language: Whether to bring the numbers of an embedding to mean 0 and deviation 1.
 
     Raises:
         PolicyError: Components or sizes that do not work together, or no camera.

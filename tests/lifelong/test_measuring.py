@@ -119,7 +119,7 @@ class Shifted(SingleTask):
         super().__init__()
         self.shift = 0.0
 
-    acting_state = Algorithm.acting_state
+    acts_by_weights = False
 
     def end_task(self, task_index, dataset, policy, generator):
         super().end_task(task_index, dataset, policy, generator)
