@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from libero_eval.check import examine
-from lifelong.algorithms import Algorithm, LoRA, PackNet, Sequential, SingleTask
+from lifelong.algorithms import LoRA, PackNet, Sequential, SingleTask
 from lifelong.errors import ConfigError
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
