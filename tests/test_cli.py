@@ -233,7 +233,7 @@ def test_doctor_finds_what_is_not_installed():
 
 def test_doctor_names_a_package_that_hides_libero(tmp_path, monkeypatch):
     assert doctor.check_facade().ok
-    monkeypatch.setattr(doctor, "_installed", lambda name: name == "hf-libero")
+    monkeypatch.setattr(doctor, "find_distribution", lambda name: name == "hf-libero")
     finding = doctor.check_facade()
     assert not finding.ok and "hf-libero writes to" in finding.detail
     assert finding.remedy.startswith("pip uninstall hf-libero")

@@ -268,16 +268,12 @@ def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
         )
     if "shapes" in table:
         first = spec.body(next(iter(table["bodies"])))
-        add_visual_mesh(spec, first, "table_visual", _from_above(table), "table")
+        mesh = merge([solid_mesh(shape) for shape in table["shapes"]])
+        from_above = mesh.vertices[:, [1, 0]] / table["style"]["period"]  # the second texture axis is along y
+        mesh = Mesh(mesh.vertices, mesh.faces, from_above)
+        add_visual_mesh(spec, first, "table_visual", mesh, "table")
     for name, pos in table.get("sites", {}).items():
         body.add_site(name=name, pos=pos, size=[0.001] * 3, rgba=[0.0] * 4)
-
-
-def _from_above(table: Mapping[str, Any]) -> Mesh:
-    """Return the shapes of a table with its texture projected from above, the second texture axis along y."""
-    mesh = merge([solid_mesh(shape) for shape in table["shapes"]])
-    period = table["style"]["period"]
-    return Mesh(mesh.vertices, mesh.faces, mesh.vertices[:, [1, 0]] / period)
 
 
 @cache

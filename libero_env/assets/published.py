@@ -197,7 +197,7 @@ def installed_folder() -> Path | None:
     Raises:
         ChangedAssetsError: Some of the distributions are missing, have another version, or are in different folders.
     """
-    distributions = {name: dist for name in WHEELS if (dist := _distribution(name))}
+    distributions = {name: dist for name in WHEELS if (dist := find_distribution(name))}
     if not distributions:
         return None
     if missing := [name for name in WHEELS if name not in distributions]:
@@ -279,7 +279,8 @@ def _intact() -> Path | None:
     return folder
 
 
-def _distribution(name: str) -> metadata.Distribution | None:
+def find_distribution(name: str) -> metadata.Distribution | None:
+    """Return an installed distribution of the Python Package Index; None where it is not installed."""
     try:
         return metadata.distribution(name)
     except metadata.PackageNotFoundError:

@@ -1,7 +1,6 @@
 """Check of this machine for `libero doctor`: each finding states how to fix it, and no check raises an error."""
 
 import importlib
-import importlib.metadata
 import importlib.util
 import json
 import os
@@ -14,6 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from libero_env.assets.pack import BUILTIN, VARIABLE, chosen_assets, facade_assets, pack_of
+from libero_env.assets.published import find_distribution
 from libero_env.assets.robot import (
     ROBOSUITE_REMEDY,
     ROBOSUITE_VERSION,
@@ -103,10 +103,9 @@ def check_python() -> Finding:
 
 def check_package(name: str, remedy: str = "make setup", essential: bool = True) -> Finding:
     """Check that a package is installed, without importing it."""
-    try:
-        return Finding(name, importlib.metadata.version(name), essential=essential)
-    except importlib.metadata.PackageNotFoundError:
+    if (distribution := find_distribution(name)) is None:
         return Finding(name, "not installed", False, remedy, essential)
+    return Finding(name, distribution.version, essential=essential)
 
 
 def check_robot_models() -> Finding:
@@ -141,7 +140,7 @@ def check_facade() -> Finding:
     found = Path(spec.origin).parent if spec is not None and spec.origin else None
     if found is None:
         return Finding(title, "not found", False, "reinstall libero-lifelong", essential=False)
-    others = [name for name in _RIVALS if _installed(name)]
+    others = [name for name in _RIVALS if find_distribution(name)]
     if (found / "_adapters").is_dir() and not others:
         return Finding(title, str(found))
     owner = " and ".join(others) or "another distribution"
@@ -150,14 +149,6 @@ def check_facade() -> Finding:
     )
     remedy = f"pip uninstall {' '.join(others) or 'it'}, then install libero-lifelong again; or use two environments"
     return Finding(title, f"{hidden} this project's package of that name", False, remedy, essential=False)
-
-
-def _installed(name: str) -> bool:
-    try:
-        importlib.metadata.distribution(name)
-    except importlib.metadata.PackageNotFoundError:
-        return False
-    return True
 
 
 def check_gl() -> Finding:

@@ -148,18 +148,18 @@ def find_demo_files(paths: list[Path]) -> list[Path]:
     """
     paths = paths or [demos_dir()]
     groups = [[path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")) for path in paths]
-    files = [file for group in groups for file in group if file in paths or not _is_part(file)]
+    files = [  # without parts of unfinished recordings, and links
+        file
+        for group in groups
+        for file in group
+        if file in paths or not (file.is_symlink() or file.parent.suffix == ".parts")
+    ]
     if not files:
         where = ", ".join(map(str, paths))
         raise DemoError(
             f"no demonstrations in {where}; record some with `libero demos generate --benchmark NAME`"
         )
     return files
-
-
-def _is_part(file: Path) -> bool:
-    """Return whether a file is a part of an unfinished recording, or a link to another file."""
-    return file.is_symlink() or file.parent.suffix == ".parts"
 
 
 def describe(file: Path) -> str:

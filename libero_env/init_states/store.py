@@ -100,18 +100,18 @@ def load_original_states(task: Task, scene: Scene | None = None) -> np.ndarray |
         StateFileError: The task's file is broken.
         LiberoError: The states are of another model than the scene's.
     """
-    path = task.states_file if isinstance(task, PublishedTask) else _configured_file(task)
-    if path is None or not path.is_file():
+    if isinstance(task, PublishedTask):
+        path = task.states_file
+    elif folder := read_config().get("init_states"):
+        path = Path(str(folder)).expanduser() / task.suite / f"{task.name}.pruned_init"
+    else:
+        return None
+    if not path.is_file():
         return None
     states = _read_npz(path) if path.suffix == ".npz" else read_states(path)
     if scene is not None:
         scene.check_states(states, path)
     return states
-
-
-def _configured_file(task: Task) -> Path | None:
-    folder = read_config().get("init_states")
-    return Path(str(folder)).expanduser() / task.suite / f"{task.name}.pruned_init" if folder else None
 
 
 def _read_npz(path: Path) -> np.ndarray:

@@ -198,8 +198,12 @@ def _distractors(count: float, rng: np.random.Generator, task: Task, scene: Scen
 def _unnamed(task: Task, scene: Scene) -> list[str]:
     """Return categories of objects that the task neither has nor could mean."""
     known = {**task.problem.objects, **task.problem.fixtures}.values()
-    there = scene.pack.categories()
-    return [c for c in _distractor_words() if c not in known and c in there and not _words(task) & _nouns(c)]
+    there, used = scene.pack.categories(), _words(task)
+    return [
+        category
+        for category, words in _distractor_words().items()
+        if category not in known and category in there and not used & set(words or category.split("_"))
+    ]
 
 
 def _words(task: Task) -> set[str]:
@@ -208,10 +212,6 @@ def _words(task: Task) -> set[str]:
 
 def _distractor_words() -> Mapping[str, list[str]]:
     return read_yaml("perturbations/data/distractors.yaml")["categories"]
-
-
-def _nouns(category: str) -> set[str]:
-    return set(_distractor_words().get(category) or category.split("_"))
 
 
 def _free_name(category: str, taken: Iterable[str]) -> str:

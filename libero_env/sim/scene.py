@@ -347,11 +347,16 @@ def scene_spec(
     add_mount(spec, workspace, detailed=faithful)
     _add_zones(spec, problem, name, workspace)
     for entity, category in problem.objects.items():
-        _add_object(spec, entity, pack.build(category) if entities is None else entities[entity])
+        item = pack.build(category) if entities is None else entities[entity]
+        joint = item.spec.body(ROOT_BODY).add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
+        set_damping(joint, item.joint_damping)
+        spec.attach(item.spec, prefix=f"{entity}_", frame=spec.worldbody.add_frame())
     for entity, category in problem.fixtures.items():
         if entity != name:
             item = pack.build(category) if entities is None else entities[entity]
-            _add_fixture(spec, entity, item, fixture_pose(problem, name, workspace, entity, item))
+            body, pose = item.spec.body(ROOT_BODY), fixture_pose(problem, name, workspace, entity, item)
+            body.pos, body.quat = pose[:3], pose[3:]
+            spec.attach(item.spec, prefix=f"{entity}_", frame=spec.worldbody.add_frame())
     if faithful and isinstance(pack, OriginalPack):
         pack.restore_drawing(spec, workspace, problem.scene_properties)
     return spec
@@ -457,15 +462,3 @@ def _add_zones(spec: mujoco.MjSpec, problem: Problem, name: str, workspace: Work
                 rgba=(0.0, 0.0, 0.0, 0.0),
                 group=3,
             )
-
-
-def _add_object(spec: mujoco.MjSpec, name: str, item: ObjectModel) -> None:
-    joint = item.spec.body(ROOT_BODY).add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
-    set_damping(joint, item.joint_damping)
-    spec.attach(item.spec, prefix=f"{name}_", frame=spec.worldbody.add_frame())
-
-
-def _add_fixture(spec: mujoco.MjSpec, name: str, item: ObjectModel, pose: np.ndarray) -> None:
-    body = item.spec.body(ROOT_BODY)
-    body.pos, body.quat = pose[:3], pose[3:]
-    spec.attach(item.spec, prefix=f"{name}_", frame=spec.worldbody.add_frame())

@@ -227,7 +227,7 @@ def test_without_their_files_one_line_says_what_brings_them(tmp_path, monkeypatc
         with pytest.raises(InvalidInputError, match=rf"{variable}.* pip install"):
             get_suite(name)
         monkeypatch.delenv(variable)
-        monkeypatch.setattr("libero_env.tasks.published.suites.metadata.distribution", absent)
+        monkeypatch.setattr("libero_env.assets.published.metadata.distribution", absent)
         with pytest.raises(MissingPackageError, match="type pip install --no-deps"):
             get_suite(name)
     assert published_sizes() == {}

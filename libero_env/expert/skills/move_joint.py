@@ -206,7 +206,8 @@ class MoveJoint(Skill):
         self._previous_value = value
         slow = abs(speed) * max(radius, 0.2) < 0.01
         self._still_steps = self._still_steps + 1 if slow and self._steps > 5 else 0
-        fully_pulled = self._is_fully_pulled(left)
+        is_pulled_door = self.state == "open" and not self._part.slides and self._grasp.gripping
+        fully_pulled = is_pulled_door and abs(left) < 0.05  # it is pushed the rest of the way
         finished = self._is_reached(view) and self._is_settled(left, speed, slow)
         if finished or fully_pulled or self._still_steps > 30:
             self._pulled = fully_pulled
@@ -244,10 +245,6 @@ class MoveJoint(Skill):
         target_speed = min(KNOB_SPEED_GAIN * abs(left) + KNOB_STOP_SPEED, MAX_KNOB_SPEED)
         lead = 0.6 * target_speed + target_speed - speed
         return float(np.clip(lead, MIN_KNOB_LEAD, MAX_KNOB_LEAD))
-
-    def _is_fully_pulled(self, left: float) -> bool:
-        """Return whether a door is as far open as it is pulled; it is pushed the rest of the way."""
-        return self.state == "open" and not self._part.slides and self._grasp.gripping and abs(left) < 0.05
 
     def _release(self, view: StateView) -> np.ndarray:
         if self._steps <= 1:

@@ -15,13 +15,13 @@ from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cache
-from importlib import metadata
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from libero_env.assets.original import LIBERO_PRO
+from libero_env.assets.published import find_distribution
 from libero_env.errors import InvalidInputError, LiberoError, MissingPackageError, UnknownNameError
 from libero_env.objects import object_names
 from libero_env.paths import read_config
@@ -104,10 +104,9 @@ def find_folder(source: Distribution) -> Path | None:
             f"{root} ({source.variable}, or {source.key} in the configuration file) has no folder bddl_files of "
             f"{source.title}: {source.remedy}"
         )
-    try:
-        folder = Path(str(metadata.distribution(source.package).locate_file(source.folder)))
-    except metadata.PackageNotFoundError:
+    if (distribution := find_distribution(source.package)) is None:
         return None
+    folder = Path(str(distribution.locate_file(source.folder)))
     return folder if (folder / "bddl_files").is_dir() else None
 
 
@@ -290,7 +289,7 @@ def _task(
     """Return a task of a suite; `variant` is None in LIBERO-PRO."""
     origin, states = _SUITES[suite], folder / "init_files"
     if variant is not None:
-        name, kind = variant.name, variant.kind
+        name, kind = variant.name, str(variant.kind)
         file = folder / "bddl_files" / base.suite / f"{variant.file}.bddl"
         is_moved, is_reworded = variant.has_own_start, variant.language is not None
         problem = _read(file) if is_moved or is_reworded else base.problem
