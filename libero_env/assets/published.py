@@ -27,7 +27,7 @@ from types import MappingProxyType
 from libero_env.assets.downloads import DownloadError, Remote, git_digest
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.paths import cache_dir
-from libero_env.storage import read_cached_record, write_cached_record
+from libero_env.storage import cached_record
 
 COMMIT = "8f1084e3132a39270c3a13ebe37270a43ece2a01"
 ALLOW = "LIBERO_ASSETS_MODIFIED"
@@ -141,14 +141,15 @@ def require_undamaged(root: Path) -> None:
 def check_folder(root: Path) -> FolderCheck:
     """Compare a folder with the published files, once in a process, and with the result in the cache if it is there."""
     stamps = {name: (stat.st_size, stat.st_mtime_ns) for name, stat in _walk(root)}
-    stamp = hashlib.sha256(repr(([(n, *stamps[n]) for n in sorted(stamps)], published_digest())).encode())
-    stored = cache_dir() / "assets_checked" / f"{hashlib.sha256(str(root).encode()).hexdigest()[:16]}.json"
-    if (record := read_cached_record(stored)) is not None and record.get("stamp") == stamp.hexdigest():
-        fields = ("missing", "replaced", "damaged")
-        return FolderCheck(record["digest"], *(tuple(record[field]) for field in fields))
-    result = _compare(root, {name: size for name, (size, _) in stamps.items()})
-    write_cached_record(stored, {"folder": str(root), "stamp": stamp.hexdigest(), **asdict(result)})
-    return result
+    content = repr(([(n, *stamps[n]) for n in sorted(stamps)], published_digest()))
+    stamp = hashlib.sha256(content.encode()).hexdigest()
+    sizes = {name: size for name, (size, _) in stamps.items()}
+    record = cached_record(
+        cache_dir() / "assets_checked" / f"{hashlib.sha256(str(root).encode()).hexdigest()[:16]}.json",
+        lambda: {"folder": str(root), "stamp": stamp, **asdict(_compare(root, sizes))},
+        lambda stored: stored.get("stamp") == stamp,
+    )
+    return FolderCheck(record["digest"], *(tuple(record[key]) for key in ("missing", "replaced", "damaged")))
 
 
 def _compare(root: Path, sizes: Mapping[str, int]) -> FolderCheck:

@@ -134,7 +134,8 @@ def certify(
     """
     pack = select_pack(assets)
     found = [Certificate(task.id, task.name, _digest(task, pack, disturb)) for task in tasks]
-    paths = [_path(out, task, disturb) if out else None for task in tasks]
+    ending = "-disturbed" if disturb else ""
+    paths = [out / "tasks" / task.suite / f"{task.name}{ending}.json" if out else None for task in tasks]
     if not again:
         found = [_stored(path, empty) if path else empty for path, empty in zip(paths, found, strict=True)]
     chunks = [(k, chunk) for k, known in enumerate(found) for chunk in _missing(known, states)]
@@ -148,7 +149,7 @@ def certify(
             merged = {o.state: o for o in (*found[k].outcomes, *outcomes)}
             found[k] = replace(found[k], outcomes=tuple(merged[i] for i in sorted(merged)))
             if path := paths[k]:
-                _store(path, found[k])
+                write_json(path, found[k])
             bar.update(len(outcomes))
     return [replace(c, outcomes=tuple(o for o in c.outcomes if o.state < states)) for c in found]
 
@@ -295,10 +296,6 @@ def _digest(task: Task, pack: Pack, disturb: bool) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
-def _path(folder: Path, task: Task, disturb: bool) -> Path:
-    return folder / "tasks" / task.suite / f"{task.name}{'-disturbed' if disturb else ''}.json"
-
-
 def _stored(path: Path, empty: Certificate) -> Certificate:
     """Return the certificate on disk if it is of the same scene and expert."""
     if not path.is_file():
@@ -309,10 +306,6 @@ def _stored(path: Path, empty: Certificate) -> Certificate:
     except (ValueError, KeyError, TypeError) as error:
         raise LiberoError(f"{path} is not a certificate ({error}); remove it, or run with --again") from error
     return replace(empty, outcomes=outcomes) if found.get("digest") == empty.digest else empty
-
-
-def _store(path: Path, certificate: Certificate) -> None:
-    write_json(path, certificate)
 
 
 def _label(certificate: Certificate) -> str:

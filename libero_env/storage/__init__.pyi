@@ -2,12 +2,11 @@ from .arrays import Arrays, atomic_write_npz, read_npz, read_packaged_npz, read_
 from .caches import (
     cached_arrays,
     cached_folder,
+    cached_record,
     check_trusted,
     make_cache_folder,
     read_cache,
-    read_cached_record,
     write_cache,
-    write_cached_record,
 )
 from .files import (
     PART_SUFFIX,
@@ -33,6 +32,7 @@ __all__ = [
     "atomic_write_text",
     "cached_arrays",
     "cached_folder",
+    "cached_record",
     "check_trusted",
     "create_text",
     "make_cache_folder",
@@ -40,7 +40,6 @@ __all__ = [
     "parse_yaml",
     "parse_yaml_text",
     "read_cache",
-    "read_cached_record",
     "read_json",
     "read_npz",
     "read_packaged_npz",
@@ -49,7 +48,6 @@ __all__ = [
     "read_yaml_file",
     "sync_folder",
     "write_cache",
-    "write_cached_record",
     "write_json",
     "write_record",
 ]

@@ -73,14 +73,16 @@ def write_cache(path: Path, arrays: Mapping[str, Any]) -> None:
     _write_cached(path, lambda: atomic_write_npz(path, arrays, fsync=True))
 
 
-def read_cached_record(path: Path) -> dict[str, Any] | None:
-    """Return the data of a cache file of `write_cached_record`; None where there is none that is intact and trusted."""
-    return read_record(path) if _is_trusted(path.parent) else None
-
-
-def write_cached_record(path: Path, record: Mapping[str, Any]) -> None:
-    """Write plain data to a cache file; where that is not possible, one line of the log says so."""
-    _write_cached(path, lambda: write_record(path, record))
+def cached_record(
+    path: Path, make: Callable[[], Mapping[str, Any]], fits: Callable[[Mapping[str, Any]], bool]
+) -> Mapping[str, Any]:
+    """Return the plain data of a cache file; where there is none that is intact and fits, make it and write it."""
+    record = read_record(path) if _is_trusted(path.parent) else None
+    if record is not None and fits(record):
+        return record
+    made = make()
+    _write_cached(path, lambda: write_record(path, made))
+    return made
 
 
 def _write_cached(path: Path, write: Callable[[], None]) -> None:
