@@ -84,9 +84,9 @@ def assign(node: Any, key: str, value: Any) -> None:
 def notes(cfg: Any) -> list[str]:
     """Return one line for each key that was changed but has no effect."""
     current, defaults = OmegaConf.create(plain(cfg)), OmegaConf.create(plain(load_config()))
-    found = {key: OmegaConf.select(defaults, key) for key in NO_EFFECT}
-    values = {key: OmegaConf.select(current, key, default=default) for key, default in found.items()}
-    changed = [key for key in NO_EFFECT if values[key] != found[key]]
+    usual = {key: OmegaConf.select(defaults, key) for key in NO_EFFECT}
+    values = {key: OmegaConf.select(current, key, default=default) for key, default in usual.items()}
+    changed = [key for key in NO_EFFECT if values[key] != usual[key]]
     return [f"{key}={values[key]} has no effect: {NO_EFFECT[key]}" for key in changed]
 
 

@@ -256,7 +256,7 @@ def unpack(archive: Path, folder: Path, *, overwrite: bool = False) -> list[Path
         DownloadError: The archive is damaged, encrypted, or has links, names that lead out of the folder, one name
             twice, or much more content than bytes; then nothing is written, or only complete files.
     """
-    kept: list[Path] = []
+    skipped: list[Path] = []
     try:
         with zipfile.ZipFile(archive) as source:
             entries = [entry for entry in source.infolist() if not entry.is_dir()]
@@ -265,7 +265,7 @@ def unpack(archive: Path, folder: Path, *, overwrite: bool = False) -> list[Path
             for entry in entries:
                 target = folder / entry.filename
                 if target.exists() and not overwrite:
-                    kept.append(target)
+                    skipped.append(target)
                 else:
                     _write(source, entry, target)
     except (
@@ -279,7 +279,7 @@ def unpack(archive: Path, folder: Path, *, overwrite: bool = False) -> list[Path
         raise DownloadError(f"{archive}: the archive is damaged ({error})") from error
     except OSError as error:
         raise DownloadError(f"{archive}: it cannot be unpacked: {error}") from error
-    return kept
+    return skipped
 
 
 def _write(source: zipfile.ZipFile, entry: zipfile.ZipInfo, target: Path) -> None:

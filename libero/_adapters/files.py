@@ -79,13 +79,11 @@ def _ensure_files(root: Path, contents: Callable[[], Iterator[tuple[str, bytes]]
 def _replace(path: Path, content: bytes) -> str:
     """Write a file unless it has this content; a file with other content, perhaps somebody's own, is kept beside it."""
     digest = hashlib.sha256(content).hexdigest()
-    if (found := _digest(path)) != digest:
-        if found is not None:
-            kept = path.with_name(f"{path.name}.changed")
-            path.replace(kept)
-            _log.warning(
-                "%s has changed since it was written; it is written again, and kept as %s", path, kept.name
-            )
+    if (present := _digest(path)) != digest:
+        if present is not None:
+            backup = path.with_name(f"{path.name}.changed")
+            path.replace(backup)
+            _log.warning("%s has changed since it was written; it is kept as %s", path, backup.name)
         make_cache_folder(path.parent)
         with atomic_path(path) as temporary, open(temporary, "wb", opener=open_for_owner) as file:
             file.write(content)

@@ -52,8 +52,8 @@ def model_of(item: Any, category: str) -> ObjectModel:
     rotation = getattr(item, "rotation", None)
     if rotation is not None and not isinstance(rotation, Mapping):
         rotation = {axis or "z": rotation}
-    given = (getattr(item, "object_properties", None) or {}).get("articulation", {})
-    articulation = {state: given.get(f"default_{state}_ranges") for state in STATES}
+    ranges = (getattr(item, "object_properties", None) or {}).get("articulation", {})
+    articulation = {state: ranges.get(f"default_{state}_ranges") for state in STATES}
     place: dict[str, Any] = {name: offsets[name] for name in OFFSETS}
     return ObjectModel(
         category=category,
@@ -75,7 +75,7 @@ def accept_plain_files(target_class: Any) -> None:
     def subtree(self: Any) -> Any:
         path = Path(self.file)
         body = arrange_body(self.worldbody, path)
-        outer = next(found for found in self.worldbody.iter("body") if body in list(found))
+        outer = next(parent for parent in self.worldbody.iter("body") if body in list(parent))
         for name, pos in read_object(path, "object")[1].items():
             if outer.find(f"site[@name='{name}_site']") is None:
                 site = {"name": f"{name}_site", "pos": " ".join(map(str, pos))}
@@ -131,7 +131,7 @@ def arrange_body(world: Element, path: Path) -> Element:
     """
     body = world.find("body/body[@name='object']")
     if body is None:
-        body = next((found for found in world.iter("body") if found.find("geom") is not None), None)
+        body = next((one for one in world.iter("body") if one.find("geom") is not None), None)
         if body is None:
             raise LiberoError(
                 f"{path}: no body with a geom; expected <worldbody><body><geom .../></body></worldbody>"

@@ -85,11 +85,11 @@ class Observer:
     def observe(self) -> "OrderedDict[str, np.ndarray]":
         """Return all observations of the state whose kinematics are computed."""
         robot, pictures, objects = self._robot(), self._pictures(), self._objects()
-        found = OrderedDict({**robot, **pictures, **objects})
-        found["robot0_proprio-state"] = np.concatenate(list(robot.values()))
+        values = OrderedDict({**robot, **pictures, **objects})
+        values["robot0_proprio-state"] = np.concatenate(list(robot.values()))
         if objects:
-            found["object-state"] = np.concatenate(list(objects.values()))
-        return found
+            values["object-state"] = np.concatenate(list(objects.values()))
+        return values
 
     def groups(self) -> dict[str, list[str]]:
         """Return the names of the observations, without the concatenated ones, by robosuite's modality."""
@@ -124,7 +124,7 @@ class Observer:
         return self.sim.data.get_site_xpos(GRIP_SITE), self.sim.data.get_body_xquat("robot0_right_hand")
 
     def _objects(self) -> dict[str, np.ndarray]:
-        found: dict[str, np.ndarray] = {}
+        values: dict[str, np.ndarray] = {}
         grip_pos, grip_quat = self._grip()
         inverse = np.empty(4)
         mujoco.mju_negQuat(inverse, grip_quat)
@@ -134,28 +134,28 @@ class Observer:
             quat = self.sim.data.get_body_xquat(f"{name}_main")
             relative = np.empty(4)
             mujoco.mju_mulQuat(relative, inverse, quat)
-            found[f"{name}_pos"], found[f"{name}_quat"] = pos.copy(), np.roll(quat, -1)
-            found[f"{name}_to_robot0_eef_pos"] = rotation @ (pos - grip_pos)
-            found[f"{name}_to_robot0_eef_quat"] = np.roll(relative if relative[0] >= 0 else -relative, -1)
-        return found
+            values[f"{name}_pos"], values[f"{name}_quat"] = pos.copy(), np.roll(quat, -1)
+            values[f"{name}_to_robot0_eef_pos"] = rotation @ (pos - grip_pos)
+            values[f"{name}_to_robot0_eef_quat"] = np.roll(relative if relative[0] >= 0 else -relative, -1)
+        return values
 
     def _pictures(self) -> dict[str, np.ndarray]:
-        found: dict[str, np.ndarray] = {}
+        values: dict[str, np.ndarray] = {}
         for camera in self.cameras:
             render = partial(self.sim.render, camera.width, camera.height, camera_name=camera.name)
             if camera.depth:
                 image, depth = render(depth=True)
-                found[f"{camera.name}_image"], found[f"{camera.name}_depth"] = image, depth[..., None]
+                values[f"{camera.name}_image"], values[f"{camera.name}_depth"] = image, depth[..., None]
             else:
-                found[f"{camera.name}_image"] = render()
+                values[f"{camera.name}_image"] = render()
             if camera.segmentations:
                 for kind in camera.segmentations:
                     element = kind == "element"
                     numbers = render(segmentation=True, hidden_sites=element)[..., 1:]
                     # the background, -1, is the last entry
                     numbers = numbers if element else self.segments[kind][numbers]
-                    found[f"{camera.name}_segmentation_{kind}"] = numbers.astype(np.int32)
-        return {key: np.ascontiguousarray(value) for key, value in found.items()}
+                    values[f"{camera.name}_segmentation_{kind}"] = numbers.astype(np.int32)
+        return {key: np.ascontiguousarray(value) for key, value in values.items()}
 
 
 _SETTERS = ("sensor", "corrupter", "filter", "delayer", "sampling_rate", "enabled", "active")
@@ -243,9 +243,9 @@ class RobosuiteMethods:
 
     def get_contacts(self, model: Any) -> set[str]:
         """Return the names of the geoms that touch an object, without its own."""
-        own = _geoms(model)
+        geoms = _geoms(model)
         pairs = [pair for touching in self._contacts() for pair in (touching, touching[::-1])]
-        return {b for a, b in pairs if a in own and b not in own}
+        return {b for a, b in pairs if a in geoms and b not in geoms}
 
     def _check_grasp(self, gripper: Any, object_geoms: Any) -> bool:
         """Return whether each finger pad of the gripper, or each given group of geoms, touches the object."""
@@ -314,10 +314,10 @@ class RobosuiteMethods:
 
     def _observe(self) -> "OrderedDict[str, np.ndarray]":
         """Return the observations of the present state, as the observables have them."""
-        found = self.observer.observe()
+        values = self.observer.observe()
         if all(isinstance(o, Observable) and o.is_plain for o in self._observables.values()):
-            return found
-        cache: dict[str, Any] = {name: value for name, value in found.items() if name in self._observables}
+            return values
+        cache: dict[str, Any] = {name: value for name, value in values.items() if name in self._observables}
         active: OrderedDict[str, np.ndarray] = OrderedDict()
         groups: dict[str, list[np.ndarray]] = {}
         for name, observable in self._observables.items():

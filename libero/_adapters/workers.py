@@ -362,15 +362,15 @@ class SubprocEnvWorker(_HostWorker):
     @staticmethod
     def wait(workers: "list[EnvWorker]", wait_num: int, timeout: float | None = None) -> "list[EnvWorker]":
         """Return the workers that are ready: at least `wait_num`, or fewer after `timeout` seconds."""
-        own = [worker for worker in workers if isinstance(worker, SubprocEnvWorker)]
-        remotes: dict[Any, SubprocEnvWorker] = {worker.parent_remote: worker for worker in own}
+        processes = [worker for worker in workers if isinstance(worker, SubprocEnvWorker)]
+        remotes: dict[Any, SubprocEnvWorker] = {worker.parent_remote: worker for worker in processes}
         end = time.monotonic() + (math.inf if timeout is None else timeout)
         ready: list[EnvWorker] = []
         while remotes and len(ready) < wait_num:
             late = [remote for remote, worker in remotes.items() if not worker.seconds_left]
             left = min(end - time.monotonic(), *(worker.seconds_left for worker in remotes.values()))
-            found = late or connection.wait(list(remotes), max(0.0, left))
-            ready += [remotes.pop(remote) for remote in found]
-            if not found and time.monotonic() >= end:
+            answered = late or connection.wait(list(remotes), max(0.0, left))
+            ready += [remotes.pop(remote) for remote in answered]
+            if not answered and time.monotonic() >= end:
                 break
         return ready

@@ -141,8 +141,8 @@ def get_dataset(
         with open_demo_file(path) as handle:
             names = set(subset_names(handle, path, filter_key))
         demos = read_demos(path, [*views, *proprio], **reading)
-        kept = [demo for demo in demos if demo.name in names]
-        windows = Windows.from_demos(kept, spec=spec, language=torch.zeros(1), source=str(path))
+        chosen = [demo for demo in demos if demo.name in names]
+        windows = Windows.from_demos(chosen, spec=spec, language=torch.zeros(1), source=str(path))
     all_shapes = dict.fromkeys(views, (3, *spec.image_size)) | {name: shapes[name] for name in proprio}
     shape_meta = {
         "ac_dim": spec.action_dim,

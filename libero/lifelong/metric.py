@@ -141,12 +141,12 @@ def evaluate_success(
         key: Key in `result_summary`; by default `k<last task>_p<task>` for each task.
     """
     algo.eval()
-    kept: Mapping[str, Any] = (result_summary or {}) if cfg.eval.save_sim_states else {}
+    stored: Mapping[str, Any] = (result_summary or {}) if cfg.eval.save_sim_states else {}
     rates = []
     for i in task_ids:
-        states = kept.get(key or f"k{task_ids[-1]}_p{i}")
-        given = benchmark.get_task(i), benchmark.get_task_emb(i), i, states
-        rates.append(evaluate_one_task_success(cfg, algo, *given, selecting=selecting))
+        states = stored.get(key or f"k{task_ids[-1]}_p{i}")
+        arguments = benchmark.get_task(i), benchmark.get_task_emb(i), i, states
+        rates.append(evaluate_one_task_success(cfg, algo, *arguments, selecting=selecting))
     return np.array(rates)
 
 
@@ -182,9 +182,9 @@ def native_task(task: Any, bddl_folder: str | None) -> Task:
     """Return a benchmark's task as a `Task`: that of the suite, unless the folder has another file of its name."""
     path = Path(bddl_folder or "", task.problem_folder, task.bddl_file)
     tasks = get_suite(task.problem_folder).tasks if task.problem_folder in suite_names() else ()
-    known = next((t for t in tasks if f"{t.name}.bddl" == task.bddl_file), None)
-    if known is not None and (not path.is_file() or path.read_text(encoding="utf-8") == known.bddl_text):
-        return known
+    native = next((t for t in tasks if f"{t.name}.bddl" == task.bddl_file), None)
+    if native is not None and (not path.is_file() or path.read_text(encoding="utf-8") == native.bddl_text):
+        return native
     return read_task(path)
 
 

@@ -72,12 +72,12 @@ def checkpoint_path(request: Evaluation) -> Path:
     """
     cfg = load_config(f"lifelong={request.algo}", f"policy={request.policy}")
     name = f"{cfg.lifelong.algo}/{cfg.policy.policy_type}_seed{request.seed}"
-    found = sorted(p for p in Path(request.experiment_dir).glob(f"*/{name}") if p.is_dir())
-    roots = [p for p in found if p.parts[-3].lower() == request.benchmark.lower()]
+    runs = sorted(p for p in Path(request.experiment_dir).glob(f"*/{name}") if p.is_dir())
+    roots = [p for p in runs if p.parts[-3].lower() == request.benchmark.lower()]
     if not roots:
         raise CheckpointError(
             f"no run {request.benchmark}/{name} in {request.experiment_dir}; there is "
-            f"{', '.join(map(str, found)) or 'none of this name'}"
+            f"{', '.join(map(str, runs)) or 'none of this name'}"
         )
     folder = roots[0] / f"run_{request.run:03d}" if request.run else latest_run(roots[0])
     if request.algo == "multitask":
@@ -94,8 +94,8 @@ def checkpoint_path(request: Evaluation) -> Path:
 def _loss(cfg: Any, algo: Sequential, benchmark: Any, task_id: int) -> float:
     """Return the loss on the task's demonstrations, NaN if there are none; none are generated for it."""
     name = benchmark.get_task_demonstration(task_id)
-    known = [Path(cfg.folder, name), *map(Path, cfg.get("demonstrations") or ())]
-    path = next((p for p in known if p.name == Path(name).name and p.exists()), None)
+    paths = [Path(cfg.folder, name), *map(Path, cfg.get("demonstrations") or ())]
+    path = next((p for p in paths if p.name == Path(name).name and p.exists()), None)
     if path is None:
         return float("nan")
     windows, _ = get_dataset(path, cfg.data.obs.modality, seq_len=cfg.data.seq_len)

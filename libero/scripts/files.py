@@ -93,10 +93,10 @@ def shasum_files(paths: Positional[tuple[Path, ...]] = (), *, check: Path | None
     if check:
         return _compare(check)
     roots = paths or [datasets_folder()]
-    found = [f for root in roots for f in (root, *sorted(root.rglob("*"))) if f.is_file()]
-    if not found:
+    all_files = [f for root in roots for f in (root, *sorted(root.rglob("*"))) if f.is_file()]
+    if not all_files:
         raise LiberoError(f"no files in {', '.join(map(str, roots))}")
-    for file in tqdm(found, unit="file", disable=None):
+    for file in tqdm(all_files, unit="file", disable=None):
         tqdm.write(f"{_digest(file)}  {file}")
     return 0
 

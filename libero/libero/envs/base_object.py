@@ -88,8 +88,8 @@ class BaseObject:
     @property
     def joints(self) -> list[str]:
         """Names of its joints; the free joint, if any, is the first."""
-        own = [name for name in self._names(self.model.spec.joints) if name != f"{self.name}_joint0"]
-        return own if self._fixed else [f"{self.name}_joint0", *own]
+        joints = [name for name in self._names(self.model.spec.joints) if name != f"{self.name}_joint0"]
+        return joints if self._fixed else [f"{self.name}_joint0", *joints]
 
     @property
     def important_sites(self) -> dict[str, str]:

@@ -253,12 +253,12 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def _sample(self) -> Start:
         """Return a settled initial state; the arm holds its pose, whatever the controller."""
-        own, self.simulations.controller_state = self.simulations.controller_state, ControllerState(1)
+        controller, self.simulations.controller_state = self.simulations.controller_state, ControllerState(1)
         try:
             fixtures = None if self._resets is None else self._resets.reset()
             return sample_settled(self.scene, self.simulations, 0, self.rng, fixtures)
         finally:
-            self.simulations.controller_state = own
+            self.simulations.controller_state = controller
 
     def restart(self, state: np.ndarray) -> None:
         """Start from [time, qpos, qvel], with or without the poses of the fixtures after it; the arm holds its pose.
@@ -333,11 +333,11 @@ class BDDLBaseDomain(RobosuiteMethods):
         return all(map(self._eval_predicate, self.parsed_problem["goal_state"]))
 
     def _eval_predicate(self, state: Sequence[Any]) -> bool:
-        """Return the truth of an atom, `["on", "a_1", "b_1"]`, or of a nested goal; case does not matter."""
+        """Return whether an atom holds, `["on", "a_1", "b_1"]`, or a nested goal; case does not matter."""
         if state[0].lower() in ("and", "or", "not", "forall"):
             return evaluate(BDDLUtils.as_expression(list(state)), self.view)
-        known = self.object_states_dict
-        states = [lookup(known, "object, fixture or region", name) for name in state[1:]]
+        entities = self.object_states_dict
+        states = [lookup(entities, "object, fixture or region", name) for name in state[1:]]
         return bool(eval_predicate_fn(state[0], *states))
 
     # Observations -------------------------------------------------------------------------------------------
@@ -370,8 +370,8 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def get_object(self, object_name: str) -> Any:
         """Return the object, fixture or region of this name; raise an UnknownNameError if there is none."""
-        known = {**self.objects_dict, **self.fixtures_dict, **self.object_sites_dict}
-        return lookup(known, "object, fixture or region", object_name)
+        entities = {**self.objects_dict, **self.fixtures_dict, **self.object_sites_dict}
+        return lookup(entities, "object, fixture or region", object_name)
 
     language_instruction = property(attrgetter("problem.language"), doc="Instruction in the task file.")
     action_spec = property(lambda self: self.robots[0].action_limits, doc="Lowest and highest action.")
@@ -423,12 +423,12 @@ class BDDLBaseDomain(RobosuiteMethods):
     def _check_names(self, model: mujoco.MjModel) -> None:
         """Raise a LiberoError unless a model has the joints and sites of the task, in their order."""
         for kind, count in (("joint", "njnt"), ("site", "nsite")):
-            own, other = (
+            expected, present = (
                 [getattr(m, kind)(i).name for i in range(getattr(m, count))]
                 for m in (self.scene.model, model)
             )
-            missing = [name for name in own if name and name not in other]
-            if missing or (kind == "joint" and own != other):
+            missing = [name for name in expected if name and name not in present]
+            if missing or (kind == "joint" and expected != present):
                 named = missing[0] if missing else "the joints in their order"
                 raise LiberoError(
                     f"the model lacks {kind} {named!r} of {self.bddl_file_name}: is it of another task?"

@@ -97,10 +97,10 @@ def as_expression(state: list[Any]) -> Expression:
 
 
 def _by_category(names: Mapping[str, str]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
+    by_category: dict[str, list[str]] = {}
     for name, category in names.items():
-        found.setdefault(category, []).append(name)
-    return found
+        by_category.setdefault(category, []).append(name)
+    return by_category
 
 
 def task_file(name: str | os.PathLike) -> str:
@@ -115,5 +115,5 @@ def task_file(name: str | os.PathLike) -> str:
         return str(name)
     suites = [path.parent.name] if into_checkout else list(suite_tasks())
     files = [Path(get_libero_path("bddl_files"), suite, path.name) for suite in suites]
-    found = [file for file in files if file.exists()]
-    return str(found[0]) if len(found) == 1 else str(name)
+    existing = [file for file in files if file.exists()]
+    return str(existing[0]) if len(existing) == 1 else str(name)

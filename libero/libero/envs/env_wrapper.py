@@ -58,14 +58,14 @@ class ControlEnv:
         renderer_config: Any = None,
         **kwargs: Any,
     ):
-        given = {key: value for key, value in locals().items() if key not in _NOT_FORWARDED}
+        arguments = {key: value for key, value in locals().items() if key not in _NOT_FORWARDED}
         info = BDDLUtils.get_problem_info(bddl_file_name)
         self.problem_name, self.domain_name = info["problem_name"], info["domain_name"]
         self.language_instruction = info["language_instruction"]
         self.env: BDDLBaseDomain = lookup(TASK_MAPPING, "problem", self.problem_name)(
             bddl_file_name,
             controller_configs={"type": controller} if isinstance(controller, str) else controller,
-            **given,
+            **arguments,
             **kwargs,
         )
 
@@ -172,15 +172,15 @@ class SegmentationRenderEnv(OffScreenRenderEnv):
     def get_segmentation_instances(self, segmentation_image: np.ndarray) -> dict[str, np.ndarray]:
         """Return the picture of each instance, and of `robot`, with everything else 0."""
         image, robot = segmentation_image, self.segmentation_robot_id + 1
-        found = {"robot": np.where(image >= robot, robot, 0)}
-        return found | {name: np.where(image == i, i, 0) for name, i in self.instance_to_id.items()}
+        pictures = {"robot": np.where(image >= robot, robot, 0)}
+        return pictures | {name: np.where(image == i, i, 0) for name, i in self.instance_to_id.items()}
 
     def get_segmentation_of_interest(self, segmentation_image: np.ndarray) -> np.ndarray:
         """Return a picture with 1 for objects of interest, -1 for the background, and 0 elsewhere."""
-        found = np.where(segmentation_image == 0, -1, 0).astype(segmentation_image.dtype)
+        picture = np.where(segmentation_image == 0, -1, 0).astype(segmentation_image.dtype)
         ids = [self.instance_to_id[name] for name in self.obj_of_interest if name in self.instance_to_id]
-        found[np.isin(segmentation_image, ids)] = 1
-        return found
+        picture[np.isin(segmentation_image, ids)] = 1
+        return picture
 
     def segmentation_to_rgb(self, seg_im: np.ndarray, random_colors: bool = False) -> np.ndarray:
         """Return a colour for each number, (H, W, 3) uint8: evenly spread hues, or random ones of a fixed seed."""

@@ -29,22 +29,22 @@ def scene_fixtures(scene: Scene) -> dict[str, Any]:
 
 
 def _instance(name: str, model: ObjectModel) -> BaseObject:
-    found = OBJECTS_DICT.get(model.category)
-    if found is None:  # a category that is registered only with `libero_env`
-        found = type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
-        return found(name=name, model=model)
-    ours = issubclass(found, BuiltinObject) and model.category in builtin_names()
-    return found(name=name, model=model) if ours else found(name=name)
+    cls = OBJECTS_DICT.get(model.category)
+    if cls is None:  # a category that is registered only with `libero_env`
+        cls = type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
+        return cls(name=name, model=model)
+    is_builtin = issubclass(cls, BuiltinObject) and model.category in builtin_names()
+    return cls(name=name, model=model) if is_builtin else cls(name=name)
 
 
 def scene_sites(scene: Scene) -> dict[str, SiteObject]:
     """Return the regions by address."""
-    model, found = scene.model, {}
+    model, sites = scene.model, {}
     for region in scene.problem.regions:
         site = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, region.address)
         if site >= 0:
             joints = [model.joint(j).name for j in scene.joints.get(region.address, ())]
-            found[region.address] = SiteObject(
+            sites[region.address] = SiteObject(
                 region.address,
                 region.target,
                 joints=joints,
@@ -53,7 +53,7 @@ def scene_sites(scene: Scene) -> dict[str, SiteObject]:
                 site_pos=model.site_pos[site].copy(),
                 site_quat=model.site_quat[site].copy(),
             )
-    return found
+    return sites
 
 
 class TaskModel:
@@ -72,7 +72,7 @@ class TaskModel:
         categories = {name: item.category for name, item in scene.entities.items()}
         classes = {name: getattr(OBJECTS_DICT.get(c), "__name__", c) for name, c in categories.items()}
         classes |= {name: name.removesuffix("0") for name in robot}
-        self.instances_to_ids = {name: _ids(model, own) for name, own in (bodies | robot).items()}
+        self.instances_to_ids = {name: _ids(model, indices) for name, indices in (bodies | robot).items()}
         self.classes_to_ids: dict[str, dict[str, list[int]]] = {}
         for name, ids in self.instances_to_ids.items():
             of_class = self.classes_to_ids.setdefault(classes[name], {"geom": [], "site": []})

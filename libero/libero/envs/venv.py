@@ -127,11 +127,11 @@ class BaseVectorEnv:
         """Wait for some environments, and move them from waiting to ready."""
         if not self.waiting_id:
             raise InvalidInputError("no environment is at a step; give some an action first")
-        found: list[EnvWorker] = []
-        while not found:
+        ready: list[EnvWorker] = []
+        while not ready:
             waiting = [self.workers[i] for i in self.waiting_id]
-            found = self.worker_class.wait(waiting, self.wait_num, self.timeout)
-        ids = [i for i in self.waiting_id if self.workers[i] in found]
+            ready = self.worker_class.wait(waiting, self.wait_num, self.timeout)
+        ids = [i for i in self.waiting_id if self.workers[i] in ready]
         self.waiting_id = [i for i in self.waiting_id if i not in ids]
         self.ready_id += ids
         return ids

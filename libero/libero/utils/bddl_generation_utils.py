@@ -94,13 +94,13 @@ def object_naming_mapping(object_name: str) -> str:
 
 def get_object_dict(object_num_info: Mapping[str, int]) -> ObjectDict:
     """Return category -> names, from category -> number; a workspace keeps its own name."""
-    found = ObjectDict()
+    objects = ObjectDict()
     for category, count in object_num_info.items():
         if category in WORKSPACE_CATEGORIES:
-            found[WORKSPACE_CATEGORIES[category]] = [category]
+            objects[WORKSPACE_CATEGORIES[category]] = [category]
         else:
-            found.setdefault(category, []).extend(f"{category}_{i}" for i in range(1, count + 1))
-    return found
+            objects.setdefault(category, []).extend(f"{category}_{i}" for i in range(1, count + 1))
+    return objects
 
 
 def get_objects_of_interest(objects_of_interest: Iterable[str]) -> tuple[str, ...]:

@@ -39,7 +39,7 @@ def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, ve
         ]
         lengths, actions = np.array([len(row) for row in rows]), np.concatenate(rows)
         structure = {name: _shapes(data[name]) for name in names}
-        found, first = file_attributes(file, path), structure[names[0]]
+        attributes, first = file_attributes(file, path), structure[names[0]]
     info = {
         "demos": len(names),
         "transitions": int(lengths.sum()),
@@ -50,7 +50,7 @@ def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, ve
         "action_min": float(actions.min()),
         "action_max": float(actions.max()),
         "observations": {key[4:]: shape[1:] for key, shape in first.items() if key.startswith("obs/")},
-        "attributes": {key: value for key, value in found.items() if key != "bddl_file_content"},
+        "attributes": {key: value for key, value in attributes.items() if key != "bddl_file_content"},
         "structure": structure,
     }
     for key, value in info.items() if verbose else ():
@@ -61,6 +61,6 @@ def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, ve
 
 def _shapes(group: Any) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the arrays in a group by path."""
-    found: dict[str, tuple[int, ...]] = {}
-    group.visititems(lambda name, item: found.update({name: item.shape}) if hasattr(item, "shape") else None)
-    return found
+    shapes: dict[str, tuple[int, ...]] = {}
+    group.visititems(lambda name, item: shapes.update({name: item.shape}) if hasattr(item, "shape") else None)
+    return shapes

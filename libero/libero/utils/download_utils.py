@@ -66,14 +66,14 @@ def download_url(url: str, download_dir: Dir, check_overwrite: bool = True, is_z
     if not is_zipfile:
         return file
     try:
-        kept = unpack(file, folder, overwrite=not check_overwrite)
+        skipped = unpack(file, folder, overwrite=not check_overwrite)
     except DownloadError as error:
         if exists:
             raise DownloadError(f"{error}; it was there before: remove it, and try again") from error
         file.unlink()
         raise DownloadError(f"{url}: {error}; it was removed, try again") from error
-    if kept:
-        print(f"kept are {len(kept)} files that exist, such as {kept[0]}")
+    if skipped:
+        print(f"kept are {len(skipped)} files that exist, such as {skipped[0]}")
     if not exists:
         file.unlink()
     return folder

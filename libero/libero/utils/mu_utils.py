@@ -171,12 +171,12 @@ class BenchmarkScene(InitialSceneTemplates):
 
 def _scenes(scene_type: str, number: int) -> dict[str, type[BenchmarkScene]]:
     """Register `KitchenScene1` and so on, and return them by name."""
-    found = {}
+    scenes = {}
     for i in range(1, number + 1):
         name, scene = f"{scene_type.title().replace('_', '')}Scene{i}", f"{scene_type}_scene{i}"
         facts = {"__module__": "libero.libero.benchmark.mu_creation", "__doc__": f"`{scene}`", "scene": scene}
-        found[name] = register_mu(scene_type)(type(name, (BenchmarkScene,), facts))
-    return found
+        scenes[name] = register_mu(scene_type)(type(name, (BenchmarkScene,), facts))
+    return scenes
 
 
 BENCHMARK_SCENES = _scenes("kitchen", 10) | _scenes("living_room", 6) | _scenes("study", 4)

@@ -22,7 +22,7 @@ def get_affordance_regions(objects: Iterable[str], verbose: bool = False) -> dic
 
     Categories without regions or without a model are left out; one that does not exist raises an UnknownNameError.
     """
-    pack, found = facade_pack(), {}
+    pack, regions = facade_pack(), {}
     for category in objects:
         if category in EXCEPTION_DICT:
             names = EXCEPTION_DICT[category]
@@ -35,8 +35,8 @@ def get_affordance_regions(objects: Iterable[str], verbose: bool = False) -> dic
                 continue
             names = [site.name for site in sites if site.type == mujoco.mjtGeom.mjGEOM_BOX]
         if names:
-            found[category] = list(names)
+            regions[category] = list(names)
     if verbose:
-        for category, names in found.items():
+        for category, names in regions.items():
             print(f"{category}: {', '.join(names)}")
-    return found
+    return regions

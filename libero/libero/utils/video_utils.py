@@ -63,8 +63,8 @@ class VideoWriter:
         self, obs: Sequence[Obs], dones: Sequence[bool], camera_name: str = "agentview_image"
     ) -> None:
         """Add the pictures of several environments."""
-        for i, (own, done) in enumerate(zip(obs, dones, strict=True)):
-            self.append_obs(own, bool(done), i, camera_name)
+        for i, (one, done) in enumerate(zip(obs, dones, strict=True)):
+            self.append_obs(one, bool(done), i, camera_name)
 
     def save(self) -> list[Path]:
         """Write the videos and return their paths."""

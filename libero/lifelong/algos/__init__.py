@@ -75,8 +75,8 @@ class EWC(Sequential):
 
     def penalty(self) -> Tensor:
         """Return the penalty on the present weights, without the factor `lifelong.e_lambda`."""
-        found = self.hooks.penalty(self.policy)
-        return torch.zeros(()) if found is None else found / self.cfg.lifelong.e_lambda
+        penalty = self.hooks.penalty(self.policy)
+        return torch.zeros(()) if penalty is None else penalty / self.cfg.lifelong.e_lambda
 
 
 class PackNet(Sequential):

@@ -203,13 +203,15 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         """Write the policy, the configuration, and the masks of an algorithm that has them."""
         torch_save_model(self.policy, path, self.cfg, getattr(self, "previous_masks", None))
 
-    def measure_success(self, task_id: int, benchmark: Any, kept: Any = None, key: str = "") -> float | None:
+    def measure_success(
+        self, task_id: int, benchmark: Any, sim_states: Any = None, key: str = ""
+    ) -> float | None:
         """Return the mean success on a task, or group of tasks, that is being learned; None without evaluation."""
         if not self.cfg.eval.eval:
             return None
         size = int(self.cfg.data.task_group_size)
         tasks = range(task_id * size, (task_id + 1) * size)
-        rates = evaluate_success(self.cfg, self, benchmark, tasks, kept, key=key, selecting=True)
+        rates = evaluate_success(self.cfg, self, benchmark, tasks, sim_states, key=key, selecting=True)
         return float(rates.mean())
 
     def train_policy(

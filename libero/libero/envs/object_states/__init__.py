@@ -52,8 +52,8 @@ class BaseObjectState:
 
     def get_joint_state(self) -> list[float]:
         """Return the positions of its joints, rad or m; empty for an object without joints."""
-        known = self.object_name in self.env.scene.joints
-        return list(self.env.view.joint_positions(self.object_name).values()) if known else []
+        has_joints = self.object_name in self.env.scene.joints
+        return list(self.env.view.joint_positions(self.object_name).values()) if has_joints else []
 
     def set_joint(self, qpos: float = 1.5) -> None:
         """Set the positions of its joints, rad or m."""

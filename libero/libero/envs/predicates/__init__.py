@@ -14,7 +14,7 @@ class Expression(ABC):
 
     @abstractmethod
     def __call__(self, *args: Any) -> bool:
-        """Return the truth for these object states."""
+        """Return whether it holds for these object states."""
 
 
 class UnaryAtomic(Expression):
@@ -35,7 +35,7 @@ class _Native(Expression):
     predicate: ClassVar[str]
 
     def __call__(self, *args: Any) -> bool:
-        """Return the truth for these object states."""
+        """Return whether it holds for these object states."""
         return evaluate(Atom(self.predicate, tuple(arg.object_name for arg in args)), args[0].env.view)
 
 
@@ -45,7 +45,7 @@ class _StateMethod(UnaryAtomic):
     method: ClassVar[str]
 
     def __call__(self, *args: Any) -> bool:
-        """Return the truth for this object state."""
+        """Return whether it holds for this object state."""
         (state,) = args
         return getattr(state, self.method)()
 
@@ -127,7 +127,7 @@ def get_predicate_fn(predicate_fn_name: str) -> Callable[..., bool]:
 
 
 def eval_predicate_fn(predicate_fn_name: str, *args: Any) -> bool:
-    """Return the truth of a predicate for object states."""
+    """Return whether a predicate holds for object states."""
     return get_predicate_fn(predicate_fn_name)(*args)
 
 

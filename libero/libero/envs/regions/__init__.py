@@ -67,14 +67,14 @@ class MultiRegionRandomSampler:
             on_top: Whether objects stand on the reference rather than at its height.
 
         Raises:
-            PlacementError: No free placement was found in 5000 tries.
+            PlacementError: There was no free placement in 5000 tries.
         """
         placed: Placements = dict(fixtures or {})
         origin = self._origin(placed, reference, on_top)
-        found: Placements = {}
+        placements: Placements = {}
         for item in self.mujoco_objects:
-            found[item.name] = placed[item.name] = self._place(item, origin, placed)
-        return found
+            placements[item.name] = placed[item.name] = self._place(item, origin, placed)
+        return placements
 
     def _origin(self, placed: Placements, reference: Any, on_top: bool) -> np.ndarray:
         if reference is None:
@@ -171,12 +171,12 @@ class SiteSequentialCompositeSampler:
 
     def sample(self, fixtures: Mapping[str, Any] | None = None, **_: Any) -> Placements:
         """Return all placements."""
-        placed, found = dict(fixtures or {}), {}
+        placed, placements = dict(fixtures or {}), {}
         for sampler, arguments in self.samplers.values():
             new = sampler.sample(fixtures=placed, **arguments)
             placed.update(new)
-            found.update(new)
-        return found
+            placements.update(new)
+        return placements
 
 
 class ObjectPropertySampler:

@@ -79,8 +79,8 @@ class DropPath(nn.Module):
         """Map (B, ...) to (B, ...)."""
         if not self.training or self.drop_prob == 0.0:
             return x
-        kept = torch.rand(len(x), *[1] * (x.dim() - 1), device=x.device) >= self.drop_prob
-        return x * kept / (1 - self.drop_prob)
+        is_kept = torch.rand(len(x), *[1] * (x.dim() - 1), device=x.device) >= self.drop_prob
+        return x * is_kept / (1 - self.drop_prob)
 
 
 class TransformerDecoder(nn.Module):
