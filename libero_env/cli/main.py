@@ -1,4 +1,4 @@
-"""The `libero` command: a table of commands, each a function that is imported when it is run.
+"""The `libero` command: `commands.yaml` lists the commands, each a function that is imported when it is run.
 
 `libero_env.cli.options` turns the words after a command's name into the arguments of its function.
 """
@@ -13,6 +13,7 @@ from typing import Any
 
 from libero_env.cli import ending
 from libero_env.errors import InvalidInputError, MissingPackageError, UnknownNameError
+from libero_env.storage import read_yaml
 
 
 @dataclass(frozen=True)
@@ -32,158 +33,9 @@ class Command:
     reads_words: bool = False
 
 
-_SAME = "the same command goes on"
-COMMANDS: dict[str, dict[str, Command]] = {
-    "Benchmark": {
-        "tasks list": Command("libero_env.cli.tasks:list_tasks", "the tasks of one suite, or of all"),
-        "tasks show": Command("libero_env.cli.tasks:show", "the BDDL of a task"),
-        "tasks new": Command("libero_env.cli.tasks:new", "write a template of a user-defined task"),
-        "tasks preview": Command(
-            "libero_env.cli.tasks:preview", "pictures of a task's initial states, and a video of the expert"
-        ),
-        "tasks lint": Command(
-            "libero_env.cli.tasks:lint", "report what is wrong or doubtful in tasks, and how to fix it"
-        ),
-        "tasks certify": Command(
-            "libero_env.cli.tasks:certify_tasks",
-            "measure the success of the expert; resumes where it was stopped",
-            f"what is measured is kept; {_SAME}",
-        ),
-        "tasks init-states": Command(
-            "libero_env.cli.tasks:init_states",
-            "generate the 50 stored initial states of a suite or task file again",
-        ),
-        "objects add": Command(
-            "libero_env.cli.objects:add", "convert an MJCF, OBJ, GLB, glTF, STL or PLY file into an object"
-        ),
-        "objects list": Command(
-            "libero_env.cli.objects:list_objects",
-            "list user-defined objects; with --all also those of the benchmark",
-        ),
-        "objects show": Command(
-            "libero_env.cli.objects:show", "print the properties of an object: size, mass, regions, grasp"
-        ),
-        "objects preview": Command("libero_env.cli.objects:preview", "render an object from all sides"),
-        "objects remove": Command("libero_env.cli.objects:remove", "remove user-defined objects"),
-        "perturb list": Command(
-            "libero_env.cli.perturb:list_kinds", "the kinds, with the unit and what severity 1 is"
-        ),
-        "perturb show": Command(
-            "libero_env.cli.perturb:show",
-            "a picture of a start without and with perturbations, side by side",
-        ),
-        "perturb certify": Command(
-            "libero_env.cli.perturb:certify",
-            "whether the expert solves what is sampled; samples again what it does not; resumes",
-            f"what is measured is kept; {_SAME}",
-        ),
-    },
-    "Demonstrations": {
-        "demos generate": Command(
-            "libero_env.cli.demos:generate",
-            "record with the scripted expert; an interrupted recording can be resumed",
-            f"what is recorded is kept; {_SAME}",
-        ),
-        "demos download": Command(
-            "libero_env.cli.demos:download",
-            "download the original's human demonstrations; an interrupted download can be resumed",
-            f"what is downloaded is kept; {_SAME}",
-        ),
-        "demos info": Command("libero_env.cli.demos:info", "list the demonstration files in a folder"),
-        "demos check": Command(
-            "libero_env.cli.demos:check", "read files completely and report what is in them or broken"
-        ),
-        "demos replay": Command(
-            "libero_env.cli.demos:replay_file", "replay demonstrations and report success and drift"
-        ),
-        "demos rerender": Command(
-            "libero_env.cli.demos:rerender_file",
-            "render the recorded states again, with other cameras or under perturbations",
-        ),
-        "demos filter": Command(
-            "libero_env.cli.demos:filter_file", "write some of the demonstrations or steps of a file"
-        ),
-        "demos export": Command(
-            "libero_env.cli.demos:export", "write files as one data set in another format"
-        ),
-        "teleop": Command(
-            "libero_env.cli.teleop:teleop",
-            "record demonstrations by hand: keyboard or 3D mouse",
-            f"what is recorded is kept; {_SAME}",
-        ),
-    },
-    "Learning": {
-        "train": Command(
-            "lifelong.cli.train:train",
-            "learn a sequence of tasks and measure forgetting and transfer",
-            reads_words=True,
-        ),
-        "tune": Command(
-            "lifelong.cli.tune:tune", "choose a setting by what it keeps and what it lets learn", _SAME
-        ),
-        "sweep status": Command("lifelong.cli.sweep:status", "what runs, what failed, and what is left"),
-        "report": Command(
-            "lifelong.cli.report:report", "a page about one run, or about several side by side"
-        ),
-    },
-    "Evaluation": {
-        "eval": Command(
-            "libero_eval.cli.evaluate:evaluate",
-            "success of a policy on tasks; resumes where it was stopped",
-        ),
-        "robustness": Command(
-            "libero_eval.cli.evaluate:robustness",
-            "what perturbations do to a policy: success against severity, kind by kind",
-        ),
-        "compare": Command(
-            "libero_eval.cli.compare:compare",
-            "whether evaluated policies differ, start by start, and what chance alone makes",
-        ),
-        "power": Command("libero_eval.cli.compare:power", "how many episodes a difference in success needs"),
-        "results export": Command(
-            "libero_eval.cli.compare:export", "write a result as another tool's result file"
-        ),
-        "protocols list": Command("libero_eval.cli.protocols:list_protocols", "the protocols of the package"),
-        "protocols show": Command(
-            "libero_eval.cli.protocols:show", "all values of a protocol, and where they stand"
-        ),
-        "protocols diff": Command(
-            "libero_eval.cli.protocols:diff", "the values in which two protocols differ"
-        ),
-        "serve": Command("libero_eval.cli.runs:serve", "serve a run's policy in openpi's WebSocket protocol"),
-        "relearn": Command(
-            "libero_eval.cli.runs:relearn",
-            "steps until the forgotten tasks of a run are back",
-            "what is measured is kept: the same command goes on with the rest",
-        ),
-        "saliency": Command(
-            "libero_eval.cli.runs:saliency", "images of where a policy looks during a rollout"
-        ),
-        "check": Command(
-            "libero_eval.cli.runs:check",
-            "whether run directories are intact: checksums, records, what belongs together",
-        ),
-    },
-    "Tools": {
-        "doctor": Command(
-            "libero_env.cli.doctor:doctor", "what this machine has and lacks, and how to fix it"
-        ),
-        "assets install": Command(
-            "libero_env.cli.assets:install",
-            "install the original's models (340 MB) with pip, the pinned version, verified",
-        ),
-        "assets download": Command(
-            "libero_env.cli.assets:download",
-            "download the same from the Hugging Face Hub (420 MB); resumes where it was stopped",
-            f"what is downloaded is kept; {_SAME}",
-        ),
-        "assets info": Command(
-            "libero_env.cli.assets:info", "print which models scenes are built from, and why"
-        ),
-        "assets check": Command(
-            "libero_env.cli.assets:check", "check that all files of the models exist and are unchanged"
-        ),
-    },
+COMMANDS: dict[str, dict[str, Command]] = {  # by heading
+    heading: {name: Command(**fields) for name, fields in group.items()}
+    for heading, group in read_yaml("cli/commands.yaml").items()
 }
 ALL = {name: command for group in COMMANDS.values() for name, command in group.items()}
 _LEARNING_PACKAGES = ("hydra", "jinja2", "matplotlib", "omegaconf", "safetensors", "torch")
