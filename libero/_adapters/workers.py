@@ -161,6 +161,8 @@ class EnvWorker(ABC):
         """Start a call of a method of the environment, whose result `finish` returns."""
         if method in ("reset", "step"):
             self.send(*(args or (None,)), **kwargs)
+        elif getattr(type(self), method) is getattr(EnvWorker, method):
+            raise LiberoError(f"{type(self).__name__} does not define {method}")
         else:
             self.result = getattr(self, method)(*args, **kwargs)
 

@@ -28,50 +28,33 @@ def demo_scene(registries):
     @register_mu(scene_type="kitchen")
     class KitchenDemoScene(InitialSceneTemplates):
         def __init__(self):
-            fixture_num_info = {"kitchen_table": 1, "wooden_cabinet": 1}
-            object_num_info = {"akita_black_bowl": 1, "plate": 1}
             super().__init__(
                 workspace_name="kitchen_table",
-                fixture_num_info=fixture_num_info,
-                object_num_info=object_num_info,
+                fixture_num_info={"kitchen_table": 1, "wooden_cabinet": 1},
+                object_num_info={"akita_black_bowl": 1, "plate": 1},
             )
 
         def define_regions(self):
-            self.regions.update(
-                self.get_region_dict(
-                    region_centroid_xy=[0.0, -0.30],
-                    region_name="wooden_cabinet_init_region",
-                    target_name=self.workspace_name,
-                    region_half_len=0.01,
-                    yaw_rotation=(np.pi, np.pi),
+            for y, category, half, yaw in (
+                (-0.30, "wooden_cabinet", 0.01, (np.pi, np.pi)),
+                (0.0, "akita_black_bowl", 0.025, (0.0, 0.0)),
+                (0.25, "plate", 0.025, (0.0, 0.0)),
+            ):
+                self.regions.update(
+                    self.get_region_dict(
+                        region_centroid_xy=[0.0, y],
+                        region_name=f"{category}_init_region",
+                        target_name=self.workspace_name,
+                        region_half_len=half,
+                        yaw_rotation=yaw,
+                    )
                 )
-            )
-            self.regions.update(
-                self.get_region_dict(
-                    region_centroid_xy=[0.0, 0.0],
-                    region_name="akita_black_bowl_init_region",
-                    target_name=self.workspace_name,
-                    region_half_len=0.025,
-                )
-            )
-            self.regions.update(
-                self.get_region_dict(
-                    region_centroid_xy=[0.0, 0.25],
-                    region_name="plate_init_region",
-                    target_name=self.workspace_name,
-                    region_half_len=0.025,
-                )
-            )
             self.xy_region_kwargs_list = get_xy_region_kwargs_list_from_regions_info(self.regions)
 
         @property
         def init_states(self):
-            states = [
-                ("On", "akita_black_bowl_1", "kitchen_table_akita_black_bowl_init_region"),
-                ("On", "plate_1", "kitchen_table_plate_init_region"),
-                ("On", "wooden_cabinet_1", "kitchen_table_wooden_cabinet_init_region"),
-            ]
-            return states
+            categories = ("akita_black_bowl", "plate", "wooden_cabinet")
+            return [("On", f"{name}_1", f"kitchen_table_{name}_init_region") for name in categories]
 
     return KitchenDemoScene
 

@@ -74,20 +74,8 @@ def test_a_run_and_the_evaluation_of_its_checkpoint(folder, capsys):
         assert len(states) == metric.SETTLE_STEPS + 4 and states[0].shape == states[-1].shape
         assert states[1][0] > states[0][0], "the first number is the time"
 
-    arguments = [
-        "--benchmark",
-        "two_tasks",
-        "--task_id",
-        "0",
-        "--algo",
-        "packnet",
-        "--policy",
-        "bc_transformer_policy",
-        "--seed",
-        "10000",
-        "--load_task",
-        "1",
-    ]
+    named = "--benchmark two_tasks --task_id 0 --algo packnet --policy bc_transformer_policy --seed 10000"
+    arguments = [*named.split(), "--load_task", "1"]
     assert evaluate.main([*arguments, "--save-videos", "--n_eval", "2"]) == 0
     assert "success 0/2 = 0%" in capsys.readouterr().out
     stats = torch.load(path / "task1_model_on0.stats")

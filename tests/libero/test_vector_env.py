@@ -150,6 +150,8 @@ def test_workers_of_a_clients_own_have_the_original_methods():
     assert env.step([1, 2])[0][1]["count"].tolist() == [2.0, 2.0]
     assert env.workers[0].step(1)[0]["count"].tolist() == [2.0, 2.0]
     assert env.get_env_attr("count") == [2, 2]
+    with pytest.raises(LiberoError, match="Own does not define seed"):
+        env.seed(0)
     env.close()
 
 

@@ -4,7 +4,7 @@ Shape legend: B batch, T time, C H W image, D dimension of a proprioceptive inpu
 """
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -86,8 +86,8 @@ class BasePolicy(nn.Module, metaclass=PolicyMeta):
         if train_mode:
             if not self.use_augmentation:
                 return dict(data)
-            images = self.img_aug([data["obs"][name] for name in self.img_names])
-            return {**data, "obs": {**data["obs"], **dict(zip(self.img_names, images, strict=True))}}
+            obs = {**data["obs"], **self._get_aug_output_dict(self.img_aug(self._get_img_tuple(data)))}
+            return {**data, "obs": obs}
         stepped = map_tensors(dict(data), lambda x: x.unsqueeze(1))
         return {**stepped, "task_emb": data["task_emb"]} if "task_emb" in data else stepped
 
@@ -99,3 +99,9 @@ class BasePolicy(nn.Module, metaclass=PolicyMeta):
     def loss(self, batch: DictBatch) -> Tensor:
         """Return the mean loss, for the algorithms of `lifelong`."""
         return self.compute_loss(batch.data)
+
+    def _get_img_tuple(self, data: Mapping[str, Any]) -> tuple[Tensor, ...]:
+        return tuple(data["obs"][name] for name in self.img_names)
+
+    def _get_aug_output_dict(self, out: Sequence[Tensor]) -> dict[str, Tensor]:
+        return dict(zip(self.img_names, out, strict=True))
