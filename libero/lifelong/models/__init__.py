@@ -2,7 +2,6 @@
 
 from libero._adapters.lookup import alias_modules
 from libero.lifelong.models.base_policy import BasePolicy, get_policy_class, get_policy_list
-from libero.lifelong.models.modules.extra_modules import ExtraModalities, ExtraModalityTokens
 from libero.lifelong.models.modules.language_modules import IdentityEncoder, MLPEncoder
 from libero.lifelong.models.modules.rgb_modules import (
     PatchEncoder,
@@ -18,7 +17,13 @@ from libero.lifelong.models.modules.transformer_modules import (
     TransformerDecoder,
     TransformerFeedForwardNN,
 )
-from libero.lifelong.models.native_policy import BCRNNPolicy, BCTransformerPolicy, BCViLTPolicy
+from libero.lifelong.models.native_policy import (
+    BCRNNPolicy,
+    BCTransformerPolicy,
+    BCViLTPolicy,
+    ExtraModalities,
+    ExtraModalityTokens,
+)
 from libero.lifelong.models.policy_head import DeterministicHead, GMMHead
 from libero.lifelong.models.saliency import PerturbationAttention
 
