@@ -5,7 +5,7 @@ initial states are valid. How an object rests and when it counts as open is not 
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -22,53 +22,14 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.catalog import get_object, user_defined_names
 from libero_env.objects.model import ObjectModel
+from libero_env.storage import read_yaml
 
+_NAMES = read_yaml("assets/original.yaml")
 # Folder -> its categories; each has one file.
-FAMILIES: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "articulated_objects": (
-            "basin_faucet", "faucet", "flat_stove", "microwave", "short_cabinet", "short_fridge", "slide_cabinet",
-            "white_cabinet", "window", "wooden_cabinet",
-        ),
-        "stable_hope_objects": (
-            "alphabet_soup", "bbq_sauce", "butter", "chocolate_pudding", "cookies", "cream_cheese", "ketchup",
-            "macaroni_and_cheese", "milk", "new_salad_dressing", "orange_juice", "popcorn", "salad_dressing",
-            "tomato_sauce",
-        ),
-        "stable_scanned_objects": (
-            "akita_black_bowl", "basket", "chefmate_8_frypan", "glazed_rim_porcelain_ramekin", "plate", "rack",
-            "white_bowl",
-        ),
-        "turbosquid_objects": (
-            "black_book", "bowl_drainer", "desk_caddy", "dining_set_group", "moka_pot", "porcelain_mug",
-            "red_coffee_mug", "white_storage_box", "white_yellow_mug", "wine_bottle", "wine_rack", "wooden_shelf",
-            "wooden_tray", "wooden_two_layer_shelf", "yellow_book",
-        ),
-    }
-)  # fmt: skip
-# Category that LIBERO-PRO adds -> category that it recolours or enlarges, and by how much. Their files are in the
-# distributions of `libero_env.assets.published`, and in no folder of the original.
+FAMILIES: Mapping[str, Sequence[str]] = MappingProxyType(_NAMES["families"])
+# Category that LIBERO-PRO adds -> category that it recolours or enlarges, and by how much.
 LIBERO_PRO: Mapping[str, tuple[str, float]] = MappingProxyType(
-    {
-        "bigger_akita_black_bowl": ("akita_black_bowl", 1.5),
-        "bigger_alphabet_soup": ("alphabet_soup", 1.5),
-        "black_bowl": ("akita_black_bowl", 1.0),
-        "blue_ketchup": ("ketchup", 1.0),
-        "brown_rack": ("wine_rack", 1.0),
-        "green_bbq_sauce": ("bbq_sauce", 1.0),
-        "green_butter": ("butter", 1.0),
-        "green_chocolate_pudding": ("chocolate_pudding", 1.0),
-        "red_basket": ("basket", 1.0),
-        "red_cream_cheese": ("cream_cheese", 1.0),
-        "red_salad_dressing": ("salad_dressing", 1.0),
-        "white_bottle": ("wine_bottle", 1.0),
-        "yellow_cabinet": ("wooden_cabinet", 1.0),
-        "yellow_milk": ("milk", 1.0),
-        "yellow_moka_pot": ("moka_pot", 1.0),
-        "yellow_plate": ("plate", 1.0),
-        "yellow_stove": ("flat_stove", 1.0),
-        "yellow_tomato_sauce": ("tomato_sauce", 1.0),
-    }
+    {name: (base, scale) for name, (base, scale) in _NAMES["libero_pro"].items()}
 )
 _OFFSETS = ("bottom_offset", "top_offset", "horizontal_radius")  # fields that grow with an object
 _STEMS = {"rack": "simple_rack"}

@@ -18,43 +18,11 @@ from libero_env.assets.original_mjcf import read_file, read_spec, to_xml, used_a
 from libero_env.mujoco_compat import delete
 from libero_env.storage import read_yaml
 
-# Workspace -> beginning of the names of its scene files.
+_NAMES = read_yaml("assets/original.yaml")
 SCENES: Mapping[str, str] = MappingProxyType(
-    {
-        "coffee_table": "libero_coffee_table",
-        "floor": "libero_floor",
-        "kitchen_table": "libero_kitchen_tabletop",
-        "living_room_table": "libero_living_room_tabletop",
-        "study_table": "libero_study",
-        "table": "libero_tabletop",
-    }
-)
-# Name of a style in task files -> file in `textures`.
-TEXTURES: Mapping[str, Mapping[str, str]] = MappingProxyType(
-    {
-        "floor": {
-            "brown-ceramic": "brown_ceramic_tile.png",
-            "dark": "dark_floor_texture.png",
-            "gray-ceramic": "gray_ceramic_tile.png",
-            "light-gray": "light-gray-floor-tile.png",
-            "rustic": "rustic_floor.png",
-            "tile_grigia_caldera": "tile_grigia_caldera_porcelain_floor.png",
-            "white-marble": "white_marble_floor.png",
-            "wood-plank": "seamless_wood_planks_floor.png",
-        },
-        "wall": {
-            "ceramic": "ceramic.png",
-            "dark-blue": "dark_blue_wall.png",
-            "dark-gray-plaster": "dark_gray_plaster.png",
-            "dark-green": "dark_green_plaster_wall.png",
-            "gray-plaster": "gray_plaster.png",
-            "light-blue": "light_blue_wall.png",
-            "light-gray-plaster": "light-gray-plaster.png",
-            "white": "white_wall.png",
-            "yellow-linen": "yellow_linen_wall_texture.png",
-        },
-    }
-)
+    _NAMES["scenes"]
+)  # workspace -> beginning of the names of its files
+TEXTURES: Mapping[str, Mapping[str, str]] = MappingProxyType(_NAMES["textures"])  # name of a style -> file
 _TEXTURE_NAMES = {"floor": "texplane", "wall": "tex-wall"}
 _STIFF = 0.004  # [s] smallest time constant that the timestep allows
 _FIRM_SOLREF = (0.02, 1.0)  # time constant [s] and damping ratio

@@ -1,17 +1,5 @@
 """Demonstrations as windows of training data, and the memory of past tasks."""
 
-from lifelong.data.dataset import SequenceVLDataset, batches
-from lifelong.data.fake import fake_batch, fake_observation
-from lifelong.data.loading import open_windows
-from lifelong.data.memory import ReplayMemory
-from lifelong.data.source import DemoSource
+import lazy_loader
 
-__all__ = [
-    "DemoSource",
-    "ReplayMemory",
-    "SequenceVLDataset",
-    "batches",
-    "fake_batch",
-    "fake_observation",
-    "open_windows",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

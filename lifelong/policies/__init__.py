@@ -1,9 +1,5 @@
 """Policies: from observations and an instruction to actions."""
 
-from lifelong.policies.base import Policy
-from lifelong.policies.bc_mlp import BCMLP
-from lifelong.policies.bc_rnn import BCRNN
-from lifelong.policies.bc_transformer import BCTransformer
-from lifelong.policies.bc_vilt import BCViLT
+import lazy_loader
 
-__all__ = ["BCMLP", "BCRNN", "BCTransformer", "BCViLT", "Policy"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,15 @@
+from .dataset import SequenceVLDataset, batches
+from .fake import fake_batch, fake_observation
+from .loading import open_windows
+from .memory import ReplayMemory
+from .source import DemoSource
+
+__all__ = [
+    "DemoSource",
+    "ReplayMemory",
+    "SequenceVLDataset",
+    "batches",
+    "fake_batch",
+    "fake_observation",
+    "open_windows",
+]

@@ -1,0 +1,27 @@
+from .augmentation import Augmentation, ColorJitter, Compose, RandomShift
+from .flow import FlowHead
+from .heads import ActionHead, DeterministicHead, GMMHead
+from .tokens import LanguageToken, ProprioScaling, ProprioTokens
+from .transformer import SpatialTransformer, TemporalLSTM, TemporalTransformer
+from .vision import FiLM, PatchEncoder, ResNetFiLMEncoder, SpatialSoftmax
+
+__all__ = [
+    "ActionHead",
+    "Augmentation",
+    "ColorJitter",
+    "Compose",
+    "DeterministicHead",
+    "FiLM",
+    "FlowHead",
+    "GMMHead",
+    "LanguageToken",
+    "PatchEncoder",
+    "ProprioScaling",
+    "ProprioTokens",
+    "RandomShift",
+    "ResNetFiLMEncoder",
+    "SpatialSoftmax",
+    "SpatialTransformer",
+    "TemporalLSTM",
+    "TemporalTransformer",
+]
