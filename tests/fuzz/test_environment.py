@@ -155,8 +155,8 @@ def digest(env):
     """All that the future of an environment depends on."""
     if isinstance(env, BatchEnv):
         states = np.array([env.get_state(i) for i in range(NUM)])
-        return states.tobytes(), env.running.tobytes(), str([g.bit_generator.state for g in env._generators])
-    return env.get_state().tobytes(), env._running, str(env.np_random.bit_generator.state)
+        return states.tobytes(), env.running.tobytes(), str([g.bit_generator.state for g in env.generators])
+    return env.get_state().tobytes(), env.batch.running.tobytes(), str(env.np_random.bit_generator.state)
 
 
 @pytest.fixture(scope="module")
@@ -187,7 +187,7 @@ def test_refused_calls_change_nothing(single, batch, data, many):
 
 
 def running(env):
-    return np.atleast_1d(env.running if isinstance(env, BatchEnv) else env._running)
+    return np.atleast_1d(env.running if isinstance(env, BatchEnv) else env.batch.running)
 
 
 FIELDS = list(EnvConfig.__dataclass_fields__)
