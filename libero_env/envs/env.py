@@ -99,6 +99,7 @@ class LiberoEnv(gymnasium.Env):
             UnknownNameError: An option does not exist; nothing has changed.
             PlacementError: The objects do not fit; no episode is running.
         """
+        self.batch.require_open()
         seed, options = checked_seed(seed), checked_options(options, valid=("init_state",))
         self.batch.generators[0] = self.np_random
         observations, infos = self.batch.reset(seed=[seed], options=options)
