@@ -162,13 +162,7 @@ def choose_top_grasp(
     """Return the best grasp from straight above around the whole body, for dropping it into a container.
 
     It depends on the shape of the body alone, and avoids collisions with obstacles; the result is deterministic.
-
-    Args:
-        cloud: Points on the body, world frame, (N, 3).
-        obstacles: Points on everything else, world frame, (M, 3).
-        surface_height: Height of the surface that the body stands on, [m].
-        finger_axis: Direction in which the fingers open now, world frame, (3,).
-        name: Name of the body, for messages.
+    Arguments as of `choose_grasp`.
 
     Raises:
         GraspError: No grasp is feasible.

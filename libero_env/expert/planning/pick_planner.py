@@ -64,14 +64,7 @@ def plan_place(
     slot: tuple[int, int] = (0, 1),
     failures: Sequence[FailedAttempt] = (),
 ) -> PickPlan:
-    """Return where to place the object that is in the hand, as the hand holds it now.
-
-    Args:
-        view: State of the simulation.
-        shapes: Shapes of the scene.
-        atom: (On object place), (In object region) or (Stack object place).
-        slot: (k, n): the object is number k of n that go to this place.
-        failures: Attempts that failed before; other places are preferred.
+    """Return where to place the object that is in the hand, as the hand holds it now; arguments as of `plan_pick`.
 
     Raises:
         PlaceError: There is no room for the object.
