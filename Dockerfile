@@ -27,6 +27,7 @@ WORKDIR /src
 COPY pyproject.toml constraints.txt README.md LICENSE ./
 COPY libero/__init__.py libero/
 COPY libero_env/__init__.py libero_env/__init__.pyi libero_env/
+COPY libero_eval/__init__.py libero_eval/
 COPY lifelong/__init__.py lifelong/
 COPY configs configs/
 RUN python3 -m venv /opt/libero \

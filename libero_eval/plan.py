@@ -271,7 +271,7 @@ class _Evaluated(TypedDict, total=False):
 
 
 def is_result(text: str) -> bool:
-    """Return whether a word of the command line is a result: `eval.json`, or a folder that has one and is no run."""
+    """Return whether a word of the command line is a result: `eval.json`, or a folder that has one and is not a run."""
     path = Path(text)
     if path.is_dir():
         return (path / FILE_NAME).is_file() and not (path / "config.yaml").is_file()

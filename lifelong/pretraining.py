@@ -90,7 +90,7 @@ def _last_checkpoint(run: Path) -> Path:
     folder = RunDirectory(run).checkpoints
     if not (found := folder.tasks()):
         raise CheckpointError(
-            f"{run} has no checkpoints/task_<k>.safetensors: it is no run directory, or no task is learned yet"
+            f"{run} has no checkpoints/task_<k>.safetensors: it is not a run directory, or no task is learned yet"
         )
     last = folder.task_path(found[-1])
     if not ResultLog(run / "results.jsonl").read().finished:

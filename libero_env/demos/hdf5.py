@@ -1,4 +1,4 @@
-"""The gate of HDF5 files, which may come from anyone: each is checked before anything in it is used.
+"""The check of HDF5 files, which may come from anyone: nothing in them is used before.
 
 A file stands for itself. It has groups and datasets, each linked once by name; soft and external links, data in other
 files, virtual datasets, named types and filters of plugins are refused. What a dataset needs in memory is known before

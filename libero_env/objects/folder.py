@@ -28,7 +28,7 @@ _MAX_ANGLE = 100.0  # [rad], or [m] of a joint that slides
 
 
 def _number(value: Any) -> Any:
-    """Return the value of a text such as `1e-3`, which is no number in YAML."""
+    """Return the value of a text such as `1e-3`, which is not a number in YAML."""
     try:
         return float(value) if isinstance(value, str) else value
     except ValueError:

@@ -200,7 +200,7 @@ def _find(source: Path, after: int | None) -> tuple[Path, Path, int]:
     there = folder.tasks()
     if not (source / "config.yaml").is_file() or not there:
         raise LifelongError(
-            f"{source} is no run directory with a learned task: it needs config.yaml and checkpoints"
+            f"{source} is not a run directory with a learned task: it needs config.yaml and checkpoints"
         )
     if after is not None and after not in there:
         raise LifelongError(f"{source} has no checkpoint after task {after}; valid: {there}")
