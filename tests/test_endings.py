@@ -144,8 +144,8 @@ def test_errors_by_kind(capsys):
             "ending_lacking:make",
             "the module ending_lacking raised ModuleNotFoundError: No module named 'a_package",
         ),
-        (":", "'' is no name of a module"),
-        ("a b:c", "is no name of a module"),
+        (":", "'' is not a name of a module"),
+        ("a b:c", "is not a name of a module"),
     ],
 )
 def test_a_policy_that_cannot_be_made_is_the_users(policy, message, here, capsys):
@@ -172,11 +172,11 @@ def test_a_policy_that_raises_shows_its_own_frames(here, capsys):
     assert f'File "{here}/ending_policy.py", line 18, in fails\n    raise ValueError(' in found
     assert "lifelong/" not in found and "fault of libero-lifelong" not in found and "\x1b" not in found
     assert cli.main(["--debug", *command, "--again"]) == ending.MISTAKE
-    assert "lifelong/evaluation/actors.py" in capsys.readouterr().err
+    assert "libero_eval/user_policy.py" in capsys.readouterr().err
     assert DEBUG_VARIABLE not in os.environ
     command[1] = "ending_policy:texts"
     assert cli.main(command) == ending.MISTAKE
-    assert "error: Policy.predict returned a list that is no array of numbers" in capsys.readouterr().err
+    assert "error: Policy.predict returned a list that is not an array of numbers" in capsys.readouterr().err
 
 
 @pytest.mark.unit
@@ -299,7 +299,7 @@ def test_numbers_out_of_range_are_one_line(words, capsys):
             "--despite is of results",
         ),
         (["tasks", "new", "../elsewhere"], "is not the name of a task"),
-        (["tasks", "new", "mine", "--goal", "()"], "is no atom"),
+        (["tasks", "new", "mine", "--goal", "()"], "is not an atom"),
         (["tasks", "preview", "libero_goal/3", "--out", "a.zzz"], "the name of a picture ends in .png"),
         (["objects", "preview", "plate", "--out", "a.zzz"], "the name of a picture ends in .png"),
     ],
@@ -328,7 +328,7 @@ def test_names_that_are_none(words, message, here, capsys):
 def test_what_is_no_address_is_refused_at_once(address, here, capsys):
     assert cli.main(["eval", address, "--suite", "libero_goal/0"]) == ending.MISTAKE
     found = capsys.readouterr().err
-    assert found.startswith(f"error: {address} is no address; write ") and found.count("\n") == 1
+    assert found.startswith(f"error: {address} is not an address; write ") and found.count("\n") == 1
 
 
 @pytest.mark.sim
