@@ -289,7 +289,7 @@ def test_errors_are_reported_in_one_line(module, tmp_path, capsys):
             "Did you mean 'openvla-oft'?",
         ),
         ([str(tmp_path / "no_run")], "no_run does not exist; give the directory of a run"),
-        ([str(tmp_path)], "no run directory"),
+        ([str(tmp_path)], "not a run directory"),
     ):
         assert cli.main(["eval", *argv]) == 2
         err = capsys.readouterr().err

@@ -61,7 +61,7 @@ def test_instructions_in_other_words_are_embedded_as_they_are(tmp_path):
 
 
 def test_paths_that_are_no_runs_are_named(tmp_path):
-    with pytest.raises(LifelongError, match="no run directory"):
+    with pytest.raises(LifelongError, match="not a run directory"):
         restore(tmp_path)
     with pytest.raises(LifelongError, match="missing does not exist; give the directory of a run"):
         restore(tmp_path / "missing")

@@ -367,7 +367,7 @@ def test_a_policy_may_start_from_a_finished_runs_weights(tmp_path) -> None:
 
 
 def test_paths_without_weights_are_refused(tmp_path) -> None:
-    with pytest.raises(CheckpointError, match=r"no run directory, or no task is learned yet"):
+    with pytest.raises(CheckpointError, match=r"not a run directory, or no task is learned yet"):
         load_initial_weights(tmp_path)
     with pytest.raises(CheckpointError, match="no checkpoint at"):
         load_initial_weights(tmp_path / "absent")
