@@ -20,9 +20,10 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
+from libero_env.cli import ending
+
 __all__ = ["Positional", "arg"]
 
-MISTAKE = 2  # exit status, as in `libero_env.cli.ending`
 MAX_SIDE = 1024  # pixels, as in libero_env.sim.render, which is slow to import
 MAX_PROCESSES = 1024  # also of threads
 MAX_STEPS = 1_000_000  # of an episode; 14 hours
@@ -185,4 +186,4 @@ def _unboxed(text: str) -> str:
 
 def _fail(message: str, prog: str) -> NoReturn:
     print(f"error: {message}; see {prog} --help", file=sys.stderr)
-    raise SystemExit(MISTAKE)
+    raise SystemExit(ending.MISTAKE)
