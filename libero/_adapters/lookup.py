@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Mapping
-from types import ModuleType
 from typing import Any
 
 from libero_env.errors import UnknownNameError
@@ -16,16 +15,14 @@ def lookup(table: Mapping[str, Any], kind: str, name: str) -> Any:
     raise UnknownNameError(kind, name, table)
 
 
-def alias_modules(package: str, **modules: str) -> None:
-    """Make names of a package importable from modules of the original, such as `arenas.table_arena`, too.
+def alias_modules(package: str, modules: str) -> None:
+    """Make a package importable by the paths of the original's modules in it, such as `arenas.table_arena`, too.
 
     Args:
-        package: Name of the package, which has the names.
-        modules: Module of the original -> names in it, separated by blanks.
+        package: Name of the package, which has the names of all these modules.
+        modules: Names of the modules, separated by blanks.
     """
     whole = sys.modules[package]
-    for module, names in modules.items():
-        alias = ModuleType(f"{package}.{module}", f"Path of the original; see `{package}`.")
-        vars(alias).update({name: getattr(whole, name) for name in names.split()})
-        sys.modules[alias.__name__] = alias
-        setattr(whole, module, alias)
+    for name in modules.split():
+        sys.modules[f"{package}.{name}"] = whole
+        setattr(whole, name, whole)

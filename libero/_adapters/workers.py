@@ -127,6 +127,16 @@ class ShArray:
         self._open(*state)
 
 
+def _asking(method: str) -> Any:
+    """Return a method of a worker that returns the result of the method of its environment."""
+
+    def ask(self: Any, *args: Any, **kwargs: Any) -> Any:
+        self.start(method, *args, **kwargs)
+        return self.finish(method)
+
+    return ask
+
+
 class EnvWorker(ABC):
     """One environment, of the original's interface or of Gymnasium's: its results are passed on as they are.
 
@@ -170,37 +180,16 @@ class EnvWorker(ABC):
         """Return the result of the call that was started."""
         return self.recv() if method in ("reset", "step") else self.result
 
-    def reset(self, **kwargs: Any) -> Any:
-        """Reset the environment; return the observation, or (observation, info)."""
-        return self._ask("reset", **kwargs)
-
-    def step(self, action: Any) -> tuple:
-        """Act in the environment; return its four or five results."""
-        return self._ask("step", action)
+    reset, step, render = map(_asking, ("reset", "step", "render"))
+    check_success, get_sim_state = map(_asking, ("check_success", "get_sim_state"))
+    set_init_state, get_segmentation_of_interest = map(
+        _asking, ("set_init_state", "get_segmentation_of_interest")
+    )
 
     def seed(self, seed: int | None = None) -> Any:
         """Seed the environment, by a reset where it has no `seed`."""
-        return self._ask("seed", seed)
-
-    def render(self, **kwargs: Any) -> Any:
-        """Return what the environment's `render` returns."""
-        return self._ask("render", **kwargs)
-
-    def check_success(self) -> bool:
-        """Return whether the goal of the environment holds."""
-        return self._ask("check_success")
-
-    def get_segmentation_of_interest(self, segmentation_image: np.ndarray) -> np.ndarray:
-        """Return the objects of interest in a segmentation picture."""
-        return self._ask("get_segmentation_of_interest", segmentation_image)
-
-    def get_sim_state(self) -> np.ndarray:
-        """Return [time, qpos, qvel] of the environment."""
-        return self._ask("get_sim_state")
-
-    def set_init_state(self, init_state: np.ndarray) -> Any:
-        """Set the state of the environment and return its observation."""
-        return self._ask("set_init_state", init_state)
+        self.start("seed", seed)
+        return self.finish("seed")
 
     def close(self) -> None:
         """Close the environment. Idempotent."""
@@ -216,10 +205,6 @@ class EnvWorker(ABC):
     def wait(workers: "list[EnvWorker]", wait_num: int, timeout: float | None = None) -> "list[EnvWorker]":
         """Return the workers that are ready: at least `wait_num`, or fewer after `timeout` seconds."""
         return workers
-
-    def _ask(self, method: str, *args: Any, **kwargs: Any) -> Any:
-        self.start(method, *args, **kwargs)
-        return self.finish(method)
 
 
 class _HostWorker(EnvWorker):

@@ -53,4 +53,4 @@ class Timer:
         return self.value
 
 
-alias_modules(__name__, log_utils="get_logger get_project_logger", time_utils="Timer")
+alias_modules(__name__, "log_utils time_utils")

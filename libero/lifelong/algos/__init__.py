@@ -159,12 +159,4 @@ class Multitask(Sequential):
         return curve.means()
 
 
-alias_modules(
-    __name__,
-    agem="AGEM",
-    er="ER cycle merge_datas",
-    ewc="EWC",
-    multitask="Multitask",
-    packnet="PackNet",
-    single_task="SingleTask",
-)
+alias_modules(__name__, "agem er ewc multitask packnet single_task")

@@ -27,13 +27,4 @@ from libero.lifelong.models.native_policy import (
 from libero.lifelong.models.policy_head import DeterministicHead, GMMHead
 from libero.lifelong.models.saliency import PerturbationAttention
 
-alias_modules(
-    __name__,
-    bc_rnn_policy="BCRNNPolicy ExtraModalities",
-    bc_transformer_policy="BCTransformerPolicy ExtraModalityTokens PerturbationAttention",
-    bc_vilt_policy="BCViLTPolicy ExtraModalityTokens",
-    policy="Attention BCRNNPolicy BCTransformerPolicy BCViLTPolicy BasePolicy DeterministicHead DropPath "
-    "ExtraModalities ExtraModalityTokens GMMHead IdentityEncoder MLPEncoder Norm PatchEncoder PerturbationAttention "
-    "ResnetEncoder SinusoidalPositionEncoding SpatialProjection SpatialSoftmax TransformerDecoder "
-    "TransformerFeedForwardNN get_policy_class get_policy_list",
-)
+alias_modules(__name__, "bc_rnn_policy bc_transformer_policy bc_vilt_policy policy")

@@ -83,26 +83,18 @@ class WorkspaceArena(Arena):
         """Do nothing: tables have the sizes and places of the benchmark."""
 
 
-def _arena(name: str, category: str) -> Any:
-    """Return the class of the arena of a workspace."""
-    return type(name, (WorkspaceArena,), {"__module__": __name__, "category": category})
-
-
-CoffeeTableArena = _arena("CoffeeTableArena", "coffee_table")
-EmptyArena = _arena("EmptyArena", "floor")
-KitchenTableArena = _arena("KitchenTableArena", "kitchen_table")
-LivingRoomTableArena = _arena("LivingRoomTableArena", "living_room_table")
-StudyTableArena = _arena("StudyTableArena", "study_table")
-TableArena = _arena("TableArena", "table")
+_CATEGORIES = {
+    "CoffeeTableArena": "coffee_table",
+    "EmptyArena": "floor",
+    "KitchenTableArena": "kitchen_table",
+    "LivingRoomTableArena": "living_room_table",
+    "StudyTableArena": "study_table",
+    "TableArena": "table",
+}
+for _name, _category in _CATEGORIES.items():
+    globals()[_name] = type(_name, (WorkspaceArena,), {"__module__": __name__, "category": _category})
 
 alias_modules(
     __name__,
-    base_arena="Arena WorkspaceArena",
-    coffee_table_arena="CoffeeTableArena",
-    empty_arena="EmptyArena",
-    kitchen_arena="KitchenTableArena",
-    living_room_arena="LivingRoomTableArena",
-    study_arena="StudyTableArena",
-    table_arena="TableArena",
-    style="STYLE_KINDS STYLE_MAPPING FLOOR_STYLE WALL_STYLE get_texture_filename",
+    "base_arena coffee_table_arena empty_arena kitchen_arena living_room_arena study_arena table_arena style",
 )

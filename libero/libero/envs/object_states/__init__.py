@@ -110,4 +110,4 @@ class SiteObjectState(BaseObjectState):
         return True
 
 
-alias_modules(__name__, base_object_states="BaseObjectState ObjectState SiteObjectState")
+alias_modules(__name__, "base_object_states")

@@ -148,12 +148,6 @@ class TargetZone(BuiltinObject):
 
 alias_modules(
     __name__,
-    articulated_objects=f"ArticulatedObject {ARTICULATED}",
-    google_scanned_objects=f"GoogleScannedObject {SCANNED}",
-    hope_objects=f"HopeBaseObject {HOPE}",
-    turbosquid_objects=f"TurbosquidObjects {TURBOSQUID}",
-    site_object="SiteObject",
-    target_zones="TargetZone",
-    base_object="OBJECTS_DICT VISUAL_CHANGE_OBJECTS_DICT get_object_dict get_object_fn register_object "
-    "register_visual_change_object",
+    "articulated_objects google_scanned_objects hope_objects "
+    "turbosquid_objects site_object target_zones base_object",
 )

@@ -32,22 +32,22 @@ class MultiarayAtomic(Expression):
 class _Native(Expression):
     """A predicate of `libero_env`."""
 
-    predicate: ClassVar[str]
+    answer: ClassVar[str]  # its name
 
     def __call__(self, *args: Any) -> bool:
         """Return whether it holds for these object states."""
-        return evaluate(Atom(self.predicate, tuple(arg.object_name for arg in args)), args[0].env.view)
+        return evaluate(Atom(self.answer, tuple(arg.object_name for arg in args)), args[0].env.view)
 
 
 class _StateMethod(UnaryAtomic):
     """A predicate that is a method of the object state."""
 
-    method: ClassVar[str]
+    answer: ClassVar[str]  # name of the method
 
     def __call__(self, *args: Any) -> bool:
         """Return whether it holds for this object state."""
         (state,) = args
-        return getattr(state, self.method)()
+        return getattr(state, self.answer)()
 
 
 class TruePredicateFn(MultiarayAtomic):
@@ -69,7 +69,7 @@ class FalsePredicateFn(MultiarayAtomic):
 class PrintJointState(_Native, UnaryAtomic):
     """Always true; prints the joint positions."""
 
-    predicate = "Printjointstate"
+    answer = "Printjointstate"
 
     def __call__(self, *args: Any) -> bool:
         """Print the joint positions and return True."""
@@ -77,28 +77,24 @@ class PrintJointState(_Native, UnaryAtomic):
         return super().__call__(*args)
 
 
-def _predicate(name: str, bases: tuple[type, ...], doc: str, **attributes: str) -> Any:
-    """Return a class of predicates."""
-    return type(name, bases, {"__module__": __name__, "__doc__": doc, **attributes})
+_TWO, _ONE, _METHOD = (_Native, BinaryAtomic), (_Native, UnaryAtomic), (_StateMethod,)
+_PREDICATES: dict[str, tuple[tuple[type, ...], str, str]] = {  # class -> bases, name of what answers, meaning
+    "InContactPredicateFn": (_TWO, "Incontact", "The two touch."),
+    "In": (_TWO, "In", "The first is in the second, a region."),
+    "On": (_TWO, "On", "The first is on the second."),
+    "Stack": (_TWO, "Stack", "The first is on the second and inside it."),
+    "Up": (_ONE, "Up", "It is at least a metre above the floor."),
+    "Open": (_METHOD, "is_open", "Any joint is in the open range."),
+    "Close": (_METHOD, "is_close", "All joints are in the closed range."),
+    "TurnOn": (_METHOD, "turn_on", "Any joint is in the range of on."),
+    "TurnOff": (_METHOD, "turn_off", "All joints are in the range of off."),
+}
+for _name, (_bases, _answer, _doc) in _PREDICATES.items():
+    globals()[_name] = type(_name, _bases, {"__module__": __name__, "__doc__": _doc, "answer": _answer})
 
-
-_TWO = (_Native, BinaryAtomic)
-InContactPredicateFn = _predicate("InContactPredicateFn", _TWO, "The two touch.", predicate="Incontact")
-In = _predicate("In", _TWO, "The first is in the second, a region.", predicate="In")
-On = _predicate("On", _TWO, "The first is on the second.", predicate="On")
-Stack = _predicate("Stack", _TWO, "The first is on the second and inside it.", predicate="Stack")
-Up = _predicate("Up", (_Native, UnaryAtomic), "It is at least a metre above the floor.", predicate="Up")
-Open = _predicate("Open", (_StateMethod,), "Any joint is in the open range.", method="is_open")
-Close = _predicate("Close", (_StateMethod,), "All joints are in the closed range.", method="is_close")
-TurnOn = _predicate("TurnOn", (_StateMethod,), "Any joint is in the range of on.", method="turn_on")
-TurnOff = _predicate("TurnOff", (_StateMethod,), "All joints are in the range of off.", method="turn_off")
-
-_CLASSES = (
-    *(TruePredicateFn, FalsePredicateFn, In, On, Up, Stack, InContactPredicateFn, PrintJointState),
-    *(Open, Close, TurnOn, TurnOff),
-)
+_CLASSES = ("TruePredicateFn", "FalsePredicateFn", *_PREDICATES, "PrintJointState")
 VALIDATE_PREDICATE_FN_DICT: dict[str, Callable[..., bool]] = {
-    cls.__name__.removesuffix("PredicateFn").lower(): cls() for cls in _CLASSES
+    name.removesuffix("PredicateFn").lower(): globals()[name]() for name in _CLASSES
 }
 
 
@@ -131,8 +127,4 @@ def eval_predicate_fn(predicate_fn_name: str, *args: Any) -> bool:
     return get_predicate_fn(predicate_fn_name)(*args)
 
 
-alias_modules(
-    __name__,
-    base_predicates="Expression UnaryAtomic BinaryAtomic MultiarayAtomic TruePredicateFn FalsePredicateFn "
-    "InContactPredicateFn In On Up Stack PrintJointState Open Close TurnOn TurnOff",
-)
+alias_modules(__name__, "base_predicates")

@@ -261,10 +261,4 @@ def update_region_samplers(problem_name: str, region_sampler_name: str, region_s
     REGION_SAMPLERS.setdefault(problem_name, {})[region_sampler_name] = region_sampler
 
 
-alias_modules(
-    __name__,
-    base_region_sampler="InSiteRegionRandomSampler MultiRegionRandomSampler SiteRegionRandomSampler "
-    "SiteSequentialCompositeSampler",
-    workspace_region_sampler="Libero100TableRegionSampler ObjectBasedSampler TableRegionSampler",
-    object_property_sampler="ObjectPropertySampler OpenCloseSampler TurnOnOffSampler",
-)
+alias_modules(__name__, "base_region_sampler workspace_region_sampler object_property_sampler")

@@ -242,4 +242,4 @@ class SingleArm:
 
 ROBOT_CLASS_MAPPING = dict.fromkeys(("Panda", "MountedPanda", "OnTheGroundPanda"), SingleArm)
 
-alias_modules(__name__, mounted_panda="MountedPanda", on_the_ground_panda="OnTheGroundPanda")
+alias_modules(__name__, "mounted_panda on_the_ground_panda")
