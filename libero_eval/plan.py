@@ -123,7 +123,7 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
     Raises:
         LiberoError: The policy, a task, the protocol or the set of initial states does not exist.
     """
-    from libero_env.cli.tasks import find_tasks
+    from libero_env.tasks import find_tasks
 
     earlier = EvaluationResult.read(request.policy_name) if is_result(request.policy_name) else None
     if earlier is None:

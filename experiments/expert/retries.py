@@ -13,12 +13,12 @@ from unittest.mock import patch
 
 import numpy as np
 
-from libero_env.cli.tasks import find_tasks
 from libero_env.demos.config import DemoConfig
 from libero_env.demos.record import DemoRecorder
 from libero_env.expert import Expert
 from libero_env.expert.expert import Attempt
 from libero_env.sim.state import StateView
+from libero_env.tasks import find_tasks
 
 AFTERMATH = ("release", "withdraw", "rest")  # phases of a skill that has already given up its attempt
 

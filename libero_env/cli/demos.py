@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -199,10 +199,10 @@ def info(paths: Files = ()) -> int:
     Args:
         paths: Files or folders (default: where demonstrations are kept).
     """
-    from libero_env.demos.curate import describe
+    from libero_env.demos.curate import describe, find_demo_files
 
     broken = 0
-    for path in demo_files(paths):
+    for path in find_demo_files(paths):
         try:
             print(describe(path))
         except DemoError as error:
@@ -217,20 +217,9 @@ def check(paths: Files = ()) -> int:
     Args:
         paths: Files or folders (default: where demonstrations are kept).
     """
-    return int(check_files(demo_files(paths)) > 0)
-
-
-def demo_files(paths: Sequence[Path]) -> list[Path]:
-    """Return the demonstration files among the given paths and in the given folders; see `find_demo_files`.
-
-    Raises:
-        DemoError: A folder is missing, or there are no files.
-    """
     from libero_env.demos.curate import find_demo_files
 
-    if missing := [path for path in paths if path.suffix != ".hdf5" and not path.exists()]:
-        raise DemoError(f"{missing[0]} does not exist; give demonstration files, or folders that hold some")
-    return find_demo_files(list(paths))
+    return int(check_files(find_demo_files(paths)) > 0)
 
 
 def check_files(files: Iterable[Path], num_demos: int | None = None) -> int:
@@ -403,7 +392,7 @@ def export(
     from libero_env.demos.lerobot import export_lerobot, export_published
     from libero_env.demos.replay import Regeneration
 
-    found = find_demo_files(list(files))
+    found = find_demo_files(files)
     if published is None:
         episodes, frames = export_lerobot(found, out, labels=labels)
         print(f"{out}: {episodes} episodes, {frames} frames")

@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Annotated
 
 from libero_env.cli.options import Field, FilePath, Positional, ProcessesOrAll, Seed, Share, Side, arg
-from libero_env.cli.tasks import find_tasks
 from libero_env.parallel import cpu_count
 
 Perturb = Annotated[str, arg(metavar="KIND=SEVERITY,...")]
@@ -40,6 +39,7 @@ def show(
     """
     from libero_env.design.preview import compare_starts
     from libero_env.perturbations import parse_perturbations
+    from libero_env.tasks import find_tasks
 
     perturbations = parse_perturbations(perturb, seed)
     for one in find_tasks([task]):
@@ -82,6 +82,7 @@ def certify(
     from libero_env.perturbations import KINDS, Perturbation
     from libero_env.perturbations.sampling import attempts_file
     from libero_env.storage import read_json, write_json
+    from libero_env.tasks import find_tasks
 
     names = kinds or [name for name, kind in KINDS.items() if kind.physical]
     perturbations = [Perturbation(kind, s, seed) for kind in dict.fromkeys(names) for s in severities if s]

@@ -20,28 +20,8 @@ from libero_env.parallel import cpu_count
 
 if TYPE_CHECKING:
     from libero_env.design.lint.report import Finding
-    from libero_env.tasks import Task
 
 LEVELS = ("error", "warning", "info")
-
-
-def find_tasks(names: Sequence[str]) -> list["Task"]:
-    """Return tasks, without duplicates, from names of suites, tasks of suites, and task files.
-
-    Raises:
-        LiberoError: A suite, task or file does not exist, or a file is not a task.
-    """
-    from libero_env.tasks import get_suite, get_task, is_suite
-    from libero_env.tasks.suites import read_yaml_tasks
-
-    tasks: dict[tuple[str, str], Task] = {}
-    for name in names:
-        if name.endswith((".yaml", ".yml")):
-            named: Sequence[Task] = read_yaml_tasks(name)
-        else:
-            named = get_suite(name).tasks if is_suite(name) else (get_task(name),)
-        tasks |= {(name if task.suite == "file" else task.suite, task.name): task for task in named}
-    return list(tasks.values())
 
 
 def list_tasks(suite: Positional[str | None] = None, *, order: Natural = 0) -> None:
@@ -87,7 +67,7 @@ def init_states(
         jobs: Number of processes (default: one per core).
     """
     from libero_env.init_states.store import cache_init_states, shipped_path, write_suite
-    from libero_env.tasks import get_suite
+    from libero_env.tasks import find_tasks, get_suite
     from libero_env.tasks.suites import ENDINGS, is_published
 
     if suite.endswith(ENDINGS) and not out:
@@ -132,6 +112,7 @@ def certify_tasks(
         again: Run again what is in the folder.
     """
     from libero_env.design.certify import certify, write_results
+    from libero_env.tasks import find_tasks
 
     certificates = certify(
         find_tasks(tasks),
@@ -184,6 +165,7 @@ def _lint(names: Sequence[str], assets: str | None, starts: int) -> "Iterator[li
     """Yield the findings of each task."""
     from libero_env.assets.pack import select_pack
     from libero_env.design.lint.checks import lint_file, lint_task, lint_text
+    from libero_env.tasks import find_tasks
 
     pack = select_pack(assets)
     for name in dict.fromkeys(names):

@@ -1,6 +1,6 @@
 """Demonstration files as a whole: where they are, what is in them, and files made of parts of them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -137,15 +137,17 @@ def filter_demos(
     return examine(writer.finish())
 
 
-def find_demo_files(paths: list[Path]) -> list[Path]:
+def find_demo_files(paths: Sequence[Path]) -> list[Path]:
     """Return the demonstration files among the given paths and in the given folders.
 
     Args:
         paths: Files and folders; none for the folder where demonstrations are kept.
 
     Raises:
-        DemoError: There are none.
+        DemoError: There are none, or a folder is missing.
     """
+    if missing := [path for path in paths if path.suffix != ".hdf5" and not path.exists()]:
+        raise DemoError(f"{missing[0]} does not exist; give demonstration files, or folders that hold some")
     paths = paths or [demos_dir()]
     groups = [[path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")) for path in paths]
     files = [  # without parts of unfinished recordings, and links

@@ -9,9 +9,10 @@ import sys
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from filelock import FileLock, Timeout
 from tqdm import tqdm
@@ -36,13 +37,11 @@ class DemoJob:
 
     Attributes:
         path: File to write.
+        writer: Writer of the file.
     """
 
     path: Path
-
-    def writer(self) -> DemoWriter:
-        """Return a writer of the file."""
-        raise NotImplementedError
+    writer: DemoWriter
 
     def missing(self, n: int) -> set[int]:
         """Return which of the first `n` demonstrations are not there.
@@ -55,7 +54,7 @@ class DemoJob:
     def is_complete(self, n: int) -> bool:
         """Return whether the file is finished and has the first `n` demonstrations."""
         try:
-            return self.path.is_file() and not self.writer().parts.exists() and not self.missing(n)
+            return self.path.is_file() and not self.writer.parts.exists() and not self.missing(n)
         except DemoError:
             return False
 
@@ -63,7 +62,7 @@ class DemoJob:
         """Remove what there is of the file, and say why."""
         tqdm.write(f"recording again: {error}", file=sys.stderr)
         self.path.unlink(missing_ok=True)
-        self.writer().discard_parts()
+        self.writer.discard_parts()
 
 
 @dataclass(frozen=True)
@@ -73,23 +72,19 @@ class RecordingJob(DemoJob):
     Attributes:
         config: What its demonstrations depend on.
         path: File to write.
-        header: Attributes of the file.
     """
 
     config: DemoConfig
     path: Path
-    header: dict[str, Any] = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "header", self.config.header())
-
+    @cached_property
     def writer(self) -> DemoWriter:
-        """Return a writer of the file."""
-        return DemoWriter(self.path, self.header)
+        """Writer of the file. The first use compiles the scene."""
+        return DemoWriter(self.path, self.config.header())
 
     def missing(self, n: int) -> set[int]:
         """Return which of the first `n` demonstrations are not recorded; see `DemoJob`."""
-        return set(range(n)) - self.writer().recorded()
+        return set(range(n)) - self.writer.recorded()
 
 
 J = TypeVar("J", bound=DemoJob)
@@ -237,10 +232,7 @@ def make_demos(
         for job in incomplete if replace else ():
             try:
                 job.missing(n)
-            except (
-                BrokenDemoError,
-                OtherRecordingError,
-            ) as error:  # not one that merely cannot be opened now
+            except (BrokenDemoError, OtherRecordingError) as error:  # not what cannot be opened just now
                 job.discard(error)
         if incomplete:
             reports |= _record(incomplete, n, workers=workers, progress=progress)
@@ -266,7 +258,7 @@ def _record(
     jobs: Sequence[RecordingJob], n: int, *, workers: int, progress: bool | None
 ) -> dict[Path, RecordingReport]:
     """Record as `make_demos` does, while no other process records in the same folders."""
-    writers = [job.writer() for job in jobs]
+    writers = [job.writer for job in jobs]
     missing = [sorted(job.missing(n)) for job in jobs]
     reports = [RecordingReport(n - len(numbers)) for numbers in missing]
     chunks = [
@@ -311,12 +303,15 @@ def _record(
 def _recording_lock(folder: Path) -> Iterator[None]:
     """Let one process at a time record or render in a folder; the lock of a process that was killed is free."""
     check_main_guard()
-    lock = FileLock(folder / ".recording.lock")
+    lock, seconds = FileLock(folder / ".recording.lock"), 0.1
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=0.1)
-    except Timeout:
-        _wait_for(lock, folder)
+        while not lock.is_locked:  # as long as it takes; a line now and every ten minutes
+            try:
+                lock.acquire(timeout=seconds)
+            except Timeout:
+                seconds, what = _WAIT_SECONDS, f"demonstrations in {folder}"
+                tqdm.write(f"another process records {what}; waiting for it", file=sys.stderr)
     except OSError as error:
         raise DemoError(
             f"{folder}: demonstrations cannot be recorded there ({error.strerror or error}); choose another folder"
@@ -325,14 +320,3 @@ def _recording_lock(folder: Path) -> Iterator[None]:
         yield
     finally:
         lock.release()
-
-
-def _wait_for(lock: FileLock, folder: Path) -> None:
-    """Wait while another process records, as long as that takes; say so now and every ten minutes."""
-    while True:
-        tqdm.write(f"another process records demonstrations in {folder}; waiting for it", file=sys.stderr)
-        try:
-            lock.acquire(timeout=_WAIT_SECONDS)
-            return
-        except Timeout:
-            continue

@@ -1,12 +1,12 @@
 """Writers of LeRobot data sets: v3.0 with many episodes to a Parquet or MP4 file, v2.0 with a file for each.
 
-Statistics can be added over episodes; those of images follow from the histograms of their channels.
+Statistics of images follow from the histograms of their channels.
 """
 
 import io
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -15,14 +15,12 @@ import numpy as np
 from PIL import Image
 
 from libero_env.demos.contents import EXPORTED_STATE
-from libero_env.demos.lerobot_layout import INDICES, Layout
+from libero_env.demos.lerobot_layout import FILES_PER_CHUNK, INDICES, ROBOT_TYPE, Layout
 from libero_env.demos.read import Episode
-from libero_env.demos.video import H264, Codec, Mp4Writer, import_av
+from libero_env.demos.video import H264, Mp4Writer, import_av
 from libero_env.errors import DemoError, LiberoError
 from libero_env.storage import atomic_write_text
 
-ROBOT_TYPE = "panda"
-FILES_PER_CHUNK = 1000
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
@@ -33,67 +31,34 @@ QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 _QUANTILE_NAMES = tuple(f"q{round(100 * q):02d}" for q in QUANTILES)
 
 
-@dataclass(frozen=True)
-class NumberStatistics:
-    """Statistics of numbers, over the first axis.
+def number_statistics(values: np.ndarray) -> dict[str, list]:
+    """Return each statistic of numbers (N,) or (N, D) as D numbers, by name; `count` is one number."""
+    x = values.reshape(len(values), -1).astype(np.float64)
+    summary = {"min": x.min(axis=0), "max": x.max(axis=0), "mean": x.mean(axis=0), "std": x.std(axis=0)}
+    summary |= dict(zip(_QUANTILE_NAMES, np.quantile(x, QUANTILES, axis=0), strict=True))
+    return {**{key: value.tolist() for key, value in summary.items()}, "count": [len(x)]}
 
-    Attributes:
-        samples: The numbers, each array (N, D) float64.
+
+def colour_counts(frames: np.ndarray) -> np.ndarray:
+    """Return how many pixels of frames (T, H, W, 3) uint8 each channel and value has, (3, 256) int64."""
+    return np.array([np.bincount(frames[..., channel].ravel(), minlength=256) for channel in range(3)])
+
+
+def colour_statistics(counts: np.ndarray, frames: int) -> dict[str, list]:
+    """Return each statistic of some frames as nested lists (3, 1, 1) in [0, 1], by name; `count` is their number.
+
+    Args:
+        counts: As from `colour_counts`, from which the statistics follow exactly.
+        frames: Number of frames.
     """
-
-    samples: tuple[np.ndarray, ...]
-
-    @classmethod
-    def from_values(cls, values: np.ndarray) -> "NumberStatistics":
-        """Return the statistics of values (N,) or (N, D)."""
-        return cls((values.reshape(len(values), -1).astype(np.float64),))
-
-    def __add__(self, other: "NumberStatistics") -> "NumberStatistics":
-        return NumberStatistics(self.samples + other.samples)
-
-    def summary(self) -> dict[str, list]:
-        """Return each statistic as D numbers, by name; `count` is one number."""
-        x = np.concatenate(self.samples)
-        summary = {"min": x.min(axis=0), "max": x.max(axis=0), "mean": x.mean(axis=0), "std": x.std(axis=0)}
-        summary |= dict(zip(_QUANTILE_NAMES, np.quantile(x, QUANTILES, axis=0), strict=True))
-        return {**{key: value.tolist() for key, value in summary.items()}, "count": [len(x)]}
-
-
-@dataclass(frozen=True)
-class ImageStatistics:
-    """Statistics of the colours of images, which follow exactly from the histograms of the channels.
-
-    Attributes:
-        counts: Number of pixels of each channel and value, (3, 256) int64.
-        frames: Number of images.
-    """
-
-    counts: np.ndarray
-    frames: int
-
-    @classmethod
-    def from_frames(cls, frames: np.ndarray) -> "ImageStatistics":
-        """Return the statistics of frames (T, H, W, 3) uint8."""
-        counts = [np.bincount(frames[..., channel].ravel(), minlength=256) for channel in range(3)]
-        return cls(np.array(counts, np.int64), len(frames))
-
-    def __add__(self, other: "ImageStatistics") -> "ImageStatistics":
-        return ImageStatistics(self.counts + other.counts, self.frames + other.frames)
-
-    def summary(self) -> dict[str, list]:
-        """Return each statistic as nested lists (3, 1, 1) in [0, 1], by name; `count` is the number of frames."""
-        levels, total = np.arange(256) / 255.0, self.counts.sum(axis=1)
-        below = np.cumsum(self.counts, axis=1)
-        mean = self.counts @ levels / total
-        std = np.sqrt(np.maximum(self.counts @ levels**2 / total - mean**2, 0.0))
-        summary = {"min": levels[(self.counts > 0).argmax(axis=1)], "mean": mean, "std": std}
-        summary["max"] = levels[255 - (self.counts[:, ::-1] > 0).argmax(axis=1)]
-        for name, q in zip(_QUANTILE_NAMES, QUANTILES, strict=True):
-            summary[name] = levels[(below >= q * total[:, None]).argmax(axis=1)]
-        return {
-            **{key: value.reshape(3, 1, 1).tolist() for key, value in summary.items()},
-            "count": [self.frames],
-        }
+    levels, total, below = np.arange(256) / 255.0, counts.sum(axis=1), np.cumsum(counts, axis=1)
+    mean = counts @ levels / total
+    std = np.sqrt(np.maximum(counts @ levels**2 / total - mean**2, 0.0))
+    summary = {"min": levels[(counts > 0).argmax(axis=1)], "mean": mean, "std": std}
+    summary["max"] = levels[255 - (counts[:, ::-1] > 0).argmax(axis=1)]
+    for name, q in zip(_QUANTILE_NAMES, QUANTILES, strict=True):
+        summary[name] = levels[(below >= q * total[:, None]).argmax(axis=1)]
+    return {**{key: value.reshape(3, 1, 1).tolist() for key, value in summary.items()}, "count": [frames]}
 
 
 class _Writer:
@@ -110,7 +75,8 @@ class _Writer:
         self._tasks: dict[str, int] = {}
         self._episodes: list[dict[str, Any]] = []
         self._shapes: dict[str, tuple[int, ...]] = {}
-        self._stats: dict[str, Any] = {}  # NumberStatistics or ImageStatistics
+        self._numbers: dict[str, list[np.ndarray]] = {}  # of all episodes, by column
+        self._colours: dict[str, np.ndarray] = {}  # see `colour_counts`
 
     def add(self, episode: Episode, language: str, where: str) -> None:
         """Append an episode.
@@ -133,10 +99,14 @@ class _Writer:
             raise DemoError(f"{where} has images {shapes}; expected {self._shapes} as in the first")
         self._shapes = shapes
         columns = self._columns(episode, self._tasks.setdefault(language, len(self._tasks)))
-        stats: dict[str, Any] = {key: NumberStatistics.from_values(values) for key, values in columns.items()}
-        stats |= {key: ImageStatistics.from_frames(frames) for key, frames in images.items()}
-        for key, one in stats.items():
-            self._stats[key] = one if key not in self._stats else self._stats[key] + one
+        stats = {}
+        for key, values in columns.items():
+            self._numbers.setdefault(key, []).append(values)
+            stats[key] = number_statistics(values)
+        for key, frames in images.items():
+            counts = colour_counts(frames)
+            self._colours[key] = self._colours.get(key, 0) + counts
+            stats[key] = colour_statistics(counts, len(frames))
         entry = {"episode_index": len(self._episodes), "tasks": [language], "length": len(episode)}
         self._episodes.append(entry | self._write(columns, images, stats))
         self._frames += len(episode)
@@ -145,7 +115,8 @@ class _Writer:
         """Write the metadata of the data set; return the number of episodes and the number of frames."""
         if not self._episodes:
             raise DemoError("no demonstrations to export")
-        summaries = {key: stats.summary() for key, stats in self._stats.items()}
+        summaries = {key: number_statistics(np.concatenate(all)) for key, all in self._numbers.items()}
+        summaries |= {key: colour_statistics(all, self._frames) for key, all in self._colours.items()}
         self._write_metadata(self.root / "meta", summaries)
         return len(self._episodes), self._frames
 
@@ -253,33 +224,50 @@ class VideoDatasetWriter(_Writer):
     def __init__(self, root: Path, layout: Layout, video_mb: float | None = None):
         super().__init__(root, layout)
         import_av()
-        self._videos: dict[str, CameraVideo] = {}
         self._video_mb = layout.video_mb if video_mb is None else video_mb
-        self._data = ParquetTable(root, layout.data_mb)
+        self._videos: dict[str, GrowingFile] = {}  # of each camera
+        self._data: GrowingFile | None = None  # one row group per episode
 
     def _write(
         self, columns: Mapping[str, np.ndarray], images: Mapping[str, np.ndarray], stats: Mapping[str, Any]
     ) -> dict[str, Any]:
         steps, first = len(columns["index"]), self._frames
-        entry = self._data.add(columns)
+        entry = self._add_rows(self._pa.table(_arrays(self._pa, columns)))
         entry |= {"dataset_from_index": first, "dataset_to_index": first + steps}
         for key, frames in images.items():
-            entry |= self._video(key).add(frames)
+            entry |= self._add_frames(key, frames)
         for key, one in stats.items():
-            entry |= {f"stats/{key}/{name}": value for name, value in one.summary().items()}
+            entry |= {f"stats/{key}/{name}": value for name, value in one.items()}
         return {**entry, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
 
-    def _video(self, key: str) -> "CameraVideo":
+    def _add_rows(self, table: Any) -> dict[str, Any]:
+        if self._data is None:
+            create = partial(self._pq.ParquetWriter, schema=table.schema, compression="snappy")
+            self._data = GrowingFile(self.root, DATA_PATH, self.layout.data_mb, create)
+        place = self._data.open()
+        self._data.writer.write_table(table)
+        self._data.bytes += table.nbytes
+        return {f"data/{name}": value for name, value in place.items()}
+
+    def _add_frames(self, key: str, frames: np.ndarray) -> dict[str, Any]:
+        fps = self.layout.fps
         if key not in self._videos:
-            codec = self.layout.codec or H264
-            self._videos[key] = CameraVideo(self.root, key, self._video_mb, self.layout.fps, codec)
-        return self._videos[key]
+            create = partial(Mp4Writer, fps=fps, codec=self.layout.codec or H264)
+            pattern = VIDEO_PATH.replace("{video_key}", key)
+            self._videos[key] = GrowingFile(self.root, pattern, self._video_mb, create)
+        video = self._videos[key]
+        place = video.open()
+        first = video.writer.frames
+        video.writer.add(frames)
+        video.bytes = video.writer.path.stat().st_size
+        times = {"from_timestamp": first / fps, "to_timestamp": video.writer.frames / fps}
+        return {f"videos/{key}/{name}": value for name, value in {**place, **times}.items()}
 
     def close(self) -> None:
         """Close all files."""
-        self._data.close()
-        for video in self._videos.values():
-            video.close()
+        for file in (self._data, *self._videos.values()):
+            if file is not None:
+                file.close()
 
     def _write_metadata(self, meta: Path, summaries: Mapping[str, Mapping[str, Any]]) -> None:
         (self.root / _EPISODES_PATH).parent.mkdir(parents=True)
@@ -328,88 +316,43 @@ def import_arrow() -> tuple[ModuleType, ModuleType]:
     return pyarrow, pyarrow.parquet
 
 
-class _GrowingFile:
+class GrowingFile:
     """A file that episodes are appended to, and that is continued in another one when it is large.
 
     Args:
         root: Folder of the data set.
         pattern: Path of a file in it, with chunk and index.
         limit_mb: Size from which a file is continued in another one, [MiB].
+        create: Function that opens a writer of the file at a path.
+
+    Attributes:
+        writer: Writer of the open file.
+        bytes: Size of what has been written to it.
     """
 
-    _writer: Any
+    def __init__(self, root: Path, pattern: str, limit_mb: float, create: Callable[[Path], Any]):
+        self._root, self._pattern, self._limit, self._create = root, pattern, limit_mb * 2**20, create
+        self._number, self.bytes = 0, 0
+        self.writer: Any = None
 
-    def __init__(self, root: Path, pattern: str, limit_mb: float):
-        self._root, self._pattern, self._limit_mb = root, pattern, limit_mb
-        self._number = 0
-        self._writer: Any = None
-
-    def _place(self, size: int) -> tuple[Path, dict[str, int]]:
-        """Return the path of the file that the next episode is in, and its indices for the table of episodes.
-
-        Args:
-            size: Size of the open file, bytes.
-        """
-        if size > self._limit_mb * 2**20:
+    def open(self) -> dict[str, int]:
+        """Open the file that the next episode is in; return its indices for the table of episodes."""
+        if self.bytes > self._limit:
             self.close()
             self._number += 1
         chunk, index = divmod(self._number, FILES_PER_CHUNK)
         place = {"chunk_index": chunk, "file_index": index}
-        path = self._root / self._pattern.format(**place)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        return path, place
+        if self.writer is None:
+            path = self._root / self._pattern.format(**place)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self.writer, self.bytes = self._create(path), 0
+        return place
 
     def close(self) -> None:
         """Close the open file. Idempotent."""
-        if self._writer is not None:
-            self._writer.close()
-            self._writer = None
-
-
-class ParquetTable(_GrowingFile):
-    """Writes the Parquet files of the data, one row group per episode."""
-
-    def __init__(self, root: Path, limit_mb: float):
-        super().__init__(root, DATA_PATH, limit_mb)
-        self._pa, self._pq = import_arrow()
-        self._bytes = 0
-
-    def add(self, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:
-        """Append an episode; return the metadata that tell where it is."""
-        table = self._pa.table(_arrays(self._pa, columns))
-        path, place = self._place(self._bytes)
-        if self._writer is None:
-            self._writer = self._pq.ParquetWriter(path, table.schema, compression="snappy")
-            self._bytes = 0
-        self._writer.write_table(table)
-        self._bytes += table.nbytes
-        return {f"data/{key}": value for key, value in place.items()}
-
-
-class CameraVideo(_GrowingFile):
-    """Writes the MP4 files of a camera.
-
-    Args:
-        root: Folder of the data set.
-        key: Feature of the camera.
-        limit_mb: As for `ParquetTable`.
-        fps: Frames per second.
-        codec: How frames are encoded.
-    """
-
-    def __init__(self, root: Path, key: str, limit_mb: float, fps: int, codec: Codec):
-        super().__init__(root, VIDEO_PATH.replace("{video_key}", key), limit_mb)
-        self._key, self._fps, self._codec = key, fps, codec
-
-    def add(self, frames: np.ndarray) -> dict[str, Any]:
-        """Append an episode; return the metadata that tell where it is."""
-        path, place = self._place(self._writer.path.stat().st_size if self._writer is not None else 0)
-        if self._writer is None:
-            self._writer = Mp4Writer(path, self._fps, self._codec)
-        first = self._writer.frames
-        self._writer.add(frames)
-        times = {"from_timestamp": first / self._fps, "to_timestamp": self._writer.frames / self._fps}
-        return {f"videos/{self._key}/{name}": value for name, value in {**place, **times}.items()}
+        if self.writer is not None:
+            self.writer.close()
+            self.writer = None
 
 
 def _arrays(pa: ModuleType, columns: Mapping[str, np.ndarray]) -> dict[str, Any]:

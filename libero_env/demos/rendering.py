@@ -5,6 +5,7 @@ import json
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -56,8 +57,9 @@ class RenderJob(DemoJob):
         folder = self.file.parent / f"under-{text}-{height}x{width}-{drawing}"
         object.__setattr__(self, "path", folder / self.file.name if text else self.file)
 
+    @cached_property
     def writer(self) -> DemoWriter:
-        """Return a writer of the file."""
+        """Writer of the file."""
         return DemoWriter(self.path, rendered_header(self.file, self.config, self.task))
 
     def missing(self, n: int) -> set[int]:
@@ -66,7 +68,7 @@ class RenderJob(DemoJob):
         Raises:
             DemoError: What is there is broken, or of other demonstrations.
         """
-        rendered, missing = self.writer().recorded_states(), set()
+        rendered, missing = self.writer.recorded_states(), set()
         for number, states in self._recorded_states(n):
             if number not in rendered:
                 missing.add(number)

@@ -15,27 +15,10 @@ from libero_env.objects.xml_file import Node, parse_xml_text
 from libero_env.sim.scene import Scene, scene_spec
 from libero_env.tasks.problem import Problem
 
-_TEXTURE_FIELDS = [
-    "type",
-    "builtin",
-    "mark",
-    "rgb1",
-    "rgb2",
-    "markrgb",
-    "random",
-    "width",
-    "height",
-    "nchannel",
-    "data",
-    "file",
-    "cubefiles",
-    "content_type",
-    "gridlayout",
-    "gridsize",
-    "hflip",
-    "vflip",
-    "colorspace",
-]
+_TEXTURE_FIELDS = (
+    *("type", "builtin", "mark", "rgb1", "rgb2", "markrgb", "random", "width", "height", "nchannel", "data"),
+    *("file", "cubefiles", "content_type", "gridlayout", "gridsize", "hflip", "vflip", "colorspace"),
+)
 _GROWING = {"include", "replicate", "composite", "flexcomp", "attach", "model", "extension", "plugin"}
 _MAX_ELEMENTS = 20_000  # of a model; a kitchen has 3,000
 _MAX_COUNT = 10_000  # of key frames and the like, for which <size> reserves memory

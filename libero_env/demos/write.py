@@ -32,24 +32,19 @@ from libero_env.storage import atomic_path
 
 TAG = "libero-v1"
 FRAMES_PER_CHUNK = 8
-# Attributes in which all demonstrations of a file agree.
-_CONFIG_KEYS = [
-    "bddl_file_name",
-    "bddl_file_content",
-    "seed",
-    "camera_size",
-    "cameras",
-    "pictures",
-    "drawing",
-    "pairing",
-    "generator",
-    "disturbed",
-    "variation",
-    "model_digest",
-    "filter",
-    "perturb",
-    "perturb_draws",
-]
+_CONFIG_KEYS = (  # attributes in which all demonstrations of a file agree
+    *(
+        "bddl_file_name",
+        "bddl_file_content",
+        "seed",
+        "camera_size",
+        "cameras",
+        "pictures",
+        "drawing",
+        "pairing",
+    ),
+    *("generator", "disturbed", "variation", "model_digest", "filter", "perturb", "perturb_draws"),
+)
 
 
 class OtherRecordingError(DemoError):

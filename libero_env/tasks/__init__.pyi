@@ -1,7 +1,7 @@
 from .benchmark import suite_names
 from .builder import make_task
 from .problem import And, Atom, ForAll, Not, Or, Problem, Region
-from .suites import get_suite, get_task, is_suite, read_suite, read_task, write_task
+from .suites import find_tasks, get_suite, get_task, is_suite, read_suite, read_task, write_task
 from .task import Suite, Task
 
 __all__ = [
@@ -14,6 +14,7 @@ __all__ = [
     "Region",
     "Suite",
     "Task",
+    "find_tasks",
     "get_suite",
     "get_task",
     "is_suite",

@@ -72,6 +72,22 @@ def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
     return tuple(made)
 
 
+def find_tasks(names: Iterable[str]) -> list[Task]:
+    """Return tasks, without duplicates, from names of suites, tasks of suites, and task files.
+
+    Raises:
+        LiberoError: A suite, task or file does not exist, or a file is not a task.
+    """
+    tasks: dict[tuple[str, str], Task] = {}
+    for name in names:
+        if name.endswith((".yaml", ".yml")):
+            named = read_yaml_tasks(name)
+        else:
+            named = get_suite(name).tasks if is_suite(name) else (get_task(name),)
+        tasks |= {(name if task.suite == FILE else task.suite, task.name): task for task in named}
+    return list(tasks.values())
+
+
 def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
     """Return a suite of user-defined tasks.
 

@@ -114,7 +114,7 @@ def test_without_matplotlib_there_is_no_figure_and_no_error(tried, tmp_path, cap
 
 @pytest.mark.unit
 def test_tasks_are_named_once(tmp_path):
-    from libero_env.cli.tasks import find_tasks
+    from libero_env.tasks import find_tasks
 
     files = [tmp_path / "a.bddl", tmp_path / "b.bddl"]
     for file in files:

@@ -168,7 +168,7 @@ def test_the_folder_names_every_option_that_is_not_the_default(tmp_path):
 
 def test_a_recording_killed_before_its_parts_were_joined_is_finished(whole, tmp_path):
     path = tmp_path / "unjoined.hdf5"
-    writer = RecordingJob(DemoConfig(get_task(TASK), SIZE), path).writer()
+    writer = RecordingJob(DemoConfig(get_task(TASK), SIZE), path).writer
     for episode in read_episodes(whole):
         writer.write(demo_number(episode.name), episode)
     assert not path.exists()
