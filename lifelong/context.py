@@ -9,8 +9,7 @@ from libero_env.perturbations import Perturbation, reword_task
 from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.settings import DataSettings
-from lifelong.evaluation.environments import EnvPool
-from lifelong.evaluation.held_out import HeldOutShift
+from lifelong.evaluation.environments import EnvPool, HeldOutShift
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory

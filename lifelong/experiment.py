@@ -30,9 +30,13 @@ from lifelong.data.demonstrations import (
 )
 from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError
-from lifelong.evaluation.environment_record import renderer_name_or_none
-from lifelong.evaluation.environments import EnvPool, run_environment
-from lifelong.evaluation.held_out import HeldOutShift, held_out_shift
+from lifelong.evaluation.environments import (
+    EnvPool,
+    HeldOutShift,
+    held_out_shift,
+    renderer_name_or_none,
+    run_environment,
+)
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
 from lifelong.pretraining import policy_at_start, pretraining_context

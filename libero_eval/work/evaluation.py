@@ -24,8 +24,7 @@ from libero_eval.work.progress import busy_seconds
 from libero_eval.work.store import PLAN_FORMAT, Unit, UnitResult, WorkStore, describe, partition, this_process
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, WatchesWorld
-from lifelong.evaluation.environment_record import common_environment, describe_environment
-from lifelong.evaluation.environments import EnvPool, VectorEnv
+from lifelong.evaluation.environments import EnvPool, VectorEnv, common_environment, describe_environment
 from lifelong.evaluation.rollout import Episode, Rollouts, run_episodes, save_animation
 from lifelong.results.provenance import installed_versions
 

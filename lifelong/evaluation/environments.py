@@ -1,15 +1,28 @@
-"""Environments of an evaluation: the interface that rollouts use, and a pool of open environments."""
+"""Environments of an evaluation: the interface that rollouts use, a pool, held-out shifts, and what numbers depend on."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from libero_env.envs.batch import BatchEnv
-from libero_env.perturbations import Perturbation
+from libero_env.errors import RenderError
+from libero_env.perturbations import (
+    Perturbation,
+    format_perturbations,
+    perturb_task,
+    replace_perturbations,
+    reword_task,
+)
+from libero_env.sim.render import renderer_name
+from libero_env.sim.scene import build_scene
 from libero_env.tasks import Task
-from lifelong.data.settings import CAMERAS
+from lifelong.data.settings import CAMERAS, DataSettings
+from lifelong.errors import ConfigError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.types import PolicySpec
 
@@ -101,3 +114,109 @@ def run_environment(
         backend=settings.backend,
         perturb=tuple(perturb),
     )
+
+
+@dataclass(frozen=True)
+class HeldOutShift:
+    """Perturbations under which a run's policies are evaluated besides its success matrix.
+
+    Attributes:
+        text: The perturbations, as text.
+        perturb: Perturbations of each task: its own, and those of the shift, which replace own ones of the same kind.
+        languages: (K, L) embeddings of the instructions under the shift.
+    """
+
+    text: str
+    perturb: tuple[tuple[Perturbation, ...], ...]
+    languages: Tensor
+
+
+def held_out_shift(
+    shift: Sequence[Perturbation],
+    tasks: Sequence[Task],
+    own: Sequence[Sequence[Perturbation]],
+    languages: Tensor,
+    data: DataSettings,
+    embed: Callable[[list[str]], Tensor],
+) -> HeldOutShift | None:
+    """Return a held-out shift, or None without one.
+
+    Args:
+        shift: Its perturbations.
+        tasks: Tasks without perturbations.
+        own: Perturbations of each task, under which it is learned.
+        languages: (K, L) embeddings of the instructions with which the tasks are learned.
+        data: Drawing and robot of the scenes.
+        embed: Function that returns the embeddings of all instructions of a run and further ones, (N, L).
+
+    Raises:
+        ConfigError: The shift changes instructions, and they are identified by their position.
+        LiberoError: A task cannot be perturbed so, or perturbations exclude each other.
+    """
+    if not shift:
+        return None
+    perturb = tuple(replace_perturbations(found, shift) for found in own)
+    said = [reword_task(task, found).language for task, found in zip(tasks, own, strict=True)]
+    words = [_instruction(task, found, data) for task, found in zip(tasks, perturb, strict=True)]
+    if words == said:
+        return HeldOutShift(format_perturbations(shift), perturb, languages)
+    found = embed(words)
+    if found.shape[1] != languages.shape[1]:
+        raise ConfigError(
+            f"eval.shift={format_perturbations(shift)} changes instructions, and this language encoder knows tasks by "
+            "their position; choose another, such as language=minilm"
+        )
+    return HeldOutShift(format_perturbations(shift), perturb, found)
+
+
+def _instruction(task: Task, perturb: Sequence[Perturbation], data: DataSettings) -> str:
+    """Return the instruction of a perturbed task; its scene is built only where the problem changes in other ways."""
+    if all(one.kind == "instruction" for one in perturb if one.definition.layer == "problem"):
+        return reword_task(task, perturb).language
+    scene = build_scene(task.problem, drawing=data.drawing, robot=data.robot)
+    return perturb_task(task, perturb, scene).language
+
+
+def describe_environment(env: VectorEnv) -> dict[str, Any]:
+    """Return the models, robot, drawing and back end of an environment, and the machine that runs it, as plain data.
+
+    Args:
+        env: Environment; one that is not a `libero_env.envs.batch.BatchEnv` contributes nothing.
+    """
+    found: dict[str, Any] = {}
+    scene, simulations = getattr(env, "scene", None), getattr(env, "simulations", None)
+    if scene is not None and simulations is not None:
+        found |= {
+            "models": scene.pack.name,
+            "models_digest": getattr(scene.pack, "digest", None),
+            "robot": scene.robot,
+            "drawing": scene.drawing,
+            **simulations.record(),
+        }
+    if (config := getattr(env, "config", None)) is not None and config.cameras and not config.backend.is_warp:
+        backend, renderer = renderer_name()
+        found |= {"gl": backend, "renderer": renderer}
+    return found | {
+        "instruction_set": torch.backends.cpu.get_cpu_capability(),
+        "policy_threads": torch.get_num_threads(),
+    }
+
+
+def renderer_name_or_none() -> str | None:
+    """Return the name of the OpenGL renderer, such as `llvmpipe (LLVM 15.0.6)`; None where nothing can be drawn."""
+    try:
+        return renderer_name()[1]
+    except RenderError:  # said where something is drawn
+        return None
+
+
+def common_environment(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the environments of several processes as one; a value that differs becomes the list of its values."""
+    together: dict[str, Any] = {}
+    for name in dict.fromkeys(key for one in found for key in one):
+        values: list[Any] = []
+        for one in found:
+            if one.get(name) not in values:
+                values.append(one.get(name))
+        together[name] = values[0] if len(values) == 1 else values
+    return together

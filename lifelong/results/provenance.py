@@ -88,16 +88,14 @@ def config_digest(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def start_record(*, config: Mapping[str, Any], group_sizes: Sequence[int] = (), **facts: Any) -> RunRecord:
+def start_record(*, config: Mapping[str, Any], **facts: Any) -> RunRecord:
     """Return the record of a run that starts now, on this machine.
 
     Args:
         config: Resolved configuration as plain data, whose digest is recorded.
-        group_sizes: Number of tasks in each group that is one step of the sequence; () for one at a time.
-        facts: Other fields of `RunRecord`; tasks, instructions and perturbations may be any sequence.
+        facts: Other fields of `RunRecord`; those that are tuples may be any sequence.
     """
-    equal = len(set(group_sizes)) < 2
-    columns = ("tasks", "instructions", "perturbed")
+    columns = ("tasks", "instructions", "perturbed", "group_sizes")
     fields: Any = {name: tuple(value) if name in columns else value for name, value in facts.items()}
     return RunRecord(
         config_digest=config_digest(config),
@@ -105,8 +103,6 @@ def start_record(*, config: Mapping[str, Any], group_sizes: Sequence[int] = (), 
         commit=source_commit(),
         cpu_count=os.cpu_count() or 1,
         started=utc_now(),
-        group_size=group_sizes[0] if group_sizes and equal else 1,
-        group_sizes=() if equal else tuple(group_sizes),
         **fields,
     )
 

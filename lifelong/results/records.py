@@ -54,10 +54,9 @@ class RunRecord:
     commit: str | None
     cpu_count: Count
     started: str  # ISO 8601, UTC
-    group_size: Annotated[int, Field(ge=1, le=1000)] = 1  # tasks learned together as one step of the sequence
     conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.provenance`
     cells: MatrixCells = "all"  # of the success matrix, which are measured
-    # of each group, where they are not all of group_size
+    # number of tasks in each group that is one step of the sequence; () for one task at a time
     group_sizes: tuple[Annotated[int, Field(ge=1)], ...] = ()
     transfer: Transfer = "cross_fitted"  # estimate of forward transfer, see `lifelong.stats.metrics`
     # perturbations of each task, in learning and evaluation; () for none at all
@@ -69,22 +68,21 @@ class RunRecord:
             raise ValueError(f"a run of {len(self.tasks)} tasks has {len(self.instructions)} instructions")
         if len(self.perturbed) not in (0, len(self.tasks)):
             raise ValueError(f"a run of {len(self.tasks)} tasks has {len(self.perturbed)} perturbations")
-        sizes = self.group_sizes
-        if sum(sizes) != len(self.tasks) if sizes else len(self.tasks) % self.group_size:
+        if self.group_sizes and sum(self.group_sizes) != len(self.tasks):
             raise ValueError(
-                f"{len(self.tasks)} tasks are no groups of {', '.join(map(str, sizes or [self.group_size]))}"
+                f"{len(self.tasks)} tasks are not groups of {', '.join(map(str, self.group_sizes))}"
             )
 
     @property
     def groups(self) -> tuple[range, ...]:
         """Positions of the tasks in each group that is one step of the sequence."""
-        sizes = self.group_sizes or (self.group_size,) * (len(self.tasks) // self.group_size)
+        sizes = self.group_sizes or (1,) * len(self.tasks)
         return tuple(range(end - size, end) for size, end in zip(sizes, accumulate(sizes), strict=True))
 
     @property
     def has_base_stage(self) -> bool:
         """Whether more tasks were learned together first than in any later group."""
-        return bool(self.group_sizes) and self.group_sizes[0] > max(self.group_sizes[1:])
+        return len(self.groups) > 1 and len(self.groups[0]) > max(map(len, self.groups[1:]))
 
     def group(self, task: int) -> range:
         """Return the positions of the tasks in a task's group."""
@@ -327,7 +325,12 @@ _KINDS: Mapping[str, type[Record]] = {record.kind: record for record in get_args
 
 def to_line(record: Record) -> bytes:
     """Return a record as one line of strict JSON, with a checksum; numbers that are not finite become null."""
-    text = _text(json_safe(asdict(record)))
+    return signed_line(asdict(record))
+
+
+def signed_line(values: Mapping[str, Any]) -> bytes:
+    """Return plain data as such a line."""
+    text = _text(json_safe(values))
     return f'{text[:-1]}, "{_CHECKSUM}": "{_checksum(text)}"}}\n'.encode()
 
 
@@ -344,8 +347,7 @@ def from_line(line: bytes) -> Record:
     kind = values.get("kind") if isinstance(values, dict) else None
     if not isinstance(kind, str) or kind not in _KINDS:
         raise ValueError(f"unknown kind of record {str(kind)[:40]!r}; valid: {', '.join(_KINDS)}")
-    stated = values.pop(_CHECKSUM, None)
-    if stated is not None and stated != _checksum(_text(values)):
+    if values.pop(_CHECKSUM, None) != _checksum(_text(values)):
         raise ValueError(f"a {kind!r} record that was changed: it does not have its checksum")
     try:
         record: Record = validate(_KINDS[kind], values)

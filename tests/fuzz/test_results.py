@@ -19,6 +19,7 @@ from lifelong.results.records import (
     PhaseRecord,
     RunEndRecord,
     TaskEndRecord,
+    signed_line,
     to_line,
 )
 from lifelong.results.summary import summarize
@@ -75,7 +76,7 @@ ODD = st.sampled_from(
 
 @st.composite
 def edited_line(draw) -> bytes:
-    """A line whose values are of other types or out of range, without a checksum."""
+    """A line whose values are of other types or out of range, with its checksum."""
     values = json.loads(draw(st.sampled_from(LINES)))
     del values["crc32"]
     for _ in range(draw(st.integers(1, 2))):
@@ -87,7 +88,10 @@ def edited_line(draw) -> bytes:
                 values.pop(key, None)
             case "nest":
                 values[key] = [values.get(key)]
-    return json.dumps(values).encode() + b"\n"
+    try:
+        return signed_line(values)
+    except (RecursionError, ValueError):  # JSON has no such number
+        return json.dumps(values).encode() + b"\n"
 
 
 @st.composite

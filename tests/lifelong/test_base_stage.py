@@ -204,15 +204,14 @@ def test_without_a_base_stage_nothing_is_measured_apart(tmp_path) -> None:
     assert scores.without_first().matrix.tolist() == [[0.4]]
 
 
-def test_records_keep_the_sizes_of_groups_and_earlier_ones_are_read() -> None:
+def test_records_keep_the_sizes_of_groups() -> None:
     found = from_line(to_line(record((6, 1, 1))))
     assert isinstance(found, RunRecord)
     assert [*map(list, found.groups)] == [[0, 1, 2, 3, 4, 5], [6], [7]] and found.has_base_stage
     assert found.group(3) == range(6) and found.group(7) == range(7, 8)
     pairs = record((2, 2, 2))
-    assert (pairs.group_size, pairs.group_sizes) == (2, ()), "as earlier versions wrote it"
     assert [len(group) for group in pairs.groups] == [2, 2, 2]
-    with pytest.raises(ValueError, match="3 tasks are no groups of 2, 2"):
+    with pytest.raises(ValueError, match="3 tasks are not groups of 2, 2"):
         replace(record((2, 1)), group_sizes=(2, 2))
 
 

@@ -30,6 +30,7 @@ from lifelong.results.records import (
     PhaseRecord,
     RunEndRecord,
     TaskEndRecord,
+    signed_line,
 )
 from lifelong.results.summary import read_episodes, summarize
 from lifelong.stats.methods import MethodRun, statistics
@@ -439,7 +440,7 @@ def test_subgoals_are_on_the_page_unless_records_are_old(finished: Path, tmp_pat
     lines = [json.loads(line) for line in (old / "results.jsonl").read_text().splitlines()]
     newer = ("atoms", "crc32")
     kept = [{k: v for k, v in r.items() if not k.startswith(newer)} for r in lines if r["kind"] != "cost"]
-    (old / "results.jsonl").write_text("".join(json.dumps(r) + "\n" for r in kept))
+    (old / "results.jsonl").write_bytes(b"".join(map(signed_line, kept)))
     assert load_run(old).results.problems == ()
     text = Page(write_report([old]).read_text()).text
     assert "Subgoals" not in text and "Costs" not in text and "FWT" in text
@@ -571,8 +572,8 @@ def test_any_text_is_shown_as_it_is(text, tmp_path):
     run = make_run(tmp_path / "run", tasks=2, epochs=(0, 2))
     first, *others = (run / "results.jsonl").read_text().splitlines()
     changed = json.loads(first) | {"instructions": [text, "b"], "algo": text}
-    del changed["crc32"]  # as of earlier versions
-    (run / "results.jsonl").write_text("\n".join([json.dumps(changed), *others]) + "\n")
+    del changed["crc32"]
+    (run / "results.jsonl").write_bytes(signed_line(changed) + ("\n".join(others) + "\n").encode())
     html = write_report([run]).read_text(encoding="utf-8")
     assert "<script>alert" not in html and "} 49 {" not in html and "\\ 49" not in html
 
