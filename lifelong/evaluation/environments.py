@@ -1,4 +1,4 @@
-"""Environments of an evaluation: the interface that rollouts use, a pool, held-out shifts, and what numbers depend on."""
+"""Environments of an evaluation: the interface that rollouts use, a pool, held-out shifts, what numbers depend on."""
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
