@@ -35,6 +35,7 @@ WORKSPACES: Mapping[str, str] = {
 SPARE = "spare_"  # prefix of materials that nothing has
 _ROOM = "room"  # file with the parameters that all workspaces share
 _MOUNT_LIFT = 0.01  # [m] height of the mount's origin above the arm's
+_SEEN: Mapping[str, Any] = {"group": 1, "contype": 0, "conaffinity": 0}  # geoms of the room
 _SHARED = ("cameras", "lights", "walls", "floor")
 
 
@@ -222,17 +223,7 @@ def _add_room(
     )
     add_material(spec, "wall", styles["wall"], *parameters["wall_gloss"])
     for name, wall in parameters["walls"].items():
-        world.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=wall["pos"],
-            quat=wall["quat"],
-            size=wall["size"],
-            material="wall",
-            group=1,
-            contype=0,
-            conaffinity=0,
-        )
+        world.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, material="wall", **_SEEN, **wall)
 
 
 def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
@@ -240,32 +231,17 @@ def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
     for name, pos in table["bodies"].items():
         body = body.add_body(name=name, pos=pos)
     body.quat = table.get("quat", [1.0, 0.0, 0.0, 0.0])
-    contact = table.get("contact", {})
     for box in table["collision"]:
-        geom = body.add_geom(
-            name=box.get("name", ""),
+        body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=box.get("pos", [0.0] * 3),
-            quat=box.get("quat", [1.0, 0.0, 0.0, 0.0]),
-            size=box["size"],
-            friction=box.get("friction") or contact["friction"],
             group=0,
             rgba=[0.5, 0.5, 0.5, 0.3],
+            **{**table.get("contact", {}), **box},
         )
-        if "solref" in contact:
-            geom.solref, geom.solimp = contact["solref"], [*contact["solimp"], 0.5, 2.0]
     add_material(spec, "table", table["style"], *table["gloss"])
     for part in table.get("visual", ()):
-        body.add_geom(
-            name=part["name"],
-            type=getattr(mujoco.mjtGeom, f"mjGEOM_{part['type'].upper()}"),
-            pos=part.get("pos", [0.0] * 3),
-            size=part["size"],
-            material="table",
-            group=1,
-            contype=0,
-            conaffinity=0,
-        )
+        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{part['type'].upper()}")
+        body.add_geom(material="table", **_SEEN, **{**part, "type": kind})
     if "shapes" in table:
         first = spec.body(next(iter(table["bodies"])))
         mesh = merge([solid_mesh(shape) for shape in table["shapes"]])

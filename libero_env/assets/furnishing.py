@@ -13,6 +13,7 @@ import numpy as np
 
 from libero_env.errors import UnknownNameError
 from libero_env.objects.builtin.mesh import Mesh, Ring, box, loft, merge, quad
+from libero_env.objects.model import VISUAL_GEOM
 from libero_env.storage import read_yaml
 
 _SIZE = 128  # [pixels] default side of a texture
@@ -205,10 +206,7 @@ def add_visual_mesh(
         type=mujoco.mjtGeom.mjGEOM_MESH,
         meshname=name,
         material=material,
-        group=1,
-        contype=0,
-        conaffinity=0,
-        mass=0.0,
+        **VISUAL_GEOM,
     )
 
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import mujoco
 
@@ -33,9 +32,6 @@ LIBERO_PRO: Mapping[str, tuple[str, float]] = MappingProxyType(
 )
 _OFFSETS = ("bottom_offset", "top_offset", "horizontal_radius")  # fields that grow with an object
 _STEMS = {"rack": "simple_rack"}
-_PHYSICS_FIELDS = (  # fields of `ObjectModel` that the original's files do not contain
-    "joint_damping", "rotation", "rotation_axis", "bottom_offset", "top_offset", "horizontal_radius", "articulation",
-)  # fmt: skip
 _ROOM = "room_"
 _NAMED_ONLY = ("cherries", "corn", "mayo")  # categories of the original whose files were never published
 
@@ -84,8 +80,7 @@ class OriginalPack:
         spec = read_spec(object_xml(file, category, Path(self.root)), file)
         self._simplify(spec)
         base, scale = LIBERO_PRO.get(category, (category, 1.0))
-        physics = load_physics(base)
-        fields: dict[str, Any] = {name: getattr(physics, name) for name in _PHYSICS_FIELDS}
+        fields = load_physics(base).of_model
         if scale != 1.0:
             fields |= {name: _scaled(fields[name], scale) for name in _OFFSETS}
         return ObjectModel(category, spec, **fields)

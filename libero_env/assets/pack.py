@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -204,10 +204,18 @@ def problems(pack: Pack) -> list[str]:
         robosuite_assets()
     except MissingPackageError as error:
         lines.append(f"robot: {error}")
-    for category in pack.categories():
-        lines += _build_problems(category, _object_alone, pack)
-    for name in WORKSPACES:
-        lines += _build_problems(name, _arena_alone, pack)
+
+    def room(name: str) -> mujoco.MjSpec:
+        spec = mujoco.MjSpec()
+        pack.add_arena(spec, load_workspace(name), {})
+        return spec
+
+    makers = dict.fromkeys(pack.categories(), lambda name: pack.build(name).spec)
+    for name, make in {**makers, **dict.fromkeys(WORKSPACES, room)}.items():
+        try:
+            make(name).compile()
+        except (LiberoError, ValueError) as error:  # MuJoCo raises ValueError for a broken mesh or texture
+            lines.append(f"{name}: {error}")
     if not isinstance(pack, OriginalPack):
         return lines
     root = Path(pack.root)
@@ -215,24 +223,6 @@ def problems(pack: Pack) -> list[str]:
         return lines + [f"{name}: missing or changed" for name in broken_files(root, record[1])]
     check_folder.cache_clear()
     return lines + list(check_folder(root).differences)
-
-
-def _build_problems(name: str, make: Callable[[Pack, str], mujoco.MjSpec], pack: Pack) -> list[str]:
-    try:
-        make(pack, name).compile()
-    except (LiberoError, ValueError) as error:  # MuJoCo raises ValueError for a broken mesh or texture
-        return [f"{name}: {error}"]
-    return []
-
-
-def _object_alone(pack: Pack, category: str) -> mujoco.MjSpec:
-    return pack.build(category).spec
-
-
-def _arena_alone(pack: Pack, workspace: str) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec()
-    pack.add_arena(spec, load_workspace(workspace), {})
-    return spec
 
 
 def _is_absent(value: str) -> bool:

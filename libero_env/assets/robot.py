@@ -15,6 +15,7 @@ import numpy as np
 from libero_env.assets.simplify import MeshSource, merge_and_simplify
 from libero_env.errors import MissingPackageError
 from libero_env.mujoco_compat import delete
+from libero_env.objects.model import VISUAL_GEOM
 
 ROBOTS = ("libero", "robosuite-1.4.1")
 DEFAULT_ROBOT = "libero"
@@ -150,10 +151,7 @@ def _replace_visuals(spec: mujoco.MjSpec, name: str) -> None:
                 type=mujoco.mjtGeom.mjGEOM_MESH,
                 meshname=mesh.name,
                 rgba=rgba,
-                group=1,
-                contype=0,
-                conaffinity=0,
-                mass=0.0,
+                **VISUAL_GEOM,
             )
     for geom in visuals:
         delete(spec, geom)

@@ -74,31 +74,8 @@ def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | Non
         arrays = whole if len(whole[1]) <= faces else decimate(*whole, faces)
         return {f"a{i}": array for i, array in enumerate(arrays)}
 
-    stored = cached_arrays(path, make, _is_textured_mesh)
+    stored = cached_arrays(path, make, lambda arrays: set(arrays) == {"a0", "a1", "a2", "a3"})
     return (stored["a0"], stored["a1"], stored["a2"], stored["a3"]) if len(stored["a1"]) else None
-
-
-def _is_textured_mesh(arrays: dict[str, np.ndarray]) -> bool:
-    if set(arrays) != {"a0", "a1", "a2", "a3"}:
-        return False
-    vertices, triangles, texcoords, indices = (arrays[f"a{i}"] for i in range(4))
-    return (
-        _is_mesh(vertices, triangles)
-        and _are_indices(indices, len(texcoords))
-        and texcoords.ndim == 2
-        and texcoords.shape[1] == 2
-        and len(indices) in (0, len(triangles))
-    )
-
-
-def _is_mesh(vertices: np.ndarray, triangles: np.ndarray) -> bool:
-    return vertices.ndim == 2 and vertices.shape[1] == 3 and _are_indices(triangles, len(vertices))
-
-
-def _are_indices(triangles: np.ndarray, count: int) -> bool:
-    """Return whether an array has three indices below `count` for each triangle."""
-    shaped = triangles.ndim == 2 and triangles.shape[1] == 3 and triangles.dtype == np.int32
-    return shaped and (not triangles.size or 0 <= triangles.min() <= triangles.max() < count)
 
 
 def merge_and_simplify(
@@ -128,13 +105,8 @@ def _merged(
         meshes = [_merge(sources, faces) for sources in groups]
         return {key: array for i, (v, f) in enumerate(meshes) for key, array in ((f"v{i}", v), (f"f{i}", f))}
 
-    def fits(arrays: dict[str, np.ndarray]) -> bool:
-        names = {f"{kind}{i}" for i in range(len(groups)) for kind in "vf"}
-        return set(arrays) == names and all(
-            _is_mesh(arrays[f"v{i}"], arrays[f"f{i}"]) for i in range(len(groups))
-        )
-
-    stored = cached_arrays(path, make, fits)
+    names = {f"{kind}{i}" for i in range(len(groups)) for kind in "vf"}
+    stored = cached_arrays(path, make, lambda arrays: set(arrays) == names)
     return [(stored[f"v{i}"], stored[f"f{i}"]) for i in range(len(groups))]
 
 

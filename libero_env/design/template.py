@@ -92,14 +92,11 @@ def _occupied(scene: str) -> list[tuple[float, float]]:
     """Return the places that are occupied in a scene of the benchmark, (x, y) [m]."""
     if scene not in scene_names():
         return []
-    regions = [
-        region for target in load_scene(scene).get("regions", {}).values() for region in _values(target)
+    targets = [
+        regions for regions in load_scene(scene).get("regions", {}).values() if isinstance(regions, dict)
     ]
-    return [tuple(region["at"]) for region in regions if region and isinstance(region.get("at"), list)]
-
-
-def _values(regions: object) -> list[dict]:
-    return list(regions.values()) if isinstance(regions, Mapping) else []
+    places = [region["at"] for regions in targets for region in regions.values() if region and "at" in region]
+    return [tuple(at) for at in places if isinstance(at, list)]
 
 
 def _assign_slots(names: Iterable[str], slots: Sequence[tuple], taken: list[tuple[float, float]], kind: str):

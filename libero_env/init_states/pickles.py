@@ -13,7 +13,6 @@ import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Container
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,9 +20,9 @@ import numpy as np
 
 from libero_env.errors import LiberoError
 from libero_env.storage import atomic_path
+from libero_env.text import shown
 
 _MAX_OPERATIONS = 2000  # an array takes 60, a tensor 40
-_MAX_SHOWN = 80  # characters of a name in a message
 _MAX_BYTES = 1 << 28  # of a file, and of a part of it
 _MAX_PARTS = 1000  # of a zip
 _MAX_EDGE = 10_000  # states, and numbers of a state
@@ -32,7 +31,25 @@ _ZIP_ERRORS = (
     *(zipfile.BadZipFile, zlib.error, struct.error),
     *(EOFError, NotImplementedError, OverflowError, ValueError),
 )
+_PICKLE_ERRORS = (
+    *(
+        pickle.UnpicklingError,
+        EOFError,
+        struct.error,
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        TypeError,
+    ),
+    *(ValueError, DeprecationWarning),  # a warning of a text with unknown escapes, where warnings are errors
+)
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # date of all parts, so that equal states give equal files
+_OPERATION_NAMES = (
+    "PROTO FRAME STOP NONE NEWTRUE NEWFALSE EMPTY_TUPLE INT BININT BININT1 BININT2 LONG LONG1 UNICODE BINUNICODE "
+    "SHORT_BINUNICODE BINUNICODE8 SHORT_BINBYTES BINBYTES BINBYTES8 BYTEARRAY8 PUT BINPUT LONG_BINPUT MEMOIZE GET "
+    "BINGET LONG_BINGET MARK TUPLE TUPLE1 TUPLE2 TUPLE3 GLOBAL STACK_GLOBAL BINPERSID REDUCE BUILD"
+)
+_OPERATIONS = frozenset(_OPERATION_NAMES.split())
 _CODES = ("f8", "f4", "i8", "i4")
 _STORAGES: dict[str, np.dtype] = {
     "torch.DoubleStorage": np.dtype("<f8"),
@@ -53,157 +70,73 @@ class StateFileError(LiberoError, ValueError):
 
 @dataclass(frozen=True)
 class Name:
-    """A function or class that a pickle names.
-
-    Attributes:
-        text: Module and name, such as `numpy.ndarray`.
-    """
+    """A function or class that a pickle names, such as `numpy.ndarray`; a call of it is only described."""
 
     text: str
+
+    def __call__(self, *args: object) -> "Call":
+        """Return the call that the pickle describes."""
+        return Call(self.text, args)
 
 
 @dataclass(frozen=True)
 class External:
-    """A reference to data outside of the pickle.
-
-    Attributes:
-        key: What the pickle has written as its identifier.
-    """
+    """A reference to data outside of the pickle, with its identifier there."""
 
     key: object
 
 
 @dataclass(eq=False)
 class Call:
-    """A call that a pickle describes.
-
-    Attributes:
-        name: What would be called, module and name.
-        args: Arguments.
-        state: What the result would be given as its state; None for none.
-    """
+    """A call that a pickle describes: of what, the arguments, and what the result would be given as its state."""
 
     name: str
     args: tuple[object, ...]
     state: tuple[object, ...] | None = None
 
+    def __setstate__(self, state: object) -> None:
+        if self.state is not None or not isinstance(state, tuple):
+            raise StateFileError("the pickle changes what is not an array")
+        self.state = state
 
-def read_pickle(content: bytes, names: Container[str]) -> object:
-    """Return what a pickle describes, made of numbers, texts, bytes, tuples and the classes of this module.
 
-    Args:
-        content: The pickle, of any protocol.
-        names: Functions and classes that it may name, such as `numpy.ndarray`.
+class _Reader(pickle.Unpickler):
+    """An unpickler that knows a few names, and calls none of them."""
+
+    def find_class(self, module: str, name: str) -> Name:
+        if (text := f"{module}.{name}") not in _NAMES:
+            raise StateFileError(
+                f"the pickle names {shown(text)}; only arrays of numbers are read, nothing is executed"
+            )
+        return Name(text)
+
+    def persistent_load(self, key: object) -> External:
+        return External(key)
+
+
+def _read_pickle(content: bytes) -> object:
+    """Return what a pickle of any protocol describes: numbers, texts, bytes, tuples, and the classes of this module.
 
     Raises:
         StateFileError: The pickle is broken, has an operation that arrays do not need, or names something else.
     """
-    machine = _Machine(names)
     try:
         for count, (operation, argument, _) in enumerate(pickletools.genops(io.BytesIO(content))):
             if count >= _MAX_OPERATIONS:
                 raise StateFileError(
                     f"a pickle of more than {_MAX_OPERATIONS} operations; expected one array"
                 )
-            machine.follow(operation.name, argument)
-        return machine.pop()
+            if operation.name not in _OPERATIONS:
+                raise StateFileError(
+                    f"the pickle has the operation {operation.name}, which arrays do not need"
+                )
+            if "PUT" in operation.name and argument > _MAX_OPERATIONS:  # the size of a table
+                raise StateFileError(f"the pickle has more than {_MAX_OPERATIONS} values")
+        return _Reader(io.BytesIO(content)).load()
     except StateFileError:
         raise
-    # a warning: `pickletools` on a text with unknown escapes, where warnings are errors
-    except (ValueError, IndexError, KeyError, struct.error, DeprecationWarning) as error:
-        raise StateFileError(f"the pickle is broken ({type(error).__name__}: {shown(error)})") from None
-
-
-def shown(value: object) -> str:
-    """Return text from a file for a message: short, and without control characters."""
-    return str(value)[:_MAX_SHOWN].encode("unicode_escape").decode("ascii")
-
-
-class _Machine:
-    """The stack and the memory of a pickle that is being read."""
-
-    def __init__(self, names: Container[str]):
-        self._names = names
-        self._stack: list[object] = []
-        self._marks: list[int] = []  # heights of the stack
-        self._memory: dict[int, object] = {}
-
-    def follow(self, operation: str, argument: object) -> None:
-        """Follow one operation.
-
-        Raises:
-            StateFileError: Arrays do not need it.
-            IndexError: The stack is empty.
-            KeyError: The memory has no such entry.
-        """
-        match operation:
-            case "PROTO" | "FRAME" | "STOP":
-                pass
-            case _ if operation in _CONSTANTS:
-                self._stack.append(_CONSTANTS[operation])
-            case _ if operation in _VALUES:
-                self._stack.append(argument)
-            case "PUT" | "BINPUT" | "LONG_BINPUT":
-                assert isinstance(argument, int)
-                self._memory[argument] = self._stack[-1]
-            case "MEMOIZE":
-                self._memory[len(self._memory)] = self._stack[-1]
-            case "GET" | "BINGET" | "LONG_BINGET":
-                assert isinstance(argument, int)
-                self._stack.append(self._memory[argument])
-            case "MARK":
-                self._marks.append(len(self._stack))
-            case "TUPLE":
-                self._stack.append(self._take(len(self._stack) - self._marks.pop()))
-            case "TUPLE1" | "TUPLE2" | "TUPLE3":
-                self._stack.append(self._take(int(operation[-1])))
-            case _:
-                self._describe(operation, argument)
-
-    def pop(self) -> object:
-        """Return the top of the stack and remove it."""
-        if self._marks and self._marks[-1] >= len(self._stack):
-            raise IndexError("nothing above the mark")
-        return self._stack.pop()
-
-    def _take(self, count: int) -> tuple[object, ...]:
-        return tuple(reversed([self.pop() for _ in range(count)]))
-
-    def _describe(self, operation: str, argument: object) -> None:
-        match operation:
-            case "GLOBAL":
-                self._push_name(str(argument).replace(" ", ".", 1))
-            case "STACK_GLOBAL":
-                self._push_name(".".join(str(part) for part in self._take(2)))
-            case "BINPERSID":
-                self._stack.append(External(self.pop()))
-            case "REDUCE":
-                name, args = self._take(2)
-                if not isinstance(name, Name) or not isinstance(args, tuple):
-                    raise StateFileError("the pickle calls what is not a function")
-                self._stack.append(Call(name.text, args))
-            case "BUILD":
-                state = self.pop()
-                call = self._stack[-1]
-                if not isinstance(call, Call) or call.state is not None or not isinstance(state, tuple):
-                    raise StateFileError("the pickle changes what is not an array")
-                call.state = state
-            case _:
-                raise StateFileError(f"the pickle has the operation {operation}, which arrays do not need")
-
-    def _push_name(self, text: str) -> None:
-        if text not in self._names:
-            raise StateFileError(
-                f"the pickle names {shown(text)}; only arrays of numbers are read, nothing is executed"
-            )
-        self._stack.append(Name(text))
-
-
-_CONSTANTS: dict[str, object] = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
-_VALUES = frozenset(
-    ("INT", "BININT", "BININT1", "BININT2", "LONG", "LONG1", "UNICODE", "BINUNICODE", "SHORT_BINUNICODE")
-    + ("BINUNICODE8", "SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8")
-)
+    except _PICKLE_ERRORS as error:
+        raise StateFileError(f"the pickle is broken ({shown(error)})") from None
 
 
 def read_states(path: str | Path) -> np.ndarray:
@@ -224,7 +157,7 @@ def read_states(path: str | Path) -> np.ndarray:
         if content.startswith(b"PK"):
             array = _read_zip(content)
         else:
-            array = _to_array(read_pickle(content, _NAMES), None)
+            array = _to_array(_read_pickle(content), None)
         if not np.isfinite(array).all():
             raise StateFileError("a state has numbers that are not finite")
     except StateFileError as error:
@@ -308,7 +241,7 @@ def _read_zip(content: bytes) -> np.ndarray:
             if len(pickles) != 1 or len(set(names)) < len(names):
                 raise StateFileError("a zip without one data.pkl; expected what torch.save writes")
             parts = _Parts(archive, pickles[0].removesuffix("data.pkl"))
-            return _to_array(read_pickle(parts.read("data.pkl"), _NAMES), parts)
+            return _to_array(_read_pickle(parts.read("data.pkl")), parts)
     except StateFileError:
         raise
     except _ZIP_ERRORS as error:
@@ -362,7 +295,7 @@ def _dtype(found: object) -> np.dtype:
         case Call("numpy.dtype", (str(code), *_), (_, ("<" | ">") as order, None, None, None, *_)):
             if code in _CODES:
                 return np.dtype(order + code)
-            raise StateFileError(f"an array of {shown(code)!r}; expected numbers of 4 or 8 bytes")
+            raise StateFileError(f"an array of {shown(code)}; expected numbers of 4 or 8 bytes")
     raise StateFileError("an array of other values than numbers")
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from libero_env.geometry import quat_from_axis_angle
 
 ROOT_BODY = "main"
+VISUAL_GEOM: Mapping[str, Any] = {"group": 1, "contype": 0, "conaffinity": 0, "mass": 0.0}
 GLOW_GROUP = 2  # geom group of sites that are visible only while their object is turned on
 
 OPPOSITE_STATES = {"open": "close", "close": "open", "turnon": "turnoff", "turnoff": "turnon"}

@@ -7,7 +7,7 @@ arithmetic with `pi`; nothing in a file is ever executed.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NoReturn
@@ -44,31 +44,12 @@ def parse(text: str, file: str = "<string>") -> Problem:
         BDDLError: The text is not of the dialect, declares a name twice, or has an atom with a name that it does not
             declare; or no scene can be built from it. The message is "file:line: what; expected ...".
     """
-    tree = parse_tree(text, file)
+    reader = Reader(file)
     try:
-        return problem_of(tree, file)
+        return reader.problem(parse_tree(text, file))
     except ProblemError as error:
         first = error.violations[0]
-        line = Lines(tree).of_part(first.section, first.part)
-        raise BDDLError(first.what, first.expected, file, line) from None
-
-
-def problem_of(tree: List, file: str) -> Problem:
-    """Return the problem of a text that is parsed to a tree; see `parse`.
-
-    Raises:
-        BDDLError: As in `parse`.
-        ProblemError: No scene can be built from it.
-    """
-    try:
-        return _Reader(file).problem(tree)
-    except ProblemError:
-        raise
-    except InvalidInputError as error:  # of one field
-        field, part, *_ = (*error.path, None, None)
-        line = Lines(tree).of_part(_SECTIONS_OF.get(str(field), f":{field}"), part)
-        what, _, expected = str(error).removeprefix("Problem: ").partition("; expected ")
-        raise BDDLError(what, expected, file, line) from None
+        reader.fail(reader.line(first.section, first.part), first.what, first.expected)
 
 
 def read(path: str | Path) -> Problem:
@@ -103,12 +84,12 @@ def parse_expression(text: str, file: str = "<string>", line: int = 1) -> Expres
     Raises:
         BDDLError: As in `parse`.
     """
-    return _Reader(file).expression(_one_list(text, file, line))
+    return Reader(file).expression(_one_list(text, file, line))
 
 
 def parse_atom(text: str, file: str = "<string>", line: int = 1) -> Atom:
     """Return the atom of a text such as `On plate_1 stove_1`; see `parse_expression`."""
-    return _Reader(file).atom(_one_list(text, file, line))
+    return Reader(file).atom(_one_list(text, file, line))
 
 
 def _one_list(text: str, file: str, line: int) -> List:
@@ -159,18 +140,44 @@ def _numbers(values: tuple[float, ...]) -> str:
     return f"({' '.join(repr(float(value)) for value in values)})"
 
 
-class _Reader:
-    """Conversion of one file into a `Problem`; it holds the name of the file for error messages."""
+class Reader:
+    """Conversion of one file into a `Problem`.
+
+    Attributes:
+        file: Name of the file for error messages.
+        sections: Line of each section.
+        entities: Name of an object or fixture -> line.
+        regions: Address of a region -> line.
+        init: Line of each init atom.
+        goal: Line of each atom of the goal, in reading order.
+    """
 
     def __init__(self, file: str):
         self.file = file
+        self.sections: dict[str, int] = {}
+        self.entities: dict[str, int] = {}
+        self.regions: dict[str, int] = {}
+        self.init: list[int] = []
+        self.goal: list[int] = []
+
+    def line(self, section: str, part: int | str | None = None) -> int:
+        """Return the line of a part of a section; see `libero_env.tasks.problem.Violation`."""
+        lines: Any = dict(enumerate({":init": self.init, ":goal": self.goal}.get(section, ())))
+        if isinstance(part, str):
+            lines = {**self.regions, **self.entities}
+        return lines.get(part, self.sections.get(section, 1))
 
     def fail(self, line: int, what: str, expected: str) -> NoReturn:
         """Raise the error of a line in this file."""
         fail(self.file, line, what, expected)
 
     def problem(self, root: List) -> Problem:
-        """Return the problem of the tree of a text."""
+        """Return the problem of the tree of a text.
+
+        Raises:
+            BDDLError: As in `parse`.
+            ProblemError: No scene can be built from it.
+        """
         if root.head != "define" or len(root.items) < 2:
             self.fail(root.line, "not a problem", "(define (problem NAME) ...)")
         title, *rest = root.items[1:]
@@ -183,33 +190,39 @@ class _Reader:
             if head not in SECTIONS:
                 self.fail(line, f"unknown section {head or show(part)!r}", f"one of {', '.join(SECTIONS)}")
             if head in sections:
-                self.fail(line, f"a second {head}", f"one (the first is on line {sections[head].line})")
-            sections[head] = section
-        return self.assemble(self.word(title.items[1]), root.line, sections)
-
-    def assemble(self, name: str, line: int, sections: dict[str, List]) -> Problem:
-        """Return the problem of the sections of a file."""
+                self.fail(line, f"a second {head}", f"one (the first is on line {self.sections[head]})")
+            sections[head], self.sections[head] = section, line
         for needed in (":language", ":fixtures", ":objects", ":init", ":goal"):
             if needed not in sections:
-                self.fail(
-                    line, f"no ({needed} ...) section", f"all of {', '.join(SECTIONS)} but the optional ones"
-                )
-        items = {key: section.items[1:] for key, section in sections.items()}
-        if len(items[":goal"]) != 1:
-            what = f"{len(items[':goal'])} goals"
-            self.fail(sections[":goal"].line, what, "one, such as (And (On plate_1 stove_1))")
-        return Problem(
-            name=name,
-            domain=" ".join(map(self.word, items.get(":domain", ()))) or "robosuite",
-            language=" ".join(map(self.word, items[":language"])),
-            regions=tuple(map(self.region, items.get(":regions", ()))),
-            fixtures=self.names(sections[":fixtures"]),
-            objects=self.names(sections[":objects"]),
-            obj_of_interest=tuple(map(self.word, items.get(":obj_of_interest", ()))),
-            scene_properties=dict(map(self.scene_property, items.get(":scene_properties", ()))),
-            init=tuple(map(self.atom, items[":init"])),
-            goal=self.expression(items[":goal"][0]),
-        )
+                expected = f"all of {', '.join(SECTIONS)} but the optional ones"
+                self.fail(root.line, f"no ({needed} ...) section", expected)
+        if (count := len(sections[":goal"].items) - 1) != 1:
+            self.fail(self.sections[":goal"], f"{count} goals", "one, such as (And (On plate_1 stove_1))")
+        fields = self.fields({key: section.items[1:] for key, section in sections.items()})
+        try:
+            return Problem(name=self.word(title.items[1]), **fields)
+        except ProblemError:
+            raise
+        except InvalidInputError as error:  # of one field
+            field, part, *_ = (*error.path, None, None)
+            what, _, expected = str(error).removeprefix("Problem: ").partition("; expected ")
+            self.fail(self.line(_SECTIONS_OF.get(str(field), f":{field}"), part), what, expected)
+
+    def fields(self, items: Mapping[str, tuple[Word | List, ...]]) -> dict[str, Any]:
+        """Return the fields of the problem that the sections of a file have."""
+        init = tuple(map(self.atom, items[":init"]))
+        self.init, self.goal = self.goal, []
+        return {
+            "domain": " ".join(map(self.word, items.get(":domain", ()))) or "robosuite",
+            "language": " ".join(map(self.word, items[":language"])),
+            "regions": tuple(map(self.region, items.get(":regions", ()))),
+            "fixtures": self.names(items[":fixtures"]),
+            "objects": self.names(items[":objects"]),
+            "obj_of_interest": tuple(map(self.word, items.get(":obj_of_interest", ()))),
+            "scene_properties": dict(map(self.scene_property, items.get(":scene_properties", ()))),
+            "init": init,
+            "goal": self.expression(items[":goal"][0]),
+        }
 
     def word(self, node: Word | List) -> str:
         """Return the text of a word, in which brackets are an error."""
@@ -217,11 +230,11 @@ class _Reader:
             self.fail(node.line, f"a list {show(node)}", "a word")
         return node.text
 
-    def names(self, section: List) -> dict[str, str]:
+    def names(self, words: Iterable[Word | List]) -> dict[str, str]:
         """Return {a_1: a, a_2: a, b_1: b} for `a_1 a_2 - a  b_1 - b`."""
         categories: dict[str, str] = {}
         waiting: list[tuple[str, int]] = []
-        items = iter(section.items[1:])
+        items = iter(words)
         for item in items:
             if (word := self.word(item)) != "-":
                 waiting.append((word, item.line))
@@ -234,7 +247,7 @@ class _Reader:
             for name, line in waiting:
                 if name in categories:
                     self.fail(line, f"{name} is declared twice", "each name declared once")
-                categories[name] = self.word(category)
+                categories[name], self.entities[name] = self.word(category), line
             waiting = []
         if waiting:
             name, line = waiting[0]
@@ -268,10 +281,12 @@ class _Reader:
         if "target" not in fields:
             self.fail(node.line, f"region {show(node.items[0])} has no target", "(:target NAME)")
         try:
-            return Region(name=self.word(node.items[0]), **fields)
+            region = Region(name=self.word(node.items[0]), **fields)
         except InvalidInputError as error:
             what, _, expected = str(error).partition("; expected ")
             raise BDDLError(what, expected, self.file, node.line) from None
+        self.regions[region.address] = node.line
+        return region
 
     def numbers(self, node: Word | List, count: int, head: str) -> tuple[float, ...]:
         """Return the `count` numbers of a list."""
@@ -299,6 +314,7 @@ class _Reader:
         predicate, *args = map(self.word, node.items)
         if not _PREDICATE.fullmatch(predicate):
             self.fail(node.line, f"{predicate} is not a predicate", "letters, such as On, In, Open or Turnon")
+        self.goal.append(node.line)
         return Atom(predicate.capitalize(), tuple(args))
 
     def expression(self, node: Word | List) -> Expression:
@@ -310,68 +326,8 @@ class _Reader:
         if head == "not" and len(parts) == 1:
             return Not(self.expression(parts[0]))
         if head == "forall" and len(parts) == 2 and isinstance(parts[0], List):
-            variables = self.names(List((Word("forall", node.line), *parts[0].items), node.line))
+            variables = Reader(self.file).names(parts[0].items)
             return ForAll(tuple(variables.items()), self.expression(parts[1]))
         if head in ("not", "forall"):
             self.fail(node.line, show(node), "(Not EXPRESSION) or (ForAll (?x - CATEGORY) EXPRESSION)")
         return self.atom(node)
-
-
-class Lines:
-    """Line numbers of the parts of a task file.
-
-    Attributes:
-        entities: Name of an object or fixture -> line.
-        regions: Address of a region -> line.
-        init: Line of each init atom.
-        goal: Line of each atom of the goal, in reading order.
-    """
-
-    def __init__(self, tree: List):
-        self._sections = {node.head: node for node in tree.items if isinstance(node, List)}
-        self.entities = {name: line for head in (":fixtures", ":objects") for name, line in self._names(head)}
-        self.regions = dict(self._regions())
-        self.init = [item.line for item in self._items(":init")]
-        self.goal = [line for item in self._items(":goal") for line in _atom_lines(item)]
-
-    def section(self, head: str) -> int:
-        """Return the line of a section such as `:goal`; 1 where there is none."""
-        return self._sections[head].line if head in self._sections else 1
-
-    def of(self, name: str) -> int:
-        """Return the line of the declaration of an object, fixture or region."""
-        return self.entities.get(name, self.regions.get(name, 1))
-
-    def of_part(self, section: str, index: int | str | None) -> int:
-        """Return the line of a part of a section; see `libero_env.tasks.problem.Violation`."""
-        lines = {":init": self.init, ":goal": self.goal}.get(section, [])
-        if isinstance(index, int) and index < len(lines):
-            return lines[index]
-        known = {**self.entities, **self.regions} if isinstance(index, str) else {}
-        return known.get(str(index), self.section(section))
-
-    def _items(self, head: str) -> tuple[Word | List, ...]:
-        return self._sections[head].items[1:] if head in self._sections else ()
-
-    def _names(self, head: str) -> Iterator[tuple[str, int]]:
-        items = [item for item in self._items(head) if isinstance(item, Word)]
-        before = [None, *items[:-1]]
-        for item, last in zip(items, before, strict=False):
-            if item.text != "-" and (last is None or last.text != "-"):
-                yield item.text, item.line
-
-    def _regions(self) -> Iterator[tuple[str, int]]:
-        for node in self._items(":regions"):
-            if not isinstance(node, List) or not node.items or not isinstance(node.items[0], Word):
-                continue
-            for part in node.items[1:]:
-                if isinstance(part, List) and part.head == ":target" and isinstance(part.items[-1], Word):
-                    yield f"{part.items[-1].text}_{node.items[0].text}", node.line
-
-
-def _atom_lines(node: Word | List) -> Iterator[int]:
-    if isinstance(node, List) and node.head in ("and", "or", "not", "forall"):
-        for part in node.items[2:] if node.head == "forall" else node.items[1:]:
-            yield from _atom_lines(part)
-    else:
-        yield node.line

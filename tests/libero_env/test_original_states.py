@@ -65,7 +65,7 @@ def test_pickles_that_call_functions_are_errors(tmp_path, zipped):
             archive.writestr("evil/data.pkl", content)
     else:
         file.write_bytes(content)
-    with pytest.raises(StateFileError, match=r"evil: the pickle names posix.mkdir"):
+    with pytest.raises(StateFileError, match=r"evil: the pickle names 'posix.mkdir'"):
         read_states(file)
     assert not (tmp_path / "pwned").exists()
 

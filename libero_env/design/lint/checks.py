@@ -68,13 +68,10 @@ def lint_text(
         starts: Number of initial states to check; 0 simulates nothing.
     """
     pack = pack or select_pack()
+    reader = bddl.Reader(file)
+    report = Report(reader)
     try:
-        tree = parse_tree(text, file)
-    except BDDLError as error:
-        return [_syntax(error, file)]
-    report = Report(file, tree)
-    try:
-        problem = bddl.problem_of(tree, file)
+        problem = reader.problem(parse_tree(text, file))
     except ProblemError as error:
         problem = error.problem
         report.violations(error)
@@ -109,8 +106,8 @@ def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
             valid = categories | set(WORKSPACES) if name in problem.fixtures else categories
             what = f"{name}: no model of {category!r} exists"
             remedy = report.suggest(category, valid)
-            report.add("error", report.lines.of(name), "unknown-category", what, remedy)
-    at = report.lines.section(":fixtures")
+            report.add("error", report.lines.line("", name), "unknown-category", what, remedy)
+    at = report.lines.line(":fixtures")
     if len(workspaces) != 1:
         what = f"{len(workspaces)} workspaces among the fixtures"
         report.add("error", at, "workspace", what, f"declare one of {', '.join(WORKSPACES)}")
@@ -174,11 +171,11 @@ def _check_places(report: Report, problem: Problem) -> None:
             remedy = f"add (On {name} REGION) to :init"
             level: Level = "error" if is_object else "warning"
             what = f"no init atom places {name}{where}"
-            report.add(level, report.lines.of(name), "not-placed", what, remedy)
+            report.add(level, report.lines.line("", name), "not-placed", what, remedy)
     declared = {*report.lines.entities, *report.lines.regions}
     for name in problem.obj_of_interest:
         if name not in declared:
-            line = report.lines.section(":obj_of_interest")
+            line = report.lines.line(":obj_of_interest")
             remedy = report.suggest(name, declared)
             report.add("warning", line, "unknown-name", f"{name} is not declared", remedy)
     if not problem.obj_of_interest:
@@ -188,7 +185,7 @@ def _check_places(report: Report, problem: Problem) -> None:
 
 def _check_words(report: Report, task: Task, pack: Pack) -> None:
     """Check the instruction of the file, and that of the task's name where they differ."""
-    line = report.lines.section(":language")
+    line = report.lines.line(":language")
     texts = {task.bddl_language: ""}
     if _words(task.language) != _words(task.bddl_language):
         what = f"policies receive {task.language!r}, which is the task's name, and not {task.bddl_language!r}"

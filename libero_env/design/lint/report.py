@@ -5,9 +5,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from libero_env.tasks.bddl import Lines
+from libero_env.tasks.bddl import Reader
 from libero_env.tasks.problem import Atom, Problem, ProblemError
-from libero_env.tasks.sexpr import List
 
 Level = Literal["error", "warning", "info"]
 LEVELS: tuple[Level, ...] = ("error", "warning", "info")  # the most severe first
@@ -41,12 +40,12 @@ class Report:
     """Collection of the findings about one task file.
 
     Attributes:
-        lines: Line numbers of the parts of the file.
+        lines: Reader of the file, which knows the lines of its parts.
         findings: Findings so far.
     """
 
-    def __init__(self, file: str, tree: List):
-        self.file, self.lines = file, Lines(tree)
+    def __init__(self, lines: Reader):
+        self.file, self.lines = lines.file, lines
         self.findings: list[Finding] = []
 
     def add(self, level: Level, line: int, rule: str, what: str, remedy: str) -> None:
@@ -56,7 +55,7 @@ class Report:
     def violations(self, error: ProblemError) -> None:
         """Add all that is wrong with a problem from which no scene can be built."""
         for one in error.violations:
-            line = self.lines.of_part(one.section, one.part)
+            line = self.lines.line(one.section, one.part)
             self.add("error", line, one.rule, one.what, f"expected {one.expected}")
 
     def init(self, problem: Problem) -> Iterator[tuple[Atom, int]]:

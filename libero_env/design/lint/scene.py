@@ -91,7 +91,7 @@ def _check_tables(report: Report, scene: Scene) -> None:
         if not all(any((np.abs(xy - point) <= half).all() for point, half in surfaces) for xy in corners):
             what = f"{region.address} is not all on the {scene.workspace.name}"
             remedy = "move or shrink it; x points away from the robot, y to its left"
-            report.add("error", report.lines.of(region.address), "off-table", what, remedy)
+            report.add("error", report.lines.line("", region.address), "off-table", what, remedy)
         _check_reach(report, scene, region, corners, region.address in goal or placed in goal)
 
 
@@ -107,7 +107,7 @@ def _check_reach(report: Report, scene: Scene, region: Region, corners: np.ndarr
     x, y = base - np.array(scene.workspace.offset[:2])
     what = f"{region.address} is {away.min():.2f} to {away.max():.2f} m from the robot"
     remedy = f"a hand that points down reaches {near:.2f} to {far:.2f} m from ({x:g}, {y:g}), in the region's frame"
-    line = report.lines.of(region.address)
+    line = report.lines.line("", region.address)
     report.add(level if needed else "info", line, "out-of-reach", what, remedy)
 
 
@@ -148,7 +148,7 @@ def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None
                 _check_goal_reach(report, scene, view)
             checked = True
     except LiberoError as error:
-        report.add("error", report.lines.section(":init"), "start", str(error), "fix what it names")
+        report.add("error", report.lines.line(":init"), "start", str(error), "fix what it names")
     finally:
         simulations.close()
     for (rule, what), count in faults.items():
@@ -191,7 +191,7 @@ def _report_start(report: Report, scene: Scene, rule: str, what: str, count: int
     """Report a fault of initial states: an error if all have it, a warning if only some have (they are resampled)."""
     level: Level = "error" if count == starts else "warning"
     atoms = list(report.init(scene.problem))
-    line = next((at for atom, at in atoms if str(atom) in what), report.lines.section(":init"))
+    line = next((at for atom, at in atoms if str(atom) in what), report.lines.line(":init"))
     if rule == "unstable-start":
         level = "warning"
         line = next((at for atom, at in atoms if atom.args[0] == what), line)
@@ -202,7 +202,7 @@ def _report_start(report: Report, scene: Scene, rule: str, what: str, count: int
     elif rule == "placement":
         remedy = "see the message"
     elif "goal" in what:
-        level, rule, line = "error", "goal-at-start", report.lines.section(":goal")
+        level, rule, line = "error", "goal-at-start", report.lines.line(":goal")
         remedy = "change the initial conditions so that the goal does not hold"
     else:
         remedy = "place it where it stays, or remove the atom"
@@ -216,7 +216,7 @@ def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
     for part in goal.parts:
         if isinstance(part, Atom) and evaluate(part, view):
             what = f"{part} holds from the beginning"
-            remedy, line = "correct if it is intended to stay so", report.lines.section(":goal")
+            remedy, line = "correct if it is intended to stay so", report.lines.line(":goal")
             report.add("info", line, "goal-at-start", what, remedy)
 
 

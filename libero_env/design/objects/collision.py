@@ -99,61 +99,24 @@ def boxes_of(mesh: "Trimesh") -> np.ndarray:
 
     Walls that are thinner than a cell become as thick as one; an open mesh has walls only.
     """
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    low, extent = vertices.min(axis=0), np.ptp(vertices, axis=0)
+    from trimesh import Trimesh
+
+    low, extent = mesh.bounds[0], mesh.extents
     cells = _CELLS
     while True:
         count = np.maximum(np.round(extent / extent.max() * cells), 1).astype(int)
-        filled = _walls(vertices, faces, low, extent, count)
-        if is_closed(mesh):
-            filled |= _inside(vertices, faces, low, extent, count)
+        # in cells, slightly towards the centre: a point on the border belongs to the inner cell
+        points = ((mesh.vertices - low) / extent - 0.5) * (1 - 1e-6) * count + (count - 1) / 2
+        grid = Trimesh(points, mesh.faces, process=False).voxelized(1.0)
+        grid = grid.fill() if is_closed(mesh) else grid
+        filled = np.zeros(count, bool)
+        filled[tuple(np.round(grid.points).astype(int).T)] = True
         found = list(_merge_cells(filled))
         if len(found) <= _MAX_BOXES or cells <= 6:
             break
         cells -= 2
     step = extent / count
     return np.array([[*(low + step * (a + b) / 2), *(step * (b - a) / 2)] for a, b in found])
-
-
-def _walls(vertices, faces, low, extent, count) -> np.ndarray:
-    """Return the cells that contain a part of the surface, found with points on it a third of a cell apart."""
-    corners = vertices[faces]
-    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    steps = np.clip(np.ceil(3 * longest / (extent / count).min()), 1, 64).astype(int)
-    filled = np.zeros(count, bool)
-    for n in np.unique(steps):
-        grid = np.array([(i, j, n - i - j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
-        points = (grid @ corners[steps == n]).reshape(-1, 3)
-        # slightly towards the centre: a point on the border belongs to the inner cell
-        inward = low + extent / 2 + (points - low - extent / 2) * (1 - 1e-6)
-        cell = np.clip(((inward - low) / extent * count).astype(int), 0, count - 1)
-        filled[tuple(cell.T)] = True
-    return filled
-
-
-def _inside(vertices, faces, low, extent, count) -> np.ndarray:
-    """Return the cells whose centre is inside a closed mesh: those with an odd number of surfaces below."""
-    step = extent / count
-    # off-centre, so as not to meet vertices
-    x, y, z = (low[k] + step[k] * (np.arange(count[k]) + 0.5013) for k in range(3))
-    below = np.zeros(count, int)
-    corners = vertices[faces]
-    for axis, lines in enumerate((x, y)):  # most triangles of a fine mesh are between the lines
-        first, last = corners[:, :, axis].min(axis=1), corners[:, :, axis].max(axis=1)
-        pad = 1e-6 * step[axis]
-        met = np.searchsorted(lines, last + pad, "right") > np.searchsorted(lines, first - pad)
-        corners = corners[met]
-    for a, b, c in corners:
-        (ux, uy), (vx, vy) = b[:2] - a[:2], c[:2] - a[:2]
-        area = ux * vy - uy * vx
-        if abs(area) < 1e-18:
-            continue
-        dx, dy = (x - a[0])[:, None], (y - a[1])[None]
-        s, t = (dx * vy - dy * vx) / area, (dy * ux - dx * uy) / area
-        i, j = np.nonzero((s >= 0) & (t >= 0) & (s + t < 1))
-        height = a[2] + s[i, j] * (b[2] - a[2]) + t[i, j] * (c[2] - a[2])
-        below[i, j] += z[None] > height[:, None]
-    return below % 2 == 1
 
 
 def _merge_cells(filled: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -18,7 +18,7 @@ from libero_env.geometry import surface_points
 from libero_env.mujoco_compat import delete
 from libero_env.objects.folder import MODEL, spec_of
 from libero_env.objects.mjcf import LIMITS, Mjcf, read_mjcf
-from libero_env.objects.model import ROOT_BODY
+from libero_env.objects.model import ROOT_BODY, VISUAL_GEOM
 from libero_env.objects.xml_file import explain, parse_xml_text
 
 _HIDDEN = 3  # first geom group that viewers hide by default
@@ -166,10 +166,7 @@ def _add_visual(geom: mujoco.MjsGeom) -> None:
         rgba=geom.rgba,
         material=geom.material,
         meshname=geom.meshname,
-        group=1,
-        contype=0,
-        conaffinity=0,
-        mass=0.0,
+        **VISUAL_GEOM,
     )
     visual.alt = geom.alt
 

@@ -8,7 +8,7 @@ import mujoco
 from libero_env.mujoco_compat import set_damping
 from libero_env.objects.builtin.appearance import Appearance, appearance_of
 from libero_env.objects.builtin.physics import Part, Physics, categories, load_physics
-from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, ObjectModel
+from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, VISUAL_GEOM, ObjectModel
 
 HIDDEN_GROUP = 3
 GLOWING_SITES = ("burner",)
@@ -44,17 +44,7 @@ def build(category: str) -> ObjectModel:
     for name, several in appearance_of(category).items():
         for index, appearance in enumerate(several):
             _add_visual(spec, bodies[name], category, appearance, suffix=f"_{index}" if index else "")
-    return ObjectModel(
-        category=category,
-        spec=spec,
-        joint_damping=physics.joint_damping,
-        rotation=physics.rotation,
-        rotation_axis=physics.rotation_axis,
-        bottom_offset=physics.bottom_offset,
-        top_offset=physics.top_offset,
-        horizontal_radius=physics.horizontal_radius,
-        articulation=physics.articulation,
-    )
+    return ObjectModel(category, spec, **physics.of_model)
 
 
 def _add_mass(body: mujoco.MjsBody, part: Part) -> None:
@@ -130,10 +120,7 @@ def _add_visual(
         type=mujoco.mjtGeom.mjGEOM_MESH,
         meshname=f"{prefix}_mesh",
         material=material.name,
-        contype=0,
-        conaffinity=0,
-        group=1,
-        mass=0.0,
+        **VISUAL_GEOM,
     )
 
 
@@ -162,6 +149,6 @@ def _target_zone() -> ObjectModel:
     spec.compiler.degree = False
     body = spec.worldbody.add_body(name=ROOT_BODY, explicitinertial=True, mass=0.0, inertia=(0.0, 0.0, 0.0))
     color, clear = (0.85, 0.15, 0.15, 0.5), (0.0, 0.0, 0.0, 0.0)
-    body.add_geom(name="visual", type=box, size=half, rgba=color, group=1, contype=0, conaffinity=0, mass=0.0)
+    body.add_geom(name="visual", type=box, size=half, rgba=color, **VISUAL_GEOM)
     body.add_site(name="default_site", type=box, size=(*half[:2], 0.007), rgba=clear, group=HIDDEN_GROUP)
     return ObjectModel(category=TARGET_ZONE, spec=spec, horizontal_radius=half[0])

@@ -2,12 +2,14 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cache
 from importlib.resources import files
-from types import MappingProxyType
 from typing import Any
 
+from pydantic import TypeAdapter
+
+from libero_env.objects.model import ObjectModel
 from libero_env.storage import parse_yaml
 
 Vector = tuple[float, ...]
@@ -123,17 +125,22 @@ class Physics:
     """
 
     root: Part
-    parts: Mapping[str, Part]
-    rotation: Mapping[str, Range]
-    rotation_axis: str | None
     bottom_offset: Vector3
     top_offset: Vector3
     horizontal_radius: float
+    parts: Mapping[str, Part] = field(default_factory=dict)
+    rotation: Mapping[str, Range] = field(default_factory=dict)
+    rotation_axis: str | None = None
     articulation: Mapping[str, Range] = field(default_factory=dict)
     friction: Vector = FRICTION
     solref: Vector = SOLREF
     solimp: Vector = SOLIMP
     joint_damping: float = 0.0005
+
+    @property
+    def of_model(self) -> dict[str, Any]:
+        """Values of the fields of an `ObjectModel` that are not those of its MJCF."""
+        return {f.name: getattr(self, f.name) for f in fields(ObjectModel) if hasattr(self, f.name)}
 
     @property
     def mass(self) -> float:
@@ -178,21 +185,10 @@ def load_physics(category: str) -> Physics:
         KeyError: No builtin object has this name.
     """
     raw = read_section("parameters", category)
-    root = _part({key: raw.pop(key) for key in _ROOT_KEYS if key in raw})
-    parts = {name: _part(part) for name, part in raw.pop("parts", {}).items()}
-    for key in ("rotation", "articulation"):
-        raw[key] = MappingProxyType(_tuples(raw.get(key, {})))
-    return Physics(root=root, parts=MappingProxyType(parts), **_tuples(raw))
+    root = {key: raw.pop(key) for key in _ROOT_KEYS if key in raw}
+    return _checker().validate_python({"root": root, **raw})
 
 
-def _part(raw: Mapping[str, Any]) -> Part:
-    values = dict(raw)
-    values["boxes"] = tuple(CollisionShape(**_tuples(box)) for box in values.get("boxes", ()))
-    values["sites"] = tuple(Site(**_tuples(site)) for site in values.get("sites", ()))
-    if "joint" in values:
-        values["joint"] = Joint(**_tuples(values["joint"]))
-    return Part(**_tuples(values))
-
-
-def _tuples(mapping: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in mapping.items()}
+@cache
+def _checker() -> TypeAdapter[Physics]:
+    return TypeAdapter(Physics)
