@@ -18,7 +18,7 @@ import numpy as np
 from libero_env.envs.batch import BatchEnv
 from libero_env.expert import Expert, Shapes
 from libero_env.sim.backend import Backend
-from libero_env.sim.engine import ViewedGoals, make_goals, make_simulations
+from libero_env.sim.engine import Goals, make_simulations
 from libero_env.sim.scene import build_scene
 from libero_env.sim.simulation import Simulations
 from libero_env.sim.state import StateView
@@ -78,16 +78,14 @@ def truths(path: Path, warp: Backend) -> dict[str, object]:
     for name, back_end in (("mujoco", Backend()), ("warp", warp)):
         simulations = make_simulations(scene.model, BATCH, 1, scene.fixture_bodies, back_end)
         views = [StateView(scene, simulations, i) for i in range(BATCH)]
-        checker = make_goals(And(tuple(goals)), goals, views, "original", simulations)
+        checker = Goals(And(tuple(goals)), goals, views, "original")
         rows = [
             _truths_of(simulations, checker.check, part, fixtures)
             for part in np.split(states, len(states) // BATCH)
         ]
         told[name] = np.concatenate(rows)
         if name == "warp":
-            assert not isinstance(checker, ViewedGoals) and not checker.one_by_one, (
-                "every atom is evaluated in all simulations at once"
-            )
+            assert not checker.one_by_one, "every atom is evaluated in all simulations at once"
         simulations.close()
     differ = np.argwhere(told["warp"] != told["mujoco"])
     return {

@@ -28,7 +28,7 @@ from libero_env.init_states.store import load_init_states
 from libero_env.memory import require_memory
 from libero_env.perturbations.episodes import TRIES
 from libero_env.perturbations.sampling import start_name
-from libero_env.sim.engine import make_goals, make_observer, make_simulations
+from libero_env.sim.engine import Goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward
 from libero_env.sim.scene import InitialStates
@@ -154,7 +154,7 @@ class BatchEnv(LiberoVectorEnv):
         )
         self.views = self.observer.views
         goal = self.scene.problem.goal
-        self.goals = make_goals(goal, self.scene.goal_atoms, self.views, config.semantics, self.simulations)
+        self.goals = Goals(goal, self.scene.goal_atoms, self.views, config.semantics)
         controller = self.simulations.controller_state.controller
         self.single_observation_space = self.observer.space()
         self.single_action_space = spaces.Box(

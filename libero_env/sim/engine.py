@@ -1,59 +1,66 @@
 """What works by the means of a backend: simulations of a model, goals in them, and their observer."""
 
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from libero_env.sim.backend import Backend
 from libero_env.sim.observations import Observer
-from libero_env.sim.predicates import evaluate
+from libero_env.sim.predicates import OF_ALL, SEMANTICS, evaluate, ground
 from libero_env.sim.scene import Scene
 from libero_env.sim.simulation import Batch, BatchSimulations, Indices, LoopSimulations, Simulations
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import And, Atom, Expression
+from libero_env.tasks.problem import Atom, Expression, Not, Or
 
 
-class Goals(Protocol):
+class Goals:
     """Whether one goal holds in simulations of its scene.
 
-    Attributes:
-        atoms: Atoms that `check` evaluates.
-    """
-
-    atoms: tuple[Atom, ...]
-
-    def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return whether the goal is reached in simulations, (k,) bool, and which atoms hold, (k, natoms)."""
-
-
-class ViewedGoals:
-    """Whether a goal holds as the predicates say, one simulation after the other.
+    They are looked at one after the other; predicates of `OF_ALL` in all simulations of MuJoCo Warp at once.
 
     Args:
         goal: The goal.
-        atoms: Atoms that `check` evaluates.
+        atoms: Atoms that `check` evaluates, such as `Scene.goal_atoms`.
         views: State view of each simulation.
         semantics: Semantics of the predicates, `original` or `strict`.
+
+    Attributes:
+        one_by_one: Atoms that are evaluated one simulation after the other.
     """
 
     def __init__(self, goal: Expression, atoms: Sequence[Atom], views: Sequence[StateView], semantics: str):
-        self._goal, self.atoms, self._views, self._semantics = goal, tuple(atoms), views, semantics
-        parts = goal.parts if isinstance(goal, And) else (goal,)
-        self._is_conjunction = all(part in self.atoms for part in parts)  # no atom is evaluated twice then
+        scene, self._simulations = views[0].scene, views[0].simulations
+        self._goal, self.atoms, self._views = ground(goal, scene), tuple(atoms), views
+        self._semantics, self._all = semantics, StateView(scene, self._simulations, slice(None))
+        self._needed = tuple(dict.fromkeys([*atoms, *self._goal.atoms()]))
+        of_all = OF_ALL if self._simulations.backend.is_warp else ()
+        table = SEMANTICS[semantics]
+        self.one_by_one = tuple(atom for atom in self._needed if table.get(atom.predicate) not in of_all)
 
     def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whether the goal is reached in simulations, (k,) bool, and which atoms hold, (k, natoms)."""
-        reached, held = np.zeros(len(ids), bool), np.zeros((len(ids), len(self.atoms)), bool)
-        for k, i in enumerate(ids):
-            view = self._views[i]
-            held[k] = [evaluate(atom, view, self._semantics) for atom in self.atoms]
-            if self._is_conjunction:
-                reached[k] = held[k].all()
+        ids, held = np.asarray(ids, np.int64), dict[Atom, np.ndarray]()
+        for atom in self._needed:
+            if atom in self.one_by_one:
+                held[atom] = np.array([evaluate(atom, self._views[i], self._semantics) for i in ids], bool)
             else:
-                reached[k] = evaluate(self._goal, view, self._semantics)
-        return reached, held
+                values = SEMANTICS[self._semantics][atom.predicate](self._all, *atom.args)
+                held[atom] = np.broadcast_to(values, self._simulations.num)[ids]
+
+        def holds(node: Expression, parts: Iterator[np.ndarray]) -> np.ndarray:
+            match node:
+                case Atom():
+                    return held[node]
+                case Or():
+                    return np.any([np.zeros(len(ids), bool), *parts], axis=0)
+                case Not():
+                    return ~next(parts)
+            return np.all([np.ones(len(ids), bool), *parts], axis=0)
+
+        of_atoms = np.reshape([held[atom] for atom in self.atoms], (len(self.atoms), len(ids)))
+        return self._goal.fold(holds), of_atoms.T.astype(bool)
 
 
 def make_simulations(
@@ -83,29 +90,6 @@ def make_simulations(
     if num > 1 and Batch is not None:
         return BatchSimulations(model, num, threads, fixture_bodies)
     return LoopSimulations(model, num, fixture_bodies)
-
-
-def make_goals(
-    goal: Expression,
-    atoms: Sequence[Atom],
-    views: Sequence[StateView],
-    semantics: str,
-    simulations: Simulations,
-) -> Goals:
-    """Return a goal in simulations, evaluated by the means of their backend.
-
-    Args:
-        goal: The goal.
-        atoms: Atoms that `check` evaluates, such as `Scene.goal_atoms`.
-        views: State view of each simulation.
-        semantics: Semantics of the predicates, `original` or `strict`.
-        simulations: The simulations.
-    """
-    if simulations.backend.is_warp:
-        from libero_env.sim.mjwarp.goals import WarpGoals  # with the extra `warp` only
-
-        return WarpGoals(goal, atoms, views, semantics, simulations)  # type: ignore[arg-type]
-    return ViewedGoals(goal, atoms, views, semantics)
 
 
 def make_observer(scene: Scene, simulations: Simulations, **options: Any) -> Observer:

@@ -1,4 +1,6 @@
-"""Predicates: pure functions of a read-only view of one simulation's state.
+"""Predicates: pure functions of a read-only view of the state of one simulation.
+
+Those of `OF_ALL` also take a view of all simulations, and return a bool of each.
 
 By default their semantics are the original's: objects are points (the origin of their root body), the half size of a
 box is |R size|, and being on a region of the table needs no contact. `semantics="strict"` requires more; see `STRICT`.
@@ -71,17 +73,17 @@ def region_boxes(view: StateView, address: str) -> list[Box]:
     return [Box(centre, np.eye(3), half) for centre, half in boxes]
 
 
-def contains(box: Box, point: np.ndarray) -> bool:
-    """Return whether a point (3,) is in a box; as in the original, along the world axes, with half size |R size|."""
+def contains(box: Box, point: np.ndarray) -> Any:
+    """Return whether a point (..., 3) is in a box; as in the original, along the world axes, half size |R size|."""
     centre, mat, size = box
     half = np.abs(mat @ size)
     low, high = centre - half, centre + half
-    low[2] -= BOX_BELOW
-    return bool((point > low).all() and (point < high).all())
+    low[..., 2] -= BOX_BELOW
+    return ((point > low) & (point < high)).all(axis=-1)
 
 
-def is_over(box: Box, point: np.ndarray, above: float = ON_ABOVE) -> bool:
-    """Return whether a point (3,) is on top of a box; as in the original, rotated by R instead of its inverse.
+def is_over(box: Box, point: np.ndarray, above: float = ON_ABOVE) -> Any:
+    """Return whether a point (..., 3) is on top of a box; as in the original, rotated by R instead of its inverse.
 
     Args:
         box: Box.
@@ -89,61 +91,67 @@ def is_over(box: Box, point: np.ndarray, above: float = ON_ABOVE) -> bool:
         above: Largest height of the point above the box, m.
     """
     centre, mat, size = box
-    delta = mat @ (point - centre)
-    return bool(size[2] - ON_BELOW < delta[2] < size[2] + above and (np.abs(delta[:2]) < size[:2]).all())
+    x, y, z = np.moveaxis((mat @ (point - centre)[..., None])[..., 0], -1, 0)
+    level = (size[2] - ON_BELOW < z) & (z < size[2] + above)
+    return level & (np.abs(x) < size[0]) & (np.abs(y) < size[1])
 
 
-def on(view: StateView, entity: str, target: str) -> bool:
+def on(view: StateView, entity: str, target: str) -> Any:
     """Return whether `entity` is on an object (touching, above it, origins within 3 cm) or over the box of a region."""
+    point = view.body_pos(entity)
     if view.is_entity(target):
-        above, below = view.body_pos(entity), view.body_pos(target)
-        near = np.linalg.norm(above[:2] - below[:2]) < ON_XY_DISTANCE
-        return bool(below[2] <= above[2] and near and view.in_contact(entity, target))
-    over = any(is_over(box, view.body_pos(entity)) for box in region_boxes(view, target))
+        offset = point - view.body_pos(target)
+        near = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2) < ON_XY_DISTANCE
+        above = near & (offset[..., 2] >= 0.0)
+        return above & view.in_contact(entity, target) if above.any() else above
+    over = np.any([is_over(box, point) for box in region_boxes(view, target)], axis=0)
     region = region_of(view, target)
-    return over and (bool(region.ranges) or view.in_contact(entity, region.target))
+    return over if region.ranges or not over.any() else over & view.in_contact(entity, region.target)
 
 
-def in_(view: StateView, entity: str, region: str) -> bool:
+def in_(view: StateView, entity: str, region: str) -> Any:
     """Return whether the origin of `entity` is in the box of a region, with or without contact."""
-    return any(contains(box, view.body_pos(entity)) for box in region_boxes(view, region))
+    point = view.body_pos(entity)
+    return np.any([contains(box, point) for box in region_boxes(view, region)], axis=0)
 
 
-def up(view: StateView, entity: str) -> bool:
+def up(view: StateView, entity: str) -> Any:
     """Return whether the origin of `entity` is at least a metre above the floor."""
-    return bool(view.body_pos(entity)[2] >= UP_HEIGHT)
+    return view.body_pos(entity)[..., 2] >= UP_HEIGHT
 
 
-def touching(view: StateView, first: str, second: str) -> bool:
+def touching(view: StateView, first: str, second: str) -> Any:
     """Return whether two entities touch."""
     return view.in_contact(first, second)
 
 
-def stack(view: StateView, entity: str, target: str) -> bool:
+def stack(view: StateView, entity: str, target: str) -> Any:
     """Return whether `entity` touches the target, is on it and, for a region, in it."""
     owner = view.scene.owner(target)
-    contact = owner is not None and view.in_contact(entity, owner)
-    return contact and on(view, entity, target) and (view.is_entity(target) or in_(view, entity, target))
+    if owner is None:
+        return False
+    stacked = view.in_contact(entity, owner) & on(view, entity, target)
+    return stacked if view.is_entity(target) else stacked & in_(view, entity, target)
 
 
-def open_(view: StateView, address: str) -> bool:
+def open_(view: StateView, address: str) -> Any:
     """Return whether any joint of an entity, or of the part that a region is on, is in the range of `open`."""
-    return any(_joints_in_state(view, address, "open"))
+    return np.any(_joints_in_state(view, address, "open"), axis=0)
 
 
-def close(view: StateView, address: str) -> bool:
+def close(view: StateView, address: str) -> Any:
     """Return whether all joints of an entity, or of the part that a region is on, are in the range of `close`."""
-    return all(_joints_in_state(view, address, "close"))
+    return np.all(_joints_in_state(view, address, "close"), axis=0)
 
 
-def turn_on(view: StateView, entity: str) -> bool:
+def turn_on(view: StateView, entity: str) -> Any:
     """Return whether any joint of an entity is in the range of `turnon`."""
-    return any(_joints_in_state(view, entity, "turnon"))
+    return np.any(_joints_in_state(view, entity, "turnon"), axis=0)
 
 
-def turn_off(view: StateView, entity: str) -> bool:
+def turn_off(view: StateView, entity: str) -> Any:
     """Return whether all joints of an entity are in the range of `turnoff`."""
-    return all(_joints_in_state(view, entity, "turnoff"))
+    return np.all(_joints_in_state(view, entity, "turnoff"), axis=0)
 
 
 def print_joint_state(view: StateView, entity: str) -> bool:
@@ -167,6 +175,8 @@ PREDICATES: dict[str, Predicate] = {
     "False": lambda view, *args: False,
 }
 """Predicates of the original by the names of task files."""
+
+OF_ALL = frozenset((on, in_, up, touching, stack, open_, close, turn_on, turn_off))
 
 
 def strict_on(view: StateView, entity: str, target: str) -> bool:
@@ -250,7 +260,7 @@ def evaluate(expression: Expression, view: StateView, semantics: str = "original
                 table = SEMANTICS[semantics]
                 if predicate not in table:
                     raise UnknownNameError("predicate", predicate, table)
-                return table[predicate](view, *args)
+                return bool(table[predicate](view, *args))
             case Or():
                 return any(parts)
             case Not():
@@ -272,7 +282,7 @@ def glowing_sites(view: StateView) -> set[int]:
     return sites
 
 
-def _joints_in_state(view: StateView, address: str, state: str) -> list[bool]:
+def _joints_in_state(view: StateView, address: str, state: str) -> list[Any]:
     """Return for each joint whether it is in a state, see `reaches_state`.
 
     An entity without joints has none that is open, and all it has are closed, as in the original.
@@ -281,7 +291,7 @@ def _joints_in_state(view: StateView, address: str, state: str) -> list[bool]:
     if owner is None:
         raise UnknownNameError("object, fixture or region of one", address, view.scene.joints)
     values = view.joint_positions(address).values()
-    return [bool(reaches_state(view.scene.entities[owner], value, state)) for value in values]
+    return [reaches_state(view.scene.entities[owner], value, state) for value in values]
 
 
 def reaches_state(model: ObjectModel, qpos: Any, state: str) -> Any:

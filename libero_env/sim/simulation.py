@@ -139,6 +139,12 @@ class Simulations(ABC):
         data = self.data(i)
         return data.contact.geom[: data.ncon]
 
+    @property
+    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the two geoms of all contacts, (n, 2), and the simulation of each, (n,), in ascending order."""
+        geoms = [self.contact_geoms(i) for i in range(self.num)]
+        return np.concatenate(geoms), np.repeat(np.arange(self.num), [len(pairs) for pairs in geoms])
+
     def record(self) -> dict[str, str]:
         """Return the backend and what of it the numbers depend on, as plain data."""
         return {"backend": self.backend.name}

@@ -15,7 +15,7 @@ from libero_env.expert.expert import MAX_STEPS
 from libero_env.sim import backend as backends
 from libero_env.sim.appearance import Appearance
 from libero_env.sim.backend import Backend
-from libero_env.sim.engine import ViewedGoals, make_goals, make_simulations
+from libero_env.sim.engine import Goals, make_simulations
 from libero_env.sim.predicates import register_predicate
 from libero_env.tasks.problem import And, Atom, ForAll, Not, Or
 
@@ -193,8 +193,7 @@ def test_truths_are_those_of_the_predicates(pair):
     goal = Or(
         (And(tuple(atoms[:3])), Not(ForAll((("b", scene.objects[names[0]].category),), Atom("Up", ("b",)))))
     )
-    checkers = [make_goals(goal, atoms, env.views, "original", env.simulations) for env in pair]
-    assert isinstance(checkers[0], ViewedGoals)
+    checkers = [Goals(goal, atoms, env.views, "original") for env in pair]
     assert checkers[1].one_by_one == (Atom("True", (names[0],)),)
     seen = []
     for _ in range(20):  # objects anywhere around the fixtures, joints anywhere
@@ -222,11 +221,11 @@ def test_predicates_of_users_and_of_strict_semantics_are_evaluated_on_the_host(p
     a, b = list(env.scene.entities)[:2]
     atom, reset_ = Atom("Leftof", (a, b)), reset(pair)
     assert reset_
-    checker = make_goals(atom, [atom], env.views, "original", env.simulations)
+    checker = Goals(atom, [atom], env.views, "original")
     assert checker.one_by_one == (atom,)
-    theirs = ViewedGoals(atom, [atom], pair[0].views, "original").check(range(NUM))[0]
+    theirs = Goals(atom, [atom], pair[0].views, "original").check(range(NUM))[0]
     assert (checker.check(range(NUM))[0] == theirs).all()
-    strict = make_goals(env.task.problem.goal, env.goals.atoms, env.views, "strict", env.simulations)
+    strict = Goals(env.task.problem.goal, env.goals.atoms, env.views, "strict")
     assert {one.predicate for one in strict.one_by_one} == {"In"}
 
 

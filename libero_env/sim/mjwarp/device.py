@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -12,6 +11,7 @@ import warp as wp
 from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import MASS_FIELD
 from libero_env.sim.backend import Backend
+from libero_env.sim.mjwarp import kernels
 from libero_env.sim.osc import ArmIndex
 from libero_env.sim.simulation import FIELDS, Closed
 
@@ -37,8 +37,8 @@ def choose_device(name: str | None) -> Any:
         raise LiberoError(f"backend=warp: there is no device {name!r}; here are: {here}") from error
 
 
-def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray) -> SimpleNamespace:
-    """Return what the kernels take beside MuJoCo Warp's model and data, on the present device.
+def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray) -> Any:
+    """Return the arrays of `kernels.Control` on the present device.
 
     Args:
         model: Model that is simulated.
@@ -47,29 +47,25 @@ def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray)
         bodies: Indices of the fixed bodies whose pose differs between simulations.
     """
     fixed = (model.body_weldid == 0) & np.isin(model.body_rootid, bodies)
-    constants = {
-        "mass_address": arm.mass_address.astype(np.int32),
-        "torque_limit": arm.torque_limit.astype(np.float64),
-        "finger_range": arm.finger_range.astype(np.float64),
-        "static_geoms": np.flatnonzero(fixed[model.geom_bodyid]).astype(np.int32),
+    values = {
+        "mass_address": wp.array(arm.mass_address.astype(np.int32)),
+        "torque_limit": wp.array(arm.torque_limit.astype(np.float64)),
+        "finger_range": wp.array(arm.finger_range.astype(np.float64)),
+        "static_geoms": wp.array(np.flatnonzero(fixed[model.geom_bodyid]).astype(np.int32)),
+        "site": arm.site,
+        "active": wp.zeros(num, dtype=wp.bool),
+        "rest": wp.zeros(7, dtype=wp.float64),
+        "grip": wp.zeros(num, dtype=wp.float64),
+        "time": wp.zeros(num),
     }
-    states = {
-        "active": (num, wp.bool),
-        "grip": (num, wp.float64),
-        "goal_pos": ((num, 3), wp.float64),
-        "goal_mat": ((num, 9), wp.float64),
-        "gripper": ((num, 2), wp.float64),
-        "rest": (7, wp.float64),
-        "arm": ((num, 7), wp.float64),
-        "kept_qpos": ((num, model.nq), float),
-        "kept_qvel": ((num, model.nv), float),
-        "kept_warm_start": ((num, model.nv), float),
-        "kept_time": (num, float),
-    }
-    return SimpleNamespace(
-        **{name: wp.array(value) for name, value in constants.items()},
-        **{name: wp.zeros(shape, dtype=dtype) for name, (shape, dtype) in states.items()},
-    )
+    double = {"goal_pos": 3, "goal_mat": 9, "gripper": 2, "arm": 7}
+    single = {"qpos": model.nq, "qvel": model.nv, "warm_start": model.nv}
+    values |= {name: wp.zeros((num, size), dtype=wp.float64) for name, size in double.items()}
+    values |= {name: wp.zeros((num, size)) for name, size in single.items()}
+    control = kernels.Control()
+    for name, value in values.items():
+        setattr(control, name, value)
+    return control
 
 
 @contextmanager

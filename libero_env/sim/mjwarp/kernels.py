@@ -66,12 +66,44 @@ def _block(a: Any, start: int):
     return found
 
 
+@wp.struct
+class Control:
+    """What the kernels take beside MuJoCo Warp's model and data.
+
+    Attributes:
+        active: Which simulations are to be stepped; the others are held.
+        grip: Gripper action of each.
+        goal_pos: Goal of the grip site's position, m.
+        goal_mat: Goal of its orientation, (num, 9).
+        gripper: Command of the fingers, (num, 2).
+        arm: Joint positions of the arm in double precision: in single they drift by the rounding of each sum.
+        qpos: As MuJoCo Warp's before the step; `qvel`, `warm_start` and `time` likewise.
+        mass_address: See `libero_env.sim.osc.ArmIndex`; `torque_limit`, `finger_range` and `site` likewise.
+        rest: Joints of the rest pose.
+        static_geoms: Geoms that are fixed to the world and whose poses differ between simulations.
+    """
+
+    active: wp.array[wp.bool]
+    grip: wp.array[wp.float64]
+    goal_pos: wp.array2d[wp.float64]
+    goal_mat: wp.array2d[wp.float64]
+    gripper: wp.array2d[wp.float64]
+    arm: wp.array2d[wp.float64]
+    qpos: wp.array2d[float]
+    qvel: wp.array2d[float]
+    warm_start: wp.array2d[float]
+    time: wp.array[float]
+    mass_address: wp.array2d[int]
+    torque_limit: wp.array[wp.float64]
+    finger_range: wp.array2d[wp.float64]
+    rest: wp.array[wp.float64]
+    static_geoms: wp.array[int]
+    site: int
+
+
 @wp.kernel
 def osc_substep(
-    active: wp.array[wp.bool],
-    grip: wp.array[wp.float64],
-    goal_pos: wp.array2d[wp.float64],
-    goal_mat: wp.array2d[wp.float64],
+    control: Control,
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
     xanchor: wp.array2d[wp.vec3],
@@ -80,20 +112,14 @@ def osc_substep(
     site_xmat: wp.array2d[wp.mat33],
     mass: wp.array2d[float],
     bias: wp.array2d[float],
-    mass_address: wp.array2d[int],
-    torque_limit: wp.array[wp.float64],
-    finger_range: wp.array2d[wp.float64],
-    rest: wp.array[wp.float64],
-    site: int,
-    gripper: wp.array2d[wp.float64],
     ctrl: wp.array2d[float],
 ):
     """Compute one substep of control, as `libero_env.sim.osc.osc_torques`, in each active simulation."""
     i = wp.tid()
-    if not active[i]:
+    if not control.active[i]:
         return
-    here = wp.vec3d(site_xpos[i, site])
-    turned = wp.mat33d(site_xmat[i, site])
+    here = wp.vec3d(site_xpos[i, control.site])
+    turned = wp.mat33d(site_xmat[i, control.site])
     jac = mat67()
     m = mat77()
     pull = vec7()
@@ -102,12 +128,12 @@ def osc_substep(
         axis = wp.vec3d(xaxis[i, j])
         lever = wp.cross(axis, here - wp.vec3d(xanchor[i, j]))
         velocity[j] = wp.float64(qvel[i, j])
-        pull[j] = NULL_KP * (rest[j] - wp.float64(qpos[i, j])) - NULL_KD * velocity[j]
+        pull[j] = NULL_KP * (control.rest[j] - wp.float64(qpos[i, j])) - NULL_KD * velocity[j]
         for r in range(3):
             jac[r, j] = lever[r]
             jac[3 + r, j] = axis[r]
         for k in range(7):
-            m[j, k] = wp.float64(mass[i, mass_address[j, k]])
+            m[j, k] = wp.float64(mass[i, control.mass_address[j, k]])
     inertia_pull = m * pull
     factor = _factor(m, 7)
     full = mat66()
@@ -126,12 +152,13 @@ def osc_substep(
     force = vec6()
     torque = vec6()
     for r in range(3):
-        force[r] = KP * (goal_pos[i, r] - here[r]) - KD * speed[r]
+        force[r] = KP * (control.goal_pos[i, r] - here[r]) - KD * speed[r]
         a = (r + 1) % 3
         b = (r + 2) % 3
         error = wp.float64(0.0)  # half the sum of the cross products of columns
         for c in range(3):
-            error += turned[a, c] * goal_mat[i, 3 * b + c] - turned[b, c] * goal_mat[i, 3 * a + c]
+            error += turned[a, c] * control.goal_mat[i, 3 * b + c]
+            error -= turned[b, c] * control.goal_mat[i, 3 * a + c]
         torque[r] = KP * HALF * error - KD * speed[3 + r]
     force = _substitute(_factor(_block(full, 0), 3), force, 3)
     torque = _substitute(_factor(_block(full, 3), 3), torque, 3)
@@ -140,60 +167,45 @@ def osc_substep(
         tau = wp.float64(bias[i, j]) + inertia_pull[j]
         for r in range(3):
             tau += jac[r, j] * (force[r] - task_pull[r]) + jac[3 + r, j] * (torque[r] - task_pull[3 + r])
-        ctrl[i, j] = float(wp.clamp(tau, -torque_limit[j], torque_limit[j]))
+        ctrl[i, j] = float(wp.clamp(tau, -control.torque_limit[j], control.torque_limit[j]))
     turn = wp.float64(0.0)
-    if grip[i] > wp.float64(0.0):
+    if control.grip[i] > wp.float64(0.0):
         turn = SPEED
-    if grip[i] < wp.float64(0.0):
+    if control.grip[i] < wp.float64(0.0):
         turn = -SPEED
     for f in range(2):
         step = turn
         if f == 0:
             step = -turn
-        gripper[i, f] = wp.clamp(gripper[i, f] + step, -ONE, ONE)
-        low = finger_range[f, 0]
-        high = finger_range[f, 1]
-        ctrl[i, 7 + f] = float(HALF * (high + low) + HALF * (high - low) * gripper[i, f])
+        control.gripper[i, f] = wp.clamp(control.gripper[i, f] + step, -ONE, ONE)
+        low = control.finger_range[f, 0]
+        high = control.finger_range[f, 1]
+        ctrl[i, 7 + f] = float(HALF * (high + low) + HALF * (high - low) * control.gripper[i, f])
 
 
 @wp.kernel
-def hold(
-    active: wp.array[wp.bool],
-    kept_qpos: wp.array2d[float],
-    kept_qvel: wp.array2d[float],
-    kept_warm_start: wp.array2d[float],
-    kept_time: wp.array[float],
+def finish_substep(
+    control: Control,
+    timestep: wp.float64,
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
     warm_start: wp.array2d[float],
     time: wp.array[float],
 ):
-    """Undo a step of the simulations that are not active."""
+    """Undo a step of the simulations that are not active, and add one to the arm's joint positions of the others."""
     i = wp.tid()
-    if active[i]:
-        return
-    for j in range(qpos.shape[1]):
-        qpos[i, j] = kept_qpos[i, j]
-    for j in range(qvel.shape[1]):
-        qvel[i, j] = kept_qvel[i, j]
-        warm_start[i, j] = kept_warm_start[i, j]
-    time[i] = kept_time[i]
-
-
-@wp.kernel
-def sum_arm(
-    active: wp.array[wp.bool],
-    timestep: wp.float64,
-    qvel: wp.array2d[float],
-    arm: wp.array2d[wp.float64],
-    qpos: wp.array2d[float],
-):
-    """Add a step to the arm's joint positions in double precision: in single they drift by the rounding of each sum."""
-    i = wp.tid()
+    if control.active[i]:
+        for j in range(7):
+            control.arm[i, j] = control.arm[i, j] + timestep * wp.float64(qvel[i, j])
+    else:
+        for j in range(qpos.shape[1]):
+            qpos[i, j] = control.qpos[i, j]
+        for j in range(qvel.shape[1]):
+            qvel[i, j] = control.qvel[i, j]
+            warm_start[i, j] = control.warm_start[i, j]
+        time[i] = control.time[i]
     for j in range(7):
-        if active[i]:
-            arm[i, j] = arm[i, j] + timestep * wp.float64(qvel[i, j])
-        qpos[i, j] = float(arm[i, j])
+        qpos[i, j] = float(control.arm[i, j])
 
 
 @wp.func
@@ -209,7 +221,7 @@ def _quat_multiply(a: wp.quat, b: wp.quat):
 
 @wp.kernel
 def pose_static_geoms(
-    geoms: wp.array[int],
+    control: Control,
     geom_body: wp.array[int],
     geom_pos: wp.array2d[wp.vec3],
     geom_quat: wp.array2d[wp.quat],
@@ -220,7 +232,7 @@ def pose_static_geoms(
 ):
     """Pose geoms that are fixed to the world, which MuJoCo Warp does when its data are made and never again."""
     i, k = wp.tid()
-    g = geoms[k]
+    g = control.static_geoms[k]
     body = geom_body[g]
     quat = xquat[i, body]
     offset = geom_pos[0, g]

@@ -72,8 +72,8 @@ class WarpSimulations(Simulations):
                     nconmax=contacts,
                     njmax=_ROWS_PER_CONTACT * contacts + self._other_rows,
                 )
-                self._arrays: Any = allocate(self.model, self.arm, num, self.fixture_bodies)
-        self._copies: Any = DeviceFields(self.device_data, self._arrays.arm)
+                self._control: Any = allocate(self.model, self.arm, num, self.fixture_bodies)
+        self._copies: Any = DeviceFields(self.device_data, self._control.arm)
         self.fields = self._copies
         self.uses_graphs, self._graphs = self.device.is_cuda, dict[int, Any]()
         self._actions_seen = np.zeros(num)
@@ -101,7 +101,6 @@ class WarpSimulations(Simulations):
 
     @property
     def contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of the two geoms of all contacts, (n, 2), and the simulation of each, (n,), in ascending order."""
         return self._copies.derived("contacts", self._download_contacts)
 
     def _download_contacts(self) -> tuple[np.ndarray, np.ndarray]:
@@ -123,27 +122,27 @@ class WarpSimulations(Simulations):
     def close(self) -> None:
         super().close()
         self._graphs = {}
-        self.device_data = self.device_model = self._arrays = self._copies = Freed()
+        self.device_data = self.device_model = self._control = self._copies = Freed()
 
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
-        model, data, arrays = self.device_model, self.device_data, self._arrays
+        model, data, control = self.device_model, self.device_data, self._control
         with wp.ScopedDevice(self.device):
             _write(data.time, ids, time)
             _write(data.qpos, ids, qpos)
             _write(data.qvel, ids, qvel)
             _write(data.qacc_warmstart, ids, 0.0)
             _write(data.ctrl, ids, 0.0)
-            _write(arrays.arm, ids, qpos[:, :7])
+            _write(control.arm, ids, qpos[:, :7])
             if self.fixture_bodies.size:
                 rows = np.ix_(ids, self.fixture_bodies)
                 _write(model.body_pos, rows, self.fixtures[ids, :, :3])
                 _write(model.body_quat, rows, self.fixtures[ids, :, 3:])
-            if arrays.static_geoms.size:
+            if control.static_geoms.size:
                 mjw.kinematics(model, data)
                 wp.launch(
                     kernels.pose_static_geoms,
-                    (self.num, arrays.static_geoms.size),
-                    inputs=[arrays.static_geoms, model.geom_bodyid, model.geom_pos, model.geom_quat],
+                    (self.num, control.static_geoms.size),
+                    inputs=[control, model.geom_bodyid, model.geom_pos, model.geom_quat],
                     outputs=[data.xpos, data.xquat, data.geom_xpos, data.geom_xmat],
                 )
             mjw.step1(model, data)
@@ -166,29 +165,29 @@ class WarpSimulations(Simulations):
                     self._copies.forget()
                     if watch is not None and done in WATCHED:
                         watch(done, ids)
-        self.controller_state.gripper[:] = self._arrays.gripper.numpy()
+        self.controller_state.gripper[:] = self._control.gripper.numpy()
         self._check_room()
 
     def _upload(self, ids: np.ndarray, actions: np.ndarray) -> None:
         """Send the goals, and which simulations are to be stepped, to the device."""
-        arrays, state, data = self._arrays, self.controller_state, self.device_data
+        control, state, data = self._control, self.controller_state, self.device_data
         self._actions_seen[ids] = actions[ids, -1]
         with wp.ScopedDevice(self.device):
             for array, values in (
-                (arrays.grip, self._actions_seen),
-                (arrays.goal_pos, state.goal),
-                (arrays.goal_mat, state.memory),
-                (arrays.gripper, state.gripper),
-                (arrays.rest, self.rest),
+                (control.grip, self._actions_seen),
+                (control.goal_pos, state.goal),
+                (control.goal_mat, state.memory),
+                (control.gripper, state.gripper),
+                (control.rest, self.rest),
             ):
                 array.assign(np.ascontiguousarray(values, np.float64))
-            wp.copy(arrays.kept_qpos, data.qpos)
-            wp.copy(arrays.kept_qvel, data.qvel)
-            wp.copy(arrays.kept_warm_start, data.qacc_warmstart)
-            wp.copy(arrays.kept_time, data.time)
+            for kept, present in zip(
+                (control.qpos, control.qvel, control.warm_start, control.time), self._moved, strict=True
+            ):
+                wp.copy(kept, present)
             if self.uses_graphs and not self._graphs:
                 self._load_kernels()
-            arrays.active.assign(_mask(self.num, ids))
+            control.active.assign(np.isin(np.arange(self.num), ids))
             data.overflow.zero_()
 
     def _control_on_host(self, ids: np.ndarray, actions: np.ndarray, inputs: Inputs) -> None:
@@ -196,7 +195,7 @@ class WarpSimulations(Simulations):
         state, ctrl = self.controller_state, self.fields["ctrl"].copy()
         state.controller.kernel(ids, actions, *inputs, *state.arrays, ctrl, *self._constants)
         self.device_data.ctrl.assign(ctrl.astype(np.float32))
-        self._arrays.gripper.assign(state.gripper)
+        self._control.gripper.assign(state.gripper)
 
     def _run(self, substeps: int) -> None:
         """Run substeps: as a graph, which is captured the first time, or one kernel after the other."""
@@ -213,48 +212,29 @@ class WarpSimulations(Simulations):
 
     def _load_kernels(self) -> None:
         """Run a substep in which every simulation is held: nothing is compiled while a graph is captured."""
-        gripper = self._arrays.gripper.numpy().copy()
-        self._arrays.active.zero_()
+        self._control.active.zero_()
         self._substep()
-        self._arrays.gripper.assign(gripper)
 
     def _substep(self) -> None:
-        data, arrays, arm = self.device_data, self._arrays, self.arm
-        wp.launch(
-            kernels.osc_substep,
-            self.num,
-            inputs=[
-                arrays.active,
-                arrays.grip,
-                arrays.goal_pos,
-                arrays.goal_mat,
-                *(getattr(data, n) for n in ("qpos", "qvel", "xanchor", "xaxis", "site_xpos", "site_xmat")),
-                data.M,
-                data.qfrc_bias,
-                arrays.mass_address,
-                arrays.torque_limit,
-                arrays.finger_range,
-                arrays.rest,
-                arm.site,
-            ],
-            outputs=[arrays.gripper, data.ctrl],
+        data, names = (
+            self.device_data,
+            ("qpos", "qvel", "xanchor", "xaxis", "site_xpos", "site_xmat", "M", "qfrc_bias"),
         )
+        seen = [getattr(data, name) for name in names]
+        wp.launch(kernels.osc_substep, self.num, inputs=[self._control, *seen], outputs=[data.ctrl])
         self._physics()
+
+    @property
+    def _moved(self) -> list[Any]:
+        """What a step changes and holding a simulation undoes."""
+        data = self.device_data
+        return [data.qpos, data.qvel, data.qacc_warmstart, data.time]
 
     def _physics(self) -> None:
         """Step the physics with the present controls, and hold the simulations that are not active."""
-        model, data, arrays = self.device_model, self.device_data, self._arrays
+        model, data, step = self.device_model, self.device_data, wp.float64(self.model.opt.timestep)
         mjw.step2(model, data)
-        kept = [arrays.kept_qpos, arrays.kept_qvel, arrays.kept_warm_start, arrays.kept_time]
-        moved = [data.qpos, data.qvel, data.qacc_warmstart, data.time]
-        wp.launch(kernels.hold, self.num, inputs=[arrays.active, *kept], outputs=moved)
-        step = wp.float64(self.model.opt.timestep)
-        wp.launch(
-            kernels.sum_arm,
-            self.num,
-            inputs=[arrays.active, step, data.qvel],
-            outputs=[arrays.arm, data.qpos],
-        )
+        wp.launch(kernels.finish_substep, self.num, inputs=[self._control, step], outputs=self._moved)
         mjw.step1(model, data)
 
     def _check_room(self) -> None:
@@ -288,9 +268,3 @@ def _write(array: Any, where: Any, values: Any) -> None:
     rows = array.numpy()
     rows[where] = values
     array.assign(rows)
-
-
-def _mask(num: int, ids: np.ndarray) -> np.ndarray:
-    chosen = np.zeros(num, bool)
-    chosen[ids] = True
-    return chosen

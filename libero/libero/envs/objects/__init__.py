@@ -99,13 +99,13 @@ class SiteObject:
 
     def in_box(self, this_position: Any, this_mat: Any, other_position: Any) -> bool:
         """Return whether a point is in the box of half size |R size| around the site, or up to 1 cm below it."""
-        return contains(self._box(this_position, this_mat), np.asarray(other_position))
+        return bool(contains(self._box(this_position, this_mat), np.asarray(other_position)))
 
     def under(
         self, this_position: Any, this_mat: Any, other_position: Any, other_height: float = 0.1
     ) -> bool:
         """Return whether a point is above the box, by less than `other_height`, m."""
-        return is_over(self._box(this_position, this_mat), np.asarray(other_position), other_height)
+        return bool(is_over(self._box(this_position, this_mat), np.asarray(other_position), other_height))
 
     def _box(self, position: Any, mat: Any) -> Box:
         return Box(np.asarray(position), np.asarray(mat).reshape(3, 3), self.size)
