@@ -16,7 +16,7 @@ from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
     from libero_env.tasks import Task
-    from lifelong.tuning.sweep import Candidate
+    from lifelong.tuning.proxy import Candidate
 
 SUITE, STEPS, HELD_OUT = "libero_90", 160, 0.25  # the defaults
 MEASUREMENT = (
@@ -91,10 +91,8 @@ def tune(request: TuneRequest) -> None:
 
     from lifelong.composition import compose_run
     from lifelong.settings import Configuration, plain_data
-    from lifelong.tuning.figure import draw_frontier
-    from lifelong.tuning.frontier import render
-    from lifelong.tuning.proxy import ProxySettings
-    from lifelong.tuning.sweep import measure_frontier, write_frontier, write_tuned
+    from lifelong.tuning.frontier import draw_frontier, render, write_frontier, write_tuned
+    from lifelong.tuning.proxy import ProxySettings, measure_frontier
 
     candidates, plain_words, default = _candidates(request.overrides, request.config_dir)
     without = [word for word in plain_words if not word.startswith(("algo", "tuned@algo"))]
@@ -163,7 +161,7 @@ def _candidate(
 ) -> "Candidate":
     from lifelong.composition import compose_run
     from lifelong.settings import Configuration, plain_data
-    from lifelong.tuning.sweep import Candidate
+    from lifelong.tuning.proxy import Candidate
 
     config = plain_data(compose_run(words, config_dir)[0])
     for group in ("algo", "data", "train"):  # before anything is recorded or learned

@@ -1,6 +1,7 @@
 """Tables of pages, and the templates that show them: self-contained HTML in one style."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jinja2
@@ -16,29 +17,18 @@ from lifelong.results.subgoals import AtomRates, Subgoals
 from lifelong.stats.intervals import mean_and_standard_error, wilson_interval
 
 # costs by their names in `lifelong.training.costs`: head of the column, its tooltip, and how a value is shown
+_bytes, _flop = (partial(quantity, unit=unit) for unit in ("B", "FLOP"))
 COST_COLUMNS: dict[str, tuple[str, str, Callable[[float], str]]] = {
     "training_seconds": ("Training", "wall time of training on a task", duration),
     "evaluation_seconds": ("Evaluation", "wall time of rollouts while and after learning a task", duration),
     "end_task_seconds": ("Between tasks", "wall time of what the algorithm does after a task", duration),
-    "flops_per_step": (
-        "A step",
-        "operations of a training step, replay and penalties included",
-        lambda value: quantity(value, "FLOP"),
-    ),
-    "flops_per_action": (
-        "An action",
-        "operations of one action with a full history",
-        lambda value: quantity(value, "FLOP"),
-    ),
+    "flops_per_step": ("A step", "operations of a training step, replay and penalties included", _flop),
+    "flops_per_action": ("An action", "operations of one action with a full history", _flop),
     "parameters": ("Parameters", "of the policy and of what the algorithm trains beside it", quantity),
     "parameters_trained": ("Trained", "parameters that the optimiser moves", quantity),
-    "stored_bytes": (
-        "Stored",
-        "kept from task to task: state, and frames to replay",
-        lambda value: quantity(value, "B"),
-    ),
-    "peak_gpu_bytes": ("GPU memory", "largest while learning a task", lambda value: quantity(value, "B")),
-    "peak_memory_bytes": ("Memory", "largest of the process so far", lambda value: quantity(value, "B")),
+    "stored_bytes": ("Stored", "kept from task to task: state, and frames to replay", _bytes),
+    "peak_gpu_bytes": ("GPU memory", "largest while learning a task", _bytes),
+    "peak_memory_bytes": ("Memory", "largest of the process so far", _bytes),
 }
 
 

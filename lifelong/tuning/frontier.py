@@ -1,14 +1,27 @@
-"""What values of a setting keep and let learn, and which of them is best."""
+"""What values of a setting keep and let learn, and which of them is best: as a table, a picture and files."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
+import yaml
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
+from libero_env.storage import atomic_write_text
+from lifelong.errors import ConfigError
+from lifelong.report.figures import INK, LINE_COLOURS, STYLE, hide_spines, save
+
 Errors = list[list[float]]  # of one trial: after each stage, the error on each task so far
+_TICKS = (1.0, 1.05, 1.1, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 8.0, 9.0)  # of factors
+_FEW_TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)  # where an axis is longer than a factor of two
 
 
 @dataclass(frozen=True)
@@ -134,3 +147,140 @@ def render(frontier: Frontier, default: str | None) -> str:
     lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in rows]
     lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
     return "\n".join(lines)
+
+
+def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
+    """Draw what is kept against what is learned and write `stem`.png and `stem`.pdf; below and left is better.
+
+    Values are joined in their order, with bars from the least to the largest trial. On the dashed line, all tasks
+    together have the error of the chosen value.
+
+    Args:
+        frontier: What was measured.
+        title: Title of the picture.
+        stem: Path without suffix.
+    """
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(4.6, 3.6), layout="constrained")
+        axes = figure.subplots()
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        learned = [o.learned.value for o in frontier.outcomes]
+        axes.plot(
+            learned, [o.kept.value for o in frontier.outcomes], color=LINE_COLOURS[0], lw=0.8, alpha=0.6
+        )
+        for outcome in frontier.outcomes:
+            chosen = outcome is frontier.chosen
+            _point(axes, outcome, "o", LINE_COLOURS[0], filled=frontier.is_efficient(outcome), large=chosen)
+        for outcome in frontier.others:
+            _point(axes, outcome, "s", LINE_COLOURS[-1], filled=True, large=False)
+        _equal_scores(axes, frontier.chosen)
+        _name_points(axes, frontier)
+        for axis in (axes.xaxis, axes.yaxis):
+            low, high = axis.get_view_interval()
+            axis.set_major_locator(LogLocator(base=10, subs=_FEW_TICKS if high > 2 * low else _TICKS))
+            axis.set_minor_locator(NullLocator())
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+            axis.set_minor_formatter(NullFormatter())
+        axes.set_xlabel("error on the newest task\n(1: just learned by fine-tuning)")
+        axes.set_ylabel("error on earlier tasks")
+        axes.set_title(title, loc="left")
+        hide_spines(axes)
+        save(figure, stem)
+
+
+def _point(axes: Axes, outcome: Outcome, marker: str, colour: str, *, filled: bool, large: bool) -> None:
+    x, y = outcome.learned, outcome.kept
+    xerr, yerr = ([[r.value - r.low], [r.high - r.value]] for r in (x, y))
+    axes.errorbar(
+        x.value, y.value, xerr=xerr, yerr=yerr, fmt="none", ecolor=colour, elinewidth=0.6, alpha=0.5
+    )
+    face = colour if filled else "white"
+    axes.plot(x.value, y.value, marker, ms=8 if large else 5, mec=colour, mfc=face, mew=1.2)
+
+
+def _name_points(axes: Axes, frontier: Frontier) -> None:
+    """Write each value beside its point, at the corner that is farthest from other points and names."""
+    outcomes = [*frontier.outcomes, *frontier.others]
+    places = axes.transData.transform([(o.learned.value, o.kept.value) for o in outcomes])
+    taken = list(places)
+    for outcome, place in zip(outcomes, places, strict=True):
+        width = 4.5 * len(outcome.label)  # of its text, [points]
+        middles = {(x, y): place + (x + np.sign(x) * width / 2, y + 4) for x in (6, -6) for y in (5, -12)}
+        rest = [other for other in taken if other is not place]
+        corner = max(
+            middles,
+            key=lambda c: min((np.hypot(*((middles[c] - other) / (width, 10))) for other in rest), default=0),
+        )
+        taken.append(middles[corner])
+        axes.annotate(
+            outcome.label,
+            (outcome.learned.value, outcome.kept.value),
+            corner,
+            textcoords="offset points",
+            fontsize=8,
+            weight="bold" if outcome is frontier.chosen else "normal",
+            ha="left" if corner[0] > 0 else "right",
+        )
+
+
+def _equal_scores(axes: Axes, chosen: Outcome) -> None:
+    """Draw where kept^(K-1) learned is that of the chosen value."""
+    earlier = len(chosen.trials[0][-1]) - 1
+    limits = axes.get_xlim(), axes.get_ylim()
+    x = np.geomspace(*limits[0], 50)
+    y = chosen.kept.value * (chosen.learned.value / x) ** (1 / earlier)
+    axes.plot(x, y, color=INK, lw=0.7, ls="--", alpha=0.6, scalex=False, scaley=False)
+    axes.set_xlim(limits[0])
+    axes.set_ylim(limits[1])
+
+
+def write_frontier(frontier: Frontier, path: Path, about: Mapping[str, Any]) -> None:
+    """Write a frontier with all errors to a JSON file.
+
+    Args:
+        frontier: What was measured.
+        path: File to write.
+        about: What else is to be known: command, tasks, versions.
+    """
+    record = {
+        **about,
+        "chosen": frontier.chosen.settings,
+        "values": [_row(outcome) for outcome in frontier.outcomes],
+        "others": [_row(outcome) for outcome in frontier.others],
+    }
+    atomic_write_text(path, json.dumps(record, indent=1) + "\n")
+
+
+def _row(outcome: Outcome) -> dict[str, Any]:
+    return {
+        "label": outcome.label,
+        "settings": outcome.settings,
+        **{name: asdict(getattr(outcome, name)) for name in ("kept", "learned", "score")},
+        "errors": outcome.trials,
+    }
+
+
+def write_tuned(outcome: Outcome, path: Path, about: str) -> None:
+    """Write a value of an algorithm's settings as a file of the configuration group `tuned`.
+
+    Args:
+        outcome: The chosen value.
+        path: File to write.
+        about: Where it comes from; a comment at the top.
+
+    Raises:
+        ConfigError: A setting is none of the algorithm.
+    """
+    node: dict[str, Any] = {}
+    for key, value in outcome.settings.items():
+        group, *names = key.split(".")
+        if group != "algo" or not names:
+            raise ConfigError(f"{key} is no setting of the algorithm: set it in a preset of your own instead")
+        place = node
+        for name in names[:-1]:
+            place = place.setdefault(name, {})
+        place[names[-1]] = value
+    path.parent.mkdir(parents=True, exist_ok=True)
+    comment = "".join(f"# {line}\n" for line in about.splitlines())
+    atomic_write_text(path, comment + yaml.safe_dump(node, sort_keys=False))

@@ -1,10 +1,14 @@
-"""Short streams of tasks, learned as a run learns them and measured on held-out demonstrations instead of rollouts."""
+"""Short streams of tasks, learned as a run learns them and measured on held-out demonstrations instead of rollouts.
+
+What is measured is kept, so a sweep that was stopped goes on.
+"""
 
 import hashlib
 import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +29,7 @@ from lifelong.settings import Configuration
 from lifelong.training.fit import fit
 from lifelong.training.precision import autocast
 from lifelong.training.settings import FitSettings
+from lifelong.tuning.frontier import Errors, Frontier, Outcome
 from lifelong.types import Batch, PolicySpec
 
 FORMAT = 1  # of a trial's record; another one is measured again
@@ -56,6 +61,21 @@ class ProxySettings:
     seeds: tuple[int, ...] = (1,)
     steps: int = 160
     held_out: float = 0.25
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A configuration to be measured.
+
+    Attributes:
+        label: Name in tables and pictures.
+        settings: Values that it differs in, by dotted key.
+        config: Configuration of a run, as plain data.
+    """
+
+    label: str
+    settings: dict[str, Any]
+    config: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -147,7 +167,7 @@ def _sample(dataset: TaskWindows, first: int) -> Batch:
     return dataset.batch(first + torch.linspace(0, left - 1, min(left, MEASURED)).round().long())
 
 
-def measure(trial: Trial, data: Callable[[], StreamData], folder: Path) -> list[list[float]]:
+def measure(trial: Trial, data: Callable[[], StreamData], folder: Path) -> Errors:
     """Learn a trial's stream and return its errors; what was measured before is read back.
 
     Args:
@@ -168,7 +188,7 @@ def measure(trial: Trial, data: Callable[[], StreamData], folder: Path) -> list[
     return errors
 
 
-def _learn(trial: Trial, data: StreamData, folder: Path) -> list[list[float]]:
+def _learn(trial: Trial, data: StreamData, folder: Path) -> Errors:
     config, seed = Configuration(trial.config), trial.seed
     algorithm: Algorithm = config.build("algo")
     if algorithm.stages(len(data.training)) != tuple((task,) for task in range(len(data.training))):
@@ -180,7 +200,7 @@ def _learn(trial: Trial, data: StreamData, folder: Path) -> list[list[float]]:
     settings = scaled(config.build("train"), trial.steps)
     algorithm.set_augmentation(config.build("augmentation"))
     first = folder / "first" / f"{trial.start_key(algorithm)}.safetensors"
-    errors: list[list[float]] = []
+    errors: Errors = []
     for task, windows in enumerate(data.training):
         if task == 0 and first.exists():
             state = checkpoints.load(first)
@@ -240,3 +260,63 @@ def _error(algorithm: Algorithm, policy: Policy, task: int, batch: Batch, settin
         parts = [batch.rows(rows) for rows in torch.arange(len(batch)).split(CHUNK)]
         errors = [(acting.predict(part).float() - part.actions).abs().flatten(1).mean(1) for part in parts]
     return float(torch.cat(errors).mean())
+
+
+def measure_frontier(
+    candidates: Sequence[Candidate],
+    others: Sequence[Candidate],
+    fine_tuning: Candidate,
+    proxy: ProxySettings,
+    folder: Path,
+    report: Callable[[str], None] = print,
+) -> Frontier:
+    """Measure candidates on all streams and with all seeds.
+
+    Args:
+        candidates: Values to choose from, in the order of the picture's line.
+        others: Algorithms to compare with.
+        fine_tuning: Sequential fine-tuning, whose errors are the unit.
+        proxy: Streams, seeds and length of training.
+        folder: Folder of what is measured.
+        report: Function that is given a line after each trial.
+
+    Raises:
+        ConfigError: A stream is too short to forget anything.
+    """
+    everyone = (fine_tuning, *others, *candidates)
+    errors: dict[str, list[Errors]] = {one.label: [] for one in everyone}
+    places = [(stream, seed) for stream in proxy.streams for seed in proxy.seeds]
+    total, done = len(places) * len(everyone), 0
+    for stream, seed in places:
+        if len(stream) < 2:
+            raise ConfigError(
+                "a stream has one task; expected two or more, of which the first can be forgotten"
+            )
+        for one in everyone:
+            began = time.perf_counter()
+            trial = Trial(one.config, stream, seed, proxy.steps, proxy.held_out)
+            found = measure(trial, partial(_opened, trial), folder)
+            errors[one.label].append(found)
+            done += 1
+            shown = ", ".join(f"{error:.3f}" for error in found[-1])
+            report(
+                f"{done}/{total} {one.label}, {stream[0].name} and {len(stream) - 1} more, seed {seed}: "
+                f"errors at the end {shown} ({time.perf_counter() - began:.0f} s)"
+            )
+    base = tuple(errors[fine_tuning.label])
+
+    def outcome(one: Candidate) -> Outcome:
+        return Outcome(one.label, one.settings, tuple(errors[one.label]), base)
+
+    return Frontier(tuple(map(outcome, candidates)), tuple(map(outcome, (fine_tuning, *others))))
+
+
+def _opened(trial: Trial) -> StreamData:
+    """Return the demonstrations of a trial, of which those of the last one are held."""
+    needed = {group: trial.config[group] for group in ("data", "language")}
+    return _open(json.dumps(needed, sort_keys=True), trial.stream, trial.held_out)
+
+
+@lru_cache(maxsize=1)
+def _open(config: str, stream: tuple[Task, ...], held_out: float) -> StreamData:
+    return open_stream(json.loads(config), stream, held_out)

@@ -13,8 +13,8 @@ from lifelong.composition import compose_run, swept
 from lifelong.errors import LiberoError
 from lifelong.settings import Configuration, plain_data
 from lifelong.training.settings import FitSettings
-from lifelong.tuning import proxy, sweep
-from lifelong.tuning.frontier import Frontier, Outcome, render
+from lifelong.tuning import proxy
+from lifelong.tuning.frontier import Frontier, Outcome, render, write_tuned
 from lifelong.tuning.proxy import StreamData, Trial, scaled
 from tests.harness.configs import CONFIGS, composed
 from tests.harness.runs import TINY, make_windows
@@ -111,10 +111,10 @@ def fake_streams(monkeypatch):
         opened.append(len(tasks))
         return StreamData(spec, tuple(windows), tuple(w.batch(torch.arange(8)) for w in windows))
 
-    sweep._open.cache_clear()
-    monkeypatch.setattr(sweep, "open_stream", open_stream)
+    proxy._open.cache_clear()
+    monkeypatch.setattr(proxy, "open_stream", open_stream)
     yield opened
-    sweep._open.cache_clear()
+    proxy._open.cache_clear()
 
 
 def tune(*words: str) -> int:
@@ -222,7 +222,7 @@ def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> 
 def test_a_key_outside_of_the_algorithm_is_measured_but_not_written(tmp_path) -> None:
     one = Outcome("0.1", {"train.lr": 0.1}, (), ())
     with pytest.raises(LiberoError, match=r"train.lr is no setting of the algorithm"):
-        sweep.write_tuned(one, tmp_path / "x.yaml", "")
+        write_tuned(one, tmp_path / "x.yaml", "")
 
 
 # --- what is shipped
