@@ -1,4 +1,4 @@
-"""What the documentation takes from the code while it is built: the two references.
+"""What the documentation takes from the code while it is built: the references, and three tables.
 
 MkDocs calls `on_page_markdown` for every page (`hooks` in mkdocs.yml). A page asks for a part with a line such as
 `<!-- generated: commands -->`. Links to files outside this folder become their paths, as the site has none of these.
@@ -296,6 +296,14 @@ def protocol_table() -> str:
     return "\n".join(lines)
 
 
+def perturbation_table() -> str:
+    """A row for each kind of perturbation, in the order in which they are applied."""
+    from libero_env.perturbations import KINDS
+
+    rows = [f"| `{k.name}` | {k.layer} | {k.at_one:g} {k.unit} | {_cell(k.what)} |" for k in KINDS.values()]
+    return "\n".join(["| kind | layer | severity 1 | what changes |", "|---|---|---|---|", *rows])
+
+
 FAMILIES = {
     "groceries": "Groceries",
     "kitchenware": "Kitchenware",
@@ -354,5 +362,6 @@ PARTS = {
     "gallery": gallery,
     "commands": command_reference,
     "configuration": configuration_reference,
+    "perturbations": perturbation_table,
     "protocols": protocol_table,
 }

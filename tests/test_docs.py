@@ -1,48 +1,114 @@
-"""What README.md and CONTRIBUTING.md show is run here; tests/test_docs_site.py does it for docs/."""
+"""README.md, CONTRIBUTING.md and docs/: what they show runs, what they name exists, and nothing is left out of them."""
 
+import importlib.util
+import inspect
+import itertools
+import os
 import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
 import yaml
 
+from libero._adapters.config import load_config
+from libero_env.cli.main import ALL, bind, find, load, main
+from libero_env.cli.options import options_of
 from libero_env.envs.env import LiberoEnv
 from libero_env.objects import catalog
-from libero_env.tasks import Task
+from libero_env.objects.builtin import builtin_names
+from libero_env.perturbations import KINDS
+from libero_env.tasks import Task, get_suite, suite_names
 from libero_env.tasks.builder import build_problem, load_scene
+from lifelong.algorithms import Algorithm
+from lifelong.composition import compose_run, swept
 
 ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+CONFIGS = ROOT / "configs"
+PAGES = sorted(DOCS.glob("*.md"))
+GUIDE = ROOT / "CONTRIBUTING.md"
+GENERATED = ("commands.md", "configuration.md")
+NOT_RUN = r"<!-- not run: \S[^>]*-->\n+"  # before a block that is not, with the reason
 
 
-def blocks(file: str, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / file).read_text(encoding="utf-8"), re.M | re.S)
+@cache
+def generate() -> ModuleType:
+    """docs/generate.py, which no package holds."""
+    spec = importlib.util.spec_from_file_location("docs_generate", DOCS / "generate.py")
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
-def test_there_is_something_to_run():
-    assert len(blocks("README.md", "python")) == 1
-    assert len(blocks("CONTRIBUTING.md", "python")) == 2
-    assert len(blocks("CONTRIBUTING.md", "yaml")) == 2
+def text(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("block", [b for kind in ("python", "yaml") for b in blocks("CONTRIBUTING.md", kind)])
-def test_examples_are_short(block):
-    assert len([line for line in block.splitlines() if line.strip()]) <= 15
+def blocks(page: Path, *languages: str) -> list[str]:
+    """The blocks that are meant to be run."""
+    found = re.findall(rf"({NOT_RUN})?^```({'|'.join(languages)})\n(.*?)^```", text(page), re.M | re.S)
+    return [code for excuse, _, code in found if not excuse]
+
+
+def lines(page: Path) -> Iterator[str]:
+    """Command lines without comments, of blocks and of indented text."""
+    indented = re.findall(r"^    (?! )(?:libero|python|torchrun|lifelong\.) .*$", text(page), re.M)
+    for line in [*"".join(blocks(page, "sh")).splitlines(), *indented]:
+        for part in line.split(" && "):
+            words = shlex.split(part, comments=True)
+            if words:
+                yield shlex.join(words)
+
+
+PYTHON = [
+    pytest.param(page, code, id=f"{page.stem}-{i}")
+    for page in [*PAGES, ROOT / "README.md"]
+    for i, code in enumerate(blocks(page, "python"))
+]
 
 
 @pytest.mark.sim
-@pytest.mark.parametrize("block", blocks("README.md", "python"))
-def test_the_environment_of_the_readme(block, capsys):
-    exec(compile(block, "README.md", "exec"), {})  # noqa: S102
-    assert "128, 128, 3)" in capsys.readouterr().out
+@pytest.mark.parametrize(("page", "code"), PYTHON)
+def test_python_blocks_run(page, code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    monkeypatch.setenv("LIBERO_OBJECTS", str(tmp_path))
+    monkeypatch.setattr(catalog, "_registered", {})
+    exec(compile(code, str(page), "exec"), {"__name__": "shown"})  # noqa: S102
+
+
+@pytest.mark.sim
+def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
+    (code,) = blocks(DOCS / "evaluating.md", "python")
+    (tmp_path / "my_policy.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    tiny = ["--suite", "libero_object/0", "--episodes", "2", "--horizon", "3"]
+    assert main(["eval", "my_policy:make", *tiny]) == 0
+    assert "eval/my_policy.make/eval.json" in capsys.readouterr().out
+    (reading,) = re.findall(
+        r"^```python\n(from libero_eval.evaluation_file.*?)^```",
+        text(DOCS / "evaluating.md"),
+        re.M | re.S,
+    )
+    exec(compile(reading, "evaluating.md", "exec"), {})  # noqa: S102
+    assert "libero_object/0 Estimate(value=0.0" in capsys.readouterr().out
+    assert main(["eval", "--status", "eval/my_policy.make"]) == 0
+    assert "1 of 1 units, 2 of 2 episodes" in capsys.readouterr().out
+    monkeypatch.delitem(sys.modules, "my_policy")
 
 
 @pytest.mark.unit
 def test_the_algorithm_of_the_guide():
-    code, config = (
-        blocks("CONTRIBUTING.md", "python")[0],
-        yaml.safe_load(blocks("CONTRIBUTING.md", "yaml")[0]),
-    )
+    code, config = blocks(GUIDE, "python")[0], yaml.safe_load(blocks(GUIDE, "yaml")[0])
     names: dict = {}
     exec(compile(code, "l2.py", "exec"), names)  # noqa: S102
     assert config.pop("_target_").endswith(".l2.L2")
@@ -59,8 +125,8 @@ def test_the_algorithm_of_the_guide():
 @pytest.mark.sim
 def test_the_object_and_the_task_of_the_guide(monkeypatch):
     monkeypatch.setattr(catalog, "_registered", {})
-    exec(compile(blocks("CONTRIBUTING.md", "python")[1], "red_cube.py", "exec"), {})  # noqa: S102
-    (facts,) = yaml.safe_load(blocks("CONTRIBUTING.md", "yaml")[1])
+    exec(compile(blocks(GUIDE, "python")[1], "red_cube.py", "exec"), {})  # noqa: S102
+    (facts,) = yaml.safe_load(blocks(GUIDE, "yaml")[1])
     problem = build_problem(load_scene(facts["scene"]), facts)
     env = LiberoEnv(Task("mine", 0, facts["name"], "pick it up", problem.language, problem), cameras=())
     env.reset(seed=1)
@@ -69,19 +135,251 @@ def test_the_object_and_the_task_of_the_guide(monkeypatch):
     env.close()
 
 
+@cache
+def composes(*overrides: str) -> None:
+    for values in itertools.product(*swept(overrides).values()):  # of a sweep, each job
+        chosen = dict(zip(swept(overrides), values, strict=True))
+        single = [word for word in overrides if word.split("=")[0] not in chosen]
+        compose_run([*single, *(f"{key}={value}" for key, value in chosen.items())])
+
+
+def check_line(line: str) -> None:
+    """A command line that its program would take.
+
+    Raises:
+        SystemExit, Exception: It would not.
+    """
+    words = shlex.split(line)
+    if words[0] == "torchrun":
+        words = ["python", *words[words.index("train.py") :]]
+    if words[0].endswith("/python"):
+        words[0] = "python"
+    if words[:2] in (["python", "train.py"], ["libero", "train"]):
+        overrides = [w for w in words[2:] if w not in ("-m", "--cfg", "job")]
+        composes(*overrides)
+    elif words[0].endswith("libero"):
+        name = find(words[1:])
+        bind(name, words[1 + len(name.split()) :])
+    elif words[0] == "python":
+        assert (ROOT / words[1]).is_file() or words[1] == "-m", line
+    else:
+        known = ("docker", "export", "git", "pip", "python3.11", ".venv/bin/pip", "source", "make")
+        assert words[0] in known, line
+
+
 @pytest.mark.unit
-@pytest.mark.parametrize("file", ["README.md", "CONTRIBUTING.md"])
-def test_what_is_named_exists(file):
-    text = (ROOT / file).read_text(encoding="utf-8")
-    named = re.findall(r"`((?:libero_env|lifelong|configs|tests|experiments)/[\w./]*)`", text)
-    named += re.findall(r"\]\((?!http)([^)#]+)\)", text)
-    missing = [name for name in named if not (ROOT / name).exists() and "l2." not in name]
-    assert named and not missing, f"{file} names what is not there: {missing}"
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
+def test_command_lines_are_valid(page):
+    for line in lines(page):
+        try:
+            check_line(line)
+        except (Exception, SystemExit) as error:
+            raise AssertionError(f"{page.name}: {line}") from error
+
+
+@pytest.mark.unit
+def test_a_wrong_command_line_is_found():
+    for line in (
+        "libero tasks lost",
+        "python train.py algo=ewx",
+        "python train.py train.epoch=3",
+        "libreo doctor",
+    ):
+        with pytest.raises((Exception, SystemExit)):
+            check_line(line)
+
+
+def written() -> str:
+    """All pages but those that are generated."""
+    return "\n".join(text(page) for page in PAGES if page.name not in GENERATED)
+
+
+@pytest.mark.unit
+def test_every_command_is_shown():
+    assert not [name for name in ALL if not re.search(rf"\blibero {re.escape(name)}\b", written())]
+
+
+@pytest.mark.unit
+def test_every_command_and_argument_is_in_the_reference():
+    page = generate().command_reference()
+    for name, command in ALL.items():
+        assert f"## libero {name}\n" in page
+        if not command.reads_words:
+            section = page.split(f"## libero {name}\n")[1].split("\n## ")[0]
+            section = section.replace("--as SET", "--published").replace("--as {", "--format {").lower()
+            for option in inspect.signature(options_of(load(command))).parameters:
+                assert option.replace("_", "-") in section, (name, option)
+
+
+OPTIONS = [
+    (file.parent.relative_to(CONFIGS).as_posix(), file.stem)
+    for file in sorted(CONFIGS.rglob("*/*.yaml"))
+    if "hydra" not in file.parts  # launchers, which scale.md shows
+]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("group", sorted({group for group, _ in OPTIONS}))
+def test_every_option_of_a_group_is_shown(group):
+    for folder in ("compat/libero", "tuned"):  # chosen by compat, or by the policy's head
+        if group.startswith(folder):
+            assert f"configs/{folder}" in written()
+            return
+    said = {name for found in re.findall(rf"\b{group}=([\w,]+)", written()) for name in found.split(",")}
+    assert not {option for g, option in OPTIONS if g == group} - said
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("algo", [option for group, option in OPTIONS if group == "algo"])
+def test_every_algorithm_has_a_section_that_names_its_keys(algo):
+    page = text(DOCS / "algorithms.md")
+    assert re.search(rf"^\| `{algo}` \|", page, re.M)
+    section = page.split(f"\n## algo={algo}\n")[1].split("\n## ")[0]
+    keys = set(yaml.safe_load((CONFIGS / "algo" / f"{algo}.yaml").read_text())) - {"_target_", "defaults"}
+    missing = [key for key in keys if not re.search(rf"\b{key}\b", section)]
+    assert not missing
+
+
+@pytest.mark.unit
+def test_hooks_of_the_guide_are_those_of_algorithms():
+    shown = text(DOCS / "algorithms.md").split("## Your own")[1]
+    hooks = (
+        "begin_task phases begin_phase mix penalty after_backward after_step end_phase end_task policy_for"
+    )
+    for hook in [*hooks.split(), "state_dict", "load_state_dict"]:
+        assert hasattr(Algorithm, hook)
+        assert hook in shown
+
+
+@pytest.mark.unit
+def test_every_key_is_in_the_reference_with_its_meaning():
+    page = generate().configuration_reference()
+    for group, option in OPTIONS:
+        values = yaml.safe_load((CONFIGS / group / f"{option}.yaml").read_text(encoding="utf-8"))
+        assert f"- `{group}={option}`" in page
+        if f"`configs/{group}/{option}.yaml`\n\n```yaml" in page:  # shown whole
+            continue
+        for key, *_ in generate().leaves(values or {}):
+            assert f"| `{group.replace('/', '.')}.{key}` |" in page
+    rows = re.findall(r"^\| `[\w.]+` \|.*$", page, re.M)
+    assert len(rows) > 100
+    assert not [row for row in rows if not row.split("|")[-2].strip()]
+
+
+def shown_keys(column: int) -> Iterator[list[str]]:
+    """Overrides of a column of the table of keys: those of an algorithm by themselves, all others together."""
+    table = text(DOCS / "migrating.md").split("## Keys")[1].split("\n## ")[0]
+    rest: list[str] = []
+    for row in re.findall(r"^\| `.*$", table, re.M):
+        for found in re.findall(r"`([^`]+)`", row.split("|")[column]):
+            words = [w if "=" in w else f"{w}=1" for w in found.replace("...", "x").split()]
+            if re.match("(lifelong|algo)=", words[0]):
+                yield words
+            else:
+                rest += words
+    assert len(rest) > 10
+    yield rest
+
+
+@pytest.mark.unit
+def test_keys_of_the_migration_guide_exist():
+    for words in shown_keys(1):
+        load_config(*words)
+    for words in shown_keys(2):
+        composes(*words)
+
+
+@pytest.mark.unit
+def test_extras_and_variables_are_told():
+    page = text(DOCS / "install.md")
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
+        "optional-dependencies"
+    ]
+    code = "".join(
+        file.read_text(encoding="utf-8")
+        for p in ("libero_env", "lifelong", "libero_eval")
+        for file in (ROOT / p).rglob("*.py")
+    )
+    variables = set(re.findall(r"\b(?:LIBERO|MUJOCO)_[A-Z_]+\b(?!\.TXT)", code))
+    assert "LIBERO_CACHE" in variables
+    assert not [name for name in {*extras, *variables} if f"\n| `{name}` |" not in page]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", GUIDE], ids=lambda page: page.stem)
+def test_what_a_page_names_exists(page):
+    content = text(page)
+    folders = "libero_env|lifelong|configs|tests|experiments|scripts|benchmark_scripts"
+    named = [ROOT / name for name in re.findall(rf"`((?:{folders})/[\w./]+)`", content) if "l2." not in name]
+    named += [page.parent / link for link in re.findall(r"\]\((?!http|#)([^)#]+)", content)]
+    assert not [path for path in named if not path.exists()]
+
+
+@pytest.mark.unit
+def test_every_page_is_in_the_navigation():
+    def pages(node) -> Iterator[str]:
+        for part in node if isinstance(node, list) else node.values():
+            yield from [part] if isinstance(part, str) else pages(part)
+
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
+    assert sorted(pages(nav)) == [page.name for page in PAGES]
+
+
+@pytest.mark.slow
+def test_the_site_builds_and_fetches_nothing(tmp_path):
+    environment = {
+        **os.environ,
+        "NO_MKDOCS_2_WARNING": "1",
+        "http_proxy": "http://127.0.0.1:9",
+        "https_proxy": "http://127.0.0.1:9",
+    }
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(build, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    site = tmp_path / "site"
+    for page in PAGES:
+        html = (site / f"{page.stem}.html").read_text(encoding="utf-8")
+        assert "<!-- generated" not in html
+        fetched = re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="(https?://[^"]+)"', html)
+        assert not fetched, f"{page.name} fetches {fetched}"
+        for link in re.findall(r'(?:href|src)="(?!https?:|mailto:|data:|#)([^"#?]+)(#[^"]*)?"', html):
+            target = (site / page.parent.relative_to(DOCS) / link[0]).resolve()
+            assert target.exists(), f"{page.name} leads to {link[0]}"
+            if link[1] and target.suffix == ".html":
+                assert link[1][1:] in anchors(target), f"{page.name}: {''.join(link)}"
+
+
+@cache
+def anchors(page: Path) -> set[str]:
+    """What links can point at in a page."""
+    return set(re.findall(r'\bid="([^"]+)"', page.read_text(encoding="utf-8")))
+
+
+@pytest.mark.unit
+def test_the_gallery_is_whole():
+    text = generate().gallery()
+    shown = re.findall(r'src="([^"]+)"', text)
+    tasks = {
+        f"images/gallery/tasks/{task.suite}-{task.index}.jpg": task
+        for suite in suite_names()
+        for task in get_suite(suite).tasks
+    }
+    assert sorted(shown) == sorted(
+        [*tasks, *(f"images/gallery/objects/{name}.jpg" for name in builtin_names())]
+    )
+    assert not [path for path in shown if not (DOCS / path).exists()]
+    for path, task in tasks.items():
+        assert re.search(f'"{re.escape(path)}"[^>]*><br>{task.index}: {task.language} \\|', text), task.id
+
+
+@pytest.mark.unit
+def test_every_kind_of_perturbation_is_shown():
+    assert all(f"| `{kind}` |" in generate().perturbation_table() for kind in KINDS)
 
 
 @pytest.mark.unit
 def test_tests_that_are_named_exist():
-    pages = [*ROOT.glob("docs/*.md"), *ROOT.glob("experiments/*/README.md")]
+    pages = [*PAGES, *ROOT.glob("experiments/*/README.md")]
     named = {m for page in pages for m in re.findall(r"(tests/[\w/]+\.py)::(\w+)", page.read_text())}
     assert named
     for file, name in named:
