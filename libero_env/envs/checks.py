@@ -180,8 +180,11 @@ class ResetRequest:
             mask = checked_numbers(values["reset_mask"], "reset_mask", ((num_envs,),)) != 0
         init_states = starts = None
         if "init_state" in values:
-            init_states = whole_numbers(values["init_state"], "init_state", ((), (1,), (num_envs,)))
-            init_states = np.broadcast_to(init_states, (num_envs,))
+            chosen = values["init_state"]
+            indices = checked_numbers(chosen, "init_state", ((), (1,), (num_envs,)))
+            if np.asarray(chosen).dtype.kind not in "iu":
+                raise InvalidInputError(f"init_state={shown(chosen)}: expected whole numbers")
+            init_states = np.broadcast_to(indices.astype(np.int64), (num_envs,))
         if "start" in values:
             starts = checked_numbers(values["start"], "start", (f"({num_envs}, n)",))
             if starts.ndim != 2 or len(starts) != num_envs:
@@ -190,18 +193,6 @@ class ResetRequest:
                 )
         outdated = validate(bool, values.get("outdated_controller", False), prefix=("outdated_controller",))
         return cls(np.flatnonzero(mask), _seeds(num_envs, seed), init_states, starts, outdated)
-
-
-def whole_numbers(value: object, name: str, shapes: Sequence[Shape]) -> np.ndarray:
-    """Return an array of whole numbers, int64.
-
-    Raises:
-        InvalidInputError: The shape is wrong, or a value is not a whole number.
-    """
-    array = checked_numbers(value, name, shapes)
-    if np.asarray(value).dtype.kind not in "iu":
-        raise InvalidInputError(f"{name}={shown(value)}: expected whole numbers")
-    return array.astype(np.int64)
 
 
 def _seeds(num_envs: int, seed: object) -> list[int | None]:

@@ -177,7 +177,8 @@ class PerturbedEpisodes:
         for i in ids:
             for one, episode in self._at_step("observation", i):
                 for name, rows in images.items():
-                    rows[i] = one.image(name, rows[i], episode)
+                    if name.endswith("_rgb") or not one.only_rgb:
+                        rows[i] = one.image(name, rows[i], episode)
 
     def see_state(self, entries: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return what arrives of the entries that are not images, name -> (num, n)."""

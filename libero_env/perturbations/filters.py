@@ -11,7 +11,6 @@ from libero_env.geometry import quat_from_axis_angle, quat_multiply, quat_to_axi
 from libero_env.perturbations.kinds import ActionFilter, Episode, ObservationFilter
 from libero_env.perturbations.sampling import direction, sign
 
-RGB = "_rgb"
 _BLUR_HEIGHT = 128  # [pixels] height of the image in which blur is measured
 _FINGERS = 0.1  # bias of the fingers over that of positions
 
@@ -24,12 +23,11 @@ class PixelNoise(ObservationFilter):
         deviation: Standard deviation, [grey levels of 255].
     """
 
+    only_rgb = True
     deviation: float
 
     def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
         """Return the picture with noise."""
-        if not name.endswith(RGB):
-            return image
         rng = episode.key.generator(name, episode.step)
         noise = self.deviation * rng.standard_normal(image.shape, np.float32)
         return np.clip(np.rint(image + noise), 0, 255).astype(np.uint8)
@@ -43,12 +41,11 @@ class Blur(ObservationFilter):
         deviation: Standard deviation in an image of 128 pixels height, [pixels]; in others in proportion.
     """
 
+    only_rgb = True
     deviation: float
 
     def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
         """Return the blurred picture."""
-        if not name.endswith(RGB):
-            return image
         radius = self.deviation * image.shape[0] / _BLUR_HEIGHT
         return np.asarray(Image.fromarray(image).filter(ImageFilter.GaussianBlur(radius)))
 
@@ -61,12 +58,11 @@ class Occlusion(ObservationFilter):
         share: Share of the picture that it hides.
     """
 
+    only_rgb = True
     share: float
 
     def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
         """Return the picture behind the rectangle."""
-        if not name.endswith(RGB):
-            return image
         rng, (height, width) = episode.key.generator(name), image.shape[:2]
         ratio, place, grey = 2.0 ** rng.uniform(-0.5, 0.5), rng.uniform(size=2), rng.integers(30, 226)
         tall = np.clip(np.sqrt(self.share * ratio), self.share, 1.0)
@@ -132,14 +128,10 @@ class StateBias(ObservationFilter):
         """Return what the sensors say."""
         turn = quat_from_axis_angle(direction(episode.key.generator("turn"), 3), self.amount)[None]
         biased = dict(entries)
-        for name, size, factor in (
-            ("joint_states", 7, 1.0),
-            ("ee_pos", 3, 1.0),
-            ("gripper_states", 2, _FINGERS),
-        ):
+        for name, factor in (("joint_states", 1.0), ("ee_pos", 1.0), ("gripper_states", _FINGERS)):
             if name in entries:
-                offset = factor * self.amount * direction(episode.key.generator(name), size)
-                biased[name] = entries[name] + offset
+                way = direction(episode.key.generator(name), len(entries[name]))
+                biased[name] = entries[name] + factor * self.amount * way
         if "ee_quat" in entries:
             biased["ee_quat"] = quat_multiply(turn, entries["ee_quat"][None])[0]
         if "ee_ori" in entries:

@@ -53,11 +53,12 @@ class ObservationFilter:
     """A change of observations on their way to who acts. By default nothing changes.
 
     Attributes:
+        only_rgb: Whether `image` is for images of colours only, and others arrive as they are.
         has_memory: Whether what arrives depends on earlier images, so that all of them must be rendered.
     """
 
     layer: Layer = "observation"
-    has_memory = False
+    only_rgb = has_memory = False
 
     def image(self, name: str, image: np.ndarray, episode: Episode) -> np.ndarray:
         """Return what arrives of an image.

@@ -95,9 +95,12 @@ class Pairing:
     def _placed(self, row: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Return a state in which what was exchanged stands in its place, and what is new over a free place."""
         scene, row = self.scene, row.copy()
-        for name in self.exchanged:
-            self._stand(row, name, rng)
-        surface, offset = scene.workspace.surface_height, np.asarray(scene.workspace.offset)[:2]
+        surface = scene.workspace.surface_height
+        for name in self.exchanged:  # where the one before stood, on the workspace
+            quat, address = scene.objects[name].rest_quat(rng), 1 + scene.pose_address(name)
+            row[address + 2] = surface - lowest_point(scene, name, quat) + _LIFT
+            row[address + 3 : address + 7] = quat
+        offset = np.asarray(scene.workspace.offset)[:2]
         taken = _stacked(self._taken(row))
         for name in self.added:
             region, quat = self._region(name), scene.objects[name].rest_quat(rng)
@@ -117,14 +120,6 @@ class Pairing:
                     f"{scene.problem.language!r}: {name} finds no free place in {region.address} after {_TRIES} tries"
                 )
         return row
-
-    def _stand(self, row: np.ndarray, name: str, rng: np.random.Generator) -> None:
-        """Let an object of another category stand where the one before stood, on the workspace."""
-        quat = self.scene.objects[name].rest_quat(rng)
-        address = 1 + self.scene.pose_address(name)
-        surface = self.scene.workspace.surface_height
-        row[address + 2] = surface - lowest_point(self.scene, name, quat) + _LIFT
-        row[address + 3 : address + 7] = quat
 
     def _region(self, name: str) -> Region:
         atom = next(a for a in self.scene.problem.init if a.args[0] == name)

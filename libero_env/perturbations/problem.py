@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 
@@ -62,23 +63,28 @@ def _of_same_scene(task: Task) -> Iterator[Task]:
 def _with_goal(task: Task, other: Task) -> Task:
     known = {region.address for region in task.problem.regions}
     more = tuple(region for region in other.problem.regions if region.address not in known)
-    problem = replace(
-        task.problem,
-        language=other.problem.language,
-        goal=other.problem.goal,
-        obj_of_interest=other.problem.obj_of_interest,
-        regions=(*task.problem.regions, *more),
-    )
-    return replace(task, language=other.language, bddl_language=other.bddl_language, problem=problem)
+    changes = {name: getattr(other.problem, name) for name in ("language", "goal", "obj_of_interest")}
+    return _with_words(task, *_instructions(other), **changes, regions=(*task.problem.regions, *more))
+
+
+def _with_words(task: Task, language: str, bddl_language: str, **changes: Any) -> Task:
+    """Return a task with other instructions and another problem."""
+    problem = replace(task.problem, **{"language": bddl_language, **changes})
+    return replace(task, language=language, bddl_language=bddl_language, problem=problem)
+
+
+def _only_atom(task: Task) -> Atom | None:
+    """Return the atom of a goal that has only one."""
+    goal = task.problem.goal
+    parts = goal.parts if isinstance(goal, And) else (goal,)
+    return parts[0] if len(parts) == 1 and isinstance(parts[0], Atom) else None
 
 
 def _of_other_objects(task: Task) -> Iterator[Task]:
     """Yield the task of carrying each other object of a name of its own that stands where the task's object could."""
-    problem, names = task.problem, read_yaml("perturbations/data/names.yaml")
-    goal = problem.goal.parts if isinstance(problem.goal, And) else (problem.goal,)
-    if len(goal) != 1 or not isinstance(goal[0], Atom) or goal[0].args[0] not in problem.objects:
+    problem, names, atom = task.problem, read_yaml("perturbations/data/names.yaml"), _only_atom(task)
+    if atom is None or atom.args[0] not in problem.objects:
         return
-    atom = goal[0]
     own = names.get(problem.objects[atom.args[0]])
     categories = list(problem.objects.values())
     for name, category in problem.objects.items():
@@ -88,30 +94,24 @@ def _of_other_objects(task: Task) -> Iterator[Task]:
         if any(arg.startswith(name) for arg in atom.args):  # it is where the object belongs
             continue
         changed = And((Atom(atom.predicate, (name, *atom.args[1:])),))
-        language, bddl_language = (text.replace(own, names[category]) for text in _instructions(task))
+        said = [text.replace(own, names[category]) for text in _instructions(task)]
         interest = entities_in_goal(changed, problem.regions, problem.objects, problem.fixtures)
-        own_problem = replace(problem, goal=changed, language=bddl_language, obj_of_interest=tuple(interest))
-        yield replace(task, language=language, bddl_language=bddl_language, problem=own_problem)
+        yield _with_words(task, *said, goal=changed, obj_of_interest=tuple(interest))
 
 
 def _of_other_places(task: Task) -> Iterator[Task]:
     """Yield the task of carrying what belongs on the plate to each other place of the scene that has a name."""
-    problem, goal = task.problem, task.problem.goal
-    atoms = goal.parts if isinstance(goal, And) else (goal,)
-    if len(atoms) != 1 or not isinstance(atoms[0], Atom) or atoms[0].predicate != "On":
+    problem, atom = task.problem, _only_atom(task)
+    if atom is None or atom.predicate != "On" or not all(t.endswith(_ON_PLATE) for t in _instructions(task)):
         return
-    carried = atoms[0].args[0]
+    carried = atom.args[0]
     start = next((a.args[1] for a in problem.init if a.args[0] == carried and len(a.args) == 2), "")
     for region in problem.regions:
         words = _PLACES.get((problem.fixtures.get(region.target, ""), region.name))
-        if words is None or start.startswith(region.target):
-            continue
-        if not all(text.endswith(_ON_PLATE) for text in _instructions(task)):
-            continue
-        changed = And((Atom("On", (carried, region.address)),))
-        language, bddl_language = (text.removesuffix(_ON_PLATE) + words for text in _instructions(task))
-        own = replace(problem, goal=changed, language=bddl_language, obj_of_interest=(carried, region.target))
-        yield replace(task, language=language, bddl_language=bddl_language, problem=own)
+        if words is not None and not start.startswith(region.target):
+            changed = And((Atom("On", (carried, region.address)),))
+            said = [text.removesuffix(_ON_PLATE) + words for text in _instructions(task)]
+            yield _with_words(task, *said, goal=changed, obj_of_interest=(carried, region.target))
 
 
 def _is_named(category: str, text: str) -> bool:
@@ -168,14 +168,12 @@ def _objects(share: float, rng: np.random.Generator, task: Task, scene: Scene) -
 
 def _instruction(distance: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
     """Return the task with other words for the same; both of its instructions are reworded in the same way."""
-    name_words = reword(task.language, distance, rng)
-    return with_instruction(task, name_words)
+    return with_instruction(task, reword(task.language, distance, rng))
 
 
 def with_instruction(task: Task, instruction: str) -> Task:
     """Return a task with another instruction."""
-    problem = replace(task.problem, language=instruction)
-    return replace(task, language=instruction, bddl_language=instruction, problem=problem)
+    return _with_words(task, instruction, instruction)
 
 
 def _distractors(count: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:

@@ -43,17 +43,16 @@ ARENA, ARM, GRIPPER = "arena", "robot", "gripper"
 DEFAULT_CAMERAS = ("agentview", "robot0_eye_in_hand")
 DEFAULT_OBSERVATIONS = ("rgb", "proprioception")
 PROPRIOCEPTION = ("joint_states", "gripper_states", "ee_pos", "ee_ori")
-# Entry about the robot -> (length, bound); bounds are never reached.
-_ROBOT = {
-    "joint_states": (7, 2 * np.pi),
-    "gripper_states": (2, 1.0),
-    "ee_pos": (3, 10.0),
-    "ee_ori": (3, 2 * np.pi),
-    "ee_quat": (4, 1.0),
-    "joint_velocities": (7, 1e3),
-    "gripper_velocities": (2, 1e3),
+_ROBOT = {  # entry about the robot -> bound, which is never reached
+    "joint_states": 2 * np.pi,
+    "gripper_states": 1.0,
+    "ee_pos": 10.0,
+    "ee_ori": 2 * np.pi,
+    "ee_quat": 1.0,
+    "joint_velocities": 1e3,
+    "gripper_velocities": 1e3,
 }
-_FAR = 1e4  # [m] farther than anything falls in an episode
+_OBJECTS = {"pos": 1e4, "quat": 1.0, "joints": 1e3}  # the same of entries about objects, by their last word
 _IMAGES = {"rgb": ((3,), np.uint8), "depth": ((), np.float32), "segmentation": ((), np.int32)}
 _BOUNDS = {np.uint8: (0, 255), np.float32: (0.0, 1e4), np.int32: (0, 2**24)}
 _IMAGE_NAMES = ("rgb", "depth", *(f"segmentation_{kind}" for kind in SEGMENTATIONS))
@@ -62,12 +61,7 @@ NAMES = (*_IMAGE_NAMES, "proprioception", *_ROBOT, "objects")
 
 def is_of_joints(name: str) -> bool:
     """Return whether an entry is of joints, and not of poses, which the simulation computes from them."""
-    return name in (
-        "joint_states",
-        "gripper_states",
-        "joint_velocities",
-        "gripper_velocities",
-    ) or name.endswith("_joints")
+    return name.startswith(("joint_", "gripper_")) if name in _ROBOT else name.endswith("_joints")
 
 
 @dataclass(frozen=True)
@@ -125,7 +119,7 @@ class Observer:
         self._cameras = {name: self.renderer.camera_id(name) for name in cameras}
         selected = {*observations, *(PROPRIOCEPTION if "proprioception" in observations else ())}
         self._robot = [name for name in _ROBOT if name in selected]
-        self._entities = _EntityObserver(scene) if "objects" in observations else None
+        self._entities = tuple(scene.entities) if "objects" in observations else ()
         self._hand = scene.model.body("robot0_right_hand").id
         self._labels_of: dict[str, Labels] = {}
         self._appearances: dict[int, SceneAppearance] = {}
@@ -148,35 +142,38 @@ class Observer:
             key: spaces.Box(*_BOUNDS[rows.dtype.type], rows.shape[1:], rows.dtype.type)
             for key, rows in self.empty_images(1).items()
         }
-        robot = {name: symmetric_box(*_ROBOT[name]) for name in self._robot}
-        return spaces.Dict({**images, **robot, **(self._entities.space() if self._entities else {})})
+        vectors = {}
+        for name, rows in self.state().items():
+            bound = _ROBOT[name] if name in self._robot else _OBJECTS[name.rpartition("_")[2]]
+            bound *= 1.0 + 1e-6  # for rounding
+            vectors[name] = spaces.Box(-bound, bound, rows.shape[1:], np.float64)
+        return spaces.Dict({**images, **vectors})
 
     def state(self) -> dict[str, np.ndarray]:
         """Return all entries except images, of all simulations: name -> (num, length) float64."""
-        robot = {name: self.robot(name) for name in self._robot}
-        if self._entities is None:
-            return robot
-        return {**robot, **self._entities.observe(self.simulations, self._eef_pose())}
-
-    def robot(self, name: str) -> np.ndarray:
-        """Return one entry about the robot, (num, length)."""
-        f, nq = self.simulations.fields, self.scene.nq_robot
-        match name:
-            case "joint_states":
-                return f["qpos"][:, :7].copy()
-            case "gripper_states":
-                return f["qpos"][:, 7:nq].copy()
-            case "joint_velocities":
-                return f["qvel"][:, :7].copy()
-            case "gripper_velocities":
-                return f["qvel"][:, 7:nq].copy()
-            case "ee_pos":
-                return self._eef_pose()[0].copy()
-            case "ee_quat":
-                return self._eef_pose()[1].copy()
-            case "ee_ori":
-                return quat_to_axis_angle(self._eef_pose()[1])
-        raise UnknownNameError("observation of the robot", name, _ROBOT)
+        fields, nq, model = self.simulations.fields, self.scene.nq_robot, self.scene.model
+        qpos, qvel = fields["qpos"], fields["qvel"]
+        ee_pos, ee_quat = fields["site_xpos"][:, self.simulations.arm.site], fields["xquat"][:, self._hand]
+        robot = {
+            "joint_states": qpos[:, :7],
+            "gripper_states": qpos[:, 7:nq],
+            "ee_pos": ee_pos,
+            "ee_ori": quat_to_axis_angle(ee_quat),
+            "ee_quat": ee_quat,
+            "joint_velocities": qvel[:, :7],
+            "gripper_velocities": qvel[:, 7:nq],
+        }
+        entries = {name: robot[name].copy() for name in self._robot}
+        world_to_ee = ee_quat * (1.0, -1.0, -1.0, -1.0)
+        for name in self._entities:
+            body = model.body(f"{name}_{ROOT_BODY}").id
+            pos, quat = fields["xpos"][:, body].copy(), fields["xquat"][:, body].copy()
+            entries |= {f"{name}_pos": pos, f"{name}_quat": quat}
+            entries[f"{name}_to_ee_pos"] = quat_rotate(world_to_ee, pos - ee_pos)
+            entries[f"{name}_to_ee_quat"] = quat_multiply(world_to_ee, quat)
+            if joints := self.scene.joints[name]:
+                entries[f"{name}_joints"] = qpos[:, model.jnt_qposadr[list(joints)]]
+        return entries
 
     def empty_images(self, num: int | None = None) -> dict[str, np.ndarray]:
         """Return zero arrays for `render_cameras`: entry -> (num, height, width, ...).
@@ -263,11 +260,6 @@ class Observer:
         """Free the OpenGL context."""
         self.renderer.close()
 
-    def _eef_pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position of the grip site (num, 3) and the orientation of the hand, wxyz (num, 4)."""
-        f = self.simulations.fields
-        return f["site_xpos"][:, self.simulations.arm.site], f["xquat"][:, self._hand]
-
     def _labels(self, kind: str) -> Labels:
         if kind not in self._labels_of:
             self._labels_of[kind] = segmentation_labels(self.scene, kind)
@@ -286,48 +278,6 @@ class Observer:
         mujoco.mj_camlight(model, data)
         if (appearance := self._appearances.get(i)) is not None:
             appearance.place_cameras(data)
-
-
-class _EntityObserver:
-    """Poses and joint positions of objects and fixtures."""
-
-    def __init__(self, scene: Scene):
-        model = scene.model
-        self._bodies = {name: model.body(f"{name}_{ROOT_BODY}").id for name in scene.entities}
-        joints = {name: [int(model.jnt_qposadr[j]) for j in scene.joints[name]] for name in self._bodies}
-        self._joints = {name: addresses for name, addresses in joints.items() if addresses}
-
-    def space(self) -> dict[str, spaces.Box]:
-        """Return the space of each entry of one simulation."""
-        boxes: dict[str, spaces.Box] = {}
-        for name in self._bodies:
-            boxes |= {f"{name}_pos": symmetric_box(3, _FAR), f"{name}_quat": symmetric_box(4, 1.0)}
-            boxes |= {
-                f"{name}_to_ee_pos": symmetric_box(3, _FAR),
-                f"{name}_to_ee_quat": symmetric_box(4, 1.0),
-            }
-            if name in self._joints:
-                boxes[f"{name}_joints"] = symmetric_box(len(self._joints[name]), 1e3)
-        return boxes
-
-    def observe(self, simulations: Simulations, eef: tuple[np.ndarray, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return the entries of all simulations.
-
-        Args:
-            simulations: Simulations to observe.
-            eef: Position (num, 3) and orientation, wxyz (num, 4), of the hand.
-        """
-        fields, (eef_pos, eef_quat) = simulations.fields, eef
-        world_to_eef = eef_quat * (1.0, -1.0, -1.0, -1.0)
-        entries: dict[str, np.ndarray] = {}
-        for name, body in self._bodies.items():
-            pos, quat = fields["xpos"][:, body].copy(), fields["xquat"][:, body].copy()
-            entries |= {f"{name}_pos": pos, f"{name}_quat": quat}
-            entries[f"{name}_to_ee_pos"] = quat_rotate(world_to_eef, pos - eef_pos)
-            entries[f"{name}_to_ee_quat"] = quat_multiply(world_to_eef, quat)
-            if name in self._joints:
-                entries[f"{name}_joints"] = fields["qpos"][:, self._joints[name]]
-        return entries
 
 
 def segmentation_labels(scene: Scene, kind: str) -> Labels:
@@ -372,9 +322,3 @@ def segmentation_labels(scene: Scene, kind: str) -> Labels:
 def image_name(camera: str, kind: str) -> str:
     """Return the name of a camera's images in observations: `robot0_eye_in_hand`, `rgb` -> `eye_in_hand_rgb`."""
     return f"{camera.removeprefix('robot0_')}_{kind}"
-
-
-def symmetric_box(length: int, bound: float) -> spaces.Box:
-    """Return the space of float64 vectors between minus and plus `bound`, with a margin for rounding."""
-    bound *= 1.0 + 1e-6
-    return spaces.Box(-bound, bound, (length,), np.float64)

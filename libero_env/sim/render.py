@@ -213,22 +213,16 @@ class Renderer:
             else:  # without the headlight, which stays at the first camera
                 mujoco.mjv_updateCamera(self._model, data, self._camera, self._scene)
             fovy = None if appearance is None else appearance.apply_to_camera(self._scene, target.camera)
-            left_out = self._leave_out(data, target.camera, fovy)
+            left_out = []
+            if self._culling is not None:
+                aspect, geoms = self._width / self._height, self._geoms[: self._scene.ngeom]
+                left_out = self._culling.apply(data, target.camera, aspect, geoms, self._faithful, fovy)
             if any(out is not None for out in (target.rgb, target.depth, target.depth_buffer)):
                 self._render_rgb_and_depth(target)
             if target.segmentation is not None:
                 self._render_segmentation(target.segmentation)
             for geom, kind in left_out:
                 geom.type = kind
-
-    def _leave_out(
-        self, data: mujoco.MjData, camera: int, fovy: float | None = None
-    ) -> list[tuple[mujoco.MjvGeom, int]]:
-        """Remove from the scene what the camera cannot show; return it with its types."""
-        if self._culling is None:
-            return []
-        aspect, geoms = self._width / self._height, self._geoms[: self._scene.ngeom]
-        return self._culling.apply(data, camera, aspect, geoms, self._faithful, fovy)
 
     def _render_rgb_and_depth(self, target: RenderTarget) -> None:
         mujoco.mjr_render(self._viewport, self._scene, self._context)

@@ -60,11 +60,20 @@ Watch = Callable[[int, np.ndarray], None]  # one of `WATCHED` or `INTEGRATED`, i
 Inputs = tuple[np.ndarray, ...]  # fields that the kernel of a controller takes, (num, ...)
 
 
-class Closed(dict[Any, Any]):
-    """What closed simulations have instead of their fields and states."""
+class Unusable:
+    """What simulations that are closed, or of another process, have instead of their states: every use is an error."""
 
-    def __missing__(self, key: object) -> None:
-        raise ClosedEnvironmentError("this simulation is closed; make another environment")
+    def __init__(self, error: LiberoError):
+        self._error = error
+
+    def __getattr__(self, name: str) -> Any:
+        raise self._error
+
+    def __getitem__(self, key: object) -> Any:
+        raise self._error
+
+
+CLOSED: Any = Unusable(ClosedEnvironmentError("this simulation is closed; make another environment"))
 
 
 class Simulations(ABC):
@@ -164,7 +173,7 @@ class Simulations(ABC):
 
     def close(self) -> None:
         """Free the simulations. Idempotent."""
-        self.fields = Closed()
+        self.fields = CLOSED
 
     def reset(
         self,
@@ -364,7 +373,7 @@ class LoopSimulations(Simulations):
 
     def close(self) -> None:
         super().close()
-        self._views = self._inputs_of = self._datas = Closed()
+        self._views = self._inputs_of = self._datas = CLOSED
 
 
 class BatchSimulations(Simulations):
@@ -422,19 +431,8 @@ class BatchSimulations(Simulations):
 
     def close(self) -> None:
         super().close()
-        self._batch = _NoBatch("this simulation is closed; make another environment", ClosedEnvironmentError)
-        self._time = self._qacc_warmstart = self._body_pos = self._body_quat = Closed()
+        self._batch = self._time = self._qacc_warmstart = self._body_pos = self._body_quat = CLOSED
         self._own_inputs = ()
-
-
-class _NoBatch:
-    """What a batch is replaced by where it cannot be used."""
-
-    def __init__(self, message: str, error: type[LiberoError] = LiberoError):
-        self._error = error(message)
-
-    def __getattr__(self, name: str) -> Any:
-        raise self._error
 
 
 _batches: "weakref.WeakSet[BatchSimulations]" = weakref.WeakSet()
@@ -451,5 +449,5 @@ def _watch_forks() -> None:
 def _leave_batches() -> None:
     for simulations in list(_batches):
         _inherited.append(simulations._batch)
-        simulations._batch = _NoBatch(FORKED)
+        simulations._batch = Unusable(LiberoError(FORKED))
     _batches.clear()

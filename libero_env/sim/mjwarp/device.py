@@ -13,7 +13,7 @@ from libero_env.mujoco_compat import MASS_FIELD
 from libero_env.sim.backend import Backend
 from libero_env.sim.mjwarp import kernels
 from libero_env.sim.osc import ArmIndex
-from libero_env.sim.simulation import FIELDS, Closed
+from libero_env.sim.simulation import FIELDS
 
 
 def choose_device(name: str | None) -> Any:
@@ -84,13 +84,6 @@ def room_for(num: int, backend: Backend) -> Iterator[None]:
             f"backend={backend}: no room for {num} simulations ({error}); take fewer, smaller images, or "
             f"fewer contacts than {backend.contacts}"
         ) from error
-
-
-class Freed(Closed):
-    """What closed simulations have instead of their arrays on the device."""
-
-    def __getattr__(self, name: str) -> Any:
-        return self[name]
 
 
 class DeviceFields(Mapping[str, np.ndarray]):

@@ -11,9 +11,9 @@ import warp as wp
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.sim.backend import Backend
 from libero_env.sim.mjwarp import kernels
-from libero_env.sim.mjwarp.device import DeviceFields, Freed, allocate, choose_device, room_for
+from libero_env.sim.mjwarp.device import DeviceFields, allocate, choose_device, room_for
 from libero_env.sim.osc import REST, osc_torques
-from libero_env.sim.simulation import WATCHED, Indices, Inputs, Simulations, Watch
+from libero_env.sim.simulation import CLOSED, WATCHED, Indices, Inputs, Simulations, Watch
 from libero_env.timing import SUBSTEPS
 
 _ROWS_PER_CONTACT = 4  # of constraints; contacts with rolling friction, which have 6, are few
@@ -122,7 +122,7 @@ class WarpSimulations(Simulations):
     def close(self) -> None:
         super().close()
         self._graphs = {}
-        self.device_data = self.device_model = self._control = self._copies = Freed()
+        self.device_data = self.device_model = self._control = self._copies = CLOSED
 
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
         model, data, control = self.device_model, self.device_data, self._control
