@@ -64,11 +64,12 @@ def _with_goal(task: Task, other: Task) -> Task:
     known = {region.address for region in task.problem.regions}
     more = tuple(region for region in other.problem.regions if region.address not in known)
     changes = {name: getattr(other.problem, name) for name in ("language", "goal", "obj_of_interest")}
-    return _with_words(task, *_instructions(other), **changes, regions=(*task.problem.regions, *more))
+    return _with_words(task, _instructions(other), **changes, regions=(*task.problem.regions, *more))
 
 
-def _with_words(task: Task, language: str, bddl_language: str, **changes: Any) -> Task:
-    """Return a task with other instructions and another problem."""
+def _with_words(task: Task, said: Sequence[str], **changes: Any) -> Task:
+    """Return a task with other instructions, `language` and `bddl_language`, and another problem."""
+    language, bddl_language = said
     problem = replace(task.problem, **{"language": bddl_language, **changes})
     return replace(task, language=language, bddl_language=bddl_language, problem=problem)
 
@@ -96,7 +97,7 @@ def _of_other_objects(task: Task) -> Iterator[Task]:
         changed = And((Atom(atom.predicate, (name, *atom.args[1:])),))
         said = [text.replace(own, names[category]) for text in _instructions(task)]
         interest = entities_in_goal(changed, problem.regions, problem.objects, problem.fixtures)
-        yield _with_words(task, *said, goal=changed, obj_of_interest=tuple(interest))
+        yield _with_words(task, said, goal=changed, obj_of_interest=tuple(interest))
 
 
 def _of_other_places(task: Task) -> Iterator[Task]:
@@ -111,7 +112,7 @@ def _of_other_places(task: Task) -> Iterator[Task]:
         if words is not None and not start.startswith(region.target):
             changed = And((Atom("On", (carried, region.address)),))
             said = [text.removesuffix(_ON_PLATE) + words for text in _instructions(task)]
-            yield _with_words(task, *said, goal=changed, obj_of_interest=(carried, region.target))
+            yield _with_words(task, said, goal=changed, obj_of_interest=(carried, region.target))
 
 
 def _is_named(category: str, text: str) -> bool:
@@ -173,7 +174,7 @@ def _instruction(distance: float, rng: np.random.Generator, task: Task, scene: S
 
 def with_instruction(task: Task, instruction: str) -> Task:
     """Return a task with another instruction."""
-    return _with_words(task, instruction, instruction)
+    return _with_words(task, (instruction, instruction))
 
 
 def _distractors(count: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:

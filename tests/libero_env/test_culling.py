@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from libero_env.sim.culling import Culling
 from libero_env.sim.render import Renderer, RenderTarget
 from libero_env.sim.scene import FAITHFUL, FAST, build_scene
 from libero_env.tasks import get_task
@@ -67,14 +68,23 @@ def assert_equal(pairs):
             assert np.array_equal(one, other)
 
 
+def left_out(model, data, camera, mirrors):
+    """Indices of the visual geoms that a camera does not show, and their types."""
+    scene, options = mujoco.MjvScene(model, maxgeom=model.ngeom + 10), mujoco.MjvOption()
+    options.geomgroup[:] = [0, 1, 0, 0, 0, 0]
+    mujoco.mjv_updateScene(model, data, options, None, mujoco.MjvCamera(), mujoco.mjtCatBit.mjCAT_ALL, scene)
+    geoms = scene.geoms[: scene.ngeom]
+    return [
+        (geom.objid, mujoco.mjtGeom(kind).name)
+        for geom, kind in Culling(model).apply(data, model.camera(camera).id, 1.0, geoms, mirrors)
+    ]
+
+
 def test_geoms_are_left_out():
     model = mujoco.MjModel.from_xml_string(MIRRORS)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)  # the camera looks down, at the mirrors and the plane
-    with Renderer(model, SIZE, SIZE, faithful=True) as renderer:
-        images(renderer, data, ["eye"])
-        left_out = renderer._leave_out(data, renderer.camera_id("eye"))
-        names = {mujoco.mjtGeom(kind).name for _, kind in left_out}
+    names = {kind for _, kind in left_out(model, data, "eye", mirrors=True)}
     assert "mjGEOM_CYLINDER" in names and "mjGEOM_PLANE" not in names
 
 
@@ -109,9 +119,7 @@ def left_out_of(model, camera, change=lambda data: None):
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     change(data)
-    with Renderer(model, SIZE, SIZE) as renderer:
-        images(renderer, data, [camera])
-        return {model.geom(g.objid).name for g, _ in renderer._leave_out(data, renderer.camera_id(camera))}
+    return {model.geom(geom).name for geom, _ in left_out(model, data, camera, mirrors=False)}
 
 
 def test_a_table_hides_its_legs_unless_it_is_transparent():
