@@ -5,7 +5,7 @@ frame.
 """
 
 import math
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 from pydantic import Field
@@ -76,7 +76,6 @@ class TransformerLayer(nn.Module):
 
     def __init__(
         self,
-        *,
         dim: int,
         heads: int,
         head_dim: int,
@@ -139,9 +138,10 @@ class TemporalTransformer(nn.Module):
         max_length: int = 10,
     ) -> None:
         super().__init__()
-        sizes: dict[str, Any] = {"dim": dim, "heads": heads, "head_dim": head_dim, "mlp_dim": mlp_dim}
-        sizes |= {"dropout": dropout, "attention_dropout": attention_dropout, "drop_path": drop_path}
-        self.layers = nn.ModuleList(TransformerLayer(**sizes) for _ in range(layers))
+        self.layers = nn.ModuleList(
+            TransformerLayer(dim, heads, head_dim, mlp_dim, dropout, attention_dropout, drop_path)
+            for _ in range(layers)
+        )
         self.register_buffer("positions", sinusoidal_positions(max_length, dim), persistent=False)
 
     def forward(self, tokens: Tensor) -> Tensor:
@@ -193,9 +193,10 @@ class SpatialTransformer(nn.Module):
         self.positions = nn.Parameter(torch.randn(views, patches, dim))
         self.modalities = nn.Parameter(torch.randn(views + 1, dim))  # each view, then language
         self.read = nn.Parameter(torch.randn(dim))
-        sizes: dict[str, Any] = {"dim": dim, "heads": heads, "head_dim": head_dim, "mlp_dim": mlp_dim}
-        sizes |= {"dropout": dropout, "attention_dropout": attention_dropout, "drop_path": drop_path}
-        self.layers = nn.ModuleList(TransformerLayer(**sizes) for _ in range(layers))
+        self.layers = nn.ModuleList(
+            TransformerLayer(dim, heads, head_dim, mlp_dim, dropout, attention_dropout, drop_path)
+            for _ in range(layers)
+        )
         self.project = nn.Linear(dim, out_dim)
 
     def forward(self, patches: Tensor, language: Tensor) -> Tensor:

@@ -3,17 +3,15 @@
 Shape legend: B batch, T time, F features of a frame.
 """
 
-import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lifelong.nn.heads import DeterministicHead
-from lifelong.nn.tokens import LanguageToken, ProprioScaling, named_parts
-from lifelong.nn.vision import ResNetFiLMEncoder, encode_views
-from lifelong.policies.history import Head, HistoryPolicy, ImageEncoder
-from lifelong.types import Observation, PolicySpec, Share, Width
+from lifelong.nn.vision import ResNetFiLMEncoder
+from lifelong.policies.history import Head, ImageEncoder, VectorPolicy
+from lifelong.types import PolicySpec, Share, Width
 
 
-class BCMLP(HistoryPolicy):
+class BCMLP(VectorPolicy):
     """Behaviour cloning from one frame: an action head on all of its features, side by side.
 
     The cameras' latents, the instruction's latent and the proprioceptive readings are joined to one vector, which the
@@ -50,26 +48,14 @@ class BCMLP(HistoryPolicy):
         standardise_language: bool = True,
     ) -> None:
         super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
-        sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": image_embed}
-        self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
-        self.language = LanguageToken(language_dim=spec.language_dim, dim=text_embed)
-        self.proprio = ProprioScaling(
-            proprio=spec.proprio, normalise=normalise_proprio, dropout=proprio_dropout
+        size = self.build_inputs(
+            encoder,
+            image_embed=image_embed,
+            text_embed=text_embed,
+            normalise=normalise_proprio,
+            dropout=proprio_dropout,
         )
-        readings = sum(spec.proprio.values())
-        self._sizes = dict.fromkeys(spec.views, image_embed) | {"language": text_embed, "proprio": readings}
-        self.head = self.build_head(head, in_dim=sum(self._sizes.values()))
-
-    def encode(self, observation: Observation) -> Tensor:
-        """Return one vector per frame, (B, T, F): the cameras' latents, the instruction's, and the readings."""
-        images, language = observation.images, self.instruction(observation)
-        seen = encode_views(self.encoders, images, language)
-        text = self.language(language)[:, None].expand(*images.shape[:2], -1)
-        return torch.cat([*seen, text, *self.proprio(observation.proprio).values()], dim=-1)
-
-    def modalities(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the parts (B, T, n) of each camera, the instruction and the readings."""
-        return named_parts(features, self._sizes, dim=-1)
+        self.head = self.build_head(head, in_dim=size)
 
     def over_time(self, features: Tensor) -> Tensor:
         """Return the features (B, T, F) as they are: each frame is by itself."""

@@ -5,18 +5,16 @@ Shape legend: B batch, T time, F features of a frame, A action, L language embed
 
 from typing import Annotated, Literal
 
-import torch
 from torch import Tensor, nn
 
 from lifelong.nn.heads import GMMHead
-from lifelong.nn.tokens import LanguageToken, ProprioScaling, named_parts
 from lifelong.nn.transformer import TemporalLSTM
-from lifelong.nn.vision import ResNetFiLMEncoder, encode_views
-from lifelong.policies.history import Component, Head, HistoryPolicy, ImageEncoder
-from lifelong.types import CompletedWith, Observation, PolicySpec, Share, Width
+from lifelong.nn.vision import ResNetFiLMEncoder
+from lifelong.policies.history import Component, Head, ImageEncoder, VectorPolicy
+from lifelong.types import CompletedWith, PolicySpec, Share, Width
 
 
-class BCRNN(HistoryPolicy):
+class BCRNN(VectorPolicy):
     """Behaviour cloning with LIBERO's ResNet-RNN (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     The cameras' latents, the instruction's latent and the proprioceptive readings are joined to one vector per frame
@@ -62,30 +60,18 @@ class BCRNN(HistoryPolicy):
         standardise_language: bool = True,
     ) -> None:
         super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
-        sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": image_embed}
-        self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
-        self.language = LanguageToken(language_dim=spec.language_dim, dim=text_embed)
-        self.proprio = ProprioScaling(
-            proprio=spec.proprio, normalise=normalise_proprio, dropout=proprio_dropout
+        size = self.build_inputs(
+            encoder,
+            image_embed=image_embed,
+            text_embed=text_embed,
+            normalise=normalise_proprio,
+            dropout=proprio_dropout,
         )
-        readings = sum(spec.proprio.values())
-        self._sizes = dict.fromkeys(spec.views, image_embed) | {"language": text_embed, "proprio": readings}
         self.memory = memory
-        self.rnn: nn.LSTM = temporal(in_dim=sum(self._sizes.values()))
+        self.rnn: nn.LSTM = temporal(in_dim=size)
         self.head = self.build_head(head, in_dim=self.rnn.hidden_size)
         self._state: tuple[Tensor, Tensor] | None = None  # each (layers, B, hidden)
         self._age = 0  # steps that the state has seen
-
-    def encode(self, observation: Observation) -> Tensor:
-        """Return one vector per frame, (B, T, F): the cameras' latents, the instruction's, and the readings."""
-        images, language = observation.images, self.instruction(observation)
-        seen = encode_views(self.encoders, images, language)
-        text = self.language(language)[:, None].expand(*images.shape[:2], -1)
-        return torch.cat([*seen, text, *self.proprio(observation.proprio).values()], dim=-1)
-
-    def modalities(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the parts (B, T, n) of each camera, the instruction and the readings."""
-        return named_parts(features, self._sizes, dim=-1)
 
     def over_time(self, features: Tensor) -> Tensor:
         """Map features (B, T, F) to the LSTM's outputs, (B, T, hidden), from an empty state."""

@@ -7,14 +7,13 @@ import torch
 from torch import Tensor, nn
 
 from lifelong.nn.heads import GMMHead
-from lifelong.nn.tokens import LanguageToken, ProprioTokens, named_parts
 from lifelong.nn.transformer import TemporalTransformer
 from lifelong.nn.vision import ResNetFiLMEncoder, encode_views
-from lifelong.policies.history import Head, HistoryPolicy, ImageEncoder, OverTime
+from lifelong.policies.history import Head, ImageEncoder, OverTime, TokenPolicy
 from lifelong.types import Observation, PolicySpec, Share, Width
 
 
-class BCTransformer(HistoryPolicy):
+class BCTransformer(TokenPolicy):
     """Behaviour cloning with LIBERO's ResNet-T (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     Each time step becomes M tokens: the instruction, one per proprioceptive modality, one per camera. All tokens of a
@@ -38,8 +37,6 @@ class BCTransformer(HistoryPolicy):
         PolicyError: Components or sizes that do not work together.
     """
 
-    uses_history = True
-
     def __init__(
         self,
         *,
@@ -56,25 +53,11 @@ class BCTransformer(HistoryPolicy):
         super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
         sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": embed_dim}
         self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
-        self.language = LanguageToken(language_dim=spec.language_dim, dim=embed_dim)
-        self.proprio = ProprioTokens(
-            proprio=spec.proprio, dim=embed_dim, normalise=normalise_proprio, dropout=proprio_dropout
-        )
-        self.transformer = temporal(dim=embed_dim, max_length=spec.seq_len)
-        self.head = self.build_head(head, in_dim=embed_dim)
+        readings = {"normalise": normalise_proprio, "dropout": proprio_dropout}
+        self.build_rest(spec.views, embed_dim, temporal, head, **readings)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""
-        images, language = observation.images, self.instruction(observation)
-        first = self.language(language)[:, None].expand(*images.shape[:2], -1)
-        tokens = [first, *self.proprio(observation.proprio), *encode_views(self.encoders, images, language)]
-        return torch.stack(tokens, dim=2)
-
-    def modalities(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the tokens of the instruction, the readings and each camera, each (B, T, n, E)."""
-        sizes = {"language": 1, "proprio": len(self.spec.proprio)} | dict.fromkeys(self.spec.views, 1)
-        return named_parts(features, sizes, dim=2)
-
-    def over_time(self, features: Tensor) -> Tensor:
-        """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
-        return self.transformer(features)[:, :, 0]
+        language = self.instruction(observation)
+        tokens = self.tokens_beside(observation, language)
+        return torch.stack([*tokens, *encode_views(self.encoders, observation.images, language)], dim=2)

@@ -10,17 +10,17 @@ from torch import Tensor, nn
 
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import GMMHead
-from lifelong.nn.tokens import LanguageToken, ProprioTokens, named_parts
+from lifelong.nn.tokens import LanguageToken
 from lifelong.nn.transformer import SpatialTransformer, TemporalTransformer
 from lifelong.nn.vision import PatchEncoder
-from lifelong.policies.history import Component, Head, HistoryPolicy, OverTime
+from lifelong.policies.history import Component, Head, OverTime, TokenPolicy
 from lifelong.types import CompletedWith, Observation, PolicySpec, Share, Width
 
 Patches = Annotated[Component, CompletedWith(("image_size", "dim"))]
 OverPatches = Annotated[Component, CompletedWith(("views", "patches", "dim", "out_dim"))]
 
 
-class BCViLT(HistoryPolicy):
+class BCViLT(TokenPolicy):
     """Behaviour cloning with LIBERO's ViT-T (Liu et al., NeurIPS 2023, section 4.2 and appendix A).
 
     Each time step becomes M tokens: the instruction, one per proprioceptive modality, and one in which a transformer
@@ -47,8 +47,6 @@ class BCViLT(HistoryPolicy):
         PolicyError: Components or sizes that do not work together, or no camera.
     """
 
-    uses_history = True
-
     def __init__(
         self,
         *,
@@ -72,12 +70,8 @@ class BCViLT(HistoryPolicy):
         self.spatial_language = LanguageToken(language_dim=spec.language_dim, dim=patch_embed)
         patches = encoders[spec.views[0]].patches
         self.spatial = spatial(views=len(encoders), patches=patches, dim=patch_embed, out_dim=embed_dim)
-        self.language = LanguageToken(language_dim=spec.language_dim, dim=embed_dim)
-        self.proprio = ProprioTokens(
-            proprio=spec.proprio, dim=embed_dim, normalise=normalise_proprio, dropout=proprio_dropout
-        )
-        self.transformer = temporal(dim=embed_dim, max_length=spec.seq_len)
-        self.head = self.build_head(head, in_dim=embed_dim)
+        readings = {"normalise": normalise_proprio, "dropout": proprio_dropout}
+        self.build_rest(("images",), embed_dim, temporal, head, **readings)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""
@@ -87,14 +81,4 @@ class BCViLT(HistoryPolicy):
         ]
         seen = self.spatial(torch.stack(patches, dim=1), self.spatial_language(language))
         seen = seen.view(*images.shape[:2], -1)
-        first = self.language(language)[:, None].expand(*images.shape[:2], -1)
-        return torch.stack([first, *self.proprio(observation.proprio), seen], dim=2)
-
-    def modalities(self, features: Tensor) -> dict[str, Tensor]:
-        """Return the tokens of the instruction, the readings and the mixed images, each (B, T, n, E)."""
-        sizes = {"language": 1, "proprio": len(self.spec.proprio), "images": 1}
-        return named_parts(features, sizes, dim=2)
-
-    def over_time(self, features: Tensor) -> Tensor:
-        """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
-        return self.transformer(features)[:, :, 0]
+        return torch.stack([*self.tokens_beside(observation, language), seen], dim=2)

@@ -8,11 +8,12 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import ActionHead
-from lifelong.nn.tokens import standardise
+from lifelong.nn.tokens import LanguageToken, ProprioScaling, ProprioTokens, named_parts, standardise
+from lifelong.nn.vision import encode_views
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, CompletedWith, Observation, PolicySpec
 
@@ -151,6 +152,67 @@ class HistoryPolicy(Policy):
             features = torch.cat([self._history, features], dim=1)
         self._history = features[:, -self.memory_steps :]
         return self.over_time(self._history)[:, -1]
+
+
+class VectorPolicy(HistoryPolicy):
+    """Policy whose features are one vector per frame: the cameras' latents, the instruction's, and the readings."""
+
+    def build_inputs(
+        self, encoder: Component, *, image_embed: int, text_embed: int, normalise: bool, dropout: float
+    ) -> int:
+        """Build what reads the observation; return the size of a frame's vector, F."""
+        spec = self.spec
+        sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": image_embed}
+        self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
+        self.language = LanguageToken(language_dim=spec.language_dim, dim=text_embed)
+        self.proprio = ProprioScaling(proprio=spec.proprio, normalise=normalise, dropout=dropout)
+        parts = {"language": text_embed, "proprio": sum(spec.proprio.values())}
+        self._sizes = dict.fromkeys(spec.views, image_embed) | parts
+        return sum(self._sizes.values())
+
+    def encode(self, observation: Observation) -> Tensor:
+        """Return one vector per frame, (B, T, F): the cameras' latents, the instruction's, and the readings."""
+        images, language = observation.images, self.instruction(observation)
+        seen = encode_views(self.encoders, images, language)
+        text = self.language(language)[:, None].expand(*images.shape[:2], -1)
+        return torch.cat([*seen, text, *self.proprio(observation.proprio).values()], dim=-1)
+
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the parts (B, T, n) of each camera, the instruction and the readings."""
+        return named_parts(features, self._sizes, dim=-1)
+
+
+class TokenPolicy(HistoryPolicy):
+    """Policy whose features are tokens of each frame: the instruction, one per reading, and what the cameras see.
+
+    A transformer over time mixes them; the action is read from the instruction's token.
+    """
+
+    uses_history = True
+
+    def build_rest(
+        self, cameras: Sequence[str], dim: int, temporal: Component, head: Component, **proprio: Any
+    ) -> None:
+        """Build all but what reads the images, whose tokens of `dim` numbers have the names `cameras`."""
+        spec = self.spec
+        self.language = LanguageToken(language_dim=spec.language_dim, dim=dim)
+        self.proprio = ProprioTokens(proprio=spec.proprio, dim=dim, **proprio)
+        self.transformer = temporal(dim=dim, max_length=spec.seq_len)
+        self.head = self.build_head(head, in_dim=dim)
+        self._sizes = {"language": 1, "proprio": len(spec.proprio)} | dict.fromkeys(cameras, 1)
+
+    def tokens_beside(self, observation: Observation, language: Tensor) -> list[Tensor]:
+        """Return the tokens of the instruction (B, L) and of each reading, each (B, T, E)."""
+        first = self.language(language)[:, None].expand(*observation.images.shape[:2], -1)
+        return [first, *self.proprio(observation.proprio)]
+
+    def modalities(self, features: Tensor) -> dict[str, Tensor]:
+        """Return the tokens of the instruction, the readings and what the cameras see, each (B, T, n, E)."""
+        return named_parts(features, self._sizes, dim=2)
+
+    def over_time(self, features: Tensor) -> Tensor:
+        """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
+        return self.transformer(features)[:, :, 0]
 
 
 def with_features(policy: Policy) -> HistoryPolicy:
