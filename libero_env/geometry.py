@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
+
+from libero_env.mujoco_compat import mujoco
 
 SPACING = 0.005  # [m] between neighbouring points
 

@@ -1,11 +1,42 @@
-"""Differences between versions of MuJoCo, and where its warnings go."""
+"""MuJoCo, which every module imports from here: differences between its versions, and where its warnings go."""
 
 import logging
+import os
 import re
+import sys
 from typing import Any
 
-import mujoco
 import numpy as np
+
+
+def forget_opengl(platform: str | None) -> None:
+    """Undo what an OpenGL backend that failed has left behind.
+
+    Args:
+        platform: Value of `PYOPENGL_PLATFORM` before, None for none: PyOpenGL keeps that of its first import.
+    """
+    os.environ.pop("PYOPENGL_PLATFORM", None)
+    if platform is not None:
+        os.environ["PYOPENGL_PLATFORM"] = platform
+    for module in list(sys.modules):
+        if re.match(r"OpenGL(\.|$)|mujoco\.(egl|osmesa|gl_context|rendering|renderer)", module):
+            del sys.modules[module]
+
+
+# MuJoCo loads the backend that MUJOCO_GL names when it is imported. Where that fails, only drawing is an error, that of
+# `libero_env.sim.render`.
+_named, _platform = os.environ.get("MUJOCO_GL"), os.environ.get("PYOPENGL_PLATFORM")
+try:
+    import mujoco
+except Exception as error:  # noqa: BLE001 - each backend fails in its own way (ImportError, AttributeError, RuntimeError)
+    if not _named or (isinstance(error, ModuleNotFoundError) and error.name == "mujoco"):
+        raise
+    forget_opengl(_platform)
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        import mujoco
+    finally:
+        os.environ["MUJOCO_GL"] = _named
 
 _warned: set[str] = set()
 

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.original_mjcf import attachable_xml, read_file, read_spec
 from libero_env.assets.pack import ORIGINAL, Pack, facade_assets, original_folder, pack_of
 from libero_env.errors import LiberoError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects import ObjectModel
 
 OFFSETS = ("bottom", "top", "horizontal_radius")  # sites, without their suffix

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from libero._adapters.lookup import lookup
@@ -17,6 +16,7 @@ from libero._adapters.sim import MjSim
 from libero_env.assets.robot import GRIP_SITE
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.geometry import quat_to_mat
+from libero_env.mujoco_compat import mujoco
 
 SEGMENTATIONS = ("instance", "class", "element")
 

@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim.render import Renderer, RenderTarget
 from libero_env.sim.scene import Scene
 from libero_env.sim.simulation import LoopSimulations

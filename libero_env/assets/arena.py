@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import mujoco
-
 from libero_env.assets.furnishing import (
     add_furniture,
     add_material,
@@ -19,7 +17,7 @@ from libero_env.assets.furnishing import (
 )
 from libero_env.assets.robot import load_robosuite, robosuite_assets
 from libero_env.errors import UnknownNameError
-from libero_env.mujoco_compat import delete
+from libero_env.mujoco_compat import delete, mujoco
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.storage import read_yaml
 

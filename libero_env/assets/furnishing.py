@@ -8,10 +8,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import UnknownNameError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.builtin.mesh import Mesh, Ring, box, loft, merge, quad
 from libero_env.objects.model import VISUAL_GEOM
 from libero_env.storage import read_yaml

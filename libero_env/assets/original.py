@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-import mujoco
-
 from libero_env.assets.arena import Workspace, add_cameras_and_lights
 from libero_env.assets.original_arena import arena_spec, restore_drawing, scene_file
 from libero_env.assets.original_mjcf import object_xml, read_spec
 from libero_env.assets.published import check_folder
 from libero_env.assets.simplify import simplify_visuals
 from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.catalog import get_object, user_defined_names
 from libero_env.objects.model import ObjectModel

@@ -10,12 +10,10 @@ from types import MappingProxyType
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import mujoco
-
 from libero_env.assets.arena import Workspace, add_light
 from libero_env.assets.furnishing import load_styles, styles_of
 from libero_env.assets.original_mjcf import read_file, read_spec, to_xml, used_assets
-from libero_env.mujoco_compat import delete
+from libero_env.mujoco_compat import delete, mujoco
 from libero_env.storage import read_yaml
 
 _NAMES = read_yaml("assets/original.yaml")

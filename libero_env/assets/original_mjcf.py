@@ -11,9 +11,8 @@ from functools import lru_cache
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
-import mujoco
-
 from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.builtin.assemble import GLOWING_SITES, HIDDEN_GROUP
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY
 from libero_env.objects.xml_file import explain, parse_xml, place_of

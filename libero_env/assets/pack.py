@@ -8,8 +8,6 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-import mujoco
-
 from libero_env.assets.arena import WORKSPACES, Workspace, add_arena, load_workspace
 from libero_env.assets.downloads import broken_files, default_folder, read_manifest
 from libero_env.assets.original import LIBERO_PRO, OriginalPack, is_original
@@ -23,6 +21,7 @@ from libero_env.assets.published import (
 )
 from libero_env.assets.robot import robosuite_assets
 from libero_env.errors import LiberoError, MissingPackageError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects import ObjectModel, get_object, object_names
 from libero_env.paths import config_file, read_config
 

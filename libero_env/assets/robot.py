@@ -9,12 +9,11 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.simplify import MeshSource, merge_and_simplify
 from libero_env.errors import MissingPackageError
-from libero_env.mujoco_compat import delete
+from libero_env.mujoco_compat import delete, mujoco
 from libero_env.objects.model import VISUAL_GEOM
 
 ROBOTS = ("libero", "robosuite-1.4.1")

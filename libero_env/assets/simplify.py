@@ -5,11 +5,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError
 from libero_env.geometry import quat_to_mat
+from libero_env.mujoco_compat import mujoco
 from libero_env.paths import cache_dir
 from libero_env.storage import cached_arrays
 

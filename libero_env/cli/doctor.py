@@ -37,8 +37,9 @@ PACKAGE_ROOT = str(Path(__file__).parents[2])
 # Runs in a separate process: a broken driver can crash it.
 _PROBE = """
 import json, sys, time
-import mujoco, numpy
+import numpy
 from libero_env.errors import RenderError
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim.render import Renderer, RenderTarget, renderer_name
 model = mujoco.MjModel.from_xml_string(
     "<mujoco><worldbody><light pos='0 0 2'/><geom type='plane' size='1 1 1' group='1'/>"

@@ -8,7 +8,6 @@ from functools import cached_property
 from importlib import metadata
 from typing import Annotated, Any
 
-import mujoco
 import numpy as np
 from pydantic import Field, PlainValidator
 
@@ -18,6 +17,7 @@ from libero_env.demos.contents import Pairing
 from libero_env.demos.write import make_header
 from libero_env.envs.config import Drawing, Names, Robot, Size
 from libero_env.errors import InvalidInputError
+from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.episodes import checked_perturbations
 from libero_env.perturbations.perturbation import KINDS, Perturbation, format_perturbations
 from libero_env.sim.backend import Backend

@@ -6,7 +6,6 @@ from functools import cached_property
 from pathlib import Path
 
 import h5py
-import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack
@@ -18,6 +17,7 @@ from libero_env.demos.read import Episode
 from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError, UnknownNameError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.scene import FAST, Scene
 from libero_env.tasks import Task, bddl, get_suite

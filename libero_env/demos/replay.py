@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import mujoco
 import numpy as np
 from pydantic import Field
 
@@ -27,6 +26,7 @@ from libero_env.demos.read import PUBLISHED_NOOP_NORM, Episode, Labels, publishe
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.config import Assets, Drawing, Size
 from libero_env.errors import DemoError
+from libero_env.mujoco_compat import mujoco
 from libero_env.parallel import progress_bar
 from libero_env.sim.observations import image_name
 from libero_env.validation import checked

@@ -3,13 +3,12 @@
 from collections.abc import Mapping
 from xml.etree.ElementTree import Element
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack
 from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.errors import DemoError, InvalidInputError
-from libero_env.mujoco_compat import delete
+from libero_env.mujoco_compat import delete, mujoco
 from libero_env.objects.model import ROOT_BODY
 from libero_env.objects.xml_file import Node, parse_xml_text
 from libero_env.sim.scene import Scene, scene_spec

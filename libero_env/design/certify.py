@@ -12,7 +12,6 @@ from functools import lru_cache
 from pathlib import Path
 from statistics import median
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.pack import Pack, select_pack
@@ -21,6 +20,7 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.errors import LiberoError, MissingPackageError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.expert import run_experts
+from libero_env.mujoco_compat import mujoco
 from libero_env.parallel import progress_bar, run_each
 from libero_env.sim.scene import build_scene
 from libero_env.storage import read_json, write_json

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from libero_env.demos.config import GENERATOR
@@ -18,6 +17,7 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, LiberoError, PlacementError
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.expert import run_experts
+from libero_env.mujoco_compat import mujoco
 from libero_env.parallel import progress_bar, run_each
 from libero_env.perturbations.perturbation import Perturbation
 from libero_env.perturbations.sampling import trying

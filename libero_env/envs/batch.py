@@ -5,7 +5,6 @@ from functools import cached_property
 from typing import Annotated, Any, NoReturn, Self
 
 import gymnasium
-import mujoco
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
@@ -26,6 +25,7 @@ from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.init_states.placement import sample_states
 from libero_env.init_states.store import load_init_states
 from libero_env.memory import require_memory
+from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.episodes import TRIES
 from libero_env.perturbations.sampling import start_name
 from libero_env.sim.engine import Goals, make_observer, make_simulations

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.robot import REST_QPOS
 from libero_env.geometry import Pose, rotation_between
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
 from libero_env.sim.state import StateView
 

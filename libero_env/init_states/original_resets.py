@@ -12,11 +12,11 @@ environments/base.py.
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import PlacementError
 from libero_env.geometry import quat_to_mat
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES, ObjectModel, rest_quat
 from libero_env.sim.scene import Scene
 from libero_env.tasks.problem import Atom, Region

@@ -6,11 +6,11 @@ They are checked against the task: its init atoms hold, its goal does not.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import PlacementError
 from libero_env.geometry import quat_from_axis_angle, quat_to_mat
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import ROBOT, InitialStates, Scene, fixture_pose, initial_qpos

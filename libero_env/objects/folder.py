@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired
 
-import mujoco
 import yaml
 from pydantic import AfterValidator, BeforeValidator, Field
 from typing_extensions import TypedDict
 
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.mjcf import Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.paths import objects_dir

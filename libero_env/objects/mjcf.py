@@ -14,11 +14,11 @@ from types import MappingProxyType
 from typing import NoReturn
 from xml.etree import ElementTree as ET
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import InvalidInputError
 from libero_env.limited import call_limited
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.xml_file import explain, parse_xml, place_of, write_xml
 from libero_env.text import suggest
 

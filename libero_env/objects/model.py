@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from libero_env.geometry import quat_from_axis_angle
+from libero_env.mujoco_compat import mujoco
 
 ROOT_BODY = "main"
 VISUAL_GEOM: Mapping[str, Any] = {"group": 1, "contype": 0, "conaffinity": 0, "mass": 0.0}

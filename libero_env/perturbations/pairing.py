@@ -6,11 +6,11 @@ it moves along. What is new finds a free place in its region, and is simulated u
 
 from collections.abc import Iterable, Iterator
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import PlacementError
 from libero_env.init_states.placement import collision_boxes, lowest_point, settle
+from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.sampling import SampleKey
 from libero_env.perturbations.starts import contacts, posed
 from libero_env.sim.scene import Scene, zone_boxes

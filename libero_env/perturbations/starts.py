@@ -5,11 +5,11 @@ from copy import copy
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.arena import WORKSPACES
 from libero_env.geometry import quat_from_axis_angle, quat_multiply
+from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import StartChange
 from libero_env.perturbations.sampling import direction, sign
 from libero_env.sim.scene import Scene

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, fields, replace
 from functools import reduce
 from typing import Any, TypeVar
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import UnknownNameError
 from libero_env.geometry import quat_to_mat
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim.scene import Scene
 
 HEADLIGHT = "headlight"  # name of the light at the camera, which models do not name

@@ -9,9 +9,9 @@ face z+.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import mujoco
 import numpy as np
 
+from libero_env.mujoco_compat import mujoco
 from libero_env.parallel import compiled
 
 _MARGIN = 1e-3  # [m] far more than the rounding of positions in single precision

@@ -3,9 +3,9 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim.backend import Backend
 from libero_env.sim.observations import Observer
 from libero_env.sim.predicates import OF_ALL, SEMANTICS, evaluate, ground

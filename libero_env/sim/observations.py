@@ -24,12 +24,12 @@ Names that `observations=` takes, and the entries they give (H W: `camera_size`;
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 from gymnasium import spaces
 
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.geometry import quat_multiply, quat_rotate, quat_to_axis_angle
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.appearance import Appearance, SceneAppearance
 from libero_env.sim.predicates import glowing_sites

@@ -11,11 +11,10 @@ with Lambda_p^-1 = J_p M^-1 J_p^T, Lambda_o^-1 = J_o M^-1 J_o^T and N^T = I - J^
 
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, REST_QPOS
-from libero_env.mujoco_compat import MASS_FIELD
+from libero_env.mujoco_compat import MASS_FIELD, mujoco
 from libero_env.parallel import compiled
 
 ACTION_DIM = 7

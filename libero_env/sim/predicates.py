@@ -9,10 +9,10 @@ box is |R size|, and being on a region of the table needs no contact. `semantics
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP, OPPOSITE_STATES, ObjectModel
 from libero_env.sim.scene import ROBOT, Scene, zone_boxes
 from libero_env.sim.state import StateView

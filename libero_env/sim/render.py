@@ -6,7 +6,7 @@ processes.
 
 import importlib
 import os
-import sys
+import re
 import threading
 import weakref
 from collections.abc import Iterable, Sequence
@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any, Protocol
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import RenderError, UnknownNameError
+from libero_env.mujoco_compat import forget_opengl, mujoco
 from libero_env.sim.appearance import SceneAppearance
 from libero_env.sim.culling import Culling
 
@@ -61,7 +61,7 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
         RenderError: No backend works here, or this process is a fork of one that has opened a context, which would
             hang; the message states what to do.
     """
-    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    chosen = os.environ.get("MUJOCO_GL", "").lower().strip()
     if _opened_in and os.getpid() not in _opened_in:
         raise RenderError(FORKED)
     if chosen and chosen not in BACKENDS:
@@ -80,17 +80,17 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
             failures.append(
                 f"{name}: {type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
             )
-            _forget_platform(platform)
+            forget_opengl(platform)
+    device = os.environ.get("MUJOCO_EGL_DEVICE_ID")
+    if device is not None and failures[0].startswith(
+        ("egl: RuntimeError: The MUJOCO_EGL_DEVICE_ID", "egl: ValueError")
+    ):
+        valid = re.findall(r"between .*?(?= \(|,|$)", failures[0])
+        raise RenderError(
+            f"MUJOCO_EGL_DEVICE_ID={device} is not a GPU that EGL can draw on; valid: whole numbers "
+            f"{valid[0] if valid else 'from 0'}. Or unset it"
+        )
     raise RenderError(f"no OpenGL backend works here ({'; '.join(failures)}). Remedy: {REMEDY}")
-
-
-def _forget_platform(platform: str | None) -> None:
-    """Undo what a backend that failed has left behind: PyOpenGL keeps the platform with which it was first imported."""
-    os.environ.pop("PYOPENGL_PLATFORM", None)
-    if platform is not None:
-        os.environ["PYOPENGL_PLATFORM"] = platform
-    for module in [m for m in sys.modules if m.partition(".")[0] == "OpenGL" or m.startswith("mujoco.egl")]:
-        del sys.modules[module]
 
 
 @lru_cache(maxsize=1)

@@ -13,10 +13,10 @@ fraction of the height.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import UnknownNameError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.scene import zone_boxes
 from libero_env.sim.state import StateView

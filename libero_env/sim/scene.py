@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from threading import RLock
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.arena import WORKSPACES, Workspace, add_mount, add_spare_materials, load_workspace
@@ -21,7 +20,7 @@ from libero_env.assets.original import OriginalPack
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.mujoco_compat import log_warnings, set_damping
+from libero_env.mujoco_compat import log_warnings, mujoco, set_damping
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY, ObjectModel
 from libero_env.tasks.problem import Atom, Problem, ProblemError, Region, Violation
 from libero_env.text import suggest

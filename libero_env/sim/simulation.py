@@ -14,11 +14,10 @@ from copy import copy
 from functools import cache, cached_property
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from libero_env.errors import ClosedEnvironmentError, LiberoError
-from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD, log_warnings
+from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD, log_warnings, mujoco
 from libero_env.sim.backend import Backend
 from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.osc import REST, ArmIndex

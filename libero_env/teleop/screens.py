@@ -8,12 +8,12 @@ import sys
 import time
 from typing import Any
 
-import mujoco
 import numpy as np
 from PIL import Image
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import LiberoError, RenderError
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP
 from libero_env.sim.predicates import glowing_sites
 from libero_env.teleop.devices import GRIPPER, HELP, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse

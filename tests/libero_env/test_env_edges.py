@@ -2,7 +2,10 @@
 
 import copy
 import multiprocessing as mp
+import os
 import pickle
+import subprocess
+import sys
 import threading
 
 import gymnasium
@@ -348,6 +351,40 @@ def test_an_interrupted_step_or_reset_ends_the_episode(env, batch, monkeypatch):
         one.reset(seed=0)
         np.testing.assert_array_equal(one.get_state(*(() if one is env else (0,))), state)
         one.step(action)
+
+
+NO_GL = [{"MUJOCO_GL": name} for name in ("nonsense", "cgl", "wgl", " OFF ")]
+NO_GL += [
+    {"MUJOCO_GL": "egl", "PYOPENGL_PLATFORM": "osmesa"},
+    {"MUJOCO_GL": "osmesa", "PYOPENGL_PLATFORM": "egl"},
+]
+NO_GL += [{"MUJOCO_EGL_DEVICE_ID": "99"}, {"MUJOCO_EGL_DEVICE_ID": "x"}]
+DRAW = """
+from libero_env import LiberoEnv
+env = LiberoEnv("libero_object/3", cameras=())
+env.reset(seed=0)
+env.step([0.0] * 7)
+try:
+    env.observer.render(0, "agentview")
+except Exception as error:
+    print(type(error).__name__, error)
+"""
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("variables", NO_GL, ids=lambda one: " ".join(one.values()))
+def test_only_what_is_drawn_needs_opengl(variables):
+    environ = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")} | variables
+    done = subprocess.run(
+        [sys.executable, "-c", DRAW], env=environ, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    (line,) = done.stdout.splitlines()
+    wrong = next(reversed(variables))
+    assert line.startswith("RenderError") and (wrong in line) and "valid" in line or "Remedy" in line
+    command = [sys.executable, "-m", "libero_env.cli", "doctor", "--gl"]
+    told = subprocess.run(command, env=environ, capture_output=True, text=True, check=False)
+    assert told.returncode == 1 and told.stdout.startswith("FAIL  GL:") and not told.stderr
 
 
 @pytest.mark.unit

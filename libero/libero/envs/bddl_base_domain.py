@@ -9,7 +9,6 @@ from inspect import signature
 from operator import attrgetter
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from libero._adapters.lookup import lookup
@@ -35,6 +34,7 @@ from libero_env.errors import (
 )
 from libero_env.init_states.original_resets import OriginalResets
 from libero_env.init_states.placement import Start, sample_settled
+from libero_env.mujoco_compat import mujoco
 from libero_env.paths import read_config
 from libero_env.sim.controller import ControllerState
 from libero_env.sim.predicates import evaluate, glowing_sites

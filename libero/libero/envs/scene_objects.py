@@ -3,11 +3,11 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObject
 from libero.libero.envs.objects import SiteObject
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.builtin import builtin_names
 from libero_env.objects.model import ObjectModel
 from libero_env.sim.scene import Scene

@@ -2,10 +2,9 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-import mujoco
-
 from libero._adapters.models import facade_pack
 from libero_env.errors import LiberoError
+from libero_env.mujoco_compat import mujoco
 
 # Category -> names of its regions, where they differ from those of its model.
 EXCEPTION_DICT: dict[str, list[str]] = {}

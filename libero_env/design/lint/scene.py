@@ -3,7 +3,6 @@
 from collections import Counter
 from math import hypot, sqrt
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.arena import Workspace
@@ -12,6 +11,7 @@ from libero_env.design.lint.report import Level, Report
 from libero_env.errors import LiberoError, PlacementError
 from libero_env.init_states.placement import sample_start, settle, start_errors
 from libero_env.init_states.store import load_init_states
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene, build_scene, initial_qpos

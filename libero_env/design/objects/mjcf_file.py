@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import mujoco
 import numpy as np
 
 from libero_env.assets.original_mjcf import attachable_xml, written_out
@@ -15,7 +14,7 @@ from libero_env.design.objects.mesh_file import Notify
 from libero_env.design.objects.mesh_object import INSIDE
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.geometry import surface_points
-from libero_env.mujoco_compat import delete
+from libero_env.mujoco_compat import delete, mujoco
 from libero_env.objects.folder import MODEL, spec_of
 from libero_env.objects.mjcf import LIMITS, Mjcf, read_mjcf
 from libero_env.objects.model import ROOT_BODY, VISUAL_GEOM

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 from PIL import Image
 
@@ -12,7 +11,7 @@ from libero_env.errors import LiberoError
 from libero_env.expert.arm import GRIPPER
 from libero_env.expert.grasping.grasps import Grasp, GraspError, find_grasps
 from libero_env.geometry import surface_points
-from libero_env.mujoco_compat import log_warnings, set_damping
+from libero_env.mujoco_compat import log_warnings, mujoco, set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.sim.render import Renderer, RenderTarget
 

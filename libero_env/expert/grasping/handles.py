@@ -5,10 +5,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
 
-import mujoco
 import numpy as np
 
 from libero_env.geometry import Pose, body_points, quat_from_axis_angle, quat_to_mat, surface_points
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim.state import StateView
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -3,9 +3,7 @@
 from collections.abc import Iterator
 from itertools import count
 
-import mujoco
-
-from libero_env.mujoco_compat import set_damping
+from libero_env.mujoco_compat import mujoco, set_damping
 from libero_env.objects.builtin.appearance import Appearance, appearance_of
 from libero_env.objects.builtin.physics import Part, Physics, categories, load_physics
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, VISUAL_GEOM, ObjectModel

@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 
-import mujoco
 import numpy as np
 
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.builtin.mesh import CORNERS, Mesh, Ring, loft, merge
 from libero_env.objects.builtin.paint import Cell
 

@@ -4,12 +4,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-import mujoco
 import numpy as np
 import warp as wp
 
 from libero_env.errors import LiberoError
-from libero_env.mujoco_compat import MASS_FIELD
+from libero_env.mujoco_compat import MASS_FIELD, mujoco
 from libero_env.sim.backend import Backend
 from libero_env.sim.mjwarp import kernels
 from libero_env.sim.osc import ArmIndex

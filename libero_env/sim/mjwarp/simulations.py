@@ -3,12 +3,12 @@
 from importlib import metadata
 from typing import Any
 
-import mujoco
 import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
 from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim.backend import Backend
 from libero_env.sim.mjwarp import kernels
 from libero_env.sim.mjwarp.device import DeviceFields, allocate, choose_device, room_for

@@ -4,12 +4,11 @@ from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any, ClassVar
 
-import mujoco
-
 from libero._adapters.lookup import alias_modules, lookup
 from libero._adapters.models import facade_pack
 from libero_env.assets.arena import load_workspace
 from libero_env.assets.original_arena import TEXTURES
+from libero_env.mujoco_compat import mujoco
 
 STYLE_KINDS = ("floor", "wall")
 STYLE_MAPPING = {kind: dict(TEXTURES[kind]) for kind in STYLE_KINDS}

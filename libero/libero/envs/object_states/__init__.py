@@ -2,11 +2,11 @@
 
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from libero._adapters.lookup import alias_modules
 from libero._adapters.sim import Domain
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim.predicates import evaluate
 from libero_env.tasks.problem import Atom
 
