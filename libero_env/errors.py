@@ -1,7 +1,7 @@
 """Errors of the package; all derive from `LiberoError`."""
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 from libero_env.text import closest
@@ -99,6 +99,22 @@ class PlacementError(LiberoError):
 
 class ActionError(LiberoError, ValueError):
     """An action of the wrong shape or with values that are not finite; the simulation has not changed."""
+
+
+class SimulationError(LiberoError):
+    """Simulations whose state is not valid any more: the solver has diverged, or has no room for the contacts.
+
+    Attributes:
+        failed: Reason by index of the simulation. The others have moved as without it.
+    """
+
+    def __init__(self, failed: Mapping[int, str]):
+        super().__init__("; ".join(f"simulation {i}: {reason}" for i, reason in sorted(failed.items())))
+        self.failed = dict(failed)
+
+    def __reduce__(self) -> tuple[type, tuple[dict[int, str]]]:
+        """Let worker processes send the error: its argument is not its message."""
+        return type(self), (self.failed,)
 
 
 class RenderError(LiberoError):

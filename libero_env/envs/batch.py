@@ -21,7 +21,7 @@ from libero_env.envs.checks import (
 )
 from libero_env.envs.config import AFTER, EnvConfig, show_options
 from libero_env.envs.scenes import open_scenes
-from libero_env.errors import InvalidInputError, PlacementError
+from libero_env.errors import InvalidInputError, PlacementError, SimulationError
 from libero_env.init_states.placement import sample_states
 from libero_env.init_states.store import load_init_states
 from libero_env.memory import require_memory
@@ -32,7 +32,7 @@ from libero_env.sim.engine import Goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward
 from libero_env.sim.scene import InitialStates
-from libero_env.sim.simulation import WATCHED, Indices
+from libero_env.sim.simulation import WATCHED, Indices, Watch
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate
@@ -164,7 +164,7 @@ class BatchEnv(LiberoVectorEnv):
         self.action_space = batch_space(self.single_action_space, num)
         self.generators = [np.random.default_rng() for _ in range(num)]
         self._images = self.observer.empty_images()
-        self._steps = np.zeros(num, np.int64)
+        self._steps, self._errors = np.zeros(num, np.int64), dict[int, str]()
         self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
         self._progress = np.zeros((num, len(self.atoms)), bool)
 
@@ -207,6 +207,7 @@ class BatchEnv(LiberoVectorEnv):
             states = self._stored_states(request.init_states[ids])
         if ids.size:
             self._running[ids] = False  # until it is done: an error or an interruption ends the episodes
+            self._errors = {i: reason for i, reason in self._errors.items() if i not in ids}
             for i in ids:
                 if (new_seed := request.seeds[i]) is not None:
                     self.generators[i] = np.random.Generator(np.random.PCG64(new_seed))
@@ -231,7 +232,8 @@ class BatchEnv(LiberoVectorEnv):
             Observations, rewards (num_envs,), terminations, truncations, and infos: `success` (num_envs,) bool and
             `progress` (num_envs, natoms) bool, whether each of the goal's `atoms` holds. Both keep the outcome of
             episodes that are over. With perturbations also `attempts` (num_envs, n): how many samples of each were not
-            valid at the reset.
+            valid at the reset. Where a simulation has diverged, its episode is truncated, and `errors` has the reason
+            by its index until it is reset.
 
         Raises:
             ActionError: The shape is wrong, or a value is not a finite number; no state has changed.
@@ -251,7 +253,9 @@ class BatchEnv(LiberoVectorEnv):
             entries = self._step_and_observe(ids, actions)
             reached[ids], rewards[ids] = self._check_goals(ids)
             self._steps[ids] += 1
-        truncated = running & ~reached & (self._steps >= self.config.horizon)
+        failed = np.isin(np.arange(self.num_envs), list(self._errors))
+        reached, rewards = reached & ~failed, np.where(failed, 0.0, rewards)
+        truncated = running & ~reached & (failed | (self._steps >= self.config.horizon))
         self._success[ids] = reached[ids]
         self._running = running & ~(reached | truncated)
         return self._with_images(entries), rewards, reached, truncated, self._info()
@@ -271,6 +275,7 @@ class BatchEnv(LiberoVectorEnv):
         self.require_open()
         i, state = checked_index(i, self.num_envs), self._checked_state(state)
         self._running[i] = False
+        self._errors.pop(i, None)
         if state.size == self.simulations.state_size + 1:
             self.simulations.set_state(i, state[:-1])
             self._steps[i] = int(state[-1])
@@ -410,7 +415,7 @@ class BatchEnv(LiberoVectorEnv):
         if self.perturbed is not None:
             actions = self.perturbed.act(ids, actions)
         if self.config.observed == AFTER:
-            self.simulations.step(ids, actions)
+            self._step_simulations(ids, actions)
             return self._observe(ids)
         seen = self.proprioception()
 
@@ -424,8 +429,15 @@ class BatchEnv(LiberoVectorEnv):
                 if (done == WATCHED[1]) == is_of_joints(name):
                     seen[name][rows] = values[rows]
 
-        self.simulations.step(ids, actions, watch=watch)
+        self._step_simulations(ids, actions, watch)
         return seen
+
+    def _step_simulations(self, ids: np.ndarray, actions: np.ndarray, watch: Watch | None = None) -> None:
+        """Advance simulations; note those that fail, whose episodes end."""
+        try:
+            self.simulations.step(ids, actions, watch=watch)
+        except SimulationError as error:
+            self._errors |= error.failed
 
     def _observe(self, ids: Indices) -> dict[str, np.ndarray]:
         """Render the images of simulations, and return all observations except images."""
@@ -457,7 +469,7 @@ class BatchEnv(LiberoVectorEnv):
         info = {"success": self._success.copy(), "progress": self._progress.copy()}
         if self.perturbed is not None:
             info["attempts"] = self.perturbed.attempts.copy()
-        return info
+        return {**info, "errors": dict(self._errors)} if self._errors else info
 
 
 def _check_range(states: np.ndarray, task: Task) -> None:

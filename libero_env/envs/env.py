@@ -8,7 +8,7 @@ import numpy as np
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.checks import checked_actions, checked_options, checked_seed
 from libero_env.envs.config import EnvConfig, show_options
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, SimulationError, UnknownNameError
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ
 
@@ -115,6 +115,7 @@ class LiberoEnv(gymnasium.Env):
 
         Raises:
             ActionError: The shape is wrong, or a value is not a finite number; the state has not changed.
+            SimulationError: The simulation has diverged; no episode is running.
             LiberoError: No episode is running.
         """
         self.batch.require_open()
@@ -122,6 +123,8 @@ class LiberoEnv(gymnasium.Env):
         if not self.batch.running[0]:
             raise LiberoError("no episode is running, or its last call was interrupted; call reset()")
         observations, rewards, terminated, truncated, infos = self.batch.advance(action[None])
+        if "errors" in infos:
+            raise SimulationError(infos["errors"])
         return (
             _first(observations),
             float(rewards[0]),

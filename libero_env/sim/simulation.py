@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.errors import ClosedEnvironmentError, LiberoError
+from libero_env.errors import ClosedEnvironmentError, LiberoError, SimulationError
 from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD, log_warnings, mujoco
 from libero_env.sim.backend import Backend
 from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.osc import REST, ArmIndex
-from libero_env.timing import SUBSTEPS
+from libero_env.timing import CONTROL_PERIOD, SUBSTEPS, TIMESTEP
 
 try:
     from mujoco.batch import Batch
@@ -54,6 +54,8 @@ FORKED = (
     "this process was forked from the one that made the environment, and can neither step nor render it. Make "
     "environments after the fork, or start processes with multiprocessing.get_context('spawn')"
 )
+DIVERGED = "it has diverged: positions, velocities or accelerations are not numbers, or are huge"
+_UNSTABLE = [getattr(mujoco.mjtWarning, f"mjWARN_BADQ{what}") for what in ("POS", "VEL", "ACC")]
 Indices = Sequence[int] | np.ndarray
 Watch = Callable[[int, np.ndarray], None]  # one of `WATCHED` or `INTEGRATED`, indices of the simulations
 Inputs = tuple[np.ndarray, ...]  # fields that the kernel of a controller takes, (num, ...)
@@ -251,13 +253,34 @@ class Simulations(ABC):
             actions: Action of each simulation, (num, action_dim), finite; rows of other simulations are not used.
             watch: Function that is called after each substep of `WATCHED`, with the number of substeps done and the
                 indices of the simulations whose fields are of that moment; by `LoopSimulations` at `INTEGRATED`, too.
+
+        Raises:
+            SimulationError: Some have failed; the others have moved.
         """
         ids = np.asarray(ids, np.int64)
+        before = {int(i): self.time(i) for i in ids}
         state, fields = self.controller_state, self._controlled_fields(ids)
         pos, mat = self._grip_site(fields)
         state.controller.set_goals(ids, actions, fields["qpos"], pos, mat, state.goal, state.memory)
         self._substeps(ids, actions, None if fields is self.fields else self._inputs(fields), watch)
         self._outdated[ids] = False
+        if failed := self._failures(before):
+            raise SimulationError(failed)
+
+    def _failures(self, before: Mapping[int, float]) -> dict[int, str]:
+        """Return why simulations have failed in a control period, by index: MuJoCo resets them, with a warning only.
+
+        Args:
+            before: Time of each simulation that was stepped, before it, s.
+        """
+        failed = {}
+        for i, time in before.items():
+            is_first = abs(time) < 0.5 * TIMESTEP  # a reset in the first substep does not show in the time
+            if abs(self.time(i) - time - CONTROL_PERIOD) > 0.5 * TIMESTEP or (
+                is_first and any(self.data(i).warning[kind].number for kind in _UNSTABLE)
+            ):
+                failed[i] = DIVERGED
+        return failed
 
     def get_state(self, i: int) -> np.ndarray:
         """Return all that the future of simulation i depends on, (state_size,).

@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
+from libero_env.errors import SimulationError
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, PolicyActor, TakesNote
 from lifelong.evaluation.environments import Obs, VectorEnv
@@ -158,6 +159,7 @@ def run_episodes(
 
     Raises:
         ConfigError: The numbers of simulations and of initial states differ.
+        SimulationError: A simulation has diverged: its episode is neither a success nor a failure.
     """
     if env.num_envs != len(init_states):
         raise ConfigError(
@@ -195,6 +197,10 @@ def run_episodes(
         bar.set_postfix(done=int(tracker.over.sum()), refresh=False)
     bar.close()
     _draw(env, True)
+    if tracker.errors:
+        raise SimulationError(
+            {i: f"{reason} (initial state {init_states[i]})" for i, reason in tracker.errors.items()}
+        )
     _tell(actor, tracker)
     done = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
     episodes = tuple(replace(one, attempts=tries) for one, tries in zip(done, attempts, strict=True))
@@ -223,12 +229,14 @@ class EpisodeTracker:
         atoms: Atoms of the goal; empty if the environment does not report them.
         over: (B,) whether each episode is over.
         success: (B,) whether each episode has succeeded.
+        errors: Why simulations have failed, by index.
     """
 
     def __init__(self, env: VectorEnv, info: Mapping[str, Any]):
         self._env = env
         self.atoms: tuple[str, ...] = tuple(getattr(env, "atoms", ()))
         self.over, self.success = np.zeros(env.num_envs, bool), np.zeros(env.num_envs, bool)
+        self.errors: dict[int, str] = {}
         self._now = self._progress(info)
         self._start = self._ever = self._now
 
@@ -240,6 +248,7 @@ class EpisodeTracker:
         """Step all simulations with (B, A) actions and return their observations."""
         obs, _, terminated, truncated, info = self._env.step(actions)
         self.success = self.success | (np.asarray(info["success"], bool) & ~self.over)
+        self.errors |= info.get("errors", {})
         self._now = np.where(self.over[:, None], self._now, self._progress(info))
         self._ever = self._ever | self._now
         self.over = self.over | terminated | truncated

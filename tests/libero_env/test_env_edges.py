@@ -21,6 +21,7 @@ from libero_env.errors import (
     InvalidInputError,
     LiberoError,
     RenderError,
+    SimulationError,
     UnknownNameError,
 )
 from libero_env.sim.osc import rotate
@@ -403,3 +404,30 @@ def test_steps_with_vanishing_rotations_are_steps_without(env):
         env.step([0.1, 0.0, 0.0, *rotation, 1.0])
         states.append(env.get_state())
     np.testing.assert_allclose(*states, atol=1e-9)
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("first", [True, False], ids=["first step", "later"])
+def test_a_simulation_that_diverges_ends_its_episode_with_an_error(first):
+    """It is neither a success nor a failure, and the others go on; MuJoCo itself resets it with a warning only."""
+    with (
+        BatchEnv(TASK, 2, cameras=()) as pair,
+        BatchEnv(TASK, 1, cameras=()) as alone,
+        LiberoEnv(TASK, cameras=()) as env,
+    ):
+        for one in (pair, alone, env):
+            one.reset(options={"init_state": 0})
+        if not first:
+            pair.step(np.zeros((2, 7))), env.step(np.zeros(7))
+        for one in (pair, env):
+            one.simulations.fields["qvel"][-1, 12] = np.nan
+        with pytest.raises(SimulationError, match="simulation 0: it has diverged"):
+            env.step(np.zeros(7))
+        with pytest.raises(LiberoError, match="no episode is running"):
+            env.step(np.zeros(7))
+        _, _, terminated, truncated, info = pair.step(np.zeros((2, 7)))
+        assert list(info["errors"]) == [1] and "diverged" in info["errors"][1]
+        assert not terminated.any() and truncated.tolist() == [False, True] == (~pair.running).tolist()
+        _, info = pair.reset(options={"init_state": 0, "reset_mask": [False, True]})
+        assert "errors" not in info and pair.running.all()
+        np.testing.assert_array_equal(pair.get_state(1), alone.get_state(0))

@@ -9,7 +9,7 @@ from libero_env.demos.config import DemoConfig
 from libero_env.demos.contents import read_header
 from libero_env.demos.generate import RecordingJob, demo_path, make_demos
 from libero_env.envs.batch import BatchEnv
-from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, SimulationError, UnknownNameError
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.expert import MAX_STEPS
 from libero_env.sim import backend as backends
@@ -229,12 +229,37 @@ def test_predicates_of_users_and_of_strict_semantics_are_evaluated_on_the_host(p
     assert {one.predicate for one in strict.one_by_one} == {"In"}
 
 
-def test_too_many_contacts_are_an_error_that_says_what_to_set(pair):
+def test_too_many_contacts_are_an_error_of_that_simulation_that_says_what_to_set(pair, monkeypatch):
     full = BatchEnv(TASK, 1, cameras=(), backend="warp,device=cpu,contacts=4")
-    with pytest.raises(LiberoError, match=r"set backend='warp,contacts=8' \(now 4\)"):
+    with pytest.raises(SimulationError, match=r"simulation 0: .* set backend='warp,contacts=8' \(now 4\)"):
         full.reset(options={"init_state": 0})
-        full.step(np.zeros((1, 7)))
     full.close()
+    env = pair[1]
+    reset(pair)
+    flags = np.array(
+        [0, int(warp_simulations.mjw.OverflowType.NEFC), int(warp_simulations.mjw.OverflowType.ITERATIONS)]
+    )
+    substep = env.simulations._substep
+    monkeypatch.setattr(
+        env.simulations,
+        "_substep",
+        lambda: (substep(), env.simulations.device_data.overflow.assign(flags.astype(np.int32))),
+    )
+    info = env.step(smooth_actions(1)[0])[4]
+    assert list(info["errors"]) == [1] and env.running.tolist() == [True, False, True]
+    assert env.simulations.limits_reached == {"ITERATIONS": 1}
+
+
+def test_a_simulation_that_diverges_ends_its_episode_with_an_error(pair):
+    env = pair[1]
+    reset(pair)
+    with wp.ScopedDevice("cpu"):
+        env.simulations.device_data.qvel.numpy()[1, 12] = np.nan
+    _, _, terminated, truncated, info = env.step(smooth_actions(1)[0])
+    assert list(info["errors"]) == [1] and "diverged" in info["errors"][1]
+    assert not terminated.any() and truncated.tolist() == [False, True, False]
+    reset(pair)
+    assert "errors" not in env.step(smooth_actions(1)[0])[4]
 
 
 def test_memory_that_does_not_suffice_is_said_in_one_line(monkeypatch):

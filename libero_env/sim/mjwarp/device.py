@@ -1,5 +1,6 @@
 """What MuJoCo Warp's simulations have on the device, and how the host reads it."""
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -13,6 +14,8 @@ from libero_env.sim.backend import Backend
 from libero_env.sim.mjwarp import kernels
 from libero_env.sim.osc import ArmIndex
 from libero_env.sim.simulation import FIELDS
+
+_log = logging.getLogger(__name__)
 
 
 def choose_device(name: str | None) -> Any:
@@ -34,6 +37,22 @@ def choose_device(name: str | None) -> Any:
     except (ValueError, RuntimeError) as error:
         here = ", ".join(str(device) for device in wp.get_devices())
         raise LiberoError(f"backend=warp: there is no device {name!r}; here are: {here}") from error
+
+
+def can_capture(device: Any) -> bool:
+    """Return whether a control step can be one CUDA graph: that needs memory pools, and CUDA 12.4 for its loop."""
+    if not device.is_cuda:
+        return False
+    if not wp.is_mempool_enabled(device):
+        lack = "memory pools"
+    elif not wp.is_conditional_graph_supported():
+        lack = "a driver for CUDA 12.4 or newer"
+    else:
+        return True
+    _log.warning(
+        "backend=warp: kernels are launched one by one, which is slower: %s has not %s", device, lack
+    )
+    return False
 
 
 def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray) -> Any:

@@ -1,5 +1,9 @@
 """Simulations of one model that MuJoCo Warp steps together, on a GPU or on the processor."""
 
+import gc
+import logging
+from collections import Counter
+from collections.abc import Mapping
 from importlib import metadata
 from typing import Any
 
@@ -7,15 +11,16 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.errors import InvalidInputError, LiberoError, SimulationError
 from libero_env.mujoco_compat import mujoco
 from libero_env.sim.backend import Backend
 from libero_env.sim.mjwarp import kernels
-from libero_env.sim.mjwarp.device import DeviceFields, allocate, choose_device, room_for
+from libero_env.sim.mjwarp.device import DeviceFields, allocate, can_capture, choose_device, room_for
 from libero_env.sim.osc import REST, osc_torques
-from libero_env.sim.simulation import CLOSED, WATCHED, Indices, Inputs, Simulations, Watch
+from libero_env.sim.simulation import CLOSED, DIVERGED, WATCHED, Indices, Inputs, Simulations, Watch
 from libero_env.timing import SUBSTEPS
 
+_log = logging.getLogger(__name__)
 _ROWS_PER_CONTACT = 4  # of constraints; contacts with rolling friction, which have 6, are few
 _FULL = (
     mjw.OverflowType.NEFC
@@ -42,6 +47,7 @@ class WarpSimulations(Simulations):
         device: Device of Warp.
         device_model: The model on the device, with the poses of fixtures of each simulation.
         device_data: The state of all simulations on the device.
+        limits_reached: How often a simulation reached a limit of the solver without an error, by the limit's name.
         uses_graphs: Whether the kernels of a control step are launched as one graph: on GPUs. On the processor that is
             possible, and slower.
 
@@ -64,7 +70,7 @@ class WarpSimulations(Simulations):
                 raise LiberoError(
                     f"backend=warp cannot simulate this model: {error}; backend=mujoco can"
                 ) from error
-            self.device_model.opt.warn_overflow = 0  # raised instead, see _check_room
+            self.device_model.opt.warn_overflow = 0  # raised instead, see _failures
             with room_for(num, self.backend):
                 self.device_data = mjw.make_data(
                     self.model,
@@ -75,7 +81,8 @@ class WarpSimulations(Simulations):
                 self._control: Any = allocate(self.model, self.arm, num, self.fixture_bodies)
         self._copies: Any = DeviceFields(self.device_data, self._control.arm)
         self.fields = self._copies
-        self.uses_graphs, self._graphs = self.device.is_cuda, dict[int, Any]()
+        self.uses_graphs, self._graphs = can_capture(self.device), dict[int, Any]()
+        self.limits_reached = Counter[str]()
         self._actions_seen = np.zeros(num)
 
     @property
@@ -145,8 +152,12 @@ class WarpSimulations(Simulations):
                     inputs=[control, model.geom_bodyid, model.geom_pos, model.geom_quat],
                     outputs=[data.xpos, data.xquat, data.geom_xpos, data.geom_xmat],
                 )
+            data.overflow.zero_()
             mjw.step1(model, data)
         self._copies.forget()
+        lost = data.nacon.numpy()[0] > data.naconmax  # of which simulation is not known, and no flag is set
+        if failed := {int(i): self._no_room(mjw.OverflowType.NARROWPHASE) for i in ids if lost}:
+            raise SimulationError(failed)
 
     def _substeps(
         self, ids: np.ndarray, actions: np.ndarray, first: Inputs | None, watch: Watch | None
@@ -166,7 +177,6 @@ class WarpSimulations(Simulations):
                     if watch is not None and done in WATCHED:
                         watch(done, ids)
         self.controller_state.gripper[:] = self._control.gripper.numpy()
-        self._check_room()
 
     def _upload(self, ids: np.ndarray, actions: np.ndarray) -> None:
         """Send the goals, and which simulations are to be stepped, to the device."""
@@ -204,9 +214,16 @@ class WarpSimulations(Simulations):
                 self._substep()
             return
         if substeps not in self._graphs:
-            with wp.ScopedCapture(self.device) as capture:
-                for _ in range(substeps):
-                    self._substep()
+            gc.collect()  # a graph that is freed meanwhile would become part of this one
+            enabled = gc.isenabled()
+            gc.disable()
+            try:
+                with wp.ScopedCapture(self.device) as capture:
+                    for _ in range(substeps):
+                        self._substep()
+            finally:
+                if enabled:
+                    gc.enable()
             self._graphs[substeps] = capture.graph
         wp.capture_launch(self._graphs[substeps])
 
@@ -237,20 +254,30 @@ class WarpSimulations(Simulations):
         wp.launch(kernels.finish_substep, self.num, inputs=[self._control, step], outputs=self._moved)
         mjw.step1(model, data)
 
-    def _check_room(self) -> None:
-        """Raise where there were more contacts or constraints than memory for them.
+    def _overflows(self) -> dict[int, str]:
+        """Return which simulations had more contacts or constraints than room, by index; count the other flags."""
+        flags = self.device_data.overflow.numpy()
+        for flag in mjw.OverflowType:
+            if not flag & _FULL and (count := int(np.count_nonzero(flags & int(flag)))):
+                if flag.name not in self.limits_reached:
+                    _log.warning(
+                        "backend=warp: a limit of the solver was reached (%s); it goes on", flag.name
+                    )
+                self.limits_reached[str(flag.name)] += count
+        full = flags & int(_FULL)
+        return {int(i): self._no_room(mjw.OverflowType(int(full[i]))) for i in np.flatnonzero(full)}
 
-        Raises:
-            LiberoError: There were; the message says what to set.
-        """
-        overflow = self.device_data.overflow.numpy() & int(_FULL)
-        if overflow.any():
-            kinds = mjw.OverflowType(int(np.bitwise_or.reduce(overflow))).name
-            contacts = self.backend.contacts
-            raise LiberoError(
-                f"backend=warp: {np.count_nonzero(overflow)} simulations have more contacts or constraints than there "
-                f"is room for ({kinds}); set backend='warp,contacts={2 * contacts}' (now {contacts})"
-            )
+    def _no_room(self, flags: mjw.OverflowType) -> str:
+        contacts = self.backend.contacts
+        return (
+            f"it has more contacts or constraints than there is room for ({flags.name}); set "
+            f"backend='warp,contacts={2 * contacts}' (now {contacts})"
+        )
+
+    def _failures(self, before: Mapping[int, float]) -> dict[int, str]:
+        finite = np.isfinite(self.fields["qpos"]).all(axis=1) & np.isfinite(self.fields["qvel"]).all(axis=1)
+        failed = {i: DIVERGED for i in before if not finite[i]} | self._overflows()
+        return {i: reason for i, reason in failed.items() if i in before}
 
     def _warm_start(self, i: int) -> list[np.ndarray]:
         return [self.device_data.qacc_warmstart.numpy()[i], self.device_data.ctrl.numpy()[i]]
