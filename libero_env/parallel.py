@@ -1,5 +1,6 @@
 """Worker processes, functions compiled for threads, and the progress of long work."""
 
+import importlib
 import logging
 import multiprocessing
 import os
@@ -18,6 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
+import cloudpickle
 from tqdm import tqdm
 
 from libero_env.errors import LiberoError
@@ -27,6 +29,70 @@ _DAMAGED = (EOFError, pickle.UnpicklingError, ValueError, LookupError, TypeError
 T = TypeVar("T")
 LONGEST_SILENCE = 4 * 3600.0  # [s] for one piece of work of a pool; the longest take minutes
 LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
+
+
+_tables: dict[str, dict[Any, Any]] = {}  # "module:name" of a table -> its entries that are not a user's
+
+
+def send_to_workers(module: str, *names: str) -> None:
+    """Have what users add to tables of a module, from now on, reach all processes that this package starts later."""
+    for name in names:
+        table = getattr(sys.modules[module], name)
+        _tables[f"{module}:{name}"] = {k: dict(v) if isinstance(v, dict) else v for k, v in table.items()}
+
+
+def user_entries() -> bytes:
+    """Return what users have added to tables, for `add_entries` in another process; empty for nothing.
+
+    Raises:
+        LiberoError: An entry cannot be sent; the message names it.
+    """
+    changes: dict[str, tuple[dict[Any, Any], list[Any]]] = {}
+    for address, own in _tables.items():
+        table = _table(address)
+        added = {k: v for k, v in table.items() if not (k in own and (own[k] is v or _same(own[k], v)))}
+        removed = [key for key in own if key not in table]
+        if added or removed:
+            changes[address] = added, removed
+    if not changes:
+        return b""
+    try:
+        return cloudpickle.dumps(changes)
+    except Exception as whole:  # whatever the objects of a user raise
+        for address, (added, _) in changes.items():
+            for key, value in added.items():
+                try:
+                    cloudpickle.dumps(value)
+                except Exception as error:
+                    raise LiberoError(
+                        f"{key!r}, which was added to {address.partition(':')[2]}, cannot be sent to a worker process "
+                        f"({error}); define it without open files, locks or environments"
+                    ) from error
+        raise LiberoError(f"what was registered cannot be sent to a worker process ({whole})") from whole
+
+
+def add_entries(content: bytes) -> None:
+    """Add what `user_entries` has returned in the process that started this one."""
+    for address, (added, removed) in (cloudpickle.loads(content) if content else {}).items():
+        table = _table(address)
+        for key in removed:
+            table.pop(key, None)
+        table.update(added)
+
+
+def with_entries(content: bytes, function: Callable[..., T], *args: Any) -> T:
+    """Call a function after `add_entries`."""
+    add_entries(content)
+    return function(*args)
+
+
+def _table(address: str) -> dict[Any, Any]:
+    module, _, name = address.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def _same(own: Any, value: Any) -> bool:
+    return isinstance(own, dict) and own == value
 
 
 def spawn_pool(workers: int, *, initializer: Callable[[], None] | None = None) -> ProcessPoolExecutor:
@@ -40,7 +106,7 @@ def spawn_pool(workers: int, *, initializer: Callable[[], None] | None = None) -
         initializer: Function of a module that each process calls when it starts.
     """
     spawn = multiprocessing.get_context("spawn")
-    return _Pool(workers, mp_context=spawn, initializer=_start_worker, initargs=(initializer,))
+    return _Pool(workers, mp_context=spawn, initializer=_start_worker, initargs=(initializer, user_entries()))
 
 
 def check_main_guard() -> None:
@@ -125,11 +191,12 @@ def run_each(
                         other.cancel()
 
 
-def _start_worker(initializer: Callable[[], None] | None) -> None:
+def _start_worker(initializer: Callable[[], None] | None, entries: bytes) -> None:
     for name in ("SIGINT", "SIGHUP"):  # a terminal sends them to all its processes; the parent ends this one
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     end_with_parent()
+    add_entries(entries)
     if initializer is not None:
         initializer()
 

@@ -163,7 +163,13 @@ class MjData:
 
 
 class ClientSimulations(LoopSimulations):
-    """A simulation in whose model clients may move fixtures."""
+    """A simulation in whose model clients may move fixtures.
+
+    Attributes:
+        domain: Weak reference to the environment that it belongs to.
+    """
+
+    domain: Any = None
 
     def read_fixtures(self) -> np.ndarray:
         """Return the poses of the fixtures in the model, (nfixtures, 7)."""

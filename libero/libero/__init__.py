@@ -4,10 +4,11 @@ The configuration file is read if it exists, and only `set_libero_default_path` 
 initial states are those of this package, which `get_libero_path` writes to the cache folder.
 """
 
+import logging
 import os
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import yaml
 
@@ -28,6 +29,8 @@ __all__ = [
     "set_libero_default_path",
 ]
 
+_log = logging.getLogger(__name__)
+_noted: set[str] = set()
 _HERE = Path(__file__).parent
 _KEYS = ("benchmark_root", "bddl_files", "init_states", "datasets", "assets")
 
@@ -52,8 +55,19 @@ def get_default_path_dict(custom_location: str | os.PathLike | None = None) -> d
 
 def get_path_dict() -> dict[str, str]:
     """Return key -> path as configured, with defaults for missing keys."""
-    configured: dict[str, Any] = read_config()
-    return {**get_default_path_dict(), **{k: str(v) for k, v in configured.items() if k in _KEYS and v}}
+    default, configured = get_default_path_dict(), {k: v for k, v in read_config().items() if k in _KEYS}
+    return {**default, **{k: v for k, v in configured.items() if not is_left_over(k, v)}}
+
+
+def is_left_over(key: str, path: str) -> bool:
+    """Return whether a configured folder is one of the original's package or checkout that is not there (any more).
+
+    Its config.yaml names `libero/libero/bddl_files` and so on; those of this package are generated.
+    """
+    names = {"bddl_files": "bddl_files", "init_states": "init_files", "assets": "assets"}
+    folder = Path(path).expanduser()
+    is_empty = not folder.is_dir() or not any(folder.iterdir())
+    return is_empty and folder.parts[-2:] == ("libero", names.get(key, ""))
 
 
 def get_libero_path(query_key: str) -> str:
@@ -63,7 +77,10 @@ def get_libero_path(query_key: str) -> str:
     if query_key not in _KEYS:
         raise UnknownNameError("path", query_key, _KEYS)
     allow_arrays()
-    path = get_path_dict()[query_key]
+    path, configured = get_path_dict()[query_key], read_config().get(query_key)
+    if configured and configured != path and query_key not in _noted:
+        _noted.add(query_key)
+        _log.warning("%s: %s has no files; those of this package are used, %s", query_key, configured, path)
     ensure(query_key, path)
     if not os.path.exists(path):
         where = f"as {_config_file()} configures" if query_key in read_config() else "the default"

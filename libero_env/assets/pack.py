@@ -225,7 +225,10 @@ def problems(pack: Pack) -> list[str]:
 
 
 def _is_absent(value: str) -> bool:
-    return value not in (BUILTIN, ORIGINAL) and not Path(value).expanduser().exists()
+    """Return whether a folder does not exist or is empty."""
+    folder = Path(value).expanduser()
+    is_empty = folder.is_dir() and not any(folder.iterdir())
+    return value not in (BUILTIN, ORIGINAL) and (is_empty or not folder.exists())
 
 
 @cache

@@ -1,5 +1,6 @@
 """The scenes of an environment's task, with and without perturbations."""
 
+import os
 from dataclasses import dataclass
 from functools import partial
 
@@ -50,8 +51,11 @@ def open_scenes(task: Task | str, config: EnvConfig, num: int) -> TaskScenes:
         config: Configuration.
         num: Number of simulations.
     """
+    task = str(task) if isinstance(task, os.PathLike) else task
     if not isinstance(task, Task | str):
-        raise InvalidInputError(f"task is {shown(task)}; expected a Task, or a text such as libero_object/3")
+        raise InvalidInputError(
+            f"task is {shown(task)}; expected a Task, a path, or a text such as libero_object/3"
+        )
     base = get_task(task) if isinstance(task, str) else task
     require_available([base])
     changes = (*config.perturb, *published_changes(base))

@@ -14,6 +14,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import connection, get_context
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
@@ -26,7 +27,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from libero_env.errors import InvalidInputError, LiberoError, is_debugging
-from libero_env.parallel import end_with_parent
+from libero_env.parallel import end_with_parent, user_entries, with_entries
 
 _JOIN_TIMEOUT = 5.0  # [s] for a worker to end by itself
 _PIPE_TIMEOUT = 60.0  # [s] for a message that has begun to go on, in either direction
@@ -218,7 +219,8 @@ class Worker:
         self.pipe, other = context.Pipe()
         _limit_waiting(self.pipe)
         self.requests = 0
-        arguments = (other, CloudpickleWrapper(self.make), self.variables, self.host)
+        make = partial(with_entries, user_entries(), self.make)
+        arguments = (other, CloudpickleWrapper(make), self.variables, self.host)
         self.process = context.Process(target=serve, args=arguments, daemon=True)
         with contextlib.nullcontext() if self.run_main else _hidden_main():
             self.process.start()

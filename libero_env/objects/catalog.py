@@ -5,10 +5,12 @@ from collections.abc import Callable
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects import builtin, folder
 from libero_env.objects.model import ROOT_BODY, ObjectModel
+from libero_env.parallel import send_to_workers
 
 Builder = Callable[[], ObjectModel]
 
 _registered: dict[str, Builder] = {}
+send_to_workers(__name__, "_registered")
 
 
 def get_object(category: str) -> ObjectModel:
@@ -47,7 +49,7 @@ def user_defined_names() -> frozenset[str]:
 
 
 def register_object(category: str, builder: Builder) -> None:
-    """Add a category of objects for this process, or replace one of the builtin pack.
+    """Add or replace a category of objects, for this process and the workers that it starts later.
 
     Args:
         category: Name for task files: letters, digits and underscores.

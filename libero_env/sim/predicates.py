@@ -14,6 +14,7 @@ import numpy as np
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP, OPPOSITE_STATES, ObjectModel
+from libero_env.parallel import send_to_workers
 from libero_env.sim.scene import ROBOT, Scene, zone_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Region, declare_predicate
@@ -111,6 +112,10 @@ def on(view: StateView, entity: str, target: str) -> Any:
 
 def in_(view: StateView, entity: str, region: str) -> Any:
     """Return whether the origin of `entity` is in the box of a region, with or without contact."""
+    if view.is_entity(region):  # as in the original, where only the places in an object can contain
+        if not np.any(view.in_contact(entity, region)):
+            return False
+        raise LiberoError(f"(In {entity} {region}): {region} is an object or fixture, not a region of one")
     point = view.body_pos(entity)
     return np.any([contains(box, point) for box in region_boxes(view, region)], axis=0)
 
@@ -219,10 +224,11 @@ STRICT: dict[str, Predicate] = {**PREDICATES, "On": strict_on, "In": strict_in}
 """On and In with extent: the object is at rest, released, and in the frame of the region."""
 
 SEMANTICS: dict[str, dict[str, Predicate]] = {"original": PREDICATES, "strict": STRICT}
+send_to_workers(__name__, "PREDICATES", "STRICT")
 
 
 def register_predicate(name: str, predicate: Predicate) -> None:
-    """Add or replace a predicate, in both semantics, for this process.
+    """Add or replace a predicate, in both semantics, for this process and the workers that it starts later.
 
     Args:
         name: Name in task files; upper and lower case are the same.

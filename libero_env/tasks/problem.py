@@ -14,6 +14,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, Field
 
 from libero_env.errors import InvalidInputError
+from libero_env.parallel import send_to_workers
 from libero_env.text import suggest
 from libero_env.validation import checked
 
@@ -345,6 +346,8 @@ KINDS: dict[str, tuple[frozenset[str], ...]] = {
     "Incontact": (_SOLID, _SOLID),
     "Printjointstate": (_PLACE,),
 }
+OWN_NAMES = frozenset(KINDS) | {"True", "False"}  # of predicates that are not a user's
+send_to_workers(__name__, "KINDS")
 
 
 def declare_predicate(predicate: str, function: Callable[..., bool]) -> None:

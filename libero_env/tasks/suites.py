@@ -1,5 +1,6 @@
 """Suites and tasks by name, and from user-defined files: one task, several, or a suite of files."""
 
+import os
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -151,6 +152,8 @@ def get_task(key: str) -> Task:
     """
     if key.endswith(ENDINGS):
         return read_task(key)
+    if os.sep in key and Path(key).exists():
+        raise LiberoError(f"{key} is not a task file; give the path of a file that ends in .bddl or .yaml")
     if is_suite(key):
         last = len(get_suite(key)) - 1
         raise LiberoError(

@@ -10,7 +10,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from libero_env.errors import LiberoError
-from libero_env.parallel import end_with_parent
+from libero_env.parallel import end_with_parent, user_entries, with_entries
 from libero_env.text import printable
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.work.claims import Claim
@@ -253,11 +253,11 @@ class Workers:
             process.join(_PATIENCE)
 
     def _start(self) -> BaseProcess:
-        process = self._context.Process(target=_call, args=(self._function, self._argument))
+        process = self._context.Process(target=_call, args=(user_entries(), self._function, self._argument))
         process.start()
         return process
 
 
-def _call(function: Callable[[Any], None], argument: Any) -> None:
+def _call(entries: bytes, function: Callable[[Any], None], argument: Any) -> None:
     end_with_parent()
-    function(argument)
+    with_entries(entries, function, argument)

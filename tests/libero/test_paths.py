@@ -10,6 +10,7 @@ import pytest
 from libero._adapters import files
 from libero.libero import benchmark, get_default_path_dict, get_libero_path, set_libero_default_path
 from libero.libero.benchmark.libero_suite_task_map import libero_task_map
+from libero_env.assets.pack import chosen_assets, pack_of
 from libero_env.demos.curate import find_demo_files
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states.pickles import read_states, write_states
@@ -181,3 +182,33 @@ def test_a_cache_of_task_files_that_cannot_be_written_is_one_line(fresh_cache):
     fresh_cache.write_text("a file")
     with pytest.raises(LiberoError, match=r"cannot be written there \(Not a directory\); set LIBERO_CACHE"):
         get_libero_path("bddl_files")
+
+
+def test_folders_of_a_checkout_that_is_gone_lead_to_the_generated_files(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    monkeypatch.setattr("libero.libero._noted", set())
+    (tmp_path / "libero" / "assets").mkdir(parents=True)
+    keys = {"bddl_files": "libero/libero/bddl_files", "init_states": "libero/libero/init_files"}
+    paths = {key: str(tmp_path / "gone" / path) for key, path in keys.items()}
+    paths["assets"] = str(tmp_path / "libero" / "assets")
+    (tmp_path / "config.yaml").write_text("".join(f"{key}: {path}\n" for key, path in paths.items()))
+    for key in keys:
+        for _ in range(2):
+            assert any(Path(get_libero_path(key)).iterdir())
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["bddl_files", "init_states"]
+    assert chosen_assets().value == paths["assets"] and pack_of(chosen_assets()).name == "builtin"
+
+
+def test_a_suite_that_is_only_a_list_of_names(monkeypatch, tmp_path):
+    class Mine(benchmark.Benchmark):
+        name = "mine"
+
+    monkeypatch.setitem(libero_task_map, "mine", ["open_the_box"])
+    suite = Mine()
+    suite._make_benchmark()
+    assert suite.get_task_names() == ["open_the_box"] and suite.get_task(0).language == "open the box"
+    with pytest.raises(LiberoError, match=r"mine/open_the_box\.pruned_init: no such file"):
+        suite.get_task_init_states(0)
+    Mine.name = "other"
+    with pytest.raises(UnknownNameError, match=r"suite.*mine"):
+        Mine()._make_benchmark()

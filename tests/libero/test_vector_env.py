@@ -1,5 +1,8 @@
 """Vector environments in this process and in others."""
 
+from pathlib import Path
+import sys
+import subprocess
 import gymnasium
 import numpy as np
 import pytest
@@ -198,3 +201,88 @@ def test_shared_arrays_and_factories_can_be_pickled():
     other.close()
     array.close()
     assert pickle.loads(pickle.dumps(CloudpickleWrapper(lambda: 3))).data() == 3  # noqa: S301 - our own
+
+
+REGISTERED = """
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from libero.libero.envs import DummyVectorEnv, OffScreenRenderEnv, SubprocVectorEnv, TASK_MAPPING, register_problem
+from libero.libero.envs.base_object import OBJECTS_DICT, MujocoXMLObject
+from libero.libero.envs.predicates import VALIDATE_PREDICATE_FN_DICT, UnaryAtomic, update_predicate_fn_dict
+from libero_env import LiberoEnv, register_predicate
+from libero_env.envs.subproc import SubprocEnv
+from libero_env.parallel import run_each
+from libero_env.tasks import get_task
+
+folder = Path(sys.argv[1])
+
+@register_problem
+class Libero_Floor_Manipulation(TASK_MAPPING["libero_floor_manipulation"]):
+    def reward(self, action=None):
+        return 5.0
+
+class Upright(UnaryAtomic):
+    def __call__(self, state):
+        return state.env.timestep > 0
+
+class Can(MujocoXMLObject):
+    def __init__(self, name="can"):
+        super().__init__(folder / "can.xml", name)
+
+def atspeed(state, speed, word):
+    return state.env.timestep > 0 and (speed, word) == ("0.5", "slow")
+
+update_predicate_fn_dict("upright", Upright)
+VALIDATE_PREDICATE_FN_DICT["atspeed"] = atspeed
+OBJECTS_DICT["red_can"] = lambda name: Can(name)
+register_predicate("always", lambda view, name: view.scene.objects[name].category == "red_can")
+
+def write(name, goal):
+    text = get_task("libero_object/0").bddl_text.replace("milk_1 - milk", "milk_1 - red_can")
+    (folder / name).write_text(text[: text.index("(:goal")] + f"(:goal {goal})\n)")
+    return str(folder / name)
+
+GOAL = "(And (Upright milk_1) (Not (Not (Upright milk_1))) (Atspeed milk_1 0.5 slow))"
+make = lambda: OffScreenRenderEnv(bddl_file_name=write("own.bddl", GOAL), use_camera_obs=False)
+
+def category(name):
+    from libero_env.objects import get_object
+    return get_object(name).category
+
+if __name__ == "__main__":
+    (folder / "can.xml").write_text(
+        "<mujoco><worldbody><body><geom type='cylinder' size='.02 .03' mass='.1'/></body></worldbody></mujoco>"
+    )
+    for kind in (DummyVectorEnv, SubprocVectorEnv):
+        envs = kind([make])
+        envs.seed(0), envs.reset()
+        print(*envs.step(np.zeros((1, 7)))[1:3], envs.check_success())
+        envs.close()
+    task = write("always.bddl", "(Not (Always milk_1))")
+    envs = SubprocEnv([lambda: LiberoEnv(Path(task), cameras=())])
+    envs.reset(seed=0), envs.step(np.zeros((1, 7)))
+    print(envs.call("task")[0].name, dict(run_each(category, [("red_can",), ("milk",)], 2)))
+    envs.close()
+    VALIDATE_PREDICATE_FN_DICT["broken"] = lambda state, lock=__import__("threading").Lock(): True
+    SubprocVectorEnv([make])
+"""
+
+
+@pytest.mark.sim
+def test_what_a_script_registers_is_the_same_in_every_worker(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(REGISTERED)
+    root = str(Path(__file__).parents[2])
+    done = subprocess.run(
+        [sys.executable, str(script), str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": root},
+        capture_output=True,
+        text=True,
+    )
+    here, there, native = done.stdout.splitlines()[:3]
+    assert here == there == "[5.] [ True] [True]", done.stderr
+    assert native in ("always {0: 'red_can', 1: 'milk'}", "always {1: 'milk', 0: 'red_can'}")
+    assert "'Broken', which was added to PREDICATES, cannot be sent" in done.stderr.splitlines()[-1]

@@ -9,7 +9,7 @@ import numpy as np
 
 from libero._adapters.lookup import lookup
 from libero.libero import get_libero_path
-from libero_env.errors import UnknownNameError
+from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.store import load_init_states
 from libero_env.sim.scene import build_scene
@@ -95,7 +95,7 @@ class Benchmark:
         self.task_order_index = task_order_index
 
     def _make_benchmark(self) -> None:
-        tasks = list(_task_maps()[self.name].values())
+        tasks = self._entries()
         if self.name in suite_names():
             self.tasks = [_entry(task) for task in get_suite(self.name).order(self.task_order_index)]
         else:
@@ -103,6 +103,21 @@ class Benchmark:
             order = orders[self.task_order_index] if len(tasks) == 10 else range(len(tasks))
             self.tasks = [tasks[i] for i in order]
         self.n_tasks = len(self.tasks)
+
+    def _entries(self) -> list[Task]:
+        """Return the tasks of the suite: of `task_maps`, or named in `libero_task_map` as in the original."""
+        from libero.libero.benchmark.libero_suite_task_map import libero_task_map
+
+        if self.name in _task_maps():
+            return list(_task_maps()[self.name].values())
+        if self.name not in libero_task_map:
+            raise UnknownNameError("suite", self.name, {**_task_maps(), **libero_task_map})
+        names = libero_task_map[self.name]
+        files = [(f"{name}.bddl", f"{name}.pruned_init") for name in names]
+        return [
+            Task(name, grab_language_from_filename(name), "Libero", self.name, *pair)
+            for name, pair in zip(names, files, strict=True)
+        ]
 
     def get_num_tasks(self) -> int:
         """Return the number of tasks."""
@@ -149,6 +164,8 @@ class Benchmark:
         path = Path(get_libero_path("init_states"), task.problem_folder, task.init_states_file)
         if path.exists():
             return read_states(path)
+        if task.problem_folder not in suite_names():
+            raise LiberoError(f"{path}: no such file; it has the initial states of {task.name}")
         names = [other.name for other in get_suite(task.problem_folder).tasks]
         native = get_native_task(f"{task.problem_folder}/{names.index(task.name)}")
         return load_init_states(native, build_scene(native.problem))

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from operator import attrgetter
 from os import PathLike
 from pathlib import Path
@@ -18,7 +18,26 @@ from libero_env.objects.builtin import builtin_names
 from libero_env.objects.builtin.physics import Physics, load_physics
 from libero_env.sim.predicates import reaches_state
 
-OBJECTS_DICT: dict[str, Any] = {}
+
+class _Objects(dict):
+    """Classes, or functions of a name, by category; scenes are built from those of users."""
+
+    def __setitem__(self, category: str, made_by: Any) -> None:
+        super().__setitem__(category, made_by)
+        is_builtin = isinstance(made_by, type) and issubclass(made_by, BuiltinObject)
+        if not (is_builtin and category in builtin_names()):
+            register_model(category, partial(_model, made_by, category))
+
+    def update(self, *entries: Any, **more: Any) -> None:
+        for category, made_by in dict(*entries, **more).items():
+            self[category] = made_by
+
+
+def _model(made_by: Any, category: str) -> ObjectModel:
+    return model_of(made_by(name=category), category)
+
+
+OBJECTS_DICT: dict[str, Any] = _Objects()
 VISUAL_CHANGE_OBJECTS_DICT: dict[str, Any] = {}
 
 
@@ -32,8 +51,6 @@ def register_object(target_class: Any) -> Any:
     category = category_of(target_class.__name__)
     if hasattr(target_class, "_get_object_subtree"):
         accept_plain_files(target_class)
-    if not (issubclass(target_class, BuiltinObject) and category in builtin_names()):
-        register_model(category, lambda: model_of(target_class(name=category), category))
     OBJECTS_DICT[category] = target_class
     return target_class
 

@@ -2,6 +2,7 @@
 
 import os
 import warnings
+import weakref
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -41,6 +42,7 @@ from libero_env.sim.predicates import evaluate, glowing_sites
 from libero_env.sim.scene import DRAWINGS, FAITHFUL, build_scene, scene_spec
 from libero_env.sim.simulation import INTEGRATED
 from libero_env.sim.state import StateView
+from libero_env.tasks.problem import OWN_NAMES
 from libero_env.text import shown
 
 TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
@@ -198,6 +200,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.simulations = ClientSimulations(model, 1, self.scene.fixture_bodies.tolist())
         self.sim = MjSim(self.simulations, self.get_xml, faithful=self.drawing == FAITHFUL)
         self.view = StateView(self.scene, self.simulations, 0)
+        self.simulations.domain = weakref.ref(self)
         self._glowing: set[int] = set()
         self.sim.glowing = lambda: self._glowing
 
@@ -337,7 +340,9 @@ class BDDLBaseDomain(RobosuiteMethods):
         if state[0].lower() in ("and", "or", "not", "forall"):
             return evaluate(BDDLUtils.as_expression(list(state)), self.view)
         entities = self.object_states_dict
-        states = [lookup(entities, "object, fixture or region", name) for name in state[1:]]
+        is_own = state[0].capitalize() not in OWN_NAMES  # whose arguments may be numbers and words
+        kind, names = "object, fixture or region", state[1:]
+        states = [n if is_own and n not in entities else lookup(entities, kind, n) for n in names]
         return bool(eval_predicate_fn(state[0], *states))
 
     # Observations -------------------------------------------------------------------------------------------

@@ -33,7 +33,9 @@ def _instance(name: str, model: ObjectModel) -> BaseObject:
     if cls is None:  # a category that is registered only with `libero_env`
         cls = type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
         return cls(name=name, model=model)
-    is_builtin = issubclass(cls, BuiltinObject) and model.category in builtin_names()
+    is_builtin = (
+        isinstance(cls, type) and issubclass(cls, BuiltinObject) and model.category in builtin_names()
+    )
     return cls(name=name, model=model) if is_builtin else cls(name=name)
 
 

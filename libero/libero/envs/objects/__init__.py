@@ -19,6 +19,7 @@ from libero.libero.envs.base_object import (
     register_object,
     register_visual_change_object,
 )
+from libero_env.parallel import send_to_workers
 from libero_env.sim.predicates import Box, contains, is_over
 
 
@@ -146,6 +147,7 @@ class TargetZone(BuiltinObject):
         return bool(inside and self.size[2] - 0.005 < delta[2] < other_height)
 
 
+send_to_workers(__name__, "OBJECTS_DICT", "VISUAL_CHANGE_OBJECTS_DICT")
 alias_modules(
     __name__,
     "articulated_objects google_scanned_objects hope_objects "

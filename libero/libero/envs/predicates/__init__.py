@@ -2,11 +2,14 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 from libero._adapters.lookup import alias_modules, lookup
-from libero_env.sim.predicates import evaluate
-from libero_env.tasks.problem import Atom
+from libero_env.errors import LiberoError
+from libero_env.parallel import send_to_workers
+from libero_env.sim.predicates import PREDICATES, evaluate, register_predicate
+from libero_env.tasks.problem import OWN_NAMES, Atom
 
 
 class Expression(ABC):
@@ -93,9 +96,53 @@ for _name, (_bases, _answer, _doc) in _PREDICATES.items():
     globals()[_name] = type(_name, _bases, {"__module__": __name__, "__doc__": _doc, "answer": _answer})
 
 _CLASSES = ("TruePredicateFn", "FalsePredicateFn", *_PREDICATES, "PrintJointState")
-VALIDATE_PREDICATE_FN_DICT: dict[str, Callable[..., bool]] = {
-    name.removesuffix("PredicateFn").lower(): globals()[name]() for name in _CLASSES
-}
+
+
+class _OfStates:
+    """A user's predicate of object states as one of `libero_env`, of names; within itself it is the builtin one."""
+
+    def __init__(self, function: Callable[..., Any], builtin: Callable[..., Any] | None):
+        self.function, self.builtin, self.is_asked = function, builtin, False
+
+    def __call__(self, view: Any, *names: str) -> bool:
+        """Return whether it holds; arguments that are no names of entities or regions are passed as they are."""
+        if self.is_asked and self.builtin is not None:
+            return self.builtin(view, *names)
+        reference = getattr(view.simulations, "domain", None)
+        domain = reference and reference()
+        if domain is None:
+            raise LiberoError(
+                "predicates of object states are for environments of libero; use register_predicate"
+            )
+        self.is_asked = True
+        try:
+            return bool(self.function(*(domain.object_states_dict.get(name, name) for name in names)))
+        finally:
+            self.is_asked = False
+
+
+class _Predicates(dict):
+    """Predicates by name; those of users hold in goals too, so that all are in one table."""
+
+    def __setitem__(self, key: str, predicate: Callable[..., bool]) -> None:
+        super().__setitem__(key, predicate)
+        name = key.capitalize()
+        register_predicate(key, _OfStates(predicate, PREDICATES.get(name) if name in OWN_NAMES else None))
+
+    def update(self, *entries: Any, **more: Any) -> None:
+        for key, predicate in dict(*entries, **more).items():
+            self[key] = predicate
+
+    def setdefault(self, key: str, default: Any = None) -> Any:
+        if key not in self:
+            self[key] = default
+        return self[key]
+
+
+VALIDATE_PREDICATE_FN_DICT: dict[str, Callable[..., bool]] = _Predicates(
+    {name.removesuffix("PredicateFn").lower(): globals()[name]() for name in _CLASSES}
+)
+send_to_workers(__name__, "VALIDATE_PREDICATE_FN_DICT")
 
 
 def update_predicate_fn_dict(fn_key: str, fn_name: str | type | Callable[..., bool]) -> None:
@@ -119,7 +166,16 @@ def get_predicate_fn_dict() -> dict[str, Callable[..., bool]]:
 
 def get_predicate_fn(predicate_fn_name: str) -> Callable[..., bool]:
     """Return a predicate by its name, ignoring case; raise an UnknownNameError if there is none."""
+    if (
+        name := predicate_fn_name.lower()
+    ) not in VALIDATE_PREDICATE_FN_DICT and name.capitalize() in PREDICATES:
+        return partial(_native, name.capitalize())  # registered with libero_env
     return lookup(VALIDATE_PREDICATE_FN_DICT, "predicate", predicate_fn_name)
+
+
+def _native(predicate: str, *args: Any) -> bool:
+    names = tuple(getattr(arg, "object_name", arg) for arg in args)
+    return evaluate(Atom(predicate, names), next(arg for arg in args if hasattr(arg, "env")).env.view)
 
 
 def eval_predicate_fn(predicate_fn_name: str, *args: Any) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 from libero._adapters.lookup import alias_modules, lookup
 from libero_env.assets.arena import load_workspace
 from libero_env.errors import PlacementError, UnknownNameError
+from libero_env.parallel import send_to_workers
 
 Placements = dict[str, tuple[tuple[float, float, float], np.ndarray, Any]]
 _TRIES = 5000
@@ -261,4 +262,5 @@ def update_region_samplers(problem_name: str, region_sampler_name: str, region_s
     REGION_SAMPLERS.setdefault(problem_name, {})[region_sampler_name] = region_sampler
 
 
+send_to_workers(__name__, "REGION_SAMPLERS")
 alias_modules(__name__, "base_region_sampler workspace_region_sampler object_property_sampler")
