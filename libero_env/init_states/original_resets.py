@@ -19,7 +19,7 @@ from libero_env.geometry import quat_to_mat
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES, ObjectModel, rest_quat
 from libero_env.sim.scene import Scene
-from libero_env.tasks.problem import Atom, Region
+from libero_env.tasks.problem import BUILTIN_PREDICATES, Atom, Region
 
 _ARM_JOINTS = 7
 _MAX_TRIES = 5000  # of one object, as in the original
@@ -188,7 +188,9 @@ def _items(scene: Scene) -> list[_Item]:
     atoms = [
         atom
         for atom in scene.problem.init
-        if len(atom.args) == 2 and atom.predicate.lower() not in OPPOSITE_STATES
+        if len(atom.args) == 2
+        and atom.predicate in BUILTIN_PREDICATES
+        and atom.predicate.lower() not in OPPOSITE_STATES
     ]
     filled = {atom.args[1] for atom in atoms if atom.predicate != "On"}
     groups: list[list[_Item]] = [[], [], [], []]

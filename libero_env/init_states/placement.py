@@ -16,7 +16,7 @@ from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import ROBOT, InitialStates, Scene, fixture_pose, initial_qpos
 from libero_env.sim.simulation import LoopSimulations, Simulations
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom, Region
+from libero_env.tasks.problem import BUILTIN_PREDICATES, Atom, Region
 
 ARM_NOISE = 0.02  # [rad] standard deviation of the arm's joints around the rest pose, as in the original
 _CLEARANCE = 0.001  # [m] above the surface
@@ -132,7 +132,11 @@ class Place:
 
 def _places(scene: Scene) -> Mapping[str, Place]:
     """Return the place of each object, by name; carriers of other objects come first."""
-    atoms = [a for a in scene.problem.init if a.args[0] in scene.objects and len(a.args) == 2]
+    atoms = [
+        a
+        for a in scene.problem.init
+        if a.args[0] in scene.objects and len(a.args) == 2 and a.predicate in BUILTIN_PREDICATES
+    ]
     places = {atom.args[0]: _place_of(scene, atom) for atom in atoms}
     if missing := set(scene.objects) - set(places):
         raise PlacementError(f"no init atom places {', '.join(sorted(missing))}; add (On object region)")

@@ -7,14 +7,16 @@ arithmetic with `pi`; nothing in a file is ever executed.
 """
 
 import re
+import warnings
 from collections.abc import Iterable, Mapping
+from difflib import get_close_matches
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NoReturn
 
 from libero_env.errors import BDDLError, InvalidInputError
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, ProblemError, Region
-from libero_env.tasks.sexpr import MAX_CHARACTERS, List, Word, fail, number, parse_tree, show
+from libero_env.tasks.sexpr import MAX_CHARACTERS, List, Word, fail, number, parse_tree, show, text_of
 
 SECTIONS = (
     ":domain",
@@ -46,10 +48,14 @@ def parse(text: str, file: str = "<string>") -> Problem:
     """
     reader = Reader(file)
     try:
-        return reader.problem(parse_tree(text, file))
+        problem = reader.problem(parse_tree(text, file))
     except ProblemError as error:
         first = error.violations[0]
         reader.fail(reader.line(first.section, first.part), first.what, first.expected)
+    for section in problem.unknown_sections:
+        head = section[1:].split(maxsplit=1)[0].rstrip(")")
+        warnings.warn(f"{file}: the section {head} is unknown and has no effect", stacklevel=2)
+    return problem
 
 
 def read(path: str | Path) -> Problem:
@@ -113,6 +119,7 @@ def write(problem: Problem) -> str:
     sections += [
         _block(":init", map(str, problem.init)),
         _block(":goal", [str(problem.goal)]),
+        *(f"  {text}" for text in problem.unknown_sections),
     ]
     return f"(define (problem {problem.name})\n" + "\n".join(sections) + "\n)\n"
 
@@ -150,6 +157,7 @@ class Reader:
         regions: Address of a region -> line.
         init: Line of each init atom.
         goal: Line of each atom of the goal, in reading order.
+        unknown: Sections that are kept as texts, for readers of their own.
     """
 
     def __init__(self, file: str):
@@ -159,6 +167,7 @@ class Reader:
         self.regions: dict[str, int] = {}
         self.init: list[int] = []
         self.goal: list[int] = []
+        self.unknown: list[str] = []
 
     def line(self, section: str, part: int | str | None = None) -> int:
         """Return the line of a part of a section; see `libero_env.tasks.problem.Violation`."""
@@ -188,7 +197,12 @@ class Reader:
             section = part if isinstance(part, List) else List((), part.line)
             head, line = section.head, section.line
             if head not in SECTIONS:
-                self.fail(line, f"unknown section {head or show(part)!r}", f"one of {', '.join(SECTIONS)}")
+                if not head.startswith(":") or get_close_matches(head, SECTIONS, cutoff=0.66):
+                    self.fail(
+                        line, f"unknown section {head or show(part)!r}", f"one of {', '.join(SECTIONS)}"
+                    )
+                self.unknown.append(text_of(part))
+                continue
             if head in sections:
                 self.fail(line, f"a second {head}", f"one (the first is on line {self.sections[head]})")
             sections[head], self.sections[head] = section, line
@@ -221,6 +235,7 @@ class Reader:
             "obj_of_interest": tuple(map(self.word, items.get(":obj_of_interest", ()))),
             "scene_properties": dict(map(self.scene_property, items.get(":scene_properties", ()))),
             "init": init,
+            "unknown_sections": tuple(self.unknown),
             "goal": self.expression(items[":goal"][0]),
         }
 

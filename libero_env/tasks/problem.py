@@ -28,6 +28,7 @@ WORKSPACES = ("table", "kitchen_table", "living_room_table", "study_table", "cof
 """Categories of the fixtures that a task takes place on, see `libero_env.assets.arena`."""
 
 _NAME = re.compile(rf"\w[\w.-]{{0,{MAX_NAME - 1}}}")
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 _NAME_RULE = f"letters, digits, _ . and -, at most {MAX_NAME} characters"
 _UNWRITABLE = re.compile("[();\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 _RESERVED = ("robot", "world", "ee")  # the robot in contacts, MuJoCo's root, the hand in observations
@@ -251,6 +252,7 @@ class Problem:
         obj_of_interest: Names of the objects that the task is about.
         scene_properties: Kind (`floor`, `wall`, `scene`) -> style.
         domain: Name of the planning domain.
+        unknown_sections: Texts of sections that only a reader of one's own knows, such as `(:camera ...)`.
 
     Raises:
         ProblemError: No scene can be built from it.
@@ -267,6 +269,7 @@ class Problem:
     obj_of_interest: tuple[Name, ...] = ()
     scene_properties: Mapping[Name, Words] = field(default_factory=dict, hash=False)
     domain: Words = "robosuite"
+    unknown_sections: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if violations := tuple(_violations(self)):
@@ -346,7 +349,7 @@ KINDS: dict[str, tuple[frozenset[str], ...]] = {
     "Incontact": (_SOLID, _SOLID),
     "Printjointstate": (_PLACE,),
 }
-OWN_NAMES = frozenset(KINDS) | {"True", "False"}  # of predicates that are not a user's
+BUILTIN_PREDICATES = frozenset(KINDS) | {"True", "False"}
 send_to_workers(__name__, "KINDS")
 
 
@@ -421,16 +424,21 @@ def _atom(
 ) -> Iterator[tuple[str, str, str]]:
     """Check number and kinds of the arguments of an atom; what is yielded is as of `_region`."""
     kinds, count = KINDS.get(atom.predicate), len(atom.args)
+    is_own = atom.predicate not in BUILTIN_PREDICATES  # a user's predicate takes numbers and words too
     if kinds is not None and count != len(kinds):
         yield "arity", f" has {_names(count)}", f"{len(kinds)}: {atom.predicate} takes {_names(len(kinds))}"
         return
     for i, name in enumerate(atom.args):
         kind = "object" if name in bound else problem.kind_of(name)
         if kind is None:
+            if is_own and _NUMBER.fullmatch(name):
+                continue
             declared = sorted(
                 {*problem.fixtures, *problem.objects, *(r.address for r in problem.regions), *bound}
             )
             near = suggest(name, declared)
+            if is_own and not near and _NAME.fullmatch(name):
+                continue  # a word
             valid = f"one of {', '.join(declared)}" if declared else "a declared name"
             yield "unknown-name", f": {name} is not declared{near and '.'}{near}", valid
         elif kinds is not None and kind not in kinds[i]:

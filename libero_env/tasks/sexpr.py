@@ -43,11 +43,12 @@ def fail(file: str, line: int, what: str, expected: str) -> NoReturn:
 
 def show(node: Word | List) -> str:
     """Return a node as text on one line, truncated where it is long."""
-    return shorten(_text(node))
+    return shorten(text_of(node))
 
 
-def _text(node: Word | List) -> str:
-    return node.text if isinstance(node, Word) else f"({' '.join(map(_text, node.items))})"
+def text_of(node: Word | List) -> str:
+    """Return a node as text on one line."""
+    return node.text if isinstance(node, Word) else f"({' '.join(map(text_of, node.items))})"
 
 
 def parse_tree(text: str, file: str, first: int = 1) -> List:

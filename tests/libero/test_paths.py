@@ -186,6 +186,7 @@ def test_a_cache_of_task_files_that_cannot_be_written_is_one_line(fresh_cache):
 
 def test_folders_of_a_checkout_that_is_gone_lead_to_the_generated_files(tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    monkeypatch.delenv("LIBERO_ASSETS", raising=False)
     monkeypatch.setattr("libero.libero._noted", set())
     (tmp_path / "libero" / "assets").mkdir(parents=True)
     keys = {"bddl_files": "libero/libero/bddl_files", "init_states": "libero/libero/init_files"}

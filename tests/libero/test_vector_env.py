@@ -1,8 +1,10 @@
 """Vector environments in this process and in others."""
 
-from pathlib import Path
-import sys
+import os
 import subprocess
+import sys
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -242,7 +244,7 @@ register_predicate("always", lambda view, name: view.scene.objects[name].categor
 
 def write(name, goal):
     text = get_task("libero_object/0").bddl_text.replace("milk_1 - milk", "milk_1 - red_can")
-    (folder / name).write_text(text[: text.index("(:goal")] + f"(:goal {goal})\n)")
+    (folder / name).write_text(text[: text.index("(:goal")] + f"(:goal {goal}))")
     return str(folder / name)
 
 GOAL = "(And (Upright milk_1) (Not (Not (Upright milk_1))) (Atspeed milk_1 0.5 slow))"

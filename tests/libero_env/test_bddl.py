@@ -7,7 +7,7 @@ import pickle
 import pytest
 
 from libero_env.errors import BDDLError
-from libero_env.tasks import bddl
+from libero_env.tasks import bddl, get_task
 from libero_env.tasks.problem import And, Atom, ForAll, Not, Or, Problem, Region, differences, same_meaning
 from libero_env.tasks.sexpr import number
 from tests.libero_env.compare_bddl import all_tasks
@@ -196,3 +196,17 @@ def test_order_without_meaning_does_not_count():
         problem, init=problem.init[::-1], regions=problem.regions[::-1], goal=And(parts[::-1])
     )
     assert same_meaning(problem, turned)
+
+
+def test_sections_and_words_of_others_are_kept():
+    text = get_task("libero_object/0").bddl_text
+    goal = "(:goal (And (Open_ratio milk_1 0.5) (Not (At_speed milk_1 -1e-2 steady))))"
+    own = text[: text.index("(:goal")] + f"(:camera (agentview 1 2)) {goal})"
+    with pytest.warns(UserWarning, match="the section :camera is unknown and has no effect"):
+        problem = bddl.parse(own)
+    assert problem.unknown_sections == ("(:camera (agentview 1 2))",)
+    assert [atom.args for atom in problem.goal.atoms()] == [("milk_1", "0.5"), ("milk_1", "-1e-2", "steady")]
+    with pytest.warns(UserWarning, match="camera"):
+        assert bddl.parse(bddl.write(problem)) == problem
+    with pytest.raises(BDDLError, match="milk_3 is not declared. Did you mean 'milk_1'"):
+        bddl.parse(text[: text.index("(:goal")] + "(:goal (Open_ratio milk_3 0.5)))")

@@ -42,7 +42,7 @@ from libero_env.sim.predicates import evaluate, glowing_sites
 from libero_env.sim.scene import DRAWINGS, FAITHFUL, build_scene, scene_spec
 from libero_env.sim.simulation import INTEGRATED
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import OWN_NAMES
+from libero_env.tasks.problem import BUILTIN_PREDICATES
 from libero_env.text import shown
 
 TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
@@ -340,7 +340,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         if state[0].lower() in ("and", "or", "not", "forall"):
             return evaluate(BDDLUtils.as_expression(list(state)), self.view)
         entities = self.object_states_dict
-        is_own = state[0].capitalize() not in OWN_NAMES  # whose arguments may be numbers and words
+        is_own = state[0].capitalize() not in BUILTIN_PREDICATES  # whose arguments may be numbers and words
         kind, names = "object, fixture or region", state[1:]
         states = [n if is_own and n not in entities else lookup(entities, kind, n) for n in names]
         return bool(eval_predicate_fn(state[0], *states))

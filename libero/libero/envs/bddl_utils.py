@@ -93,7 +93,7 @@ def as_expression(state: list[Any]) -> Expression:
         return Not(as_expression(state[1]))
     if head == "forall":
         return ForAll(tuple((name, category) for name, category in state[1]), as_expression(state[2]))
-    return Atom(head.capitalize(), tuple(state[1:]))
+    return Atom(head.capitalize(), tuple(map(str, state[1:])))
 
 
 def _by_category(names: Mapping[str, str]) -> dict[str, list[str]]:

@@ -148,7 +148,7 @@ def region_module(
 
 def get_init_state(init_states: Iterable[Sequence[str]]) -> tuple[Atom, ...]:
     """Return the initial conditions of tuples such as `("On", "plate_1", "kitchen_table_plate_init_region")`."""
-    return tuple(Atom(predicate.capitalize(), tuple(args)) for predicate, *args in init_states)
+    return tuple(Atom(predicate.capitalize(), tuple(map(str, args))) for predicate, *args in init_states)
 
 
 def get_goal_state(goal_states: Sequence[Any]) -> Expression:

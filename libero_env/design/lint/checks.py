@@ -82,6 +82,8 @@ def lint_text(
     if task is None:
         name = Path(file).stem
         task = Task(FILE, 0, name, language_from_name(name), problem.language, problem)
+    for section in problem.unknown_sections:
+        report.add("warning", 1, "unknown-section", f"the section {section:.40} has no effect", "remove it")
     _check_categories(report, problem, pack)
     _check_atoms(report, problem)
     _check_regions(report, problem)

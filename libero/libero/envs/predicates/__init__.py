@@ -9,7 +9,7 @@ from libero._adapters.lookup import alias_modules, lookup
 from libero_env.errors import LiberoError
 from libero_env.parallel import send_to_workers
 from libero_env.sim.predicates import PREDICATES, evaluate, register_predicate
-from libero_env.tasks.problem import OWN_NAMES, Atom
+from libero_env.tasks.problem import BUILTIN_PREDICATES, Atom
 
 
 class Expression(ABC):
@@ -127,7 +127,9 @@ class _Predicates(dict):
     def __setitem__(self, key: str, predicate: Callable[..., bool]) -> None:
         super().__setitem__(key, predicate)
         name = key.capitalize()
-        register_predicate(key, _OfStates(predicate, PREDICATES.get(name) if name in OWN_NAMES else None))
+        register_predicate(
+            key, _OfStates(predicate, PREDICATES.get(name) if name in BUILTIN_PREDICATES else None)
+        )
 
     def update(self, *entries: Any, **more: Any) -> None:
         for key, predicate in dict(*entries, **more).items():
