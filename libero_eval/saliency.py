@@ -24,6 +24,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
+from libero_env.storage import atomic_path, atomic_write_text
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import PolicyActor, observe
 from lifelong.evaluation.environments import Obs
@@ -290,10 +291,11 @@ def draw_saliency(
     folder = run.path / "saliency"
     folder.mkdir(exist_ok=True)
     path = folder / f"task_{task:02d}_after_{run.learned:02d}.png"
-    Image.fromarray(contact_sheet(pictures, heats, enlarge)).save(path)
+    with atomic_path(path) as part:
+        Image.fromarray(contact_sheet(pictures, heats, enlarge)).save(part, "PNG")
     outcome = "success" if success else "failure"
     caption = f"{run.learned_task(task).language}: {outcome}, after learning {run.learned + 1} tasks"
-    path.with_suffix(".txt").write_text(f"{caption}; steps {', '.join(map(str, steps))}\n", encoding="utf-8")
+    atomic_write_text(path.with_suffix(".txt"), f"{caption}; steps {', '.join(map(str, steps))}\n")
     return path
 
 

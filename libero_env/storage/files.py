@@ -4,6 +4,7 @@ import json
 import os
 import secrets
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.text import to_json
 
+MAX_JSON_BYTES = 1 << 30
 PART_SUFFIX = ".part"  # of files and folders that are not yet complete
 
 
@@ -73,11 +75,37 @@ def read_json(path: Path, error: type[LiberoError] = InvalidInputError) -> Any:
         LiberoError: The file cannot be read, or is not JSON, in one line; of the type `error`.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(read_bounded(path, MAX_JSON_BYTES))
     except OSError as failure:
         raise error(f"{path}: {failure.strerror or failure}") from failure
     except (ValueError, RecursionError) as failure:
         raise error(f"{path} is not JSON ({failure}): it is broken or incomplete") from None
+
+
+def read_bounded(path: Path, most: int, *, within: Path | None = None) -> bytes:
+    """Return the content of a file that may be somebody else's.
+
+    Args:
+        path: File to read.
+        most: Largest size, [bytes].
+        within: Folder that a link must not lead out of; None for any.
+
+    Raises:
+        OSError: It cannot be read, is a folder, a pipe or a device, is too large, or lies outside of the folder.
+    """
+    if within is not None and not path.resolve().is_relative_to(within.resolve()):
+        raise OSError(f"it is a link that leads out of {within}")
+    with open(path, "rb", opener=_open_without_waiting) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError("it is a folder, a pipe or a device; expected a file")
+        if status.st_size > most:
+            raise OSError(f"it is larger than {most >> 20} MiB")
+        return file.read(most)
+
+
+def _open_without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def create_text(target: Path, text: str) -> bool:

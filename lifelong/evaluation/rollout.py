@@ -14,6 +14,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from libero_env.errors import SimulationError
+from libero_env.storage import atomic_path
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, PolicyActor, TakesNote
 from lifelong.evaluation.environments import Obs, VectorEnv
@@ -215,11 +216,10 @@ def save_animation(frames: Sequence[np.ndarray], path: Path, *, seconds_per_fram
         path: File to write; its folder is created.
         seconds_per_frame: Duration of each frame, [s].
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
     first, *rest = [Image.fromarray(frame) for frame in frames]
-    first.save(
-        path, save_all=True, append_images=rest, duration=round(1000 * seconds_per_frame), loop=0, quality=70
-    )
+    duration = round(1000 * seconds_per_frame)
+    with atomic_path(path) as part:
+        first.save(part, "WEBP", save_all=True, append_images=rest, duration=duration, loop=0, quality=70)
 
 
 class EpisodeTracker:

@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from libero_env.storage import atomic_path
 from lifelong.stats.intervals import mean_and_standard_error, wilson_interval
 from lifelong.stats.metrics import Curve
 
@@ -131,13 +132,15 @@ def learning_figure(
     curves: Mapping[int, Curve],
     losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float64]]],
     labels: Sequence[str],
+    kept: Mapping[int, int],
 ) -> Figure:
-    """Draw for each task its success (with Wilson's 95 % band, best epoch circled) above its training loss.
+    """Draw for each task its success (with Wilson's 95 % band, the kept epoch circled) above its training loss.
 
     Args:
         curves: Learning curve of each task.
         losses: Epochs and mean training losses of each task.
         labels: K short task names.
+        kept: Epoch whose weights are kept, of each task that is learned.
     """
     tasks = sorted(curves.keys() | losses.keys())
     columns = min(5, len(tasks))
@@ -156,7 +159,7 @@ def learning_figure(
             boxes = [(x / width, y / height, panel / width, h / height) for y, h in bottoms]
             above, below = (figure.add_axes(box) for box in boxes)
             above.set_title(f"{task + 1}  {shorten(labels[task], 24)}", loc="left", fontsize=8.5)
-            _draw_curve(above, curves.get(task))
+            _draw_curve(above, curves.get(task), kept.get(task))
             if task in losses:
                 marker = "o" if len(losses[task][0]) < 4 else None
                 below.plot(*losses[task], color=LINE_COLOURS[1], lw=1.2, marker=marker, ms=2.6)
@@ -234,9 +237,9 @@ def save(figure: Figure, stem: Path) -> None:
     with matplotlib.rc_context(STYLE), _any_script():
         FigureCanvasAgg(figure)
         for suffix, options in ((".png", {"dpi": 300}), (".pdf", {"metadata": {"CreationDate": None}})):
-            figure.savefig(
-                stem.with_suffix(suffix), facecolor="white", bbox_inches="tight", pad_inches=0.05, **options
-            )
+            with atomic_path(stem.with_suffix(suffix)) as part:
+                form = {"format": suffix[1:], "bbox_inches": "tight", "pad_inches": 0.05, **options}
+                figure.savefig(part, facecolor="white", **form)
 
 
 @contextmanager
@@ -305,7 +308,7 @@ def _name_rows(axes: Axes, labels: Sequence[str]) -> None:
         axes.annotate(str(task + 1), (0, task), (-4, 0), rows, "offset points", ha="right", va="center")
 
 
-def _draw_curve(axes: Axes, curve: Curve | None) -> None:
+def _draw_curve(axes: Axes, curve: Curve | None, kept: int | None) -> None:
     axes.set_ylim(0, 100)
     axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
     if curve is None or len(curve.rates) == 0:
@@ -314,8 +317,10 @@ def _draw_curve(axes: Axes, curve: Curve | None) -> None:
     colour = LINE_COLOURS[0]
     axes.fill_between(curve.epochs, 100 * low, 100 * high, color=colour, alpha=0.16, lw=0)
     axes.plot(curve.epochs, 100 * curve.rates, color=colour, lw=1.4, marker="o", ms=2.6, clip_on=False)
-    best = (curve.epochs[curve.best], 100 * curve.rates[curve.best])
-    axes.plot(*best, "o", ms=6.5, mfc="none", mec=INK, mew=0.9, clip_on=False)
+    ring = curve.epochs == kept
+    axes.plot(
+        curve.epochs[ring], 100 * curve.rates[ring], "o", ms=6.5, mfc="none", mec=INK, mew=0.9, clip_on=False
+    )
 
 
 def _set_epoch_axis(axes: Axes, last: int, labelbottom: bool) -> None:

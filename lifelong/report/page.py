@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.storage import atomic_write_text
+from libero_env.storage import atomic_write_text, read_bounded
 from libero_env.text import duration
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import MUJOCO, Plan, compare, findings, write_comparison
@@ -39,7 +39,7 @@ from lifelong.results.relearning import by_measure, read_relearning, savings_hea
 from lifelong.results.shifts import shift_scores
 from lifelong.results.summary import write_episodes
 from lifelong.stats.methods import MARGIN
-from lifelong.stats.metrics import METRIC_NAMES, Metrics, average_success, metric_values
+from lifelong.stats.metrics import METRIC_NAMES, Curve, Metrics, average_success, metric_values
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -132,7 +132,7 @@ def _default_folder(paths: Sequence[Path]) -> Path:
         return paths[0]
     folder = Path.cwd() / "comparison"
     folder.mkdir(exist_ok=True)
-    (folder / ".gitignore").write_text("*\n", encoding="utf-8")
+    atomic_write_text(folder / ".gitignore", "*\n")
     return folder
 
 
@@ -152,12 +152,11 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "metrics": _metric_rows(run.metrics),
         "later_metrics": _metric_rows(run.results.after_base_stage()),
         "base_tasks": _base_tasks(record),
-        "transfer": TRANSFER_TEXTS[run.results.transfer],
+        "transfer": " ".join([TRANSFER_TEXTS[run.results.transfer], *_points(curves)]),
         "published": _published(run),
-        "ring": run.results.transfer != "plain",
         "bar_low": min(0.0, run.metrics.nbt.value) if run.metrics else 0.0,
         "heatmaps": [run_heatmap(run.results, labels)],
-        "learning": as_svg(learning_figure(curves, losses, labels)) if curves or losses else None,
+        "learning": as_svg(learning_figure(curves, losses, labels, _kept(run))) if curves or losses else None,
         "forgetting": as_svg(forgetting_figure([Line("", average)])) if run.learned > 1 else None,
         "tasks": _task_rows(run, rates),
         "times": [(name, duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
@@ -184,6 +183,8 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
     groups = group_runs(runs)
     found = compare(groups, plan)
     later = found["after_base_stage"]
+    for group in found["groups"].values():  # a page that is sent says nothing of this machine
+        group["runs"] = [os.path.relpath(path, folder) for path in group["runs"]]
     write_comparison(found, folder / "comparison.json")
     write_episodes(folder / "episodes.csv.gz", [(g.label, run.results) for g in groups for run in g.runs])
     panels, heatmaps, lines = zip(*map(_success_of, groups), strict=True)
@@ -238,6 +239,23 @@ def _success_of(group: Group) -> tuple[Panel, dict[str, Any], Line]:
         row[: run.learned] = average_success(rates[: run.learned, : run.learned])
     titled = table | {"title": group.label, "seeds": [run.record.seed for run in runs]}
     return Panel(group.label, mean, labels), titled, Line(group.label, values)
+
+
+def _points(curves: Mapping[int, Curve]) -> list[str]:
+    """Return a sentence about the points of the learning curves, of which FWT is the mean; none without any."""
+    counts = {int(n) for curve in curves.values() for n in curve.episodes}
+    epochs = sorted({int(e) for curve in curves.values() for e in curve.epochs})
+    if not epochs:
+        return []
+    shown = ", ".join(map(str, epochs if len(epochs) < 8 else [*epochs[:3], "…", epochs[-1]]))
+    starts = f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
+    return [f"The points of a learning curve are epochs {shown}, of {starts} starts each."]
+
+
+def _kept(run: Run) -> dict[int, int]:
+    """Return the epoch whose weights are kept of each task that is learned."""
+    ends = {t: run.results.task_end(run.results.last_of_group(t)) for t in range(len(run.record.tasks))}
+    return {task: end.best_epoch for task, end in ends.items() if end is not None}
 
 
 def _facts(run: Run) -> list[tuple[str, Any]]:
@@ -321,7 +339,7 @@ def _run_row(run: Run, label: str, folder: Path) -> dict[str, Any]:
         "metrics": run.metrics,
         "learned": f"{run.learned} of {len(run.record.tasks)}",
         "time": duration(sum(run.results.seconds_by_phase().values())),
-        "path": str(run.path),
+        "path": os.path.relpath(run.path, folder),
         "link": os.path.relpath(page, folder) if page.is_file() else None,
     }
 
@@ -356,13 +374,16 @@ def _media(folder: Path) -> dict[str, Any]:
         kind = MEDIA_TYPES.get(path.suffix.lower())
         if kind is None:
             continue
-        used += path.stat().st_size
-        if used > MEDIA_LIMIT:
-            left_out.append(path.name)
+        note, caption = path.with_suffix(".txt"), path.stem.replace("_", " ")
+        try:  # a run may be somebody else's, and its page is passed on
+            content = read_bounded(path, MEDIA_LIMIT - used, within=folder.parent)
+            if os.path.lexists(note):
+                caption = read_bounded(note, 1 << 20, within=folder.parent).decode(errors="replace").strip()
+        except OSError as error:
+            left_out.append(f"{path.name} ({error})")
             continue
-        note = path.with_suffix(".txt")
-        caption = note.read_text(encoding="utf-8").strip() if note.is_file() else path.stem.replace("_", " ")
-        data = base64.b64encode(path.read_bytes()).decode()
+        used += len(content)
+        data = base64.b64encode(content).decode()
         items.append(
             {"url": f"data:{kind};base64,{data}", "video": kind.startswith("video"), "caption": caption}
         )

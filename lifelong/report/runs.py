@@ -9,6 +9,7 @@ from typing import Any
 
 import yaml
 
+from libero_env.storage import MAX_YAML_BYTES, read_bounded
 from libero_env.text import flatten
 from lifelong.errors import LifelongError, ResultsError
 from lifelong.results.log import ResultLog
@@ -19,7 +20,14 @@ from lifelong.stats.metrics import Metrics, lifelong_metrics
 
 _BASICS = ("algo", "benchmark", "policy", "preset")
 # of keys that change no result
-_IGNORED = ("benchmark.order", "data.memory", "eval.reuse", "eval.transfer", "eval.shift")
+_IGNORED = (
+    "benchmark.order",
+    "language.cache_dir",
+    "data.memory",
+    "eval.reuse",
+    "eval.transfer",
+    "eval.shift",
+)
 # sections of the config
 _COMPARED = ("algo", "policy", "train", "data", "eval", "language", "benchmark", "stream", "pretrain")
 
@@ -182,7 +190,7 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
     settings: dict[str, Any] = {}
     for key, value in flatten({k: v for k, v in run.config.items() if k in _COMPARED}).items():
         section, _, name = key.rpartition(".")
-        if key in _IGNORED or name in ("_partial_", "seed", "dir", "path") or not section:
+        if key in _IGNORED or name == "_partial_" or not section:
             continue
         if name == "_target_":  # a component goes by the name of its class
             key, value = f"{section}.", str(value).rpartition(".")[2]
@@ -196,9 +204,11 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
 
 def _load_config(path: Path) -> tuple[dict[str, Any], str, list[str]]:
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_bounded(path, MAX_YAML_BYTES, within=path.parent).decode(errors="replace")
     except FileNotFoundError:
         return {}, "", [f"{path.name} is missing; the configuration is not shown."]
+    except OSError as error:
+        return {}, "", [f"{path.name} is not read: {error}; the configuration is not shown."]
     try:
         config = yaml.safe_load(text)
     except yaml.YAMLError as error:

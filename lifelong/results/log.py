@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
@@ -11,6 +12,7 @@ from lifelong.results.records import DemonstrationsRecord, Record, RunRecord, fr
 from lifelong.results.results import Results
 
 MAX_LINE = 4 << 20  # [bytes]
+MAX_FILE = 4 << 30  # [bytes]
 
 _Stamp = tuple[int, int, int]  # inode, size, time of the last change
 
@@ -42,7 +44,7 @@ class ResultLog:
         record, known = from_line(line), self._file_stamp() == self._stamp  # as another process would read it
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with open(self.path, "a+b", buffering=0) as file:
+            with open(self.path, "a+b", buffering=0, opener=_open_own) as file:
                 size, separator = _end_of_records(file)
                 known = known and not separator  # else what is before it is read again
                 try:
@@ -75,7 +77,7 @@ class ResultLog:
         problems: list[tuple[int, str]] = []
         lines: dict[bytes, int] = {}  # digest of each line -> its number
         try:
-            with open(self.path, "rb") as file:
+            with open(self.path, "rb", opener=_open_own) as file:
                 for number, line in _lines(file):
                     try:
                         record = from_line(_whole(line))
@@ -102,6 +104,16 @@ class ResultLog:
         except OSError as error:
             raise ResultsError(f"{self.path}: cannot be read ({error})") from error
         return found.st_ino, found.st_size, found.st_mtime_ns
+
+
+def _open_own(path: str, flags: int) -> int:
+    """Open the file of records, which may be in somebody else's folder: not through a link, nor a pipe or a device."""
+    file = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), 0o666)
+    status = os.fstat(file)
+    if stat.S_ISREG(status.st_mode) and status.st_size <= MAX_FILE:
+        return file
+    os.close(file)
+    raise OSError(f"it is a pipe or a device, or larger than {MAX_FILE >> 30} GiB")
 
 
 def _lines(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:

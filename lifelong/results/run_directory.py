@@ -209,6 +209,8 @@ def read_saved_config(path: str | Path) -> dict[str, Any]:
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Hold a file lock within the context; the system releases it whenever the process ends."""
+    if path.is_symlink():  # which would be emptied where it leads
+        raise ConfigError(f"{path} is a link; remove it")
     lock = FileLock(path)
     try:
         lock.acquire(timeout=0)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from libero_env.perturbations import format_perturbations
+from libero_env.storage import atomic_path, atomic_write_text
 from libero_env.timing import CONTROL_PERIOD
 from lifelong.context import RunContext
 from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
@@ -138,17 +139,18 @@ class Evaluator:
     def _copy_video(self, original: EvalRecord, learned: int) -> bool:
         """Copy the video of rollouts as that after learning another task; return whether there is one."""
         source, path = self._video(original.learned, original.task), self._video(learned, original.task)
-        if original.phase != "matrix" or not source.is_file():
+        if original.phase != "matrix" or source.is_symlink() or not source.is_file():
             return False
         if source != path:
-            shutil.copyfile(source, path)
+            with atomic_path(path) as part:
+                shutil.copyfile(source, part)
         self._write_caption(path, learned, original.task, original.successes[0])
         return True
 
     def _write_caption(self, path: Path, learned: int, task: int, success: bool) -> None:
         outcome = "success" if success else "failure"
         caption = f"{self._context.instructions[task]}: {outcome}, after learning {learned + 1} tasks"
-        path.with_suffix(".txt").write_text(caption + "\n", encoding="utf-8")
+        atomic_write_text(path.with_suffix(".txt"), caption + "\n")
 
 
 def digest(circumstances: Mapping[str, Any], acting: Policy) -> str:

@@ -17,7 +17,7 @@ from PIL import Image
 from libero_env.tasks import get_suite
 from libero_env.text import json_safe
 from lifelong.errors import LifelongError
-from lifelong.report.figures import Line, Panel, forgetting_figure, heatmap_figure
+from lifelong.report.figures import Line, Panel, forgetting_figure, heatmap_figure, learning_figure
 from lifelong.report.page import comparison_text, write_report
 from lifelong.report.runs import group_runs, load_run, short_labels
 from lifelong.results.log import ResultLog
@@ -34,7 +34,7 @@ from lifelong.results.records import (
 )
 from lifelong.results.summary import read_episodes, summarize
 from lifelong.stats.methods import MethodRun, statistics
-from lifelong.stats.metrics import METRIC_NAMES
+from lifelong.stats.metrics import METRIC_NAMES, Curve
 
 GROCERIES = [
     "alphabet soup",
@@ -322,7 +322,7 @@ def test_intervals_stay_where_the_metric_can_be(tmp_path: Path, monkeypatch):
                 few = {k: v[:2] for k, v in row.items() if k.startswith("atoms_")}
                 row |= {**few, "successes": [False] * 2, "lengths": [9, 9], "init_states": [0, 1]}
         rows = [{k: v for k, v in row.items() if k != "crc32"} for row in rows]
-        (folder / "results.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
+        (folder / "results.jsonl").write_bytes(b"".join(map(signed_line, rows)))
         runs.append(folder)
     page = write_report(runs, tmp_path / "out")
     found = json.loads((page.parent / "comparison.json").read_text())
@@ -412,7 +412,7 @@ def test_forgetting_by_task_and_by_subgoal(compared: tuple[Path, dict]):
     page, found = compared
     er = found["groups"]["er"]
     soup = "pick_up_the_alphabet_soup_and_place_it_in_the_basket"
-    runs = [load_run(Path(p)) for p in er["runs"]]
+    runs = [load_run(page.parent / p) for p in er["runs"]]
     places = [(r, r.record.tasks.index(soup)) for r in runs]
     drops = [r.metrics.nbt_by_task[k] for r, k in places if k < 2]
     assert er["forgetting_by_task"][soup]["mean"] == pytest.approx(np.mean(drops))
@@ -540,7 +540,7 @@ def test_media_above_the_limit_are_omitted_by_name(tmp_path: Path, monkeypatch: 
     (folder / "videos" / "a.txt").write_text("the first one")
     monkeypatch.setattr("lifelong.report.page.MEDIA_LIMIT", (folder / "videos" / "a.gif").stat().st_size)
     raw = write_report([folder]).read_text()
-    assert "the first one" in raw and "Omitted because of their size: b.gif" in raw
+    assert "the first one" in raw and "Omitted: b.gif (it is larger than" in raw
     assert base64.b64encode((folder / "videos" / "a.gif").read_bytes()).decode() in raw
 
 
@@ -591,3 +591,76 @@ def test_nothing_is_forgotten_in_a_sequence_of_one_task(tmp_path: Path):
     assert "nan" not in Page(page.read_text()).text.lower()
     (group,) = json.loads((page.parent / "comparison.json").read_text())["groups"].values()
     assert group["metrics"]["nbt"]["mean"] is None and group["metrics"]["final_success"]["mean"] is not None
+
+
+# --- runs of somebody else
+
+
+def test_a_report_follows_no_link_out_of_a_run_and_waits_for_no_pipe(tmp_path: Path):
+    run, secret, victim = make_run(tmp_path / "run", tasks=2), tmp_path / "secret", tmp_path / "victim"
+    secret.write_text("c2VjcmV0 private")
+    victim.write_text("precious")
+    for name in ("heatmap.png", "heatmap.pdf"):
+        (run / name).symlink_to(victim)
+    (run / "videos").mkdir(exist_ok=True)
+    (run / "videos" / "a.webp").symlink_to(secret)
+    os.mkfifo(run / "videos" / "b.webp")
+    (run / "config.yaml").unlink(missing_ok=True)
+    (run / "config.yaml").symlink_to(secret)
+    html = write_report([run]).read_text()
+    assert victim.read_text() == "precious" and not (run / "heatmap.png").is_symlink()
+    assert "private" not in html and base64.b64encode(secret.read_bytes()).decode() not in html
+    assert "a.webp (it is a link that leads out of" in html and "b.webp (it is a folder, a pipe" in html
+    (run / "config.yaml").unlink()
+    os.mkfifo(run / "config.yaml")
+    assert "config.yaml is not read" in write_report([run]).read_text()
+
+
+@pytest.mark.parametrize("place", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+def test_records_are_a_regular_file(place, tmp_path: Path):
+    path = tmp_path / "results.jsonl"
+    place(path)
+    log = ResultLog(path)
+    for use in (log.read, lambda: log.append(PhaseRecord(phase="demos", seconds=1.0))):
+        with pytest.raises(LifelongError, match=r"results\.jsonl"):
+            use()
+
+
+def test_records_are_not_appended_to_where_a_link_leads(tmp_path: Path):
+    victim = tmp_path / "victim"
+    victim.write_text("without a newline at its end")
+    (tmp_path / "results.jsonl").symlink_to(victim)
+    with pytest.raises(LifelongError):
+        ResultLog(tmp_path / "results.jsonl").append(PhaseRecord(phase="demos", seconds=1.0))
+    assert victim.read_text() == "without a newline at its end"
+
+
+@pytest.mark.parametrize(
+    "key", ["policy.temporal.drop_path", "stream.perturb_seed", "policy.path", "algo.dir"]
+)
+def test_runs_that_differ_in_any_setting_are_two_methods(key: str, tmp_path: Path):
+    section, _, name = key.rpartition(".")
+    runs = []
+    for value in (0.0, 0.1):
+        run = make_run(tmp_path / str(value), tasks=2)
+        node = {name: value}
+        for part in reversed(section.split(".")):
+            node = {part: node}
+        (run / "config.yaml").write_text(json.dumps(node))
+        runs.append(load_run(run))
+    assert len(group_runs(runs)) == 2
+    (tmp_path / "0.1" / "config.yaml").write_text(
+        (tmp_path / "0.0" / "config.yaml").read_text().replace("0.0", "0")
+    )
+    assert len(group_runs([load_run(run.path) for run in runs])) == 1, "0.0 and 0 are one value"
+
+
+def test_the_ring_is_the_kept_epoch_and_a_sent_page_names_no_folder_of_the_machine(tmp_path: Path):
+    curve = Curve(np.array([4, 8]), np.array([0.8, 0.2]), np.array([5, 5]))
+    axes = learning_figure({0: curve}, {}, ["a"], {0: 8}).axes[0]
+    (ring,) = [line for line in axes.lines if line.get_markerfacecolor() == "none"]
+    assert ring.get_xydata().tolist() == [[8, 20]]
+    runs = [make_run(tmp_path / str(seed), tasks=2, seed=seed) for seed in (1, 2)]
+    page = write_report(runs, tmp_path / "page")
+    for file in ("report.html", "comparison.json"):
+        assert str(tmp_path) not in (page.parent / file).read_text()
