@@ -36,6 +36,12 @@ def _number(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+def _square(value: Any) -> Any:
+    """Return one number as height and width."""
+    number = _number(value)
+    return (number, number) if isinstance(number, int) and not isinstance(number, bool) else _tuple(value)
+
+
 def _assets(value: Any) -> Any:
     if value is None or isinstance(value, str | Path) or hasattr(value, "add_arena"):
         return value
@@ -54,7 +60,7 @@ def _known(kind: str, names: Iterable[str]) -> AfterValidator:
 
 
 Pixels = Annotated[int, BeforeValidator(_number), Field(ge=1)]  # the renderer knows the largest size
-Size = Annotated[tuple[Pixels, Pixels], BeforeValidator(_tuple)]
+Size = Annotated[tuple[Pixels, Pixels], BeforeValidator(_square)]
 Names = Annotated[tuple[str, ...], BeforeValidator(_tuple)]
 Assets = Annotated[Pack | str | Path | None, PlainValidator(_assets)]
 Drawing = Annotated[str, _known("drawing", DRAWINGS)]
@@ -67,7 +73,7 @@ class EnvConfig:
 
     Attributes:
         cameras: Names of the cameras that are rendered for each observation; empty for none.
-        camera_size: Height and width of the images, pixels.
+        camera_size: Height and width of the images, pixels; one number is both.
         horizon: Number of steps after which an episode is truncated.
         observations: Names of observations, see `libero_env.sim.observations`.
         controller: Name of the controller, which defines the action, see `libero_env.sim.controller`.

@@ -67,8 +67,12 @@ class Ranks:
             device = torch.device(name)
         except (RuntimeError, ValueError) as error:
             raise ConfigError(f"device is {name!r}; valid: auto, cpu, cuda, cuda:<number>") from error
-        if device.type in ("cpu", "mps"):
+        if device.type == "cpu" or (device.type == "mps" and torch.backends.mps.is_available()):
             return device
+        if device.type == "mps":
+            raise ConfigError(
+                f"device={name}, but torch finds no Metal device; use device=auto or device=cpu"
+            )
         if device.type != "cuda":  # such as meta, which holds no values
             raise ConfigError(f"device is {name!r}; valid: auto, cpu, cuda, cuda:<number>")
         if not torch.cuda.is_available():

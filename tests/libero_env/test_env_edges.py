@@ -30,7 +30,7 @@ TASK = "libero_object/3"
 
 BAD_VALUES = {
     "horizon": (0, 1.5, True),
-    "camera_size": (128, (0, 1), (1, 2, 3)),
+    "camera_size": (0, True, "64", (0, 1), (1, 2, 3)),
     "cameras": ("agentview", [3]),
     "control_delta": (1,),
     "reward_scale": (float("nan"),),
@@ -51,6 +51,9 @@ def test_options_outside_of_their_bounds_are_named_with_their_value(name):
 def test_options_of_numpy_and_whole_floats_are_made_plain():
     config = EnvConfig(horizon=np.int64(5), camera_size=np.array([32, 48]), reward_scale=np.float32(0.5))
     assert (config.horizon, config.camera_size, config.reward_scale) == (5, (32, 48), 0.5)
+    assert all(
+        EnvConfig(camera_size=size).camera_size == (64, 64) for size in (64, 64.0, np.int64(64), [64, 64])
+    )
     assert EnvConfig(cameras=iter(["agentview"])).cameras == ("agentview",)
     assert type(EnvConfig(horizon=7.0).horizon) is int
 

@@ -96,6 +96,9 @@ def test_a_single_process_communicates_with_nobody():
 def test_invalid_devices_are_named(monkeypatch):
     with pytest.raises(ConfigError, match="valid: auto, cpu, cuda"):
         Ranks().device("tpu")
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(ConfigError, match="no Metal device"):
+        Ranks().device("mps")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert Ranks().device("auto") == torch.device("cpu")
     with pytest.raises(ConfigError, match="finds no GPU"):
