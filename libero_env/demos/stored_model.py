@@ -1,6 +1,7 @@
 """The scene as MJCF in demonstration files, and the poses of the fixtures in it."""
 
 from collections.abc import Mapping
+from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -33,7 +34,14 @@ def spec_without_textures(
         material.textures = [""] * len(list(material.textures))
     for texture in list(spec.textures):
         delete(spec, texture)
-    spec.compile()
+    try:
+        spec.compile()
+    except ValueError:  # before MuJoCo 3.4 some materials still ask for theirs
+        whole = scene_spec(problem, pack, drawing=drawing, robot=robot)
+        whole.compile()
+        spec = mujoco.MjSpec.from_string(_stripped(whole.to_xml()))
+        spec.assets = whole.assets
+        spec.compile()
     return spec
 
 
@@ -80,7 +88,8 @@ def _copy_texture(spec: mujoco.MjSpec, texture: mujoco.MjsTexture) -> None:
     copied = spec.add_texture(name=texture.name)
     for field in _TEXTURE_FIELDS:
         if hasattr(texture, field):  # MuJoCo 3.3 has no colour space of the scene's textures to keep
-            setattr(copied, field, getattr(texture, field))
+            value = getattr(texture, field)
+            setattr(copied, field, bytes(value) if field == "data" else value)
 
 
 def model_xml(spec: mujoco.MjSpec, poses: Mapping[str, np.ndarray]) -> str:
@@ -89,6 +98,19 @@ def model_xml(spec: mujoco.MjSpec, poses: Mapping[str, np.ndarray]) -> str:
         body = spec.body(f"{name}_{ROOT_BODY}")
         body.pos, body.quat = pose[:3], pose[3:]
     return spec.to_xml()
+
+
+def _stripped(xml: str) -> str:
+    """Return MJCF without textures."""
+    root = ElementTree.fromstring(xml)  # noqa: S314 - our own
+    for assets in root.iter("asset"):
+        for texture in assets.findall("texture"):
+            assets.remove(texture)
+        for material in assets.findall("material"):
+            material.attrib.pop("texture", None)
+            for layer in material.findall("layer"):
+                material.remove(layer)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 def read_fixture_poses(xml: str, scene: Scene, where: str = "the stored model") -> dict[str, np.ndarray]:

@@ -13,9 +13,12 @@ from libero_env.assets.original_arena import TEXTURES
 from libero_env.assets.pack import BuiltinPack, problems
 from libero_env.assets.published import check_folder
 from libero_env.assets.simplify import decimate, nearest
+from libero_env.demos.stored_model import compile_stored, model_xml, spec_without_textures
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects import ObjectModel, register_object
 from libero_env.objects.catalog import _registered
+from libero_env.sim.scene import scene_spec
+from libero_env.tasks import get_task
 
 pytestmark = pytest.mark.sim
 
@@ -285,3 +288,12 @@ def test_nearest_is_the_nearest():
     points, among = rng.normal(size=(300, 3)), rng.normal(size=(80, 3))
     distances = np.linalg.norm(points[:, None] - among[None], axis=2)
     np.testing.assert_array_equal(nearest(points, among), distances.argmin(axis=1))
+
+
+def test_a_scene_is_written_without_textures_and_read_again(pack):
+    problem = get_task("libero_goal/3").problem
+    xml = model_xml(spec_without_textures(problem, pack), {})
+    assert "<texture" not in xml and "<mesh" in xml
+    whole = compile_stored(xml, scene_spec(problem, pack))
+    scene = scene_spec(problem, pack).compile()
+    assert (whole.ntex > 0, whole.nbody, whole.ngeom) == (True, scene.nbody, scene.ngeom)
