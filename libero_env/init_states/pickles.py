@@ -130,7 +130,7 @@ def _read_pickle(content: bytes) -> object:
                 raise StateFileError(
                     f"the pickle has the operation {operation.name}, which arrays do not need"
                 )
-            if "PUT" in operation.name and argument > _MAX_OPERATIONS:  # the size of a table
+            if "PUT" in operation.name and int(argument or 0) > _MAX_OPERATIONS:  # the size of a table
                 raise StateFileError(f"the pickle has more than {_MAX_OPERATIONS} values")
         return _Reader(io.BytesIO(content)).load()
     except StateFileError:

@@ -218,9 +218,9 @@ class Reader:
         except ProblemError:
             raise
         except InvalidInputError as error:  # of one field
-            field, part, *_ = (*error.path, None, None)
+            field, place, *_ = (*error.path, None, None)
             what, _, expected = str(error).removeprefix("Problem: ").partition("; expected ")
-            self.fail(self.line(_SECTIONS_OF.get(str(field), f":{field}"), part), what, expected)
+            self.fail(self.line(_SECTIONS_OF.get(str(field), f":{field}"), place), what, expected)
 
     def fields(self, items: Mapping[str, tuple[Word | List, ...]]) -> dict[str, Any]:
         """Return the fields of the problem that the sections of a file have."""

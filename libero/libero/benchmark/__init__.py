@@ -111,7 +111,7 @@ class Benchmark:
         if self.name in _task_maps():
             return list(_task_maps()[self.name].values())
         if self.name not in libero_task_map:
-            raise UnknownNameError("suite", self.name, {**_task_maps(), **libero_task_map})
+            raise UnknownNameError("suite", self.name, [*_task_maps(), *libero_task_map])
         names = libero_task_map[self.name]
         files = [(f"{name}.bddl", f"{name}.pruned_init") for name in names]
         return [
