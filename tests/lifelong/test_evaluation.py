@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 from torch import nn
 
+from libero_env.errors import SimulationError
 from lifelong.errors import ConfigError
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.rollout import rollout, save_animation
@@ -117,3 +118,14 @@ def test_the_pool_closes_the_least_recently_used_and_all_at_the_end():
         third = pool.get(3)
         assert (first.closed, second.closed, third.closed) == (False, True, False)
     assert first.closed and third.closed
+
+
+def test_a_simulation_that_diverges_is_neither_a_success_nor_a_failure():
+    class Diverging(Countdown):
+        def step(self, actions):
+            *rest, info = super().step(actions)
+            return (*rest, {**info, "errors": {1: "it has diverged"}})
+
+    with pytest.raises(SimulationError, match=r"simulation 1: it has diverged \(initial state 7\)") as caught:
+        rollout(Forward(), Diverging(2), [3, 7], language=torch.zeros(2), horizon=5, settle_steps=0)
+    assert list(caught.value.failed) == [1]
