@@ -21,7 +21,7 @@ from libero_env.assets.robot import (
     robosuite_version,
 )
 from libero_env.errors import LiberoError, MissingPackageError
-from libero_env.paths import cache_dir, demos_dir
+from libero_env.paths import cache_dir, config_file, demos_dir, read_config
 from libero_env.storage import check_trusted
 from libero_env.text import show_bytes
 
@@ -92,7 +92,7 @@ def examine(gl_only: bool = False) -> list[Finding]:
         return [check_gl()]
     packages = [check_package(name) for name in ("mujoco", "numba", "numpy", "gymnasium", "h5py")]
     models = [check_facade(), check_robot_models(), check_models()]
-    return [check_python(), *packages, *models, check_gl(), check_cache(), check_demos()]
+    return [check_python(), *packages, *models, check_gl(), check_cache(), check_demos(), *check_configured()]
 
 
 def check_python() -> Finding:
@@ -207,6 +207,16 @@ def check_demos() -> Finding:
     if not files:
         return Finding("demonstrations", f"none in {path}", False, remedy, essential=False)
     return Finding("demonstrations", f"{len(files)} files in {path}, {show_bytes(folder_bytes(path))}")
+
+
+def check_configured() -> list[Finding]:
+    """Check the folders of task files and initial states in the configuration file, if it names any."""
+    found = []
+    for key in ("bddl_files", "init_states"):
+        if (value := read_config().get(key)) and not Path(value).expanduser().is_dir():
+            remedy = f"remove the line {key} from {config_file()}: the files of this package are then used"
+            found.append(Finding(key, f"{value} does not exist", False, remedy, essential=False))
+    return found
 
 
 def folder_bytes(path: Path) -> int:
