@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.errors import LiberoError, MissingPackageError
+from libero_env.errors import LiberoError, MissingPackageError, SimulationError
 from libero_env.tasks import Task, get_suite
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
 from libero_eval.protocols.environment import ProtocolEnv, resolve_world, run_protocol
@@ -184,6 +184,7 @@ class LiberoBenchmark(StepBenchmark):
 
         Raises:
             PolicyError: It has another shape, or values that are not finite.
+            SimulationError: The simulation has diverged.
         """
         assert self._env is not None and self._adapter is not None, "reset was called"
         predicted = np.asarray(action.get("actions", action.get("action")), np.float64)
@@ -191,6 +192,8 @@ class LiberoBenchmark(StepBenchmark):
             raise PolicyError(f"the server sent actions of shape {predicted.shape}; expected (7,)")
         executed = predicted if self.observations else self._adapter.actions(predicted)
         obs, reward, _, _, info = self._env.step(executed[None])
+        if "errors" in info:
+            raise SimulationError(info["errors"])
         success = bool(info["success"][0])
         self._ever |= success
         self._recorder.record_video(self._frame(obs))
