@@ -63,6 +63,9 @@ from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 
 PRETRAIN_KEYS = ("pretrain", "policy", "data", "augmentation", "train", "language", "seed", "init_from")
+LARGE_FOR_CPU = (
+    4_000_000  # pixels in a batch: the published protocol has 10 million, the laptop's less than one
+)
 EXAMPLE_DIM = 384  # of instructions' embeddings, by which a policy is measured before they are computed
 
 
@@ -146,6 +149,19 @@ def _set_threads(settings: RunSettings, directory: Path) -> None:
         torch.set_num_threads(threads)
 
 
+def _warn_of_cpu(data: DataSettings, fit: FitSettings) -> None:
+    """Say on the standard error that a step is large for a CPU, such as one of the published protocol."""
+    height, width = data.spec(EXAMPLE_DIM).image_size
+    images = fit.batch_size * data.seq_len * len(data.views)
+    if images * height * width > LARGE_FOR_CPU:
+        print(
+            f"warning: there is no GPU, and each training step reads {images} images of {height}x{width} pixels: "
+            "on a CPU it takes many seconds, and a run of the published protocol weeks (device=cpu says that this is "
+            "meant)",
+            file=sys.stderr,
+        )
+
+
 def _build_contexts(
     config: Configuration, settings: RunSettings, directory: RunDirectory, ranks: Ranks
 ) -> tuple[RunContext, RunContext | None]:
@@ -167,6 +183,8 @@ def _build_contexts(
     check_memory(needs, memory_limit() + on_gpu)
     if fit.compile != "off":
         check_compiler(device)
+    if ranks.first and settings.device == "auto" and device.type == "cpu":
+        _warn_of_cpu(data, fit)
 
     first, said = len(plan.before), list(plan.instructions)
     languages = ranks.broadcast(lambda: config.build("language").embed(said))

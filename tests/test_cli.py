@@ -275,3 +275,34 @@ def test_folders_follow_the_environment(tmp_path, monkeypatch):
 
 def test_doctor_knows_the_device():
     assert check_torch().ok and "threads" in check_torch().detail
+
+
+def test_doctor_notes_a_gpu_that_is_not_used(monkeypatch):
+    monkeypatch.setattr(doctor, "gpu_name", lambda: "NVIDIA H100, 580.105")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    found = check_torch()
+    assert not found.ok and not found.essential and "beside a GPU (NVIDIA H100" in found.detail
+    answer = {"backend": "egl", "device": "llvmpipe (LLVM 15)", "milliseconds": 1.0}
+    monkeypatch.setattr(doctor, "_PROBE", f"print({json.dumps(json.dumps(answer))})")
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    assert "beside a GPU" in doctor.check_gl().detail and not doctor.check_gl().ok
+    answer["device"] = "NVIDIA H100"
+    monkeypatch.setattr(doctor, "_PROBE", f"print({json.dumps(json.dumps(answer))})")
+    assert doctor.check_gl().ok
+
+
+def test_training_warns_where_a_batch_is_too_large_for_a_cpu(capsys):
+    from lifelong.data.settings import DataSettings
+    from lifelong.experiment import _warn_of_cpu
+    from lifelong.training.settings import FitSettings
+
+    def data(size: int, steps: int) -> DataSettings:
+        views = ("agentview_rgb", "eye_in_hand_rgb")
+        return DataSettings(demos=1, image_size=size, seq_len=steps, views=views, proprio=("joint_states",))
+
+    _warn_of_cpu(data(128, 10), FitSettings(batch_size=32))
+    assert capsys.readouterr().err.startswith(
+        "warning: there is no GPU, and each training step reads 640 images"
+    )
+    _warn_of_cpu(data(64, 1), FitSettings(batch_size=64))
+    assert not capsys.readouterr().err

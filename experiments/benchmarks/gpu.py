@@ -146,7 +146,13 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=128, help="edge of a picture, pixels")
     parser.add_argument("--one", nargs=2, type=int, metavar=("WORLDS", "PICTURES"), help=argparse.SUPPRESS)
     args = parser.parse_args()
-    Backend.read(args.backend).require_installed()
+    backend = Backend.read(args.backend)
+    backend.require_installed()
+    if not backend.device:
+        import warp
+
+        if not warp.get_cuda_device_count():
+            sys.exit("error: there is no GPU; --backend warp,device=cpu measures the processor, for hours")
     if args.one:
         print(json.dumps(asdict(measure(args, args.one[0], bool(args.one[1])))))
         return

@@ -94,6 +94,10 @@ def main() -> None:
         "overrides", nargs="*", help="further settings of train.py, such as data.memory=device"
     )
     args = parser.parse_args()
+    import torch
+
+    if not (args.only_read or torch.cuda.is_available() or "device=cpu" in args.overrides):
+        sys.exit("error: there is no GPU, and a run takes weeks without one; add device=cpu if that is meant")
     for algo in args.algo:
         for seed in args.seeds:
             if not args.only_read:

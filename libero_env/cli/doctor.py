@@ -92,7 +92,21 @@ def examine(gl_only: bool = False) -> list[Finding]:
         return [check_gl()]
     packages = [check_package(name) for name in ("mujoco", "numba", "numpy", "gymnasium", "h5py")]
     models = [check_facade(), check_robot_models(), check_models()]
-    return [check_python(), *packages, *models, check_gl(), check_cache(), check_demos(), *check_configured()]
+    warp = check_package(
+        "mujoco-warp", "pip install 'libero-lifelong[warp]', for backend=warp", essential=False
+    )
+    folders = [check_cache(), check_demos(), *check_configured()]
+    return [check_python(), *packages, warp, *models, check_gl(), *folders]
+
+
+def gpu_name() -> str:
+    """Return name and driver of the first NVIDIA GPU, as its driver says; empty where there is none."""
+    command = ["nvidia-smi", "--query-gpu=name,driver_version", "--format=csv,noheader"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=PROBE_SECONDS, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return done.stdout.partition("\n")[0].strip()
 
 
 def check_python() -> Finding:
@@ -178,6 +192,9 @@ def check_gl() -> Finding:
     if "error" in found:
         return Finding("GL", found["error"], False, GL_REMEDY)
     detail = f"{found['backend']} on {found['device']}, a 128x128 frame takes {found['milliseconds']:.1f} ms"
+    if "llvmpipe" in found["device"] and (gpu := gpu_name()):
+        remedy = "let EGL find the driver: in a container NVIDIA_DRIVER_CAPABILITIES=all, else the vendor's EGL file"
+        return Finding("GL", f"{detail}, beside a GPU ({gpu})", False, remedy, essential=False)
     return Finding("GL", detail)
 
 

@@ -121,7 +121,7 @@ def examine() -> "list[Finding]":
 
 def check_torch() -> "Finding":
     """Return a finding about the device that training would use."""
-    from libero_env.cli.doctor import Finding
+    from libero_env.cli.doctor import Finding, gpu_name
 
     if importlib.util.find_spec("torch") is None:
         return Finding("torch", "not installed", False, "make setup")
@@ -136,4 +136,8 @@ def check_torch() -> "Finding":
         device = "mps"
     else:
         device = "cpu"
-    return Finding("torch", f"{torch.__version__}, device {device}, {torch.get_num_threads()} threads")
+    detail = f"{torch.__version__}, device {device}, {torch.get_num_threads()} threads"
+    if device == "cpu" and (gpu := gpu_name()):
+        remedy = "install a build of torch for CUDA that the driver supports: pytorch.org"
+        return Finding("torch", f"{detail}, beside a GPU ({gpu})", False, remedy, essential=False)
+    return Finding("torch", detail)

@@ -17,6 +17,9 @@ import numpy as np
 
 np.bool = bool  # robomimic 0.2 writes it so, and numpy took it away
 
+# torchvision's kernels are of no use here, and a build for another torch cannot register them.
+sys.modules["torchvision._meta_registrations"] = types.ModuleType("torchvision._meta_registrations")
+
 
 def prepare(source: Path) -> None:
     """Make `libero` that of the checkout, with stand-ins for its simulator."""
