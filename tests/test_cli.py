@@ -306,3 +306,18 @@ def test_training_warns_where_a_batch_is_too_large_for_a_cpu(capsys):
     )
     _warn_of_cpu(data(64, 1), FitSettings(batch_size=64))
     assert not capsys.readouterr().err
+
+
+def test_doctor_checks_the_gpu(monkeypatch, capsys):
+    monkeypatch.setattr(doctor, "gpu_name", lambda: "")
+    assert cli.main(["doctor", "--gpu"]) == 1
+    assert capsys.readouterr().out.startswith("FAIL  GPU: ")
+    probes = {
+        "print('{\"milliseconds\": 1}')": True,
+        "print('{\"error\": 1}')": False,
+        "import time; time.sleep(99)": False,
+    }
+    monkeypatch.setattr(doctor, "PROBE_SECONDS", 2)
+    for probe, ok in probes.items():
+        monkeypatch.setattr(doctor, "_PROBE", probe)
+        assert doctor.check_renderers(2).ok is ok

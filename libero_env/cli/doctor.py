@@ -8,6 +8,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -198,6 +199,46 @@ def check_gl() -> Finding:
     return Finding("GL", detail)
 
 
+def examine_gpu() -> list[Finding]:
+    """Return the findings about the GPU: its driver, and whether 1, 4 and one renderer a core draw on it at once."""
+    if not (gpu := gpu_name()):
+        return [
+            Finding(
+                "GPU", "nvidia-smi finds none", False, "install the driver; everything runs without one, too"
+            )
+        ]
+    return [Finding("GPU", gpu), *(check_renderers(n) for n in sorted({1, 4, os.cpu_count() or 1}))]
+
+
+def check_renderers(count: int) -> Finding:
+    """Draw with several processes at once: some drivers hang in that for ever."""
+    title, remedy = (
+        f"{count} renderers at once",
+        "record and evaluate with fewer --workers, or MUJOCO_GL=osmesa",
+    )
+    path = os.pathsep.join(filter(None, (PACKAGE_ROOT, os.environ.get("PYTHONPATH"))))
+    command, env = [sys.executable, "-c", _PROBE], {**os.environ, "PYTHONPATH": path}
+    started = [subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) for _ in range(count)]
+    end, texts = time.monotonic() + PROBE_SECONDS, []
+    try:
+        for process in started:
+            texts.append(process.communicate(timeout=max(0.0, end - time.monotonic()))[0])
+    except subprocess.TimeoutExpired:
+        return Finding(title, f"{count - len(texts)} have no frame within {PROBE_SECONDS} s", False, remedy)
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()
+            if process.stdout:
+                process.stdout.close()
+    failed = [text for text in texts if '"milliseconds"' not in text]
+    if failed or any("llvmpipe" in text for text in texts):
+        return Finding(
+            title, f"{len(failed)} failed, or they draw on the processor: {texts[0].strip()}", False, remedy
+        )
+    return Finding(title, "all draw on the GPU")
+
+
 def check_cache() -> Finding:
     """Check that the cache folder can be written and has enough free space."""
     remedy = "set LIBERO_CACHE to a folder that you can write to"
@@ -270,15 +311,16 @@ def is_broken(findings: Iterable[Finding]) -> bool:
     return any(finding.essential and not finding.ok for finding in findings)
 
 
-def doctor(*, gl: bool = False, json: bool = False) -> int:
+def doctor(*, gl: bool = False, gpu: bool = False, json: bool = False) -> int:
     """Say what this machine has and lacks, and how to fix it; return 1 where something essential is broken.
 
     Args:
         gl: Only draw a frame.
+        gpu: Only check the GPU: its driver, and renderers that draw at once; 1 is returned where there is none.
         json: Print the findings as JSON.
     """
-    findings = examine(gl_only=gl)
-    if not gl and importlib.util.find_spec("lifelong"):
+    findings = examine_gpu() if gpu else examine(gl_only=gl)
+    if not (gl or gpu) and importlib.util.find_spec("lifelong"):
         findings += importlib.import_module("lifelong.cli.runs").examine()
     print(findings_json(findings) if json else render_findings(findings))
     return int(is_broken(findings))
