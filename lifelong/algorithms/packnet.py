@@ -1,5 +1,6 @@
 """PackNet: every task owns a share of the weights, which later tasks do not change."""
 
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Annotated, Any
@@ -15,6 +16,7 @@ from lifelong.errors import CheckpointError
 from lifelong.policies.base import Policy
 from lifelong.types import NonNegative
 
+_log = logging.getLogger(__name__)
 _NORMS = (nn.modules.batchnorm._BatchNorm, nn.modules.instancenorm._InstanceNorm)
 _DIVIDED = (nn.Linear, nn.Conv2d)  # layers whose weights LIBERO's code divides
 _UNTRAINED = (nn.modules.batchnorm._BatchNorm, nn.LayerNorm)  # layers that it never trains
@@ -74,6 +76,16 @@ class PackNet(Algorithm):
             chosen = p.dim() >= 2 if divided is None else name in divided
             if p.requires_grad and chosen and name not in self._owner:
                 self._owner[name] = torch.zeros(p.shape, dtype=torch.uint8, device=p.device)
+        full = [name for name, owner in self._owner.items() if not bool((owner == 0).any())]
+        if full:
+            _log.warning(
+                "PackNet: task %d has no free weight in %d of %d tensors (such as %s), whose weights earlier tasks "
+                "own; a larger algo.prune_perc leaves more for later tasks",
+                task_index + 1,
+                len(full),
+                len(self._owner),
+                full[0],
+            )
 
     def begin_phase(self, phase: Phase, policy: Policy) -> None:
         """Store which weights may change, and the values of the others."""

@@ -152,11 +152,14 @@ class SequenceVLDataset:
         Raises:
             DataError: An index is out of range.
         """
-        indices = torch.as_tensor(indices, dtype=torch.int64, device=self.last.device)
+        indices = torch.as_tensor(
+            indices, dtype=torch.int64
+        )  # checked before they go to a GPU, which would wait
         if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < len(self)):
             raise DataError(
                 f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}"
             )
+        indices = indices.to(self.last.device)
         frames = self.frames(indices)
         gather = lambda x: self._gather(x, frames)  # noqa: E731
         language = self.language.expand(len(indices), -1)

@@ -31,9 +31,9 @@ def sinusoidal_positions(length: int, dim: int, factor: float = 10.0) -> Tensor:
     return codes
 
 
-def block_causal_mask(length: int, tokens: int) -> Tensor:
+def block_causal_mask(length: int, tokens: int, device: torch.device | None = None) -> Tensor:
     """Return a mask (T M, T M) bool, True where a token attends: to its own time step and earlier ones."""
-    step = torch.arange(length).repeat_interleave(tokens)
+    step = torch.arange(length, device=device).repeat_interleave(tokens)
     return step[None, :] <= step[:, None]
 
 
@@ -147,7 +147,7 @@ class TemporalTransformer(nn.Module):
     def forward(self, tokens: Tensor) -> Tensor:
         """Map tokens (B, T, M, E) to the same shape; those of a time step carry that step's position code."""
         b, t, m, e = tokens.shape
-        mask = block_causal_mask(t, m).to(tokens.device)
+        mask = block_causal_mask(t, m, tokens.device)
         x = (tokens + self.positions[:t, None]).reshape(b, t * m, e)
         for layer in self.layers:
             x = layer(x, mask)

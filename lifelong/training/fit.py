@@ -246,3 +246,5 @@ def _load_optimizer(optimizer: torch.optim.AdamW, state: dict[str, Any]) -> None
     if not fits:
         raise CheckpointError("the state of the optimiser belongs to other parameters than those of this run")
     optimizer.load_state_dict(state)
+    for entry in optimizer.state.values():  # as in an uninterrupted run: AdamW reads the counter on the host
+        entry["step"] = entry["step"].cpu()

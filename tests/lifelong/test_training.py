@@ -427,3 +427,41 @@ def test_parts_of_a_policy_learn_at_a_factor_of_the_rate():
     moved = {name for name, value in policy.state_dict().items() if not torch.equal(value, before[name])}
     assert moved and not any(name.startswith("encoders") for name in moved)
     assert any(name.startswith("encoders") for name in before)
+
+
+@pytest.mark.parametrize(("device", "asynchronous"), [("cpu", False), ("cuda", True)])
+def test_only_copies_to_a_gpu_are_asynchronous(device, asynchronous, monkeypatch):
+    """The values of an asynchronous copy to the host may be read before they are there."""
+    from lifelong.data import fake_batch
+    from lifelong.types import PolicySpec
+
+    asked = []
+
+    def to(tensor, *, device, non_blocking):
+        asked.append(non_blocking)
+        return tensor
+
+    batch = fake_batch(PolicySpec(image_size=(4, 4)), 2, torch.Generator())
+    monkeypatch.setattr(torch.Tensor, "to", to)
+    batch.to(device)
+    assert len(asked) >= 6 and set(asked) == {asynchronous}
+
+
+def test_counters_of_a_resumed_optimiser_are_on_the_host():
+    from lifelong.training.fit import _load_optimizer
+
+    weight = torch.nn.Parameter(torch.ones(2))
+    optimizer = torch.optim.AdamW([weight])
+    weight.grad = torch.ones(2)
+    optimizer.step()
+    state = optimizer.state_dict()
+    state["state"][0] = {
+        k: v.to("cpu") if k != "step" else v.to("meta") for k, v in state["state"][0].items()
+    }
+    moved = []
+    real = torch.Tensor.cpu
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.Tensor, "cpu", lambda t: (moved.append(t.device.type), real(torch.zeros(())))[1])
+        patch.setattr("lifelong.training.fit.check", lambda *_: None)
+        _load_optimizer(optimizer, state)
+    assert moved == ["meta"] and optimizer.state[weight]["step"].device.type == "cpu"
