@@ -27,6 +27,7 @@ from libero_env.errors import DemoError, InvalidInputError
 if TYPE_CHECKING:
     from libero_env.demos.config import DemoConfig, Variation
     from libero_env.demos.record import RecordingReport
+    from libero_env.tasks import Task
 
 Drawing = Literal["fast", "faithful"]
 Files = Positional[tuple[FilePath, ...]]
@@ -212,7 +213,7 @@ def info(paths: Files = ()) -> int:
 
 
 def check(paths: Files = ()) -> int:
-    """Read files completely and report what is in them or broken; return 1 if one is broken.
+    """Read files completely; report what is in them, broken, or missing for training; return 1 if one is broken.
 
     Args:
         paths: Files or folders (default: where demonstrations are kept).
@@ -247,7 +248,16 @@ def check_files(files: Iterable[Path], num_demos: int | None = None) -> int:
             print(f"FAIL  {path}: {fault}")
         if not faults:
             print(f"ok    {path}: {len(stats.lengths)} demonstrations, {stats}")
+        for note in stats.notes:
+            print(f"note  {path}: {note}")
     return broken
+
+
+def task_of(bddl: Path | None) -> "Task | None":
+    """Return the task of a task file, None without one."""
+    from libero_env.tasks import read_task
+
+    return read_task(bddl) if bddl else None
 
 
 def replay_file(
@@ -259,6 +269,7 @@ def replay_file(
     cameras: tuple[str, ...] = ("agentview",),
     size: Size = (256, 256),
     assets: str | None = None,
+    bddl: FilePath | None = None,
 ) -> int:
     """Replay demonstrations and report success and drift; return 1 if one that succeeded does not any more.
 
@@ -270,6 +281,7 @@ def replay_file(
         cameras: Cameras of the video.
         size: Size of the video, 128 or 120x160.
         assets: Where models come from: builtin, original, or a folder with the original's.
+        bddl: Task file of what was recorded (default: the task that the file states).
     """
     from libero_env.demos.replay import replay
     from libero_env.demos.video import check_video_path, write_video
@@ -279,9 +291,8 @@ def replay_file(
         check_video_path(video)
     demos = [f"demo_{number}" for number in demo] if demo else None
     results, lost = [], 0
-    for result in replay(
-        file, by=by, demos=demos, cameras=cameras if video else (), size=size, assets=assets
-    ):
+    task, shown = task_of(bddl), cameras if video else ()
+    for result in replay(file, by=by, demos=demos, cameras=shown, size=size, assets=assets, task=task):
         lost += result.recorded and not result.success
         outcome = "success" if result.success else "no success"
         drift = f"objects {1000 * result.drift.max():.2f} mm, arm {1000 * result.arm_drift.max():.2f} mrad"
@@ -308,6 +319,7 @@ def rerender_file(
     depth: bool = False,
     segmentation: Segmentation | None = None,
     assets: str | None = None,
+    bddl: FilePath | None = None,
 ) -> None:
     """Render the recorded states again, with other cameras or under perturbations, and describe the new file.
 
@@ -321,8 +333,9 @@ def rerender_file(
         cameras: Cameras to render (default: agentview robot0_eye_in_hand).
         drawing: How images are drawn (default: that of the models).
         depth: Render depth too, in metres.
-        segmentation: Render a segmentation too.
+        segmentation: Render a segmentation too; the file's attribute segmentation_names names its numbers.
         assets: Where models come from: builtin, original, or a folder with the original's.
+        bddl: Task file of what was recorded (default: the task that the file states).
     """
     from libero_env.demos.config import RenderConfig
     from libero_env.demos.curate import describe
@@ -337,7 +350,7 @@ def rerender_file(
     if depth or segmentation or perturb is None:
         chosen["modalities"] = modalities(depth=depth, segmentation=segmentation)
     config = replace(config, **{key: value for key, value in chosen.items() if value is not None})
-    print(describe(rerender(file, out, config, assets=assets)))
+    print(describe(rerender(file, out, config, assets=assets, task=task_of(bddl))))
 
 
 def filter_file(
@@ -347,6 +360,7 @@ def filter_file(
     success: bool = False,
     no_ops: bool = False,
     threshold: Annotated[float, Field(ge=0, le=1)] = 1e-3,
+    bddl: FilePath | None = None,
 ) -> None:
     """Write some of the demonstrations or steps of a file, and print the contents of both.
 
@@ -356,11 +370,15 @@ def filter_file(
         success: Keep only demonstrations that reached the goal.
         no_ops: Leave out steps in which the action does nothing.
         threshold: Largest motion of a no-op.
+        bddl: Task file of what was recorded, which the new file states (default: the task that the file states).
     """
     from libero_env.demos.curate import examine, filter_demos
 
     print(f"{file}: {examine(file, threshold=threshold)}")
-    stats = filter_demos(file, out, success_only=success, without_noops=no_ops, threshold=threshold)
+    task = task_of(bddl)
+    stats = filter_demos(
+        file, out, success_only=success, without_noops=no_ops, threshold=threshold, task=task
+    )
     print(f"{out}: {stats}")
 
 
@@ -374,6 +392,7 @@ def export(
     settle: Annotated[int, Field(ge=0, le=1000)] = 10,
     assets: str | None = None,
     drawing: Drawing = "faithful",
+    bddl: FilePath | None = None,
 ) -> None:
     """Write files as one data set in another format, and print its size.
 
@@ -387,6 +406,7 @@ def export(
         settle: With --as: waiting steps before the first action.
         assets: With --as: where models come from (default: the original's where they are installed).
         drawing: With --as: how images are drawn.
+        bddl: Task file of what was recorded (default: the tasks that the files state).
     """
     from libero_env.demos.curate import find_demo_files
     from libero_env.demos.lerobot import export_lerobot, export_published
@@ -394,11 +414,11 @@ def export(
 
     found = find_demo_files(files)
     if published is None:
-        episodes, frames = export_lerobot(found, out, labels=labels)
+        episodes, frames = export_lerobot(found, out, labels=labels, task=task_of(bddl))
         print(f"{out}: {episodes} episodes, {frames} frames")
         return
     config = Regeneration(settle_steps=settle, labels=labels, assets=assets, drawing=drawing)
-    written = export_published(found, out, published, config)
+    written = export_published(found, out, published, config, task=task_of(bddl))
     print(f"{out}: {written.episodes} episodes, {written.frames} frames, as {published}")
     print(f"models: {config.pack().name}, drawing: {config.drawing}")
     for where in written.failed:

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from importlib import metadata
@@ -17,19 +17,19 @@ from libero_env.demos.contents import Pairing
 from libero_env.demos.write import make_header
 from libero_env.envs.config import Drawing, Names, Robot, Size
 from libero_env.errors import InvalidInputError
-from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.episodes import checked_perturbations
 from libero_env.perturbations.perturbation import KINDS, Perturbation, format_perturbations
 from libero_env.sim.backend import Backend
-from libero_env.sim.observations import DEFAULT_CAMERAS
+from libero_env.sim.observations import DEFAULT_CAMERAS, segmentation_labels
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
-from libero_env.sim.scene import FAST, build_scene, default_drawing
+from libero_env.sim.scene import FAST, Scene, build_scene, default_drawing
 from libero_env.tasks import Task, get_task, read_task
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import checked
 
 GENERATOR = "scripted-expert-14"  # change it when the same seed yields different demonstrations
 PERTURBED_HEADER = ("perturb", "perturb_draws")  # attributes of a file that was rendered under perturbations
+MASK_NAMES = "segmentation_names"  # attribute: JSON, number in a segmentation -> name
 PERTURB_DRAWS = 1  # change it when the same perturbation of the same demonstration gives other observations
 
 _IN_PATH = ("source", "camera_size", "seed")  # options that the path of a file names anyhow
@@ -114,6 +114,16 @@ class RenderConfig:
             attributes |= zip(PERTURBED_HEADER, (text, PERTURB_DRAWS), strict=True)
         return attributes
 
+    def mask_names(self, scene: Scene) -> dict[str, str]:
+        """Return the attribute of a file that says what each number of its segmentation is; empty without one."""
+        kinds = [one.partition("_")[2] for one in self.modalities if one.startswith("segmentation_")]
+        names = {
+            str(number): name
+            for kind in kinds
+            for number, name in segmentation_labels(scene, kind).names.items()
+        }
+        return {MASK_NAMES: json.dumps(names)} if names else {}
+
 
 @checked
 class DemoConfig:
@@ -185,7 +195,8 @@ class DemoConfig:
         """Return the attributes of the file. This compiles the scene, for its digest."""
         task, pack = self.task, select_pack()
         versions = {name: metadata.version(name) for name in ("mujoco", "h5py")}
-        extra = self.render_config.header()
+        scene = build_scene(task.problem, drawing=self.drawn, robot=self.robot)
+        extra = self.render_config.header() | self.render_config.mask_names(scene)
         if variation := changed_options(self.variation):
             extra["variation"] = json.dumps(variation)
         if self.backend.is_warp:  # files without it are of MuJoCo
@@ -201,19 +212,36 @@ class DemoConfig:
             generator=GENERATOR,
             disturbed=self.disturb,
             robot=self.robot,
-            model_digest=_model_digest(task, self.drawn, self.robot),
+            model_digest=model_digest(scene.model),
             models=json.dumps({"pack": pack.name, "digest": pack.digest}),
             versions=json.dumps({**versions, "robosuite": robosuite_version()}),
             **extra,
         )
 
 
-def _model_digest(task: Task, drawing: str, robot: str) -> str:
-    """Return 16 hex digits that change with anything in the task's compiled scene, its appearance included."""
-    model = build_scene(task.problem, drawing=drawing, robot=robot).model
-    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, buffer)
-    return hashlib.sha256(buffer.tobytes()).hexdigest()[:16]
+def model_digest(model: Any) -> str:
+    """Return 16 hex digits that change with anything in a compiled scene, its appearance included.
+
+    Where its files are installed does not matter: paths and what depends on their lengths are left out.
+    """
+    digest = hashlib.sha256()
+    for name, content in _contents(model):
+        digest.update(name.encode() + b"\0" + content)
+    return digest.hexdigest()[:16]
+
+
+def _contents(part: Any) -> Iterator[tuple[str, bytes]]:
+    """Yield the name and the bytes of each value of a compiled model, or of a structure in it."""
+    for name in dir(part):
+        if name.startswith("_") or "path" in name or name in ("nbuffer", "signature"):
+            continue
+        value = getattr(part, name)
+        if isinstance(value, np.ndarray):
+            yield name, f"{value.shape} {value.dtype}".encode() + value.tobytes()
+        elif isinstance(value, bytes | int | float):
+            yield name, repr(value).encode()
+        elif not callable(value):  # opt, vis, stat
+            yield from ((f"{name}.{own}", content) for own, content in _contents(value))
 
 
 def _env_kwargs(render: RenderConfig) -> dict[str, Any]:

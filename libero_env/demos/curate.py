@@ -8,19 +8,21 @@ import h5py
 import numpy as np
 
 from libero_env.demos.contents import (
+    IMAGE_KEYS,
     check_demo,
     count_steps,
     demo_names,
     file_attributes,
     json_attribute,
-    read_header,
     value_fault,
 )
 from libero_env.demos.hdf5 import open_demo_file
+from libero_env.demos.observe import recorded_task, task_header
 from libero_env.demos.read import NOOP_THRESHOLD, Episode, noop_steps, read_episodes
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
 from libero_env.paths import demos_dir
+from libero_env.tasks import Task
 from libero_env.text import show_bytes
 
 
@@ -33,6 +35,7 @@ class DemoStats:
         successes: Number of demonstrations that reached the goal.
         noops: Number of no-op steps, see `noop_steps`.
         faults: What is wrong although it can be read.
+        notes: What it cannot be used for.
         perturb: Perturbations under which it was rendered, as text.
     """
 
@@ -40,6 +43,7 @@ class DemoStats:
     successes: int
     noops: int
     faults: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     perturb: str = ""
 
     def __str__(self) -> str:
@@ -73,7 +77,16 @@ def examine(file: Path, *, threshold: float = NOOP_THRESHOLD) -> DemoStats:
     for key, value in (("num_demos", len(lengths)), ("total", sum(lengths))):
         if (stated := attributes.get(key, value)) != value:
             faults.append(f"attribute {key} is {stated}; expected {value}")
-    return DemoStats(tuple(lengths), successes, noops, tuple(faults), str(attributes.get("perturb", "")))
+    notes = []
+    if unseen := [key for key in IMAGE_KEYS if f"obs/{key}" not in shapes]:
+        which = f"has no {' and no '.join(unseen)}: no policy that sees them can be trained on it"
+        notes.append(f"{which}; `libero demos rerender` draws them")
+    try:
+        recorded_task(file)
+    except DemoError as error:
+        notes.append(str(error).removeprefix(f"{file}: "))
+    perturb = str(attributes.get("perturb", ""))
+    return DemoStats(tuple(lengths), successes, noops, tuple(faults), tuple(notes), perturb)
 
 
 def _faults(episode: Episode, shapes: dict[str, tuple[int, ...]]) -> Iterator[str]:
@@ -97,6 +110,7 @@ def filter_demos(
     success_only: bool = False,
     without_noops: bool = False,
     threshold: float = NOOP_THRESHOLD,
+    task: Task | None = None,
 ) -> DemoStats:
     """Write some of the demonstrations or steps of a file into another one; demonstrations are numbered from 0.
 
@@ -109,6 +123,7 @@ def filter_demos(
         success_only: Whether to leave out demonstrations that did not reach the goal.
         without_noops: Whether to leave out the steps of `noop_steps`.
         threshold: As for `noop_steps`.
+        task: Task that was recorded, which the new file states; None for the one that the file states.
 
     Returns:
         Contents of the new file.
@@ -119,9 +134,8 @@ def filter_demos(
     if target.exists():
         raise DemoError(f"{target} exists; choose another name or remove it")
     dropped = [key for key, on in (("failures", success_only), ("no-ops", without_noops)) if on]
-    writer = DemoWriter(
-        target, {**read_header(file), "filter": f"without {' and '.join(dropped) or 'nothing'}"}
-    )
+    dropped_text = f"without {' and '.join(dropped) or 'nothing'}"
+    writer = DemoWriter(target, task_header(file, task) | {"filter": dropped_text})
     writer.discard_parts()  # of an interrupted call, perhaps with another file
     count = 0
     for episode in read_episodes(file):

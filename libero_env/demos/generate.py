@@ -22,7 +22,7 @@ from libero_env.demos.config import GENERATOR, DemoConfig
 from libero_env.demos.contents import Pairing
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.record import RecordingReport, record_chunk, recorders
-from libero_env.demos.write import DemoWriter, OtherRecordingError
+from libero_env.demos.write import REMEDY, DemoWriter, OtherRecordingError
 from libero_env.errors import DemoError, InvalidInputError
 from libero_env.parallel import check_main_guard, cpu_count, progress_bar, run_each
 from libero_env.paths import demos_dir
@@ -60,7 +60,8 @@ class DemoJob:
 
     def discard(self, error: DemoError) -> None:
         """Remove what there is of the file, and say why."""
-        tqdm.write(f"recording again: {error}", file=sys.stderr)
+        reason = str(error).removesuffix(f"; {REMEDY}")
+        tqdm.write(f"{reason}: recording again", file=sys.stderr)
         self.path.unlink(missing_ok=True)
         self.writer.discard_parts()
 

@@ -25,6 +25,7 @@ from libero_env.demos.replay import Regeneration, regenerate
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_folder
+from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ
 
 ORIGIN = "meta/libero.json"  # how a data set was made
@@ -50,6 +51,7 @@ def export_lerobot(
     *,
     labels: Labels = "expert",
     video_mb: float | None = None,
+    task: Task | None = None,
     progress: bool | None = None,
 ) -> tuple[int, int]:
     """Write demonstration files as one data set in this package's layout.
@@ -59,6 +61,7 @@ def export_lerobot(
         root: Folder to write; it must not exist.
         labels: As for `read_demos`.
         video_mb: Size from which a video is continued in another file, [MiB].
+        task: Task that all files recorded; None for those that they state.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.
 
     Returns:
@@ -71,7 +74,7 @@ def export_lerobot(
     _check_absent(root)
     with atomic_folder(root) as folder, closing(VideoDatasetWriter(folder, OWN, video_mb)) as dataset:
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
-            language = _language(file)
+            language = _language(file, task)
             for episode in read_episodes(file):
                 where = f"{file}: {episode.name}"
                 dataset.add(_exported(episode, where, labels), language, where)
@@ -87,6 +90,7 @@ def export_published(
     name: str,
     config: Regeneration | None = None,
     *,
+    task: Task | None = None,
     progress: bool | None = None,
 ) -> PublishedExport:
     """Run demonstrations again and write them as one data set in the layout of a published one.
@@ -96,6 +100,7 @@ def export_published(
         root: Folder to write; it must not exist.
         name: Published set, one of `libero_env.demos.lerobot_layout.PUBLISHED`.
         config: How the demonstrations are run.
+        task: Task that all files recorded; None for those that they state.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.
 
     Raises:
@@ -111,11 +116,11 @@ def export_published(
     exported, failed = 0, []
     with atomic_folder(root) as folder, closing(writer(folder, layout)) as dataset:
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
-            language = recorded_task(file).language
-            for episode in regenerate(file, config):
+            recorded = task or recorded_task(file)
+            for episode in regenerate(file, config, recorded):
                 where = f"{file}: {episode.name}"
                 if episode.success:
-                    dataset.add(episode, language, where)
+                    dataset.add(episode, recorded.language, where)
                     exported += 1
                 else:
                     failed.append(where)
@@ -134,7 +139,9 @@ def _check_absent(root: Path) -> None:
         raise DemoError(f"{root} exists; choose another folder or remove it")
 
 
-def _language(file: Path) -> str:
+def _language(file: Path, task: Task | None) -> str:
+    if task is not None:
+        return task.language
     stated = json_attribute(read_header(file), "problem_info", file).get("language_instruction")
     return stated if isinstance(stated, str) else recorded_task(file).language
 

@@ -4,6 +4,8 @@ import re
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
+from textwrap import shorten
+from typing import Any
 
 import h5py
 import numpy as np
@@ -16,13 +18,16 @@ from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
 from libero_env.demos.read import Episode
 from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
 from libero_env.envs.env import LiberoEnv
-from libero_env.errors import DemoError, UnknownNameError
+from libero_env.errors import DemoError, LiberoError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.scene import FAST, Scene
 from libero_env.tasks import Task, bddl, get_suite
 from libero_env.tasks.builder import language_from_name
 from libero_env.tasks.problem import same_meaning
+from libero_env.tasks.task import FILE
+
+_OPEN_FILE = "<_io."  # begins what `str(open(file))` returns
 
 
 def recorded_robot(file: Path) -> str:
@@ -41,11 +46,10 @@ def recorded_task(file: Path) -> Task:
     """Return the task that was recorded.
 
     It is the benchmark's task that the file names, if the file's task text means the same, and else the task that the
-    text describes.
+    text describes. The original's collector stores the text of an open file, `<_io.TextIOWrapper ...>`: no task text.
 
     Raises:
-        DemoError: The file names no task.
-        BDDLError: Its task text cannot be read.
+        DemoError: The file names no task, or its task text cannot be read.
     """
     header = read_header(file)
     name, text = Path(str(header.get("bddl_file_name", ""))), str(header.get("bddl_file_content", ""))
@@ -53,16 +57,40 @@ def recorded_task(file: Path) -> Task:
         named = next((t for t in get_suite(name.parent.name).tasks if t.name == name.stem), None)
     except UnknownNameError:
         named = None
-    if not text.strip():
+    if not text.strip() or text.startswith(_OPEN_FILE):
         if named is None:
             raise DemoError(
-                f"{file}: neither bddl_file_content nor bddl_file_name states which task was recorded"
+                f"{file}: neither bddl_file_content, {shorten(text, 40)!r}, nor bddl_file_name, {str(name)!r}, states "
+                "which task was recorded; name its task file with --bddl"
             )
         return named
-    problem = bddl.parse(text, f"{file} bddl_file_content")
+    try:
+        problem = bddl.parse(text, f"{file} bddl_file_content")
+    except LiberoError as error:
+        raise DemoError(f"{error}; name its task file with --bddl") from error
     if named is not None and same_meaning(named.problem, problem):
         return named
-    return Task("file", 0, name.stem, language_from_name(name.stem), problem.language, problem)
+    return Task(FILE, 0, name.stem, language_from_name(name.stem), problem.language, problem)
+
+
+def task_header(file: Path, task: Task | None) -> dict[str, Any]:
+    """Return the attributes of a file as `read_header` does, with a task's text where they do not state that task.
+
+    Args:
+        file: Demonstration file.
+        task: Task that was recorded; None for the one that the file states.
+    """
+    header = read_header(file)
+    if task is None:
+        return header
+    try:
+        stated = same_meaning(recorded_task(file).problem, task.problem)
+    except DemoError:
+        stated = False
+    if stated and not str(header.get("bddl_file_content", "")).startswith(_OPEN_FILE):
+        return header
+    name = f"bddl_files/{task.suite}/{task.name}.bddl"
+    return header | {"bddl_file_name": name, "bddl_file_content": task.bddl_text}
 
 
 def recorded_rendering(file: Path) -> RenderConfig:

@@ -14,11 +14,11 @@ import numpy as np
 from tqdm import tqdm
 
 from libero_env.assets.pack import Pack, select_pack
-from libero_env.demos.config import PERTURBED_HEADER, RenderConfig
-from libero_env.demos.contents import demo_names, demo_number, json_attribute, read_header, read_values
+from libero_env.demos.config import MASK_NAMES, PERTURBED_HEADER, RenderConfig
+from libero_env.demos.contents import demo_names, demo_number, json_attribute, read_values
 from libero_env.demos.generate import DemoJob, claim_incomplete, number_of_processes, run_each
 from libero_env.demos.hdf5 import open_demo_file
-from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
+from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task, task_header
 from libero_env.demos.read import read_episodes
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
@@ -170,10 +170,11 @@ def rerender(
         raise DemoError(f"{target} is the file to read; choose another name")
     config = replace(config, drawing=config.drawing or default_drawing(select_pack(assets)))
     task = task or recorded_task(file)
-    writer = DemoWriter(target, rendered_header(file, config, task))
-    recorded = writer.recorded_states()
     renderer = StateRenderer.of_file(file, config, assets, task=task)
     try:
+        header = rendered_header(file, config, task) | config.mask_names(renderer.scene)
+        writer = DemoWriter(target, header)
+        recorded = writer.recorded_states()
         episodes = islice(read_episodes(file), limit)
         for episode in progress_bar(episodes, desc="render", unit="demo", progress=progress):
             name, number = episode.name, demo_number(episode.name)
@@ -196,8 +197,8 @@ def rendered_header(file: Path, config: RenderConfig, task: Task) -> dict[str, A
         config: What is rendered; its drawing is named.
         task: Task that was recorded.
     """
-    before = read_header(file)
-    replaced = ("cameras", "pictures", "drawing", *PERTURBED_HEADER)
+    before = task_header(file, task)
+    replaced = ("cameras", "pictures", "drawing", MASK_NAMES, *PERTURBED_HEADER)
     header = {k: v for k, v in before.items() if k not in replaced}
     header |= {**config.header(), "pairing": "aligned"}
     if "instruction" in f"{before.get('perturb', '')} {header.get('perturb', '')}":

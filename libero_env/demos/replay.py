@@ -29,6 +29,7 @@ from libero_env.errors import DemoError
 from libero_env.mujoco_compat import mujoco
 from libero_env.parallel import progress_bar
 from libero_env.sim.observations import image_name
+from libero_env.tasks import Task
 from libero_env.validation import checked
 
 Steps = Annotated[int, Field(ge=0)]
@@ -67,6 +68,7 @@ def replay(
     cameras: Sequence[str] = (),
     size: tuple[int, int] = (256, 256),
     assets: Pack | str | Path | None = None,
+    task: Task | None = None,
 ) -> Iterator[ReplayResult]:
     """Replay demonstrations from their first state, with the fixtures at their recorded poses.
 
@@ -78,6 +80,7 @@ def replay(
         cameras: Cameras to render; none by default.
         size: (height, width) of the images, pixels.
         assets: Where models come from, as for `LiberoEnv`.
+        task: Task that was recorded; None for the one that the file states.
 
     Raises:
         DemoError: The file is broken, does not fit its task's scene, or has no such demonstration.
@@ -85,7 +88,7 @@ def replay(
     if by not in REPLAY_MODES:
         raise DemoError(f"replay by {by!r}; valid: {', '.join(REPLAY_MODES)}")
     config = RenderConfig(tuple(cameras), size, drawing=read_header(file).get("drawing"))
-    renderer = StateRenderer.of_file(file, config, assets)
+    renderer = StateRenderer.of_file(file, config, assets, task=task)
     keys = [image_name(camera, "rgb") for camera in cameras]
     replayed = set()
     try:
@@ -202,21 +205,21 @@ class Regeneration:
         }
 
 
-def regenerate(file: Path, config: Regeneration) -> Iterator[Episode]:
+def regenerate(file: Path, config: Regeneration, task: Task | None = None) -> Iterator[Episode]:
     """Run the demonstrations of a file again; one that does not reach the goal is yielded with `success` False.
 
     Args:
         file: Demonstration file.
         config: How they are run.
+        task: Task that was recorded; None for the one that the file states.
 
     Raises:
         DemoError: The file is broken or does not fit its task's scene.
     """
     if "generator" not in read_header(file):  # not of this package's expert
         config = replace(config, extra_steps=0)
-    renderer = StateRenderer.of_file(
-        file, RenderConfig(size=config.size, drawing=config.drawing), config.pack()
-    )
+    rendering = RenderConfig(size=config.size, drawing=config.drawing)
+    renderer = StateRenderer.of_file(file, rendering, config.pack(), task=task)
     try:
         for episode in read_episodes(file):
             renderer.prepare(episode, f"{file}: {episode.name}")

@@ -45,6 +45,7 @@ _CONFIG_KEYS = (  # attributes in which all demonstrations of a file agree
     ),
     *("generator", "disturbed", "variation", "model_digest", "filter", "perturb", "perturb_draws"),
 )
+REMEDY = "choose another file or remove this one"
 
 
 class OtherRecordingError(DemoError):
@@ -165,9 +166,11 @@ class DemoWriter:
         for key in _CONFIG_KEYS if self.header else ():
             here, expected = (_plain(values.get(key)) for values in (stated, self.header))
             if here != expected:
+                if key == "model_digest":
+                    raise OtherRecordingError(f"{file}: was recorded with other models; {REMEDY}")
                 raise OtherRecordingError(
                     f"{file}: was recorded with {key} = {shorten(repr(here), 80)}, not "
-                    f"{shorten(repr(expected), 80)}; choose another file or remove this one"
+                    f"{shorten(repr(expected), 80)}; {REMEDY}"
                 )
 
     def _write_demo(self, group: h5py.Group, episode: Episode) -> None:

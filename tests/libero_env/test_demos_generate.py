@@ -9,10 +9,11 @@ import time
 from pathlib import Path
 
 import h5py
+import mujoco
 import numpy as np
 import pytest
 
-from libero_env.demos.config import GENERATOR, DemoConfig, Variation
+from libero_env.demos.config import GENERATOR, DemoConfig, Variation, model_digest
 from libero_env.demos.contents import demo_number, read_header
 from libero_env.demos.generate import RecordingJob, demo_path, ensure_demos, generate, make_demos
 from libero_env.demos.read import read_demos, read_episodes
@@ -175,7 +176,21 @@ def test_a_recording_killed_before_its_parts_were_joined_is_finished(whole, tmp_
     check_same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
 
 
-def test_a_file_of_an_older_scene_is_recorded_again(whole, tmp_path):
+@pytest.mark.unit
+def test_the_digest_of_models_does_not_depend_on_where_they_are_installed(tmp_path):
+    def digest(folder, height):
+        folder.mkdir(parents=True, exist_ok=True)
+        points = f"v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 {height}\n"
+        (folder / "m.obj").write_text(points + "f 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+        mesh = f"<asset><mesh name='m' file='{folder / 'm.obj'}'/></asset>"
+        body = "<worldbody><geom type='mesh' mesh='m'/></worldbody>"
+        return model_digest(mujoco.MjModel.from_xml_string(f"<mujoco>{mesh}{body}</mujoco>"))
+
+    here, there = tmp_path / "a", tmp_path / "another_environment" / "lib"
+    assert digest(here, 0.1) == digest(there, 0.1) != digest(tmp_path / "b", 0.2)
+
+
+def test_a_file_of_an_older_scene_is_recorded_again(whole, tmp_path, capsys):
     kept = demo_path(tmp_path, DemoConfig(TASK, SIZE))
     kept.parent.mkdir(parents=True)
     kept.write_bytes(whole.read_bytes())
@@ -183,6 +198,7 @@ def test_a_file_of_an_older_scene_is_recorded_again(whole, tmp_path):
         handle["data"].attrs["model_digest"] = "another"
     ensure_demos([get_task(TASK)], 1, root=tmp_path, workers=1, **KINDS)
     assert len(read_demos(kept)) == 1
+    assert "was recorded with other models: recording again" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from libero_env.demos.config import DemoConfig, RenderConfig, Variation
+from libero_env.demos.contents import read_header
 from libero_env.demos.curate import examine
 from libero_env.demos.generate import RecordingJob, generate, make_demos
 from libero_env.demos.lerobot import export_lerobot
@@ -104,6 +105,10 @@ def test_rendering_again_with_other_cameras_depth_and_segmentation(path, tmp_pat
         and demo.obs["frontview_depth"].dtype == np.float32
     )
     assert len(np.unique(demo.obs["agentview_segmentation"])) > 3
+    names = json.loads(read_header(out)["segmentation_names"])
+    assert set(map(str, np.unique(demo.obs["agentview_segmentation"]))) <= names.keys()
+    again = rerender(out, tmp_path / "plain.hdf5", RenderConfig(size=(8, 8)), progress=False)
+    assert "segmentation_names" not in read_header(again)
     renderer = StateRenderer(get_task(TASK), config)
     episode = next(read_episodes(path))
     seen, _ = renderer.render_states(episode.states[:1], episode.fixtures)

@@ -6,12 +6,15 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env.cli.main import main
+from libero_env.demos.contents import read_header
 from libero_env.demos.curate import examine, filter_demos
 from libero_env.demos.lerobot_writers import QUANTILES, colour_counts, colour_statistics
 from libero_env.demos.observe import recorded_task
 from libero_env.demos.read import noop_steps, read_demos, read_episodes
 from libero_env.errors import DemoError
-from libero_env.tasks import get_task
+from libero_env.tasks import get_task, write_task
+from libero_env.tasks.problem import same_meaning
 from tests.harness.demos import episode, write
 
 pytestmark = pytest.mark.unit
@@ -106,6 +109,41 @@ def test_the_task_is_found_by_name_and_by_text(tmp_path):
     nameless = write(tmp_path / "no.hdf5", [episode(0)], bddl_file_name="x.bddl", bddl_file_content="")
     with pytest.raises(DemoError, match="bddl_file_name"):
         recorded_task(nameless)
+
+
+@pytest.mark.parametrize(
+    "name", ["/home/me/LIBERO/libero/bddl_files/libero_object/{}.bddl", "x/my_task.bddl"]
+)
+def test_the_name_of_an_open_file_is_no_task_text(name, tmp_path, capsys):
+    """The original's collector stores `str(open(file))`: the name decides, and else the user."""
+    task = get_task("libero_object/3")
+    raw = {
+        "bddl_file_name": name.format(task.name),
+        "bddl_file_content": "<_io.TextIOWrapper name='x' mode='r'>",
+    }
+    path, known = write(tmp_path / "raw.hdf5", [episode(0)], **raw), "{}" in name
+    assert main(["demos", "check", str(path)]) == 0
+    assert ("name its task file with --bddl" in capsys.readouterr().out) != known
+    if known:
+        assert recorded_task(path) is task
+    else:
+        with pytest.raises(DemoError, match="_io.TextIOWrapper.*--bddl"):
+            recorded_task(path)
+    bddl = write_task(task, tmp_path / "own.bddl")
+    for out, words in (("kept.hdf5", ["--bddl", str(bddl)]), ("same.hdf5", [])):
+        assert main(["demos", "filter", str(path), str(tmp_path / out), *words]) == 0
+    stated = recorded_task(tmp_path / "kept.hdf5")
+    assert same_meaning(stated.problem, task.problem), "the new file states the task that was named"
+    assert read_header(tmp_path / "kept.hdf5")["bddl_file_content"].startswith("(define")
+
+
+def test_views_that_are_missing_are_told(tmp_path, capsys):
+    blind = episode(0)
+    del blind.obs["agentview_rgb"]
+    path = write(tmp_path / "blind.hdf5", [blind])
+    assert main(["demos", "check", str(path)]) == 0
+    out = capsys.readouterr().out
+    assert "note" in out and "has no agentview_rgb: no policy" in out and "eye_in_hand_rgb:" not in out
 
 
 def test_statistics_of_histograms_are_those_of_the_pixels():
