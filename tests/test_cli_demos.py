@@ -1,5 +1,6 @@
 """`libero demos`: options take effect, and every tool runs on a recorded file."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -49,6 +50,15 @@ def test_options_are_recorded(file):
         assert attrs["camera_size"].tolist() == [16, 24] and not attrs["disturbed"]
         assert '"style": false' in attrs["variation"] and "expert_actions" not in demo
         assert demo["obs/agentview_depth"].shape[1:] == (16, 24) and "eye_in_hand_rgb" not in demo["obs"]
+
+
+@pytest.mark.unit
+def test_images_have_the_size_that_a_run_reads():
+    request = cli_demos.RecordingRequest(task="libero_goal/3", training=("preset=laptop",))
+    (config,) = cli_demos.demo_configs(request)
+    assert config.camera_size == (64, 64)
+    (config,) = cli_demos.demo_configs(replace(request, size=(32, 48)))
+    assert config.camera_size == (32, 48)
 
 
 def test_every_tool_runs(file, tmp_path, capsys):

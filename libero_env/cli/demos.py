@@ -1,5 +1,6 @@
 """`libero demos`: record demonstrations; describe, check, replay, render again, filter and convert files."""
 
+import importlib
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -43,7 +44,8 @@ class RecordingRequest:
         task: One task, such as libero_goal/3.
         bddl: A user-defined task file.
         n: Demonstrations of each task.
-        size: Size of the images, 128 or 120x160.
+        size: Size of the images, 128 or 120x160 (default: 128, or that of --for).
+        training: Overrides of libero train, such as preset=laptop: size, drawing and robot are those of this run.
         cameras: Cameras to render.
         no_images: Record states, proprioception and actions only; `rerender` can add images later.
         drawing: How images are drawn (default: that of the models).
@@ -64,7 +66,8 @@ class RecordingRequest:
     task: str | None = None
     bddl: FilePath | None = None
     n: Positive = 50
-    size: Size = (128, 128)
+    size: Size | None = None
+    training: Annotated[tuple[str, ...], arg(name="for", metavar="OVERRIDE ...")] = ()
     cameras: tuple[str, ...] = ("agentview", "robot0_eye_in_hand")
     no_images: bool = False
     drawing: Drawing | None = None
@@ -118,18 +121,23 @@ def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
     else:
         tasks = (read_task(Path(str(request.bddl))),)
     shown = () if request.no_images else modalities(depth=request.depth, segmentation=request.segmentation)
+    size, drawing, robot = request.size or DemoConfig.camera_size, request.drawing, request.robot
+    if request.training:
+        data = importlib.import_module("lifelong.cli.runs").data_settings(request.training)
+        size, drawing = request.size or (data.image_size, data.image_size), drawing or data.drawing
+        robot = data.robot if robot == DemoConfig.robot else robot
     return [
         DemoConfig(
             task,
-            request.size,
+            size,
             request.seed,
             request.pairing,
             disturb=bool({"noise", "pushes"} & set(request.variation)),
             variation=variation(request),
             cameras=() if request.no_images else request.cameras,
             modalities=shown,
-            drawing=request.drawing,
-            robot=request.robot,
+            drawing=drawing,
+            robot=robot,
             backend=Backend.read(request.backend),
         )
         for task in tasks

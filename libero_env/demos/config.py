@@ -24,6 +24,8 @@ from libero_env.sim.observations import DEFAULT_CAMERAS, segmentation_labels
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
 from libero_env.sim.scene import FAST, Scene, build_scene, default_drawing
 from libero_env.tasks import Task, get_task, read_task
+from libero_env.tasks.suites import OWN
+from libero_env.tasks.task import FILE
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import checked
 
@@ -204,7 +206,7 @@ class DemoConfig:
         return make_header(
             problem_name=task.problem.name,
             language=task.language,
-            bddl_name=f"{task.suite}/{task.name}.bddl",
+            bddl_name=f"{task_home(task)}/{task.name}.bddl",
             bddl_text=task.bddl_text,
             env_kwargs=_env_kwargs(self.render_config),
             pairing=self.pairing,
@@ -217,6 +219,11 @@ class DemoConfig:
             versions=json.dumps({**versions, "robosuite": robosuite_version()}),
             **extra,
         )
+
+
+def task_home(task: Task) -> str:
+    """Return the folder of a task's demonstrations: its suite, or its own name where it is the user's."""
+    return task.name if task.suite in (FILE, OWN) else task.suite
 
 
 def model_digest(model: Any) -> str:

@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 from tqdm import tqdm
 
 from libero_env.assets.robot import DEFAULT_ROBOT
-from libero_env.demos.config import GENERATOR, DemoConfig
+from libero_env.demos.config import GENERATOR, DemoConfig, task_home
 from libero_env.demos.contents import Pairing
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.record import RecordingReport, record_chunk, recorders
@@ -37,11 +37,14 @@ class DemoJob:
 
     Attributes:
         path: File to write.
-        writer: Writer of the file.
     """
 
     path: Path
-    writer: DemoWriter
+
+    @cached_property
+    def writer(self) -> DemoWriter:
+        """Writer of the file."""
+        raise NotImplementedError
 
     def missing(self, n: int) -> set[int]:
         """Return which of the first `n` demonstrations are not there.
@@ -245,7 +248,7 @@ def demo_path(root: Path, config: DemoConfig) -> Path:
     (height, width), task, options = config.camera_size, config.task, config.options()
     suffix = f"-{zlib.crc32(json.dumps(options, sort_keys=True).encode()):08x}" if options else ""
     folder = f"{height}x{width}-seed{config.seed}-{GENERATOR}{suffix}"
-    return root / task.suite / folder / f"{task.name}_demo.hdf5"
+    return root / task_home(task) / folder / f"{task.name}_demo.hdf5"
 
 
 def _raise_errors(reports: dict[Path, RecordingReport]) -> None:

@@ -10,6 +10,7 @@ from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
     from libero_env.cli.doctor import Finding
+    from lifelong.data.settings import DataSettings
 
 RECORDS = "results.jsonl"  # in the directory of each run
 _TRAIN_HELP = """\
@@ -41,6 +42,14 @@ def train(words: Sequence[str]) -> int:
     from lifelong.launch import main
 
     return main(words)
+
+
+def data_settings(words: Sequence[str]) -> "DataSettings":
+    """Return the settings of the demonstrations that a run with these overrides learns from."""
+    from lifelong.composition import compose_run
+    from lifelong.settings import build
+
+    return build(compose_run(words)[0].data)
 
 
 def status(folders: Positional[tuple[FilePath, ...]] = (Path("runs"),)) -> None:

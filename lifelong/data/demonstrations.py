@@ -1,5 +1,6 @@
 """Demonstrations of a run's tasks: recorded if there are none, read when they are needed."""
 
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -7,12 +8,18 @@ from weakref import WeakValueDictionary
 
 import torch
 
-from libero_env.demos.config import RenderConfig
-from libero_env.demos.generate import ensure_demos
+from libero_env.demos.config import DemoConfig, RenderConfig
+from libero_env.demos.contents import demo_names, read_header
+from libero_env.demos.generate import demo_path, ensure_demos
+from libero_env.demos.hdf5 import open_demo_file
+from libero_env.demos.observe import recorded_robot, recorded_task
 from libero_env.demos.read import demo_lengths
 from libero_env.demos.rendering import RenderJob, ensure_rendered
+from libero_env.errors import DemoError
 from libero_env.perturbations import Perturbation, replace_perturbations
+from libero_env.sim.scene import FAST
 from libero_env.tasks import Task
+from libero_env.tasks.problem import same_meaning
 from libero_env.text import closest
 from lifelong.data import DemoSource, open_windows
 from lifelong.data.settings import DataSettings
@@ -26,32 +33,25 @@ def find_demos(
 ) -> list[Path]:
     """Return the demonstration file of each task; missing demonstrations are recorded.
 
-    If `data.folder` is set and has a file `<suite>/<task>_demo.hdf5`, the layout of the original's data sets, that file
-    is used.
+    Files of `data.files` are those of the tasks that they state. Of `data.folder`, a file `<suite>/<task>_demo.hdf5`,
+    the layout of the original's data sets, is used, or else the one file of the folder that states the task and fits.
 
     Args:
         tasks: Tasks in learning order.
         counts: Number of demonstrations required of each task.
-        data: Image size, robot, and the folder of the files.
+        data: Image size, robot, and the files or their folder.
         progress: Whether to show a progress bar; None shows one in a terminal, and lines otherwise.
 
     Raises:
-        DataError: `data.folder` does not exist, or a file in the original's layout has fewer demonstrations than
-            required.
+        DataError: A named file or folder does not exist, or demonstrations that are there cannot be used.
         DemoError: A file is broken, or demonstrations cannot be recorded.
     """
-    folder, files = check_folder(data), dict[str, Path]()
-    for task, count in zip(tasks, counts, strict=True) if folder else ():
-        file = Path(folder or "") / task.suite / f"{task.name}_demo.hdf5"
-        if file.is_file():
-            available = len(demo_lengths(file, count))
-            if available < count:
-                raise DataError(
-                    f"{file} has {available} demonstrations and {count} are required; use data.demos={available}"
-                )
-            files[task.id] = file
+    folder, required = check_folder(data), dict(zip([task.id for task in tasks], counts, strict=True))
+    files = _named_files(tasks, required, data)
+    if folder is not None:
+        files = _files_in(folder, [task for task in tasks if task.id not in files], required, data) | files
     for count in sorted(set(counts), reverse=True):
-        missing = [t for t, n in zip(tasks, counts, strict=True) if n == count and t.id not in files]
+        missing = [t for t in tasks if required[t.id] == count and t.id not in files]
         if not missing:
             continue
         paths = ensure_demos(
@@ -65,6 +65,111 @@ def find_demos(
         )
         files |= zip([task.id for task in missing], paths, strict=True)
     return [files[task.id] for task in tasks]
+
+
+def _named_files(tasks: Sequence[Task], required: Mapping[str, int], data: DataSettings) -> dict[str, Path]:
+    """Return the files of `data.files`, by the id of the task that each states.
+
+    Raises:
+        DataError: One is not of a task of the run or does not fit, or two are of the same task.
+    """
+    files: dict[str, Path] = {}
+    for path in (Path(name).expanduser() for name in data.files):
+        stated = recorded_task(path)
+        task = next((one for one in tasks if same_meaning(one.problem, stated.problem)), None)
+        if task is None:
+            names = ", ".join(one.name for one in tasks[:5]) + (", ..." if len(tasks) > 5 else "")
+            raise DataError(f"data.files: {path} is of {stated.name!r}, not of a task of this run: {names}")
+        if task.id in files:
+            raise DataError(f"data.files: {files[task.id]} and {path} are of the same task, {task.name!r}")
+        if reason := _misfit(path, required[task.id], data):
+            raise DataError(f"data.files: {path} {reason}")
+        files[task.id] = path
+    return files
+
+
+def _files_in(
+    folder: Path, tasks: Sequence[Task], required: Mapping[str, int], data: DataSettings
+) -> dict[str, Path]:
+    """Return the files of a folder that are used as they are, by the id of their task; say which are not, and why.
+
+    Raises:
+        DataError: Demonstrations that the expert did not record do not fit, or several files do.
+    """
+    files: dict[str, Path] = {}
+    for task in tasks:
+        file = folder / task.suite / f"{task.name}_demo.hdf5"
+        if file.is_file():
+            if (available := len(demo_lengths(file, required[task.id]))) < required[task.id]:
+                raise DataError(f"{file} {_too_few(available, required[task.id])}")
+            files[task.id] = file
+    if not (left := [task for task in tasks if task.id not in files]):
+        return files
+    stated = [(path, one) for path in _demo_files_below(folder) if (one := _stated_task(path)) is not None]
+    for task in left:
+        size = (data.image_size, data.image_size)
+        own = demo_path(folder, DemoConfig(task, size, drawing=data.drawing, robot=data.robot))
+        paths = [path for path, other in stated if same_meaning(task.problem, other.problem)]
+        if own in paths:  # which the recording completes
+            continue
+        reasons = {path: _misfit(path, required[task.id], data) for path in paths}
+        fitting = [path for path, reason in reasons.items() if not reason]
+        if len(fitting) > 1:
+            several = ", ".join(map(str, fitting))
+            raise DataError(
+                f"data.folder has several files of {task.name!r}: {several}; name one in data.files"
+            )
+        if fitting:
+            files[task.id] = fitting[0]
+            continue
+        for path, reason in reasons.items():
+            if not str(read_header(path).get("generator", "")).startswith("scripted-expert"):
+                raise DataError(f"data.folder: {path} {reason}")
+            print(f"not used: {path} {reason}; others are recorded", file=sys.stderr)
+    if stated and not files and not any(same_meaning(t.problem, o.problem) for t in left for _, o in stated):
+        names = ", ".join(sorted({task.name for _, task in stated})[:3])
+        print(f"data.folder has demonstrations of other tasks only, such as {names}", file=sys.stderr)
+    return files
+
+
+def _demo_files_below(folder: Path) -> list[Path]:
+    return [p for p in sorted(folder.rglob("*.hdf5")) if not (p.is_symlink() or p.parent.suffix == ".parts")]
+
+
+def _stated_task(file: Path) -> Task | None:
+    try:
+        return recorded_task(file)
+    except DemoError:
+        return None
+
+
+def _too_few(available: int, required: int) -> str:
+    return f"has {available} demonstrations and {required} are required; use data.demos={available}"
+
+
+def _misfit(file: Path, required: int, data: DataSettings) -> str:
+    """Return why a file cannot be learned from with these settings, to follow its name; "" where it can."""
+    header, size = read_header(file), data.image_size
+    if "perturb" in header:
+        return f"was rendered under {header['perturb']}; use data.perturb or stream.perturb"
+    if "generator" in header and recorded_robot(file) != data.robot:
+        return f"has the robot {recorded_robot(file)}; data.robot is {data.robot}"
+    if data.drawing and "generator" in header and header.get("drawing", FAST) != data.drawing:
+        return f"is drawn {header.get('drawing', FAST)}; data.drawing is {data.drawing}"
+    available = len(demo_lengths(file, required))
+    if available < required:
+        return _too_few(available, required)
+    with open_demo_file(file) as handle:
+        obs = handle["data"][demo_names(handle, file)[0]].get("obs", {})
+        shapes = {view: tuple(obs[view].shape[1:3]) for view in data.views if view in obs}
+    for view in data.views:
+        if view not in shapes:
+            return f"has no {view}, which data.views has; `libero demos rerender` draws it"
+        if shapes[view] != (size, size):
+            height, width = shapes[view]
+            use = f"data.image_size={height}" if height == width else "`libero demos rerender`"
+            return f"has images of {height}x{width} pixels and data.image_size is {size}; use {use}"
+    return ""
 
 
 def check_folder(data: DataSettings) -> Path | None:

@@ -37,6 +37,8 @@ class DataSettings:
         pairing: `aligned` pairs each action with the observation before it; `stored` reads files as they are.
         labels: `expert` learns the actions that the expert chose, `executed` those with noise that were executed.
         robot: Model of the arm in demonstrations and evaluation, see `libero_env.assets.robot`.
+        files: Demonstration files of tasks of the run, which are the tasks that they state; other tasks have theirs in
+            `folder`.
         folder: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
         memory: Where frames are held, see `lifelong.data.loading`; batches do not depend on it.
         drawing: How images are drawn, in the demonstrations and in evaluations of the policy: `fast`, `faithful`, or
@@ -55,6 +57,7 @@ class DataSettings:
     pairing: Literal["aligned", "stored"] = "aligned"
     labels: Literal["expert", "executed"] = "expert"
     robot: Annotated[str, OneOf(ROBOTS)] = DEFAULT_ROBOT
+    files: Sequence[PathText] = ()
     folder: PathText | None = None
     memory: Annotated[str, OneOf(MEMORY)] = "auto"
     drawing: Literal["fast", "faithful"] | None = None

@@ -1,5 +1,7 @@
 """Which file a task's demonstrations are read from."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,6 +12,7 @@ from libero_env.tasks import get_suite
 from lifelong.data import demonstrations
 from lifelong.data.settings import DataSettings
 from lifelong.errors import DataError
+from tests.harness.demos import episode, write
 
 pytestmark = pytest.mark.unit
 TASKS = get_suite("libero_object").tasks[:3]
@@ -47,6 +50,58 @@ def test_files_in_the_originals_layout_are_used(tmp_path, recorded):
     assert found[1] == human
     assert recorded == [TASKS[0].name, TASKS[2].name]
     assert [path.name for path in found[::2]] == [f"{TASKS[0].name}_2.hdf5", f"{TASKS[2].name}_1.hdf5"]
+
+
+def own(path, task=TASKS[1], demos=2, size=8, **more):
+    """Write demonstrations of a task under any name."""
+    stated = {"bddl_file_name": f"x/{task.name}.bddl", "bddl_file_content": task.bddl_text}
+    return write(path, [episode(i, size=size) for i in range(demos)], **stated, **more)
+
+
+def test_named_files_and_files_of_a_folder_are_found_by_the_task_that_they_state(tmp_path, recorded):
+    path = own(tmp_path / "deep" / "whatever.hdf5")
+    for data in (replace(settings(None), files=[str(path)]), settings(str(tmp_path))):
+        assert demonstrations.find_demos(TASKS, [2, 2, 2], data, False)[1] == path
+        assert recorded == [TASKS[0].name, TASKS[2].name]
+        recorded.clear()
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "words"),
+    [
+        ({"size": 16}, "16x16 pixels and data.image_size is 8; use data.image_size=16"),
+        ({"demos": 1}, "has 1 demonstrations and 2 are required; use data.demos=1"),
+        ({"perturb": "light=0.5"}, "was rendered under light=0.5"),
+        ({"generator": "teleoperation", "robot": "robosuite-1.4.1"}, "data.robot is libero"),
+    ],
+)
+def test_demonstrations_that_do_not_fit_are_refused_by_name(kwargs, words, tmp_path, recorded):
+    path = own(tmp_path / "mine.hdf5", **kwargs)
+    for data in (replace(settings(None), files=[str(path)]), settings(str(tmp_path))):
+        with pytest.raises(DataError, match=rf"mine.hdf5 .*{re.escape(words)}"):
+            demonstrations.find_demos(TASKS, [2, 2, 2], data, False)
+    assert not recorded
+
+
+def test_what_the_expert_recorded_otherwise_is_told_and_recorded_again(tmp_path, recorded, capsys):
+    own(tmp_path / "expert.hdf5", size=16, generator="scripted-expert-14", robot="libero")
+    demonstrations.find_demos(TASKS[1:2], [2], settings(str(tmp_path)), False)
+    assert recorded == [TASKS[1].name] and "not used" in capsys.readouterr().err
+    demonstrations.find_demos(TASKS[:1], [2], settings(str(tmp_path)), False)
+    assert f"other tasks only, such as {TASKS[1].name}" in capsys.readouterr().err
+
+
+def test_files_of_no_task_of_the_run_or_of_the_same_task_are_refused(tmp_path, recorded):
+    first, second = own(tmp_path / "a.hdf5"), own(tmp_path / "b.hdf5")
+    for files, tasks, words in (
+        ([first], TASKS[:1], "not of a task of this run"),
+        ([first, second], TASKS, "of the same task"),
+    ):
+        with pytest.raises(DataError, match=words):
+            data = replace(settings(None), files=list(map(str, files)))
+            demonstrations.find_demos(tasks, [2] * len(tasks), data, False)
+    with pytest.raises(DataError, match="several files"):
+        demonstrations.find_demos(TASKS, [2, 2, 2], settings(str(tmp_path)), False)
 
 
 def test_without_a_folder_recorded_files_are_used(tmp_path, recorded, monkeypatch):
