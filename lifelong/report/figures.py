@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -238,7 +239,12 @@ def save(figure: Figure, stem: Path) -> None:
         FigureCanvasAgg(figure)
         for suffix, options in ((".png", {"dpi": 300}), (".pdf", {"metadata": {"CreationDate": None}})):
             with atomic_path(stem.with_suffix(suffix)) as part:
-                form = {"format": suffix[1:], "bbox_inches": "tight", "pad_inches": 0.05, **options}
+                form: dict[str, Any] = {
+                    "format": suffix[1:],
+                    "bbox_inches": "tight",
+                    "pad_inches": 0.05,
+                    **options,
+                }
                 figure.savefig(part, facecolor="white", **form)
 
 

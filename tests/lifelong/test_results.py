@@ -20,6 +20,7 @@ from lifelong.results.records import (
     RunEndRecord,
     TaskEndRecord,
     from_line,
+    signed_line,
     to_line,
 )
 from lifelong.results.results import Results
@@ -176,33 +177,40 @@ def test_reading_never_changes_the_file(log: ResultLog):
     assert log.path.read_bytes() == broken
 
 
+def _signed(text: str) -> str:
+    return signed_line(json.loads(text)).decode().strip()
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
         ("{not json", "not JSON"),
         ('{"kind": "lost"}', "unknown kind of record 'lost'; valid: run, loss, eval"),
-        ('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1}', "seconds"),
+        (_signed('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1}'), "seconds"),
         (
-            '{"kind": "loss", "task": "zero", "epoch": 1, "loss": 0.1, "seconds": 1}',
+            _signed('{"kind": "loss", "task": "zero", "epoch": 1, "loss": 0.1, "seconds": 1}'),
             "a 'loss' record: task is 'zero'; expected a whole number",
         ),
         (
-            '{"kind": "task_end", "task": true, "best_epoch": 1, "seconds": 1}',
+            _signed('{"kind": "task_end", "task": true, "best_epoch": 1, "seconds": 1}'),
             "a 'task_end' record: task is True",
         ),
         ("[1, 2]", "unknown kind"),
         ('{"kind": [1]}', "unknown kind"),
         ("[" * 50_000, "not JSON"),
         ("\0" * 40, "not JSON"),
-        ('{"kind": "cost", "task": 0, "costs": {"bytes": "many"}}', "costs.bytes is 'many'"),
+        (_signed('{"kind": "cost", "task": 0, "costs": {"bytes": "many"}}'), "costs.bytes is 'many'"),
         (
-            '{"kind": "loss", "task": -1, "epoch": 1, "loss": 0.1, "seconds": 1}',
+            _signed('{"kind": "loss", "task": -1, "epoch": 1, "loss": 0.1, "seconds": 1}'),
             "task is -1; expected at least 0",
         ),
-        ('{"kind": "loss", "task": 2, "epoch": 1, "loss": 0.1, "seconds": 1}', "task 2, of 2 from 0 on"),
+        (
+            _signed('{"kind": "loss", "task": 2, "epoch": 1, "loss": 0.1, "seconds": 1}'),
+            "task 2, of 2 from 0 on",
+        ),
         (
             '{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1, "seconds": 1e400}',
-            "expected a finite number",
+            "not JSON compliant",
         ),
         (to_line(RUN[3]).decode().strip().replace("-3.25", "-3.26"), "does not have its checksum"),
         (to_line(RUN[2]).decode().strip(), "repeats line 3"),
