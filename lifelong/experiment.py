@@ -64,7 +64,7 @@ from lifelong.types import PolicySpec
 
 PRETRAIN_KEYS = ("pretrain", "policy", "data", "augmentation", "train", "language", "seed", "init_from")
 LARGE_FOR_CPU = (
-    4_000_000  # pixels in a batch: the published protocol has 10 million, the laptop's less than one
+    4_000_000  # pixels of a batch; the published protocol has 10 million, the laptop's less than one
 )
 EXAMPLE_DIM = 384  # of instructions' embeddings, by which a policy is measured before they are computed
 

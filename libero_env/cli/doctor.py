@@ -202,20 +202,15 @@ def check_gl() -> Finding:
 def examine_gpu() -> list[Finding]:
     """Return the findings about the GPU: its driver, and whether 1, 4 and one renderer a core draw on it at once."""
     if not (gpu := gpu_name()):
-        return [
-            Finding(
-                "GPU", "nvidia-smi finds none", False, "install the driver; everything runs without one, too"
-            )
-        ]
+        remedy = "install the driver; everything runs without a GPU, too"
+        return [Finding("GPU", "nvidia-smi finds none", False, remedy)]
     return [Finding("GPU", gpu), *(check_renderers(n) for n in sorted({1, 4, os.cpu_count() or 1}))]
 
 
 def check_renderers(count: int) -> Finding:
     """Draw with several processes at once: some drivers hang in that for ever."""
-    title, remedy = (
-        f"{count} renderers at once",
-        "record and evaluate with fewer --workers, or MUJOCO_GL=osmesa",
-    )
+    title = f"{count} renderers at once"
+    remedy = "record and evaluate with fewer --workers, or MUJOCO_GL=osmesa"
     path = os.pathsep.join(filter(None, (PACKAGE_ROOT, os.environ.get("PYTHONPATH"))))
     command, env = [sys.executable, "-c", _PROBE], {**os.environ, "PYTHONPATH": path}
     started = [subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) for _ in range(count)]
@@ -233,9 +228,8 @@ def check_renderers(count: int) -> Finding:
                 process.stdout.close()
     failed = [text for text in texts if '"milliseconds"' not in text]
     if failed or any("llvmpipe" in text for text in texts):
-        return Finding(
-            title, f"{len(failed)} failed, or they draw on the processor: {texts[0].strip()}", False, remedy
-        )
+        answer = (failed or texts)[0].strip()
+        return Finding(title, f"{len(failed)} failed, or they draw on the processor: {answer}", False, remedy)
     return Finding(title, "all draw on the GPU")
 
 

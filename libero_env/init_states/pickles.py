@@ -6,10 +6,8 @@ most 10,000 numbers and 16 million numbers in all. Sizes are compared with the f
 """
 
 import io
-import os
 import pickle
 import pickletools
-import stat
 import struct
 import zipfile
 import zlib
@@ -19,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from libero_env.errors import LiberoError
-from libero_env.storage import atomic_path
+from libero_env.storage import atomic_path, read_bounded
 from libero_env.text import shown
 
 _MAX_OPERATIONS = 2000  # an array takes 60, a tensor 40
@@ -153,7 +151,7 @@ def read_states(path: str | Path) -> np.ndarray:
             module describes.
     """
     try:
-        content = _read_file(Path(path))
+        content = read_bounded(Path(path), _MAX_BYTES)
         if content.startswith(b"PK"):
             array = _read_zip(content)
         else:
@@ -191,16 +189,6 @@ def states_content(rows: np.ndarray, name: str) -> bytes:
         for part, data in (("data.pkl", content), ("version", b"3\n")):
             archive.writestr(zipfile.ZipInfo(f"{name}/{part}", _EPOCH), data)
     return stream.getvalue()
-
-
-def _read_file(path: Path) -> bytes:
-    found = os.stat(path)
-    if not stat.S_ISREG(found.st_mode):
-        raise StateFileError("not a file")
-    if found.st_size > _MAX_BYTES:
-        raise StateFileError(f"larger than {_MAX_BYTES >> 20} MiB")
-    with open(path, "rb") as file:
-        return file.read(found.st_size)
 
 
 @dataclass(frozen=True)

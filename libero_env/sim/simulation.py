@@ -21,7 +21,7 @@ from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD, log_warnin
 from libero_env.sim.backend import Backend
 from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.osc import REST, ArmIndex
-from libero_env.timing import CONTROL_PERIOD, SUBSTEPS, TIMESTEP
+from libero_env.timing import SUBSTEPS
 
 try:
     from mujoco.batch import Batch
@@ -258,7 +258,7 @@ class Simulations(ABC):
             SimulationError: Some have failed; the others have moved.
         """
         ids = np.asarray(ids, np.int64)
-        before = {int(i): self.time(i) for i in ids}
+        before = dict(zip(ids.tolist(), self._times(ids), strict=True))
         state, fields = self.controller_state, self._controlled_fields(ids)
         pos, mat = self._grip_site(fields)
         state.controller.set_goals(ids, actions, fields["qpos"], pos, mat, state.goal, state.memory)
@@ -267,16 +267,19 @@ class Simulations(ABC):
         if failed := self._failures(before):
             raise SimulationError(failed)
 
+    def _times(self, ids: np.ndarray) -> list[float]:
+        return [self.time(i) for i in ids]
+
     def _failures(self, before: Mapping[int, float]) -> dict[int, str]:
         """Return why simulations have failed in a control period, by index: MuJoCo resets them, with a warning only.
 
         Args:
             before: Time of each simulation that was stepped, before it, s.
         """
-        failed = {}
+        failed, step = {}, self.model.opt.timestep
         for i, time in before.items():
-            is_first = abs(time) < 0.5 * TIMESTEP  # a reset in the first substep does not show in the time
-            if abs(self.time(i) - time - CONTROL_PERIOD) > 0.5 * TIMESTEP or (
+            is_first = abs(time) < 0.5 * step  # a reset in the first substep does not show in the time
+            if abs(self.time(i) - time - SUBSTEPS * step) > 0.5 * step or (
                 is_first and any(self.data(i).warning[kind].number for kind in _UNSTABLE)
             ):
                 failed[i] = DIVERGED

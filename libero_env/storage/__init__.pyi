@@ -17,6 +17,7 @@ from .files import (
     open_for_owner,
     read_bounded,
     read_json,
+    regular_file,
     sync_folder,
     write_json,
 )
@@ -48,6 +49,7 @@ __all__ = [
     "read_record",
     "read_yaml",
     "read_yaml_file",
+    "regular_file",
     "sync_folder",
     "write_cache",
     "write_json",

@@ -5,7 +5,7 @@ import os
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -95,17 +95,32 @@ def read_bounded(path: Path, most: int, *, within: Path | None = None) -> bytes:
     """
     if within is not None and not path.resolve().is_relative_to(within.resolve()):
         raise OSError(f"it is a link that leads out of {within}")
-    with open(path, "rb", opener=_open_without_waiting) as file:
-        status = os.fstat(file.fileno())
-        if not stat.S_ISREG(status.st_mode):
-            raise OSError("it is a folder, a pipe or a device; expected a file")
-        if status.st_size > most:
-            raise OSError(f"it is larger than {most >> 20} MiB")
+    with open(path, "rb", opener=regular_file(most)) as file:
         return file.read(most)
 
 
-def _open_without_waiting(path: str, flags: int) -> int:
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+def regular_file(most: int, *, links: bool = True) -> Callable[[str, int], int]:
+    """Return an opener, as for `open`, of files that may be somebody else's: it never waits.
+
+    It raises an OSError for a folder, a pipe or a device, and for what is too large.
+
+    Args:
+        most: Largest size, [bytes].
+        links: Whether a link is followed; else it is an OSError, too.
+    """
+
+    def opener(path: str, flags: int) -> int:
+        flags |= getattr(os, "O_NONBLOCK", 0) | (0 if links else getattr(os, "O_NOFOLLOW", 0))
+        file = os.open(path, flags, 0o666)
+        status = os.fstat(file)
+        if stat.S_ISREG(status.st_mode) and status.st_size <= most:
+            return file
+        os.close(file)
+        if stat.S_ISREG(status.st_mode):
+            raise OSError(f"it is larger than {most >> 20} MiB")
+        raise OSError("it is a folder, a pipe or a device; expected a file")
+
+    return opener
 
 
 def create_text(target: Path, text: str) -> bool:

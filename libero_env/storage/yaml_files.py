@@ -1,7 +1,6 @@
 """YAML files: those of the package, and those of users, with the line of each value; nothing in them is executed."""
 
 import math
-import stat
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -11,6 +10,7 @@ from typing import Any
 import yaml
 
 from libero_env.errors import InvalidInputError
+from libero_env.storage.files import read_bounded
 
 MAX_YAML_BYTES = 4 << 20
 _MAX_NODES = 200_000  # of a document, each alias counted as often as it is used
@@ -69,14 +69,7 @@ def read_yaml_file(path: str | Path) -> YamlFile:
     """
     path = Path(path)
     try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):  # a pipe has no end, and a device no size
-            raise InvalidInputError(f"{path} is a folder, a pipe or a device; expected a YAML file")
-        if status.st_size > MAX_YAML_BYTES:
-            raise InvalidInputError(
-                f"{path} is larger than {MAX_YAML_BYTES >> 20} MiB; expected a short YAML file"
-            )
-        return parse_yaml_text(path.read_text(encoding="utf-8"), str(path))
+        return parse_yaml_text(read_bounded(path, MAX_YAML_BYTES).decode(), str(path))
     except OSError as error:
         raise InvalidInputError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

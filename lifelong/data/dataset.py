@@ -152,9 +152,7 @@ class SequenceVLDataset:
         Raises:
             DataError: An index is out of range.
         """
-        indices = torch.as_tensor(
-            indices, dtype=torch.int64
-        )  # checked before they go to a GPU, which would wait
+        indices = torch.as_tensor(indices, dtype=torch.int64)  # checked here: on a GPU that would wait
         if len(indices) and not (int(indices.min()) >= 0 and int(indices.max()) < len(self)):
             raise DataError(
                 f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}"

@@ -139,7 +139,8 @@ def _demo_files_below(folder: Path) -> list[Path]:
 def _stated_task(file: Path) -> Task | None:
     try:
         return recorded_task(file)
-    except DemoError:
+    except DemoError as error:
+        print(f"not used: {error}", file=sys.stderr)
         return None
 
 

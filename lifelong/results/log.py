@@ -2,17 +2,17 @@
 
 import hashlib
 import os
-import stat
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
+from libero_env.storage import regular_file
 from lifelong.errors import ResultsError
 from lifelong.results.records import DemonstrationsRecord, Record, RunRecord, from_line, to_line
 from lifelong.results.results import Results
 
 MAX_LINE = 4 << 20  # [bytes]
-MAX_FILE = 4 << 30  # [bytes]
+_open_own = regular_file(4 << 30, links=False)  # the folder may be somebody else's
 
 _Stamp = tuple[int, int, int]  # inode, size, time of the last change
 
@@ -104,16 +104,6 @@ class ResultLog:
         except OSError as error:
             raise ResultsError(f"{self.path}: cannot be read ({error})") from error
         return found.st_ino, found.st_size, found.st_mtime_ns
-
-
-def _open_own(path: str, flags: int) -> int:
-    """Open the file of records, which may be in somebody else's folder: not through a link, nor a pipe or a device."""
-    file = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), 0o666)
-    status = os.fstat(file)
-    if stat.S_ISREG(status.st_mode) and status.st_size <= MAX_FILE:
-        return file
-    os.close(file)
-    raise OSError(f"it is a pipe or a device, or larger than {MAX_FILE >> 30} GiB")
 
 
 def _lines(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:

@@ -110,6 +110,14 @@ def test_packnet_owns_a_quarter_of_what_is_free_and_covers_all_weights():
     assert set(algorithm.state_dict()["owner"]) == {n for n, p in policy.named_parameters() if p.dim() > 1}
 
 
+def test_packnet_says_when_no_weight_is_free(caplog):
+    policy, algorithm = DeepPolicy(), PackNet(prune_perc=0.01)
+    learn(algorithm, policy, 0)
+    assert "no free weight" not in caplog.text
+    learn(algorithm, policy, 1)
+    assert "task 2 has no free weight in" in caplog.text and "algo.prune_perc" in caplog.text
+
+
 def test_packnet_trains_norms_and_biases_with_the_first_task_only():
     policy, algorithm = DeepPolicy(), PackNet()
     fresh = copy.deepcopy(policy.state_dict())

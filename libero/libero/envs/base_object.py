@@ -1,7 +1,8 @@
 """Classes of objects by category, as the original registers them, with the models of `libero_env`."""
 
 import re
-from collections.abc import Mapping
+from collections import UserDict
+from collections.abc import Mapping, MutableMapping
 from functools import cached_property, partial
 from operator import attrgetter
 from os import PathLike
@@ -19,7 +20,7 @@ from libero_env.objects.builtin.physics import Physics, load_physics
 from libero_env.sim.predicates import reaches_state
 
 
-class _Objects(dict):
+class _Objects(UserDict):
     """Classes, or functions of a name, by category; scenes are built from those of users."""
 
     def __setitem__(self, category: str, made_by: Any) -> None:
@@ -28,16 +29,12 @@ class _Objects(dict):
         if not (is_builtin and category in builtin_names()):
             register_model(category, partial(_model, made_by, category))
 
-    def update(self, *entries: Any, **more: Any) -> None:
-        for category, made_by in dict(*entries, **more).items():
-            self[category] = made_by
-
 
 def _model(made_by: Any, category: str) -> ObjectModel:
     return model_of(made_by(name=category), category)
 
 
-OBJECTS_DICT: dict[str, Any] = _Objects()
+OBJECTS_DICT: MutableMapping[str, Any] = _Objects()
 VISUAL_CHANGE_OBJECTS_DICT: dict[str, Any] = {}
 
 
@@ -66,7 +63,7 @@ def get_object_fn(category_name: str) -> type:
     return lookup(OBJECTS_DICT, "object category", category_name)
 
 
-def get_object_dict() -> dict[str, type]:
+def get_object_dict() -> MutableMapping[str, Any]:
     """Return all classes by category."""
     return OBJECTS_DICT
 

@@ -84,6 +84,7 @@ class WarpSimulations(Simulations):
         self.uses_graphs, self._graphs = can_capture(self.device), dict[int, Any]()
         self.limits_reached = Counter[str]()
         self._actions_seen = np.zeros(num)
+        self._unplaced = np.ones(num, bool)  # not started yet: all things at one place
 
     @property
     def _other_rows(self) -> int:
@@ -133,6 +134,16 @@ class WarpSimulations(Simulations):
 
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
         model, data, control = self.device_model, self.device_data, self._control
+        if not len(ids):
+            return
+        started = ids
+        self._unplaced[ids] = False
+        unplaced = np.flatnonzero(
+            self._unplaced
+        )  # they take the first state: their contacts would fill all memory
+        source = np.append(np.arange(len(ids)), np.zeros(len(unplaced), np.int64))
+        poses = self.fixtures[ids[source]]
+        ids, qpos, qvel = np.append(ids, unplaced), qpos[source], qvel[source]
         with wp.ScopedDevice(self.device):
             _write(data.time, ids, time)
             _write(data.qpos, ids, qpos)
@@ -142,8 +153,8 @@ class WarpSimulations(Simulations):
             _write(control.arm, ids, qpos[:, :7])
             if self.fixture_bodies.size:
                 rows = np.ix_(ids, self.fixture_bodies)
-                _write(model.body_pos, rows, self.fixtures[ids, :, :3])
-                _write(model.body_quat, rows, self.fixtures[ids, :, 3:])
+                _write(model.body_pos, rows, poses[..., :3])
+                _write(model.body_quat, rows, poses[..., 3:])
             if control.static_geoms.size:
                 mjw.kinematics(model, data)
                 wp.launch(
@@ -156,7 +167,7 @@ class WarpSimulations(Simulations):
             mjw.step1(model, data)
         self._copies.forget()
         lost = data.nacon.numpy()[0] > data.naconmax  # of which simulation is not known, and no flag is set
-        if failed := {int(i): self._no_room(mjw.OverflowType.NARROWPHASE) for i in ids if lost}:
+        if failed := {int(i): self._no_room(mjw.OverflowType.NARROWPHASE) for i in started if lost}:
             raise SimulationError(failed)
 
     def _substeps(
@@ -273,6 +284,9 @@ class WarpSimulations(Simulations):
             f"it has more contacts or constraints than there is room for ({flags.name}); set "
             f"backend='warp,contacts={2 * contacts}' (now {contacts})"
         )
+
+    def _times(self, ids: np.ndarray) -> list[float]:
+        return [0.0] * len(ids)  # not asked for: values that are not finite stay so
 
     def _failures(self, before: Mapping[int, float]) -> dict[int, str]:
         finite = np.isfinite(self.fields["qpos"]).all(axis=1) & np.isfinite(self.fields["qvel"]).all(axis=1)

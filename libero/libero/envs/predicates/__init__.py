@@ -1,7 +1,8 @@
 """Predicates as callables of object states, by name; `libero_env.sim.predicates` decides whether they hold."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections import UserDict
+from collections.abc import Callable, MutableMapping
 from functools import partial
 from typing import Any, ClassVar
 
@@ -121,7 +122,7 @@ class _OfStates:
             self.is_asked = False
 
 
-class _Predicates(dict):
+class _Predicates(UserDict):
     """Predicates by name; those of users hold in goals too, so that all are in one table."""
 
     def __setitem__(self, key: str, predicate: Callable[..., bool]) -> None:
@@ -131,19 +132,11 @@ class _Predicates(dict):
             key, _OfStates(predicate, PREDICATES.get(name) if name in BUILTIN_PREDICATES else None)
         )
 
-    def update(self, *entries: Any, **more: Any) -> None:
-        for key, predicate in dict(*entries, **more).items():
-            self[key] = predicate
 
-    def setdefault(self, key: str, default: Any = None) -> Any:
-        if key not in self:
-            self[key] = default
-        return self[key]
-
-
-VALIDATE_PREDICATE_FN_DICT: dict[str, Callable[..., bool]] = _Predicates(
-    {name.removesuffix("PredicateFn").lower(): globals()[name]() for name in _CLASSES}
-)
+VALIDATE_PREDICATE_FN_DICT = _Predicates()
+VALIDATE_PREDICATE_FN_DICT.data = {  # which are in the table already
+    name.removesuffix("PredicateFn").lower(): globals()[name]() for name in _CLASSES
+}
 send_to_workers(__name__, "VALIDATE_PREDICATE_FN_DICT")
 
 
@@ -161,17 +154,16 @@ def update_predicate_fn_dict(fn_key: str, fn_name: str | type | Callable[..., bo
     VALIDATE_PREDICATE_FN_DICT[fn_key.lower()] = predicate
 
 
-def get_predicate_fn_dict() -> dict[str, Callable[..., bool]]:
+def get_predicate_fn_dict() -> MutableMapping[str, Callable[..., bool]]:
     """Return all predicates by name."""
     return VALIDATE_PREDICATE_FN_DICT
 
 
 def get_predicate_fn(predicate_fn_name: str) -> Callable[..., bool]:
     """Return a predicate by its name, ignoring case; raise an UnknownNameError if there is none."""
-    if (
-        name := predicate_fn_name.lower()
-    ) not in VALIDATE_PREDICATE_FN_DICT and name.capitalize() in PREDICATES:
-        return partial(_native, name.capitalize())  # registered with libero_env
+    name = predicate_fn_name.capitalize()
+    if name.lower() not in VALIDATE_PREDICATE_FN_DICT and name in PREDICATES:
+        return partial(_native, name)  # registered with libero_env
     return lookup(VALIDATE_PREDICATE_FN_DICT, "predicate", predicate_fn_name)
 
 
