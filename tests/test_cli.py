@@ -321,3 +321,16 @@ def test_doctor_checks_the_gpu(monkeypatch, capsys):
     for probe, ok in probes.items():
         monkeypatch.setattr(doctor, "_PROBE", probe)
         assert doctor.check_renderers(2).ok is ok
+
+
+@pytest.mark.parametrize(
+    "line", ["train preset=smoke", "demos generate --task libero_goal/3 --for preset=laptop", "report runs"]
+)
+def test_a_package_of_learning_that_is_not_installed_is_one_line(line):
+    program = "import sys; sys.modules[sys.argv.pop(1)] = None; from libero_env.cli.main import main; sys.exit(main())"
+    package = "matplotlib" if line == "report runs" else "hydra"
+    done = subprocess.run(
+        [sys.executable, "-c", program, package, *line.split()], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert done.stderr == f"error: {package} is not installed; type pip install 'libero-lifelong[train]'\n"

@@ -79,6 +79,13 @@ def _run(words: list[str]) -> int:
             if resume := ALL[name].resume:
                 error.add_note(resume)
             raise
+        except ModuleNotFoundError as error:
+            package = (error.name or "").partition(".")[0]
+            if package not in _LEARNING_PACKAGES:
+                raise
+            raise MissingPackageError(
+                f"{package} is not installed", "pip install 'libero-lifelong[train]'"
+            ) from None
 
 
 def find(words: Sequence[str]) -> str | None:
@@ -102,20 +109,9 @@ def bind(name: str, words: Sequence[str]) -> Callable[[], int | None]:
 
 
 def load(command: Command) -> Callable[..., Any]:
-    """Import the function of a command.
-
-    Raises:
-        MissingPackageError: A package that learning needs is not installed.
-    """
+    """Import the function of a command."""
     module, _, name = command.target.partition(":")
-    try:
-        return getattr(importlib.import_module(module), name)
-    except ModuleNotFoundError as error:
-        if error.name not in _LEARNING_PACKAGES:
-            raise
-        raise MissingPackageError(
-            f"{error.name} is not installed", "pip install 'libero-lifelong[train]'"
-        ) from None
+    return getattr(importlib.import_module(module), name)
 
 
 def _overview(words: Sequence[str]) -> int:
