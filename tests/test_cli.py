@@ -62,31 +62,22 @@ def test_a_task_is_shown_as_bddl(capsys):
     assert bddl.parse(capsys.readouterr().out) == get_task("libero_object/7").problem
 
 
-@pytest.mark.parametrize(
-    ("argv", "hint"),
-    [
-        (["tasks", "list", "libero_objet"], "Did you mean 'libero_object'?"),
-        (["tasks", "show", "libero_object/12"], "unknown index of libero_object '12'. Valid: 0 to 9\n"),
-        (["tasks", "list", "libero_object", "--order", "30"], "libero_object 30. Valid: 0 to 20\n"),
-        (
-            ["tasks", "show", "libero_goa"],
-            "unknown suite 'libero_goa'. Did you mean 'libero_goal'? Valid: li",
-        ),
-        (["tasks", "certify", "libero-goal"], "unknown suite 'libero-goal'. Did you mean 'libero_goal'?"),
-        (["tasks", "lint", "LIBERO_GOAL"], "Did you mean 'libero_goal'?"),
-        (["perturb", "certify", "libero_gola"], "Did you mean 'libero_goal'?"),
-        (["robustness", "expert", "--suite", "libero_gaol"], "Did you mean 'libero_goal'?"),
-        (["eval", "expert", "--suite", "libero_goa"], "Did you mean 'libero_goal'?"),
-        (
-            ["eval", "nowhere", "--suite", "libero_goal"],
-            "nowhere does not exist; give the directory of a run",
-        ),
-        (["serve", "nowhere"], "nowhere does not exist; give the directory of a run"),
-        (["relearn", "nowhere"], "nowhere does not exist; give the directory of a run"),
-        (["demos", "check", "/nonexist"], "/nonexist does not exist; give demonstration files, or folders"),
-        (["demos", "info", "/nonexist", "tests"], "/nonexist does not exist; give demonstration files"),
-    ],
-)
+@pytest.mark.parametrize(("argv", "hint"), [
+    (["tasks", "list", "libero_objet"], "Did you mean 'libero_object'?"),
+    (["tasks", "show", "libero_object/12"], "unknown index of libero_object '12'. Valid: 0 to 9\n"),
+    (["tasks", "list", "libero_object", "--order", "30"], "libero_object 30. Valid: 0 to 20\n"),
+    (["tasks", "show", "libero_goa"], "unknown suite 'libero_goa'. Did you mean 'libero_goal'? Valid: li"),
+    (["tasks", "certify", "libero-goal"], "unknown suite 'libero-goal'. Did you mean 'libero_goal'?"),
+    (["tasks", "lint", "LIBERO_GOAL"], "Did you mean 'libero_goal'?"),
+    (["perturb", "certify", "libero_gola"], "Did you mean 'libero_goal'?"),
+    (["robustness", "expert", "--suite", "libero_gaol"], "Did you mean 'libero_goal'?"),
+    (["eval", "expert", "--suite", "libero_goa"], "Did you mean 'libero_goal'?"),
+    (["eval", "nowhere", "--suite", "libero_goal"], "nowhere does not exist; give the directory of a run"),
+    (["serve", "nowhere"], "nowhere does not exist; give the directory of a run"),
+    (["relearn", "nowhere"], "nowhere does not exist; give the directory of a run"),
+    (["demos", "check", "/nonexist"], "/nonexist does not exist; give demonstration files, or folders"),
+    (["demos", "info", "/nonexist", "tests"], "/nonexist does not exist; give demonstration files"),
+])  # fmt: skip
 def test_errors_are_one_line_and_a_status(argv, hint, capsys):
     assert cli.main(argv) == 2
     err = capsys.readouterr().err

@@ -22,18 +22,9 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("libero_env.demos.record.run_experts", wander)
         argv = [
-            "demos",
-            "generate",
-            "--task",
-            "libero_goal/3",
-            "--n",
-            "2",
-            "--size",
-            "16x24",
-            "--depth",
-            "--workers",
-            "1",
-        ]
+            "demos", "generate", "--task", "libero_goal/3", "--n", "2", "--size", "16x24", "--depth", "--workers",
+            "1"
+        ]  # fmt: skip
         assert cli.main([*argv, "--folder", str(root), "--cameras", "agentview", "--variation", "none"]) == 0
     return root
 
@@ -110,20 +101,14 @@ def test_sizes_are_one_number_or_two():
             parse(_size, ["--size", wrong], "x")
 
 
-@pytest.mark.parametrize(
-    ("argv", "hint"),
-    [
-        (["generate", "--task", "libero_goal/99", "--n", "1"], "index of libero_goal"),
-        (
-            ["generate", "--task", "libero_goal/3", "--n", "1", "--cameras", "agentveiw"],
-            "Did you mean 'agentview'?",
-        ),
-        (["generate", "--bddl", "nowhere.bddl", "--n", "1"], "nowhere.bddl"),
-        (["replay", "nowhere.hdf5"], "nowhere.hdf5"),
-        (["filter", "nowhere.hdf5", "b.hdf5"], "nowhere.hdf5"),
-        (["export", "nowhere.hdf5", "--out", "set"], "nowhere.hdf5"),
-    ],
-)
+@pytest.mark.parametrize(("argv", "hint"), [
+    (["generate", "--task", "libero_goal/99", "--n", "1"], "index of libero_goal"),
+    (["generate", "--task", "libero_goal/3", "--n", "1", "--cameras", "agentveiw"], "Did you mean 'agentview'?"),
+    (["generate", "--bddl", "nowhere.bddl", "--n", "1"], "nowhere.bddl"),
+    (["replay", "nowhere.hdf5"], "nowhere.hdf5"),
+    (["filter", "nowhere.hdf5", "b.hdf5"], "nowhere.hdf5"),
+    (["export", "nowhere.hdf5", "--out", "set"], "nowhere.hdf5"),
+])  # fmt: skip
 def test_invalid_input_gives_one_line_and_a_status(argv, hint, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path))

@@ -180,11 +180,8 @@ def test_command_lines_are_valid(page):
 @pytest.mark.unit
 def test_a_wrong_command_line_is_found():
     for line in (
-        "libero tasks lost",
-        "python train.py algo=ewx",
-        "python train.py train.epoch=3",
-        "libreo doctor",
-    ):
+        "libero tasks lost", "python train.py algo=ewx", "python train.py train.epoch=3", "libreo doctor"
+    ):  # fmt: skip
         with pytest.raises((Exception, SystemExit)):
             check_line(line)
 

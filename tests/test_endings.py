@@ -125,29 +125,20 @@ def test_errors_by_kind(capsys):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    ("policy", "message"),
-    [
-        ("ending_nowhere:make", "there is no module ending_nowhere, neither in the current folder ("),
-        ("ending_nowhere:make", ") nor installed; type the command in the folder of ending_nowhere.py"),
-        ("ending_policy.py:make", "a module is named without .py: write ending_policy:make, in the folder"),
-        ("ending_policy:missing", "module ending_policy has no function missing"),
-        ("ending_policy:number", "module ending_policy has a int, not a function, number"),
-        ("ending_policy:nothing", "returns a NoneType without predict"),
-        ("ending_policy:misshapen", "the policy's cameras is 5; expected a list"),
-        (
-            "ending_policy:without_weights",
-            "ending_policy:without_weights() raised FileNotFoundError: [Errno 2]",
-        ),
-        ("ending_broken:make", "the module ending_broken raised File"),
-        (
-            "ending_lacking:make",
-            "the module ending_lacking raised ModuleNotFoundError: No module named 'a_package",
-        ),
-        (":", "'' is not a name of a module"),
-        ("a b:c", "is not a name of a module"),
-    ],
-)
+@pytest.mark.parametrize(("policy", "message"), [
+    ("ending_nowhere:make", "there is no module ending_nowhere, neither in the current folder ("),
+    ("ending_nowhere:make", ") nor installed; type the command in the folder of ending_nowhere.py"),
+    ("ending_policy.py:make", "a module is named without .py: write ending_policy:make, in the folder"),
+    ("ending_policy:missing", "module ending_policy has no function missing"),
+    ("ending_policy:number", "module ending_policy has a int, not a function, number"),
+    ("ending_policy:nothing", "returns a NoneType without predict"),
+    ("ending_policy:misshapen", "the policy's cameras is 5; expected a list"),
+    ("ending_policy:without_weights", "ending_policy:without_weights() raised FileNotFoundError: [Errno 2]"),
+    ("ending_broken:make", "the module ending_broken raised File"),
+    ("ending_lacking:make", "the module ending_lacking raised ModuleNotFoundError: No module named 'a_package"),
+    (":", "'' is not a name of a module"),
+    ("a b:c", "is not a name of a module"),
+])  # fmt: skip
 def test_a_policy_that_cannot_be_made_is_the_users(policy, message, here, capsys):
     assert cli.main(["eval", policy, "--suite", "libero_object/0"]) == ending.MISTAKE
     found = capsys.readouterr().err
@@ -157,15 +148,8 @@ def test_a_policy_that_cannot_be_made_is_the_users(policy, message, here, capsys
 @pytest.mark.sim
 def test_a_policy_that_raises_shows_its_own_frames(here, capsys):
     command = [
-        "eval",
-        "ending_policy:failing",
-        "--suite",
-        "libero_object/0",
-        "--episodes",
-        "1",
-        "--horizon",
-        "2",
-    ]
+        "eval", "ending_policy:failing", "--suite", "libero_object/0", "--episodes", "1", "--horizon", "2"
+    ]  # fmt: skip
     assert cli.main(command) == ending.MISTAKE
     found = capsys.readouterr().err
     assert "error: the policy's Policy.predict raised ValueError: no such weights\\x1b[2J\n" in found
@@ -246,39 +230,35 @@ def test_mistyped_options_are_one_line(capsys):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["eval", "m:f", "--size", "0"],
-        ["eval", "m:f", "--seed", "-1"],
-        ["eval", "m:f", "--timeout", "nan"],
-        ["eval", "m:f", "--timeout", "inf"],
-        ["eval", "m:f", "--horizon", "0"],
-        ["eval", "m:f", "--policy-threads", "1000000000"],
-        ["eval", "m:f", "--episodes", "1.5"],
-        ["eval", "m:f", "--out", " "],
-        ["eval", "m:f", "--after", "-1"],
-        ["eval", "m:f", "--in-flight", "0"],
-        ["eval", "m:f", "--device", "zz"],
-        ["serve", "run", "--port", "99999"],
-        ["saliency", "run", "--stride", "nan"],
-        ["power", "--tests", "1" + 400 * "0"],
-        ["power", "--episodes", "1" + 30 * "0"],
-        ["power", "--alpha", "nan"],
-        ["compare", "a", "b", "--alpha", "0"],
-        ["demos", "generate", "--task", "libero_goal/3", "--seed", "-1"],
-        ["demos", "generate", "--task", "libero_goal/3", "--noise", "nan"],
-        ["demos", "generate", "--task", "libero_goal/3", "--workers", "-3"],
-        ["demos", "generate", "--task", "libero_goal/3", "--size", "99999999"],
-        ["demos", "export", "a", "--out", "b", "--settle", "-1"],
-        ["tasks", "preview", "libero_goal/3", "--starts", "0"],
-        ["tasks", "certify", "libero_goal/3", "--require", "7"],
-        ["tasks", "lint", "libero_goal/3", "--starts", "10000000"],
-        ["objects", "add", "a.obj", "--mass", "-1"],
-        ["teleop", "libero_goal/3", "--pos-sensitivity", "nan"],
-    ],
-    ids=" ".join,
-)
+@pytest.mark.parametrize("words", [
+    ["eval", "m:f", "--size", "0"],
+    ["eval", "m:f", "--seed", "-1"],
+    ["eval", "m:f", "--timeout", "nan"],
+    ["eval", "m:f", "--timeout", "inf"],
+    ["eval", "m:f", "--horizon", "0"],
+    ["eval", "m:f", "--policy-threads", "1000000000"],
+    ["eval", "m:f", "--episodes", "1.5"],
+    ["eval", "m:f", "--out", " "],
+    ["eval", "m:f", "--after", "-1"],
+    ["eval", "m:f", "--in-flight", "0"],
+    ["eval", "m:f", "--device", "zz"],
+    ["serve", "run", "--port", "99999"],
+    ["saliency", "run", "--stride", "nan"],
+    ["power", "--tests", "1" + 400 * "0"],
+    ["power", "--episodes", "1" + 30 * "0"],
+    ["power", "--alpha", "nan"],
+    ["compare", "a", "b", "--alpha", "0"],
+    ["demos", "generate", "--task", "libero_goal/3", "--seed", "-1"],
+    ["demos", "generate", "--task", "libero_goal/3", "--noise", "nan"],
+    ["demos", "generate", "--task", "libero_goal/3", "--workers", "-3"],
+    ["demos", "generate", "--task", "libero_goal/3", "--size", "99999999"],
+    ["demos", "export", "a", "--out", "b", "--settle", "-1"],
+    ["tasks", "preview", "libero_goal/3", "--starts", "0"],
+    ["tasks", "certify", "libero_goal/3", "--require", "7"],
+    ["tasks", "lint", "libero_goal/3", "--starts", "10000000"],
+    ["objects", "add", "a.obj", "--mass", "-1"],
+    ["teleop", "libero_goal/3", "--pos-sensitivity", "nan"],
+], ids=" ".join)  # fmt: skip
 def test_numbers_out_of_range_are_one_line(words, capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(words)
@@ -288,22 +268,16 @@ def test_numbers_out_of_range_are_one_line(words, capsys):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["tasks", "show", "a\0"], "null character"),
-        (["tasks", "show", ""], "the word after show is empty"),
-        (["eval", "ending_policy:make", "--suite", "libero_goal/0", "--after", "9"], "--after is of runs"),
-        (
-            ["eval", "ending_policy:make", "--suite", "libero_goal/0", "--despite", "x"],
-            "--despite is of results",
-        ),
-        (["tasks", "new", "../elsewhere"], "is not the name of a task"),
-        (["tasks", "new", "mine", "--goal", "()"], "is not an atom"),
-        (["tasks", "preview", "libero_goal/3", "--out", "a.zzz"], "the name of a picture ends in .png"),
-        (["objects", "preview", "plate", "--out", "a.zzz"], "the name of a picture ends in .png"),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), [
+    (["tasks", "show", "a\0"], "null character"),
+    (["tasks", "show", ""], "the word after show is empty"),
+    (["eval", "ending_policy:make", "--suite", "libero_goal/0", "--after", "9"], "--after is of runs"),
+    (["eval", "ending_policy:make", "--suite", "libero_goal/0", "--despite", "x"], "--despite is of results"),
+    (["tasks", "new", "../elsewhere"], "is not the name of a task"),
+    (["tasks", "new", "mine", "--goal", "()"], "is not an atom"),
+    (["tasks", "preview", "libero_goal/3", "--out", "a.zzz"], "the name of a picture ends in .png"),
+    (["objects", "preview", "plate", "--out", "a.zzz"], "the name of a picture ends in .png"),
+])  # fmt: skip
 def test_names_that_are_none(words, message, here, capsys):
     assert cli.main(words) == ending.MISTAKE
     found = capsys.readouterr().err
@@ -312,19 +286,9 @@ def test_names_that_are_none(words, message, here, capsys):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    "address",
-    [
-        "ws://",
-        "ws://host:99999",
-        "ws://[::1",
-        "ws://host:0x",
-        "ws://a b:1",
-        "vla-eval://",
-        "gr00t://",
-        "gr00t://host",
-    ],
-)
+@pytest.mark.parametrize("address", [
+    "ws://", "ws://host:99999", "ws://[::1", "ws://host:0x", "ws://a b:1", "vla-eval://", "gr00t://", "gr00t://host"
+])  # fmt: skip
 def test_what_is_no_address_is_refused_at_once(address, here, capsys):
     assert cli.main(["eval", address, "--suite", "libero_goal/0"]) == ending.MISTAKE
     found = capsys.readouterr().err
@@ -466,15 +430,8 @@ def is_running(pid: int) -> bool:
 
 
 EVALUATION = [
-    "eval",
-    "ending_policy:waiting",
-    "--suite",
-    "libero_object/0",
-    "--unit-starts",
-    "1",
-    "--workers",
-    "2",
-]
+    "eval", "ending_policy:waiting", "--suite", "libero_object/0", "--unit-starts", "1", "--workers", "2"
+]  # fmt: skip
 
 
 @pytest.mark.sim

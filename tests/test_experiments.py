@@ -14,15 +14,8 @@ SCRIPTS = sorted(EXPERIMENTS.rglob("*.py"))
 PACKAGES = ("libero", "libero_env", "libero_eval", "lifelong")
 # of extras, and of environments in which some scripts are run
 FOREIGN = (
-    "easydict",
-    "gymnasium",
-    "liberoplus",
-    "robomimic",
-    "robosuite",
-    "tests",
-    "warp",
-    "websocket_policy_server",
-)
+    "easydict", "gymnasium", "liberoplus", "robomimic", "robosuite", "tests", "warp", "websocket_policy_server"
+)  # fmt: skip
 # started by another script, with arguments in order, in an environment without the project
 WORKERS = ("original_training.py", "original_worker.py", "robomimic_loader.py")
 COMMANDS = [p for p in SCRIPTS if "__main__" in p.read_text(encoding="utf-8") and p.name not in WORKERS]

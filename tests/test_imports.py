@@ -66,11 +66,8 @@ print(json.dumps({"deeds": deeds, "loaded": sorted(sys.modules)}))
 def import_in_fresh_process(names: list[str], home: Path) -> dict:
     """What importing the modules did in a process that knew nothing."""
     env = {
-        "PATH": os.environ["PATH"],
-        "HOME": str(home),
-        "PYTHONPATH": str(ROOT),
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
+        "PATH": os.environ["PATH"], "HOME": str(home), "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"
+    }  # fmt: skip
     command = [sys.executable, "-W", "error", "-c", _PROBE, json.dumps(names)]
     done = subprocess.run(
         command, env=env, cwd=home, capture_output=True, text=True, timeout=300, check=False

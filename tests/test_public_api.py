@@ -15,29 +15,14 @@ import lifelong
 pytestmark = pytest.mark.unit
 
 OFFERED = {
-    "libero_env": {
-        *(
-            "BatchEnv",
-            "Expert",
-            "LiberoEnv",
-            "LiberoError",
-            "SubprocEnv",
-            "Suite",
-            "Task",
-            "UnknownNameError",
-        ),
-        *("ensure_demos", "get_suite", "get_task", "make_task", "read_demos", "read_task"),
-        *("register_object", "register_predicate"),
-    },
-    "lifelong": {
-        *("Algorithm", "Batch", "EvalSettings", "FitSettings", "LifelongError", "Policy", "PolicySpec"),
-        *("fit", "lifelong_metrics", "rollout", "write_report"),
-    },
-    "libero_eval": {
-        *("Comparison", "EvalProtocol", "EvalRequest", "EvaluationResult", "TaskResult"),
-        *("compare_groups", "evaluate", "load_protocol"),
-    },
-}
+    "libero_env": {*("BatchEnv", "Expert", "LiberoEnv", "LiberoError", "SubprocEnv", "Suite", "Task",
+     "UnknownNameError"), *("ensure_demos", "get_suite", "get_task", "make_task", "read_demos", "read_task"),
+     *("register_object", "register_predicate")},
+    "lifelong": {*("Algorithm", "Batch", "EvalSettings", "FitSettings", "LifelongError", "Policy", "PolicySpec"),
+     *("fit", "lifelong_metrics", "rollout", "write_report")},
+    "libero_eval": {*("Comparison", "EvalProtocol", "EvalRequest", "EvaluationResult", "TaskResult"),
+     *("compare_groups", "evaluate", "load_protocol")},
+}  # fmt: skip
 PACKAGES = sorted(
     module.name
     for root in (libero_env, lifelong, libero_eval)
@@ -64,14 +49,11 @@ def test_every_offered_name_exists(package):
         assert not isinstance(getattr(module, name), type(sys)), f"{package}.{name} is a module"
 
 
-@pytest.mark.parametrize(
-    ("package", "heavy"),
-    [
-        ("libero_env", {"mujoco", "torch", "numpy", "h5py"}),
-        ("lifelong", {"mujoco", "torch", "numpy", "hydra"}),
-        ("libero_eval", {"mujoco", "torch", "numpy", "hydra"}),
-    ],
-)
+@pytest.mark.parametrize(("package", "heavy"), [
+    ("libero_env", {"mujoco", "torch", "numpy", "h5py"}),
+    ("lifelong", {"mujoco", "torch", "numpy", "hydra"}),
+    ("libero_eval", {"mujoco", "torch", "numpy", "hydra"}),
+])  # fmt: skip
 def test_importing_a_package_loads_nothing_heavy(package, heavy):
     code = f"import json, sys, {package}; print(json.dumps(sorted(sys.modules)))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

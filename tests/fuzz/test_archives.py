@@ -89,24 +89,8 @@ def test_listings_name_files_of_one_folder_or_are_refused(files):
 
 
 ADDRESS = [
-    "http",
-    "https",
-    "file",
-    "ftp",
-    "data",
-    ":",
-    "//",
-    "/",
-    "[",
-    "]",
-    "::1",
-    "@",
-    "127.0.0.1",
-    "a",
-    ".",
-    "%2e",
-    "#",
-]
+    "http", "https", "file", "ftp", "data", ":", "//", "/", "[", "]", "::1", "@", "127.0.0.1", "a", ".", "%2e", "#"
+]  # fmt: skip
 ADDRESS += [":99999", ":x", " ", "\n", "\0", "é", "\ud800", "?x=..", "..", "xn--", "-" * 70]
 
 

@@ -16,51 +16,14 @@ pytestmark = pytest.mark.sim
 
 TASK, NUM = "libero_object/3", 2
 EXTREME = (
-    0.0,
-    -0.0,
-    1.0,
-    -1.0,
-    0.5,
-    1e-320,
-    1e-170,
-    1e10,
-    -1e10,
-    1.1e10,
-    1e30,
-    1e308,
-    np.nan,
-    np.inf,
-    -np.inf,
-)
+    0.0, -0.0, 1.0, -1.0, 0.5, 1e-320, 1e-170, 1e10, -1e10, 1.1e10, 1e30, 1e308, np.nan, np.inf, -np.inf
+)  # fmt: skip
 STRANGE = (
-    None,
-    True,
-    "1",
-    "a",
-    b"1",
-    1j,
-    10**400,
-    -(10**30),
-    (),
-    [1],
-    {},
-    object(),
-    np.datetime64("2020-01-01"),
-)
+    None, True, "1", "a", b"1", 1j, 10**400, -(10**30), (), [1], {}, object(), np.datetime64("2020-01-01")
+)  # fmt: skip
 KINDS = (
-    list,
-    tuple,
-    np.float32,
-    np.float16,
-    np.int8,
-    np.uint64,
-    bool,
-    complex,
-    object,
-    str,
-    "masked",
-    "torch",
-)
+    list, tuple, np.float32, np.float16, np.int8, np.uint64, bool, complex, object, str, "masked", "torch"
+)  # fmt: skip
 values = st.sampled_from(EXTREME) | st.sampled_from(STRANGE) | st.integers(-3, 60) | st.floats()
 
 

@@ -28,31 +28,11 @@ PLACES = ("data", "data/demo_0", "data/demo_1", *(f"data/demo_{k}/{key}" for k i
 NAMES = ("demo_0", "demo_01", "demo_2", "demo_\u00b2", "demo_-1", "..", "a b", "x" * 300, "obs", "caf\u00e9")
 NUMBERS = (0, 1, -1, 255, 1e-320, 1e30, np.nan, np.inf, -np.inf, 3.5)
 TEXTS = (
-    "",
-    "aligned",
-    "libero",
-    "bogus",
-    "{",
-    "[" * 5000,
-    "../../etc/passwd",
-    "a\nb",
-    "\u202e",
-    "$x$",
-    "NaN",
-)
+    "", "aligned", "libero", "bogus", "{", "[" * 5000, "../../etc/passwd", "a\nb", "\u202e", "$x$", "NaN"
+)  # fmt: skip
 SHAPES = (
-    (),
-    (0,),
-    (3,),
-    (3, 7),
-    (4, 7),
-    (0, 7),
-    (3, 7, 1),
-    (3, 4, 4, 3),
-    (1 << 40,),
-    (3, 1 << 30),
-    (1 << 62, 7),
-)
+    (), (0,), (3,), (3, 7), (4, 7), (0, 7), (3, 7, 1), (3, 4, 4, 3), (1 << 40,), (3, 1 << 30), (1 << 62, 7)
+)  # fmt: skip
 TYPES = ("f8", ">f8", "f4", "f2", "i8", "u1", ">u2", "c16", "?", "S3", "g", "i1")
 OBJECTS = (h5py.Reference, h5py.RegionReference)
 

@@ -33,39 +33,20 @@ TASK = {
 }
 DEFINITIONS = [
     TASK,
-    {
-        "scene": "kitchen_scene1",
-        "objects": ["plate", {"butter": 2}],
-        "place": {"plate_2": [0.1, 0.1], "butter_1": "plate_2", "butter_2": "In wooden_cabinet_1_top_region"},
-        "goal": "(Or (Open wooden_cabinet_1_top_region) (Not (ForAll (?x - butter) (On ?x plate_2))))",
-        "init_also": ["Open wooden_cabinet_1_top_region"],
-        "language": "open it",
-        "name": "one",
-        "scene_properties": {"floor": "rustic_floor"},
-    },
-    {
-        "fixtures": {"floor": "floor"},
-        "objects": ["$first", "basket"],
-        "with": {"first": "milk", "at": [0.1, 0.2]},
-        "regions": {
-            "floor": {
-                "middle": {"at": "$at", "half": 0.02, "yaw": ["-pi/4", 1.5], "rgba": [0, 0, 1, 0.5]},
-                "edge": {"ranges": [[-0.2, -0.2, -0.1, -0.1]]},
-            },
-            "basket_1": ["contain_region"],
-        },
-        "init": ["On ${first}_1 floor_middle", "On basket_1 floor_edge"],
-        "obj_of_interest": ["milk_1"],
-        "problem": "LIBERO_Floor_Manipulation",
-        "goal": ["In milk_1 basket_1_contain_region"],
-        "language": "put it in",
-    },
-    {
-        **{key: value for key, value in TASK.items() if key not in ("goal", "language")},
-        "tasks": [{"name": "a", "goal": "Up plate_1"}, {"name": "b", "goal": "Up akita_black_bowl_1"}],
-    },
+    {"scene": "kitchen_scene1", "objects": ["plate", {"butter": 2}],
+     "place": {"plate_2": [0.1, 0.1], "butter_1": "plate_2", "butter_2": "In wooden_cabinet_1_top_region"},
+     "goal": "(Or (Open wooden_cabinet_1_top_region) (Not (ForAll (?x - butter) (On ?x plate_2))))",
+     "init_also": ["Open wooden_cabinet_1_top_region"], "language": "open it", "name": "one",
+     "scene_properties": {"floor": "rustic_floor"}},
+    {"fixtures": {"floor": "floor"}, "objects": ["$first", "basket"], "with": {"first": "milk", "at": [0.1, 0.2]},
+     "regions": {"floor": {"middle": {"at": "$at", "half": 0.02, "yaw": ["-pi/4", 1.5], "rgba": [0, 0, 1, 0.5]},
+     "edge": {"ranges": [[-0.2, -0.2, -0.1, -0.1]]}}, "basket_1": ["contain_region"]},
+     "init": ["On ${first}_1 floor_middle", "On basket_1 floor_edge"], "obj_of_interest": ["milk_1"],
+     "problem": "LIBERO_Floor_Manipulation", "goal": ["In milk_1 basket_1_contain_region"], "language": "put it in"},
+    {**{key: value for key, value in TASK.items() if key not in ("goal", "language")},
+     "tasks": [{"name": "a", "goal": "Up plate_1"}, {"name": "b", "goal": "Up akita_black_bowl_1"}]},
     {"scene": "scene.yaml", "goal": "Up milk_1", "with": {"other": "butter"}},
-]
+]  # fmt: skip
 SCENE = {
     "scene": "base.yaml",
     "objects": ["$other"],

@@ -38,12 +38,8 @@ class Countdown:
         self.steps += 1
         reached = self.steps == self.goal
         return (
-            {"x": np.zeros((self.num_envs, 1))},
-            reached,
-            reached,
-            np.zeros(self.num_envs, bool),
-            self._info(),
-        )
+            {"x": np.zeros((self.num_envs, 1))}, reached, reached, np.zeros(self.num_envs, bool), self._info()
+        )  # fmt: skip
 
     def close(self):
         pass
@@ -66,13 +62,9 @@ def evaluation(out: Path, policy=None, **changes) -> Evaluation:
         yield CallableActor(policy, (), task.language)
 
     arguments = {
-        "identity": {"policy": "still"},
-        "tasks": TASKS,
-        "init_states": (3, 4, 9, 20),
-        "protocol": QUICK,
-        "env": lambda task, count: Countdown(count),
-        "versions": {"mujoco": "3"},
-    }
+        "identity": {"policy": "still"}, "tasks": TASKS, "init_states": (3, 4, 9, 20), "protocol": QUICK,
+        "env": lambda task, count: Countdown(count), "versions": {"mujoco": "3"}
+    }  # fmt: skip
     return Evaluation(out=out, actor=actor, **(arguments | changes))
 
 

@@ -29,13 +29,10 @@ TINY = (
     "eval.eval_every=1",
 )
 TINY_TRANSFORMER = (
-    "policy.embed_size=8",
-    "policy.transformer_num_layers=1",
-    "policy.transformer_num_heads=2",
-    "policy.transformer_head_output_size=4",
-    "policy.transformer_mlp_hidden_size=8",
-    "policy.transformer_max_seq_len=3",
-)
+    "policy.embed_size=8", "policy.transformer_num_layers=1", "policy.transformer_num_heads=2",
+    "policy.transformer_head_output_size=4", "policy.transformer_mlp_hidden_size=8",
+    "policy.transformer_max_seq_len=3"
+)  # fmt: skip
 
 
 class TwoTasks(Benchmark):

@@ -8,76 +8,16 @@ from typing import Any
 from hypothesis import strategies as st
 
 NUMBERS = (
-    0,
-    -1,
-    1,
-    2,
-    100,
-    10**9,
-    10**400,
-    -(10**30),
-    0.5,
-    -0.0,
-    1e-163,
-    1e308,
-    -1e308,
-    float("nan"),
-    float("inf"),
-)
+    0, -1, 1, 2, 100, 10**9, 10**400, -(10**30), 0.5, -0.0, 1e-163, 1e308, -1e308, float("nan"), float("inf")
+)  # fmt: skip
 WORDS = (
-    "",
-    " ",
-    "x",
-    "..",
-    "../../etc/passwd",
-    "/etc/passwd",
-    "a/b",
-    "a\\b",
-    "a\0b",
-    "a\nb",
-    "a\u202eb",
-    "\u2028",
-    "é",
-    "İ",
-    "😀",
-    "$",
-    "$x",
-    "${x}",
-    "$$",
-    "%s",
-    "{0}",
-    "pi",
-    "-pi/2",
-    "nan",
-    "1e999",
-    "null",
-    "true",
-    "(",
-    ")",
-    "()",
-    "(And)",
-    ";",
-    "world",
-    "robot0_base",
-    "robot",
-    "main",
-    "?x",
-    "x" * 5000,
-)
+    "", " ", "x", "..", "../../etc/passwd", "/etc/passwd", "a/b", "a\\b", "a\0b", "a\nb", "a\u202eb", "\u2028", "é",
+    "İ", "😀", "$", "$x", "${x}", "$$", "%s", "{0}", "pi", "-pi/2", "nan", "1e999", "null", "true", "(", ")", "()",
+    "(And)", ";", "world", "robot0_base", "robot", "main", "?x", "x" * 5000
+)  # fmt: skip
 OTHERS = (
-    None,
-    True,
-    False,
-    [],
-    {},
-    [[]],
-    [None],
-    [0, 1],
-    [[0, 1, 2, 3]],
-    {"a": 1},
-    {"at": [0, 0]},
-    [1, [2, [3, [4]]]],
-)
+    None, True, False, [], {}, [[]], [None], [0, 1], [[0, 1, 2, 3]], {"a": 1}, {"at": [0, 0]}, [1, [2, [3, [4]]]]
+)  # fmt: skip
 
 hostile = st.sampled_from(NUMBERS) | st.sampled_from(WORDS) | st.sampled_from(OTHERS)
 

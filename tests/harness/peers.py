@@ -91,15 +91,8 @@ def _installed_plugin(python: Path) -> Path:
     """Return a folder with the plug-in as pip installs it: LeRobot asks the metadata of distributions."""
     folder = python.parents[1] / "plugin"
     command = [
-        str(python),
-        "-m",
-        "pip",
-        "install",
-        "--quiet",
-        "--no-deps",
-        "--no-build-isolation",
-        "--upgrade",
-    ]
+        str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--upgrade"
+    ]  # fmt: skip
     done = subprocess.run([*command, "--target", str(folder), str(PLUGIN)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return folder

@@ -10,15 +10,9 @@ from libero_env.tasks import Task, get_suite
 
 BASE = "put_the_bowl_on_the_plate"
 ENDINGS = (
-    "view_300_15_100_0_0_initstate_0",
-    "view_0_0_100_0_0_initstate_451",
-    "view_0_0_100_0_0_initstate_0_noise_47",
-    "language_7_view_0_0_100_0_0_initstate_0",
-    "light_1",
-    "tb_2",
-    "add_3",
-    "moved_level1_sample1",
-)
+    "view_300_15_100_0_0_initstate_0", "view_0_0_100_0_0_initstate_451", "view_0_0_100_0_0_initstate_0_noise_47",
+    "language_7_view_0_0_100_0_0_initstate_0", "light_1", "tb_2", "add_3", "moved_level1_sample1"
+)  # fmt: skip
 REWORDED = "Could you kindly put the bowl onto the plate"
 PRO = {"lan": "set the bowl down on the plate", "task": "put the wine bottle on the plate"}
 
@@ -42,15 +36,11 @@ def write_plus(folder: Path, states: np.ndarray) -> Path:
     files = {
         BASE: text,
         f"{BASE}_language_7": re.sub(r"\(:language [^)]*\)", f"(:language {REWORDED})", text),
-        f"{BASE}_light_1": text.replace(
-            "LIBERO_Tabletop_Manipulation", "Libero_Tabletop_Manipulation_light_367"
-        ),
+        f"{BASE}_light_1": text.replace("LIBERO_Tabletop_Manipulation", "Libero_Tabletop_Manipulation_light_367"),
         f"{BASE}_tb_2": text.replace("LIBERO_Tabletop_Manipulation", long),
-        f"{BASE}_add_3": text.replace(
-            "plate_1 - plate", "plate_1 - plate\n    can_of_soda_1 - can_of_soda__1"
-        ),
+        f"{BASE}_add_3": text.replace("plate_1 - plate", "plate_1 - plate\n    can_of_soda_1 - can_of_soda__1"),
         f"{BASE}_moved_level1_sample1": moved,
-    }
+    }  # fmt: skip
     _write(folder, "libero_goal", files)
     _write_map(folder, {"libero_goal": [f"{BASE}_{ending}" for ending in ENDINGS]})
     own = [Path("libero_newobj", "libero_goal", f"{BASE}_{ending}") for ending in ENDINGS[-2:]]

@@ -31,11 +31,8 @@ TASKS = 3
 
 
 ALGORITHMS = {
-    "sequential": Sequential,
-    "er": lambda: ER(memory=ReplayMemory(12)),
-    "ewc": EWC,
-    "packnet": PackNet,
-}
+    "sequential": Sequential, "er": lambda: ER(memory=ReplayMemory(12)), "ewc": EWC, "packnet": PackNet
+}  # fmt: skip
 
 
 class FakeEnv:

@@ -18,26 +18,16 @@ AXES = ["height", "width", "channel"]
 NUMBERS = {"observation.state": (8, "state"), "action": (7, "actions")}
 # Features of HuggingFaceVLA/libero as its data set card lists them, without those of the indices.
 CARD = {
-    **{
-        f"observation.images.{name}": {"dtype": "image", "shape": (256, 256, 3), "names": AXES, "fps": 10.0}
-        for name in ("image", "image2")
-    },
-    **{
-        key: {"dtype": "float32", "shape": (length,), "names": [name], "fps": 10.0}
-        for key, (length, name) in NUMBERS.items()
-    },
-}
+    **{f"observation.images.{name}": {"dtype": "image", "shape": (256, 256, 3), "names": AXES,
+     "fps": 10.0} for name in ("image", "image2")},
+    **{key: {"dtype": "float32", "shape": (length,), "names": [name], "fps": 10.0} for key,
+     (length, name) in NUMBERS.items()},
+}  # fmt: skip
 # What LeRobot 0.4 states of the videos that its conversion of images writes; newer versions state it in other words.
 VIDEO = {
-    "video.height": 256,
-    "video.width": 256,
-    "video.codec": "av1",
-    "video.pix_fmt": "yuv420p",
-    "video.is_depth_map": False,
-    "video.fps": 10,
-    "video.channels": 3,
-    "has_audio": False,
-}
+    "video.height": 256, "video.width": 256, "video.codec": "av1", "video.pix_fmt": "yuv420p",
+    "video.is_depth_map": False, "video.fps": 10, "video.channels": 3, "has_audio": False
+}  # fmt: skip
 
 
 def merge(ours: Path, scratch: Path) -> dict:

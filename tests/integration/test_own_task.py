@@ -21,19 +21,10 @@ pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 TINY = (
-    "preset=smoke",
-    "algo=er",
-    "threads=1",
-    "data.demos=2",
-    "data.image_size=32",
-    "train.epochs=1",
-    "train.steps_per_epoch=3",
-    "train.batch_size=4",
-    "eval.every=1",
-    "eval.horizon=8",
-    "eval.episodes=1",
-    "eval.curve_episodes=1",
-)
+    "preset=smoke", "algo=er", "threads=1", "data.demos=2", "data.image_size=32", "train.epochs=1",
+    "train.steps_per_epoch=3", "train.batch_size=4", "eval.every=1", "eval.horizon=8", "eval.episodes=1",
+    "eval.curve_episodes=1"
+)  # fmt: skip
 SCENE = {
     "fixtures": {"kitchen_table": "kitchen_table"},
     "objects": ["checked_bar", "basket"],

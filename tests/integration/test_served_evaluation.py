@@ -200,16 +200,11 @@ def test_what_a_server_announces_is_compared_with_the_protocol(card, tmp_path, c
         assert "does not state action.replan" in capsys.readouterr().err
     spec = {"gripper": {"name": "gripper", "dims": 1, "format": "continuous_01"}}
     for hello, message in (
-        (
-            {"action_spec": spec},
-            "gripper: LIBERO takes binary_close_positive, the server sends continuous_01",
-        ),
+        ({"action_spec": spec}, "gripper: LIBERO takes binary_close_positive, the server sends continuous_01"),
         ({"observation_params": {"num_steps_wait": 50}}, "settle_steps: protocol card has 1, the policy 50"),
-        (
-            {"observation_params": {"send_state": True, "quat_no_antipodal": True}},
-            "rotation: protocol card has 'axis_angle_positive', the policy 'axis_angle'",
-        ),
-    ):
+        ({"observation_params": {"send_state": True, "quat_no_antipodal": True}},
+         "rotation: protocol card has 'axis_angle_positive', the policy 'axis_angle'"),
+    ):  # fmt: skip
         with policy_servers.vla_eval(lambda _: {}, hello, []) as address:
             address = address.replace("ws:", "vla-eval:")
             assert on_server(address, tmp_path / "out", card(VLA_CARD)) == 2

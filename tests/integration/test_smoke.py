@@ -19,20 +19,10 @@ pytestmark = [pytest.mark.sim, pytest.mark.slow]
 ROOT = Path(__file__).parents[2]
 ALGORITHMS = sorted(file.stem for file in (ROOT / "configs" / "algo").glob("*.yaml"))
 TINY = (
-    "preset=smoke",
-    "benchmark=libero_object",
-    "benchmark.tasks=2",
-    "algo=packnet",
-    "threads=1",
-    "data.demos=2",
-    "train.epochs=2",
-    "train.steps_per_epoch=2",
-    "train.batch_size=4",
-    "eval.every=1",
-    "eval.horizon=12",
-    "eval.episodes=2",
-    "eval.curve_episodes=1",
-)
+    "preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "algo=packnet", "threads=1", "data.demos=2",
+    "train.epochs=2", "train.steps_per_epoch=2", "train.batch_size=4", "eval.every=1", "eval.horizon=12",
+    "eval.episodes=2", "eval.curve_episodes=1"
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -152,18 +142,12 @@ def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
         assert found["finished"] and found["tasks_learned"] == 2, algo
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        (
-            "algo=evc",
-            "unknown algo 'evc'. Did you mean 'ewc'? Valid: agem, ",
-        ),
-        ("benchmark.tasks=[butter]", "unknown task of libero_object 'butter'"),
-        ("eval.select=first", "eval.select is 'first'; expected one of 'best' or 'last'"),
-        ("device=tpu", "valid: auto, cpu, cuda"),
-    ],
-)
+@pytest.mark.parametrize(("override", "message"), [
+    ("algo=evc", "unknown algo 'evc'. Did you mean 'ewc'? Valid: agem, "),
+    ("benchmark.tasks=[butter]", "unknown task of libero_object 'butter'"),
+    ("eval.select=first", "eval.select is 'first'; expected one of 'best' or 'last'"),
+    ("device=tpu", "valid: auto, cpu, cuda"),
+])  # fmt: skip
 def test_errors_of_the_command_line_are_one_line(home, tmp_path, override, message):
     process = start(home, tmp_path, "preset=smoke", "benchmark=libero_object", override)
     output, _ = process.communicate(timeout=300)

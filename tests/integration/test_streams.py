@@ -14,19 +14,10 @@ pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 ROOT = Path(__file__).parents[2]
 TINY = (
-    "preset=smoke",
-    "benchmark=libero_object",
-    "benchmark.tasks=2",
-    "threads=1",
-    "data.demos=2",
-    "train.epochs=1",
-    "train.steps_per_epoch=2",
-    "train.batch_size=4",
-    "eval.horizon=6",
-    "eval.episodes=1",
-    "eval.curve_episodes=1",
-    "policy.encoder.width=4",
-)
+    "preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "threads=1", "data.demos=2", "train.epochs=1",
+    "train.steps_per_epoch=2", "train.batch_size=4", "eval.horizon=6", "eval.episodes=1", "eval.curve_episodes=1",
+    "policy.encoder.width=4"
+)  # fmt: skip
 
 
 def train(home: Path, *overrides: str) -> tuple[int, str]:
@@ -39,14 +30,9 @@ def train(home: Path, *overrides: str) -> tuple[int, str]:
 
 def test_streams_from_the_command_line(tmp_path):
     stream = (
-        "algo=er",
-        "benchmark.tasks=2",
-        "benchmark.group_size=2",
-        "pretrain.suite=libero_object",
-        "pretrain.tasks=[1]",
-        "stream.demos_later=1",
-        "stream.blur=0.2",
-    )
+        "algo=er", "benchmark.tasks=2", "benchmark.group_size=2", "pretrain.suite=libero_object",
+        "pretrain.tasks=[1]", "stream.demos_later=1", "stream.blur=0.2"
+    )  # fmt: skip
     status, output = train(tmp_path, *stream, "data.memory=disk")
     assert status == 0, output
     assert "1 tasks of libero_object" in output and "Tasks 1-2/2: together" in output

@@ -23,13 +23,9 @@ pytestmark = pytest.mark.unit
 VIEWS = ("agentview_rgb", "eye_in_hand_rgb")
 SHAPES = {
     "ac_dim": 7,
-    "all_shapes": {
-        "agentview_rgb": (3, 128, 128),
-        "eye_in_hand_rgb": (3, 128, 128),
-        "gripper_states": (2,),
-        "joint_states": (7,),
-    },
-}
+    "all_shapes": {"agentview_rgb": (3, 128, 128), "eye_in_hand_rgb": (3, 128, 128), "gripper_states": (2,),
+     "joint_states": (7,)},
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -49,23 +45,13 @@ def test_sizes_are_the_originals(group, count):
 
 
 SMALL = {
-    "bc_rnn_policy": (
-        "policy.image_embed_size=8",
-        "policy.text_embed_size=8",
-        "policy.rnn_hidden_size=8",
-        "policy.rnn_num_layers=1",
-        "+policy.native.image_width=8",
-    ),
+    "bc_rnn_policy": ("policy.image_embed_size=8", "policy.text_embed_size=8", "policy.rnn_hidden_size=8",
+     "policy.rnn_num_layers=1", "+policy.native.image_width=8"),
     "bc_transformer_policy": ("+policy.native.image_width=8",),
-    "bc_vilt_policy": (
-        "policy.spatial_down_sample_embed_size=8",
-        "policy.spatial_transformer_num_layers=1",
-        "policy.spatial_transformer_num_heads=2",
-        "policy.spatial_transformer_head_output_size=4",
-        "policy.spatial_transformer_mlp_hidden_size=8",
-        "+policy.native.patch_width=8",
-    ),
-}
+    "bc_vilt_policy": ("policy.spatial_down_sample_embed_size=8", "policy.spatial_transformer_num_layers=1",
+     "policy.spatial_transformer_num_heads=2", "policy.spatial_transformer_head_output_size=4",
+     "policy.spatial_transformer_mlp_hidden_size=8", "+policy.native.patch_width=8"),
+}  # fmt: skip
 
 
 def small(group: str, file, *overrides: str):
@@ -172,16 +158,13 @@ def test_configured_variants(file):
     assert len(policy.network.proprio.linears) == 3
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["policy.image_encoder.network_kwargs.pretrained=true"], "pretrained"),
-        (["policy.policy_head.network_kwargs.activation=exp"], "softplus"),
-        (["policy.transformer_input_size=5"], "transformer_input_size"),
-        (["policy/language_encoder=identity_encoder"], "IdentityEncoder"),
-        (["policy.color_aug.network=Blur"], "BatchWiseImgColorJitterAug"),
-    ],
-)
+@pytest.mark.parametrize(("overrides", "message"), [
+    (["policy.image_encoder.network_kwargs.pretrained=true"], "pretrained"),
+    (["policy.policy_head.network_kwargs.activation=exp"], "softplus"),
+    (["policy.transformer_input_size=5"], "transformer_input_size"),
+    (["policy/language_encoder=identity_encoder"], "IdentityEncoder"),
+    (["policy.color_aug.network=Blur"], "BatchWiseImgColorJitterAug"),
+])  # fmt: skip
 def test_unsupported_configurations_raise(overrides, message, file):
     with pytest.raises(LiberoError, match=message):
         small("bc_transformer_policy", file, *overrides)

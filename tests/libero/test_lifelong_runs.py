@@ -141,19 +141,10 @@ def test_missing_demonstrations_are_generated(folder, monkeypatch, capsys):
 def test_from_the_command_line(folder, tmp_path):
     """The script itself, with groups of tasks; modules of its folder do not shadow others of their names."""
     command = [
-        sys.executable,
-        str(ROOT / "libero/lifelong/main.py"),
-        *TINY,
-        *TINY_TRANSFORMER,
-        *SMALL,
-        f"folder={folder}",
-        "benchmark_name=LIBERO_OBJECT",
-        "lifelong=multitask",
-        "eval.eval=false",
-        "data.task_group_size=5",
-        "train.debug=true",
-        "seed=7",
-    ]
+        sys.executable, str(ROOT / "libero/lifelong/main.py"), *TINY, *TINY_TRANSFORMER, *SMALL, f"folder={folder}",
+        "benchmark_name=LIBERO_OBJECT", "lifelong=multitask", "eval.eval=false", "data.task_group_size=5",
+        "train.debug=true", "seed=7"
+    ]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=dict(os.environ))
     assert done.returncode == 0, done.stderr
     assert "train.debug=True has no effect" in done.stdout

@@ -24,11 +24,8 @@ def test_importing_neither_writes_nor_prompts(tmp_path):
         "import libero.libero, libero.libero.benchmark, libero.libero.envs, libero.libero.utils.video_utils"
     )
     env = {
-        "HOME": str(tmp_path),
-        "PATH": "",
-        "PYTHONPATH": str(Path(__file__).parents[2]),
-        "NUMBA_CACHE_DIR": "/tmp",
-    }
+        "HOME": str(tmp_path), "PATH": "", "PYTHONPATH": str(Path(__file__).parents[2]), "NUMBA_CACHE_DIR": "/tmp"
+    }  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-c", code],
         env=env,

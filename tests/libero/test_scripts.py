@@ -158,11 +158,8 @@ def test_create_libero_task_example(tmp_path, capsys):
 @pytest.mark.usefixtures("registries")
 def test_templates_work_unchanged(tmp_path, capsys, monkeypatch):
     for kind, name in (
-        ("problem_class", "MyProblem"),
-        ("scene", "MyKitchenScene2"),
-        ("object", "MyBox3"),
-        ("arena", "MyRoom"),
-    ):
+        ("problem_class", "MyProblem"), ("scene", "MyKitchenScene2"), ("object", "MyBox3"), ("arena", "MyRoom")
+    ):  # fmt: skip
         assert files.create_template(["-t", kind, "-n", name, "-o", str(tmp_path)]) == 0
     made = capsys.readouterr().out.split()
     assert [Path(path).name for path in made] == [
@@ -248,17 +245,8 @@ def test_check_task_suites(monkeypatch, capsys, tmp_path):
 @pytest.mark.sim
 def test_render_single_task(collected, tmp_path, capsys):
     argv = [
-        "--benchmark_name",
-        "libero_goal",
-        "--task_id",
-        "1",
-        "--num",
-        "2",
-        "--size",
-        "32",
-        "--out",
-        str(tmp_path),
-    ]
+        "--benchmark_name", "libero_goal", "--task_id", "1", "--num", "2", "--size", "32", "--out", str(tmp_path)
+    ]  # fmt: skip
     assert tasks.render_single_task(argv) == 0
     (path,) = capsys.readouterr().out.split()
     stored = np.asarray(Image.open(path)).astype(int)

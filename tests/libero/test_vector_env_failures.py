@@ -214,12 +214,8 @@ def test_after_close_every_call_says_so(make):
     env.close()
     env.close()
     calls = [
-        env.reset,
-        env.render,
-        lambda: env.step([1.0]),
-        lambda: env.get_env_attr("value"),
-        env.check_success,
-    ]
+        env.reset, env.render, lambda: env.step([1.0]), lambda: env.get_env_attr("value"), env.check_success
+    ]  # fmt: skip
     for use in [*calls, env.workers[0].reset, lambda: env.workers[0].step(1.0), lambda: env.action_space]:
         with pytest.raises(ClosedEnvironmentError, match="closed"):
             use()

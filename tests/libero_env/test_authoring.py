@@ -37,14 +37,11 @@ FACTS = {
     "scene": "kitchen",
     "furniture": ["wooden_cabinet"],
     "objects": ["akita_black_bowl", "plate"],
-    "place": {
-        "wooden_cabinet_1": {"at": [0, -0.3], "yaw": "pi"},
-        "akita_black_bowl_1": [0, 0],
-        "plate": {"at": [0.05, 0.2], "half": [0.01, 0.02]},
-    },
+    "place": {"wooden_cabinet_1": {"at": [0, -0.3], "yaw": "pi"}, "akita_black_bowl_1": [0, 0],
+     "plate": {"at": [0.05, 0.2], "half": [0.01, 0.02]}},
     "goal": ["On akita_black_bowl_1 plate_1", "Open wooden_cabinet_1_top_region"],
     "language": "Put the bowl on the plate",
-}
+}  # fmt: skip
 BDDL = """(define (problem LIBERO_Kitchen_Tabletop_Manipulation) (:domain robosuite)
 (:language Put the bowl on the plate)
 (:regions
@@ -104,18 +101,12 @@ def test_empty_scenes_have_their_workspace_alone(scene):
     assert len(task.problem.fixtures) == 1 and list(task.problem.objects) == ["plate_1"]
 
 
-@pytest.mark.parametrize(
-    ("goal", "expected"),
-    [
-        ("On plate_1 akita_black_bowl_1", [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
-        ("(on plate_1 akita_black_bowl_1)", [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
-        (("On", "plate_1", "akita_black_bowl_1"), [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
-        (
-            [("Up", "plate_1"), "Up akita_black_bowl_1"],
-            [Atom("Up", ("plate_1",)), Atom("Up", ("akita_black_bowl_1",))],
-        ),
-    ],
-)
+@pytest.mark.parametrize(("goal", "expected"), [
+    ("On plate_1 akita_black_bowl_1", [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
+    ("(on plate_1 akita_black_bowl_1)", [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
+    (("On", "plate_1", "akita_black_bowl_1"), [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
+    ([("Up", "plate_1"), "Up akita_black_bowl_1"], [Atom("Up", ("plate_1",)), Atom("Up", ("akita_black_bowl_1",))]),
+])  # fmt: skip
 def test_goals_are_atoms_in_any_notation(goal, expected):
     assert list(make_task(**said(goal=goal)).problem.goal.parts) == expected
 
@@ -155,11 +146,8 @@ def test_objects_are_added_to_a_scene_and_those_of_the_scene_can_be_moved():
 def test_a_scene_may_be_a_file_beside_the_task(tmp_path):
     regions = {"floor": {"middle": {"at": [0, 0], "half": 0.02}}}
     base = {
-        "fixtures": {"floor": "floor"},
-        "objects": ["milk"],
-        "regions": regions,
-        "init": ["On milk_1 floor_middle"],
-    }
+        "fixtures": {"floor": "floor"}, "objects": ["milk"], "regions": regions, "init": ["On milk_1 floor_middle"]
+    }  # fmt: skip
     yaml_file(tmp_path / "base.yaml", base)
     yaml_file(
         tmp_path / "my_scene.yaml",
@@ -173,24 +161,21 @@ def test_a_scene_may_be_a_file_beside_the_task(tmp_path):
     assert Atom("On", ("butter_1", "floor_butter_1_start")) in task.problem.init
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"scene": "kitchn"}, "Did you mean 'kitchen'"),
-        ({"scene": None}, "it has no scene; add one of kitchen"),
-        ({"scene": "mine.yaml"}, "mine.yaml is missing"),
-        ({"plce": {}}, "Did you mean 'place'"),
-        ({"objects": ["akita_black_bowl", "plat"]}, "Did you mean 'plate'"),
-        ({"objects": ["akita_black_bowl", "plate", "milk"]}, "milk_1 has no place.*`milk_1: \\[0, 0\\]`"),
-        ({"place": {"cup_1": [0, 0]}}, "object or fixture to place of task 'cup_1'"),
-        ({"place": {**FACTS["place"], "plate": 0.1}}, "place.plate is 0.1; expected \\[x, y\\]"),
-        ({"goal": "Open wooden_cabinet_1_top_regio"}, "Did you mean 'top_region'"),
-        ({"goal": "In plate_1 akita_black_bowl_1_inside"}, "Valid: none"),
-        ({"goal": "On plate_1 cup_1"}, "cup_1"),
-        ({"goal": None}, "it has no goal"),
-        ({"language": None}, "neither a name nor a language"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"scene": "kitchn"}, "Did you mean 'kitchen'"),
+    ({"scene": None}, "it has no scene; add one of kitchen"),
+    ({"scene": "mine.yaml"}, "mine.yaml is missing"),
+    ({"plce": {}}, "Did you mean 'place'"),
+    ({"objects": ["akita_black_bowl", "plat"]}, "Did you mean 'plate'"),
+    ({"objects": ["akita_black_bowl", "plate", "milk"]}, "milk_1 has no place.*`milk_1: \\[0, 0\\]`"),
+    ({"place": {"cup_1": [0, 0]}}, "object or fixture to place of task 'cup_1'"),
+    ({"place": {**FACTS["place"], "plate": 0.1}}, "place.plate is 0.1; expected \\[x, y\\]"),
+    ({"goal": "Open wooden_cabinet_1_top_regio"}, "Did you mean 'top_region'"),
+    ({"goal": "In plate_1 akita_black_bowl_1_inside"}, "Valid: none"),
+    ({"goal": "On plate_1 cup_1"}, "cup_1"),
+    ({"goal": None}, "it has no goal"),
+    ({"language": None}, "neither a name nor a language"),
+])  # fmt: skip
 def test_errors_state_what_is_valid(changes, message):
     with pytest.raises(LiberoError, match=message):
         make_task(**said(**changes))
@@ -252,21 +237,13 @@ def test_the_settings_of_a_run_take_files(tmp_path):
         BenchmarkSettings("own", files=files, tasks=["w"]).sequence()
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"objects": ["butter", "basket"]},
-        {"scene": "floor", "objects": ["milk", "butter", "ketchup", "basket"]},
-        {
-            "furniture": ["wooden_cabinet"],
-            "objects": ["butter"],
-            "goal": ["Open wooden_cabinet_1_top_region"],
-        },
-        {"scene": "kitchen_scene1", "objects": ["butter"], "goal": ["On butter_1 plate_1"]},
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize("options", [
+    {},
+    {"objects": ["butter", "basket"]},
+    {"scene": "floor", "objects": ["milk", "butter", "ketchup", "basket"]},
+    {"furniture": ["wooden_cabinet"], "objects": ["butter"], "goal": ["Open wooden_cabinet_1_top_region"]},
+    {"scene": "kitchen_scene1", "objects": ["butter"], "goal": ["On butter_1 plate_1"]},
+], ids=str)  # fmt: skip
 def test_templates_are_tasks_with_space_between_objects(options):
     text, task = task_template(**options)
     assert make_task(**yaml.safe_load(text)) == task

@@ -85,38 +85,31 @@ def test_a_problem_travels_between_processes():
     assert hash(problem) == hash(bddl.parse(GOOD))
 
 
-@pytest.mark.parametrize(
-    ("change", "line", "message"),
-    [
-        (("(0 0 1 1)", "(0 0 1)"), 7, "(0 0 1) in :ranges; expected a list of 4 numbers"),
-        (("-pi/2", "__import__('os')"), 7, "expected"),
-        (("-pi/2", "exit"), 7, "exit is not a number; expected a finite number such as 0.25 or -pi/4"),
-        (("-pi/2", "1e999"), 7, "1e999 is not a number"),
-        (("-pi/2", "1/0"), 7, "1/0 is not a number"),
-        (("(:target stove_1)", ""), 8, "region cook_region has no target; expected (:target NAME)"),
-        (("plate_1 - plate", "pot_1 - plate"), 12, "pot_1 is declared twice"),
-        (("pot_3 - moka_pot", "pot_3"), 13, "pot_3 has no category; expected NAME NAME - CATEGORY"),
-        (("plate_1 - plate", "table - plate"), 12, "table is a fixture too"),
-        (("On pot_1 table_pot_region", "On pot_1 floor"), 16, "floor is not declared; expected one of "),
-        (("(turnon stove_1)", "turnon"), 16, "not an atom: turnon; expected (PREDICATE NAME ...)"),
-        (("(:language", "(:languish"), 5, "unknown section ':languish'; expected one of :domain, "),
-        (("(:domain robosuite)", "(:goal)"), 17, "a second :goal; expected one (the first is on line 3)"),
-        (("(:init", "(:obj_of_interest"), 16, "a second :obj_of_interest"),
-        (("(Not (Turnon stove_1))", "(Not)"), 18, "(Not); expected (Not EXPRESSION)"),
-        (("(:rgba (0 0 1 0.5))", "(:target table)"), 8, "a second :target in a region; expected one"),
-        (
-            ("(cook_region (:target stove_1)", "(pot_region (:target table)"),
-            8,
-            "table_pot_region is declared twice",
-        ),
-        (("(turnon stove_1)", "(turn/on stove_1)"), 16, "turn/on is not a predicate; expected letters"),
-        (("moka_pot\n", "moka_pot\0\n"), 11, "the character '\\x00'; expected text"),
-        (("(Not ", "(" * 70), 18, "more than 64 nested brackets"),
-        (("(define", "(defined"), 2, "not a problem; expected (define (problem NAME) ...)"),
-        (("(define", ") (define"), 2, "a ) closes nothing; expected as many ( as )"),
-        (("(:domain robosuite)", "(:domain robosuite"), 2, "this ( is never closed; expected as many ( as )"),
-    ],
-)
+@pytest.mark.parametrize(("change", "line", "message"), [
+    (("(0 0 1 1)", "(0 0 1)"), 7, "(0 0 1) in :ranges; expected a list of 4 numbers"),
+    (("-pi/2", "__import__('os')"), 7, "expected"),
+    (("-pi/2", "exit"), 7, "exit is not a number; expected a finite number such as 0.25 or -pi/4"),
+    (("-pi/2", "1e999"), 7, "1e999 is not a number"),
+    (("-pi/2", "1/0"), 7, "1/0 is not a number"),
+    (("(:target stove_1)", ""), 8, "region cook_region has no target; expected (:target NAME)"),
+    (("plate_1 - plate", "pot_1 - plate"), 12, "pot_1 is declared twice"),
+    (("pot_3 - moka_pot", "pot_3"), 13, "pot_3 has no category; expected NAME NAME - CATEGORY"),
+    (("plate_1 - plate", "table - plate"), 12, "table is a fixture too"),
+    (("On pot_1 table_pot_region", "On pot_1 floor"), 16, "floor is not declared; expected one of "),
+    (("(turnon stove_1)", "turnon"), 16, "not an atom: turnon; expected (PREDICATE NAME ...)"),
+    (("(:language", "(:languish"), 5, "unknown section ':languish'; expected one of :domain, "),
+    (("(:domain robosuite)", "(:goal)"), 17, "a second :goal; expected one (the first is on line 3)"),
+    (("(:init", "(:obj_of_interest"), 16, "a second :obj_of_interest"),
+    (("(Not (Turnon stove_1))", "(Not)"), 18, "(Not); expected (Not EXPRESSION)"),
+    (("(:rgba (0 0 1 0.5))", "(:target table)"), 8, "a second :target in a region; expected one"),
+    (("(cook_region (:target stove_1)", "(pot_region (:target table)"), 8, "table_pot_region is declared twice"),
+    (("(turnon stove_1)", "(turn/on stove_1)"), 16, "turn/on is not a predicate; expected letters"),
+    (("moka_pot\n", "moka_pot\0\n"), 11, "the character '\\x00'; expected text"),
+    (("(Not ", "(" * 70), 18, "more than 64 nested brackets"),
+    (("(define", "(defined"), 2, "not a problem; expected (define (problem NAME) ...)"),
+    (("(define", ") (define"), 2, "a ) closes nothing; expected as many ( as )"),
+    (("(:domain robosuite)", "(:domain robosuite"), 2, "this ( is never closed; expected as many ( as )"),
+])  # fmt: skip
 def test_errors_name_file_line_and_remedy(change, line, message):
     assert change[0] in GOOD
     with pytest.raises(BDDLError) as caught:
@@ -147,40 +140,20 @@ def test_numbers_are_arithmetic_and_nothing_else():
     assert number("1 - 2*-3/4 + +1") == 1 - 2 * -3 / 4 + 1
     assert number("-2.5e-3") == -0.0025
     words = (
-        "open",
-        "pi()",
-        "[1]",
-        "'a'",
-        "1j",
-        "True",
-        "a.b",
-        "2**9",
-        "",
-        "*1",
-        "1 2",
-        "1_0",
-        "0x1",
-        "٣",
-        "nan",
-    )
+        "open", "pi()", "[1]", "'a'", "1j", "True", "a.b", "2**9", "", "*1", "1 2", "1_0", "0x1", "٣", "nan"
+    )  # fmt: skip
     for text in (*words, "1e999", "1e300*1e300", "pi/0", "9" * 5000, "-" * 100_000 + "1"):
         with pytest.raises(ValueError):
             number(text)
 
 
-@pytest.mark.parametrize(
-    ("change", "where"),
-    [
-        ({"language": "other words"}, "language"),
-        ({"objects": dict(sorted(bddl.parse(GOOD).objects.items()))}, "objects"),
-        ({"init": ()}, "init"),
-        ({"goal": Atom("On", ("pot_2", "stove_1_cook_region"))}, "goal"),
-        (
-            {"regions": bddl.parse(GOOD).regions[:1], "goal": Atom("Up", ("pot_1",))},
-            "region stove_1_cook_region",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("change", "where"), [
+    ({"language": "other words"}, "language"),
+    ({"objects": dict(sorted(bddl.parse(GOOD).objects.items()))}, "objects"),
+    ({"init": ()}, "init"),
+    ({"goal": Atom("On", ("pot_2", "stove_1_cook_region"))}, "goal"),
+    ({"regions": bddl.parse(GOOD).regions[:1], "goal": Atom("Up", ("pot_1",))}, "region stove_1_cook_region"),
+])  # fmt: skip
 def test_differences_are_found(change, where):
     problem = bddl.parse(GOOD)
     found = differences(problem, dataclasses.replace(problem, **change))

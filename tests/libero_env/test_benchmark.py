@@ -20,28 +20,14 @@ pytestmark = pytest.mark.sim
 
 TASKS = sorted({task.id for name in suite_names() for task in get_suite(name).tasks})
 PREDICATE_RECORDINGS = (
-    "libero_10-03",
-    "libero_10-08",
-    "libero_90-01",
-    "libero_90-70",
-    "libero_goal-01",
-    "libero_object-00",
-    "libero_spatial-02",
-)
+    "libero_10-03", "libero_10-08", "libero_90-01", "libero_90-70", "libero_goal-01", "libero_object-00",
+    "libero_spatial-02"
+)  # fmt: skip
 MOTION_RECORDINGS = (
-    "libero_10-00-grasp",
-    "libero_10-04-grasp",
-    "libero_10-09-random",
-    "libero_90-20-random",
-    "libero_90-60-grasp",
-    "libero_90-85-random",
-    "libero_goal-00-random",
-    "libero_goal-02-grasp",
-    "libero_object-00-random",
-    "libero_object-03-grasp",
-    "libero_spatial-00-grasp",
-    "libero_spatial-07-random",
-)
+    "libero_10-00-grasp", "libero_10-04-grasp", "libero_10-09-random", "libero_90-20-random", "libero_90-60-grasp",
+    "libero_90-85-random", "libero_goal-00-random", "libero_goal-02-grasp", "libero_object-00-random",
+    "libero_object-03-grasp", "libero_spatial-00-grasp", "libero_spatial-07-random"
+)  # fmt: skip
 IDLE_STEPS = 10
 STILL = 0.005  # m, what may move in the idle steps
 FARTHER = 0.02  # m, what may move farther than with the original's models

@@ -69,17 +69,8 @@ def test_results_are_on_disk_and_are_not_run_again(expert, tmp_path, capsys, mon
     (tmp_path / "draws.json").write_text("{}")
     monkeypatch.setattr(sampling, "attempts_file", lambda: tmp_path / "draws.json")
     words = [
-        "perturb",
-        "certify",
-        "libero_goal/3",
-        "--kinds",
-        "robot",
-        "gain",
-        "--severities",
-        "0.4",
-        "--starts",
-        "2",
-    ]
+        "perturb", "certify", "libero_goal/3", "--kinds", "robot", "gain", "--severities", "0.4", "--starts", "2"
+    ]  # fmt: skip
     words += ["--jobs", "1", "--out", str(tmp_path)]
     expert.solves = lambda row: len(expert.joints) > 1
     assert main([*words, "--keep"]) == 0

@@ -84,14 +84,9 @@ def test_file_has_the_originals_layout(path):
         )
         demo = data["demo_0"]
         types = {
-            "actions": "float64",
-            "states": "float64",
-            "robot_states": "float64",
-            "rewards": "uint8",
-            "dones": "uint8",
-            "obs/agentview_rgb": "uint8",
-            "obs/ee_states": "float64",
-        }
+            "actions": "float64", "states": "float64", "robot_states": "float64", "rewards": "uint8",
+            "dones": "uint8", "obs/agentview_rgb": "uint8", "obs/ee_states": "float64"
+        }  # fmt: skip
         assert {key: str(demo[key].dtype) for key in types} == types
         np.testing.assert_array_equal(demo["obs/agentview_rgb"][()], episode(0).obs["agentview_rgb"][:, ::-1])
         np.testing.assert_array_equal(demo.attrs["init_state"], demo["states"][0])
@@ -130,30 +125,18 @@ def _replace(key, values):
     return damage
 
 
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
-        (_delete("data"), ("data", "missing")),
-        (_delete("data/demo_1/actions"), ("demo_1/actions", "missing")),
-        (
-            _delete("data/demo_1/obs/agentview_rgb"),
-            ("demo_1/obs/agentview_rgb", "missing", "eye_in_hand_rgb"),
-        ),
-        (_delete("data/demo_0/obs"), ("demo_0/obs", "missing")),
-        (_replace("data/demo_2/actions", np.zeros((11, 6))), ("demo_2/actions", "(11, 6)", "(11, 7)")),
-        (_replace("data/demo_1/states", np.zeros((10, 30))), ("demo_1/states", "(10, 30)", "(11, any)")),
-        (
-            _replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 16, 16, 3))),
-            ("eye_in_hand_rgb", "float64", "un"),
-        ),
-        (
-            _replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 8, 8, 3), np.uint8)),
-            ("demo_1", "(16, 16, 3)"),
-        ),
-        (_replace("data/demo_1/expert_actions", np.full((11, 7), np.nan)), ("demo_1", "not finite")),
-        (lambda handle: [handle.__delitem__(f"data/demo_{i}") for i in range(3)], ("no demonstrations",)),
-    ],
-)
+@pytest.mark.parametrize(("damage", "words"), [
+    (_delete("data"), ("data", "missing")),
+    (_delete("data/demo_1/actions"), ("demo_1/actions", "missing")),
+    (_delete("data/demo_1/obs/agentview_rgb"), ("demo_1/obs/agentview_rgb", "missing", "eye_in_hand_rgb")),
+    (_delete("data/demo_0/obs"), ("demo_0/obs", "missing")),
+    (_replace("data/demo_2/actions", np.zeros((11, 6))), ("demo_2/actions", "(11, 6)", "(11, 7)")),
+    (_replace("data/demo_1/states", np.zeros((10, 30))), ("demo_1/states", "(10, 30)", "(11, any)")),
+    (_replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 16, 16, 3))), ("eye_in_hand_rgb", "float64", "un")),
+    (_replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 8, 8, 3), np.uint8)), ("demo_1", "(16, 16, 3)")),
+    (_replace("data/demo_1/expert_actions", np.full((11, 7), np.nan)), ("demo_1", "not finite")),
+    (lambda handle: [handle.__delitem__(f"data/demo_{i}") for i in range(3)], ("no demonstrations",)),
+])  # fmt: skip
 def test_broken_files_are_named(path, damage, words):
     with h5py.File(path, "r+") as handle:
         damage(handle)

@@ -91,23 +91,17 @@ def deep(handle):
     handle.create_group("/".join(["x"] * 40))
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (
-            put("data/demo_1/actions", h5py.SoftLink("/data/demo_0/actions")),
-            ("data/demo_1/actions", "soft link"),
-        ),
-        (put("data/demo_1", h5py.SoftLink("/nowhere")), ("data/demo_1", "soft link")),
-        (put("data/demo_1", h5py.ExternalLink("/etc/passwd", "/data")), ("data/demo_1", "another file")),
-        (put("mask", h5py.ExternalLink("other.hdf5", "/data")), ("mask", "another file")),
-        (external_storage, ("data/demo_0/obs/agentview_rgb", "other files")),
-        (virtual, ("data/demo_0/actions", "other files")),
-        (loop, ("data/demo_0/obs/again", "within itself")),
-        (deep, ("too deep",)),
-        (put("data/demo_0/kind", np.dtype("f8")), ("data/demo_0/kind", "named type")),
-    ],
-)
+@pytest.mark.parametrize(("change", "words"), [
+    (put("data/demo_1/actions", h5py.SoftLink("/data/demo_0/actions")), ("data/demo_1/actions", "soft link")),
+    (put("data/demo_1", h5py.SoftLink("/nowhere")), ("data/demo_1", "soft link")),
+    (put("data/demo_1", h5py.ExternalLink("/etc/passwd", "/data")), ("data/demo_1", "another file")),
+    (put("mask", h5py.ExternalLink("other.hdf5", "/data")), ("mask", "another file")),
+    (external_storage, ("data/demo_0/obs/agentview_rgb", "other files")),
+    (virtual, ("data/demo_0/actions", "other files")),
+    (loop, ("data/demo_0/obs/again", "within itself")),
+    (deep, ("too deep",)),
+    (put("data/demo_0/kind", np.dtype("f8")), ("data/demo_0/kind", "named type")),
+])  # fmt: skip
 def test_a_file_stands_for_itself(path, change, words):
     damaged(path, change)
     for read in (read_demos, demo_lengths, read_header, read_episodes, describe):
@@ -140,28 +134,22 @@ def ragged(handle):
     handle.create_dataset("data/demo_0/actions", (4, 7), h5py.vlen_dtype(float))
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (huge, ("obs/agentview_rgb", "3.3 TB", "not complete")),
-        (huge_fill, ("demo_0/states", "35.2 TB", "not complete")),
-        (huge_chunks, ("demo_0/states", "chunks of 2.1 GB")),
-        (references, ("demo_0/actions", "float")),
-        (ragged, ("demo_0/actions", "float")),
-        (put("data/demo_0/actions", np.zeros((4, 7), [("x", float)])), ("demo_0/actions", "float")),
-        (put("data/demo_0/actions", np.zeros((4, 7), complex)), ("demo_0/actions", "float")),
-        (put("data/demo_0/actions", np.zeros((4, 7), np.longdouble)), ("demo_0/actions", "64 bits")),
-        (put("data/demo_0/actions", np.zeros((4, 7), np.int64)), ("demo_0/actions", "float")),
-        (put("data/demo_0/actions", np.zeros((0, 7))), ("demo_0/actions", "empty")),
-        (put("data/demo_0/actions", 1.0), ("demo_0/actions", "empty")),
-        (put("data/demo_0/actions", h5py.Empty("f8")), ("demo_0/actions", "empty")),
-        (
-            put("data/demo_0/obs/agentview_rgb", np.zeros((4, 8, 8, 3), np.uint16)),
-            ("agentview_rgb", "8 bits"),
-        ),
-        (put("data/demo_01", h5py.Empty("f8")), ("demo_01", "demo_1", "same number")),
-    ],
-)
+@pytest.mark.parametrize(("change", "words"), [
+    (huge, ("obs/agentview_rgb", "3.3 TB", "not complete")),
+    (huge_fill, ("demo_0/states", "35.2 TB", "not complete")),
+    (huge_chunks, ("demo_0/states", "chunks of 2.1 GB")),
+    (references, ("demo_0/actions", "float")),
+    (ragged, ("demo_0/actions", "float")),
+    (put("data/demo_0/actions", np.zeros((4, 7), [("x", float)])), ("demo_0/actions", "float")),
+    (put("data/demo_0/actions", np.zeros((4, 7), complex)), ("demo_0/actions", "float")),
+    (put("data/demo_0/actions", np.zeros((4, 7), np.longdouble)), ("demo_0/actions", "64 bits")),
+    (put("data/demo_0/actions", np.zeros((4, 7), np.int64)), ("demo_0/actions", "float")),
+    (put("data/demo_0/actions", np.zeros((0, 7))), ("demo_0/actions", "empty")),
+    (put("data/demo_0/actions", 1.0), ("demo_0/actions", "empty")),
+    (put("data/demo_0/actions", h5py.Empty("f8")), ("demo_0/actions", "empty")),
+    (put("data/demo_0/obs/agentview_rgb", np.zeros((4, 8, 8, 3), np.uint16)), ("agentview_rgb", "8 bits")),
+    (put("data/demo_01", h5py.Empty("f8")), ("demo_01", "demo_1", "same number")),
+])  # fmt: skip
 def test_shapes_types_and_sizes_are_checked_before_memory_is_asked_for(path, change, words):
     damaged(path, change)
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
@@ -240,19 +228,16 @@ def test_an_unknown_pairing_is_refused(path, stated):
         refused(path, "pairing", read=read)
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "words"),
-    [
-        ("robot", "sawyer", ("robot", "sawyer", "libero")),
-        ("robot", 3, ("robot",)),
-        ("drawing", "crayon", ("drawing", "crayon")),
-        ("total", "many", ("total", "many")),
-        ("bddl_file_content", 7, ("bddl_file_content",)),
-        ("models", np.zeros(3), ("models",)),
-        ("anything", h5py.Reference(), ("anything", "neither text nor numbers")),
-        ("anything", b"\xff\xfe", ("anything", "damaged")),
-    ],
-)
+@pytest.mark.parametrize(("key", "value", "words"), [
+    ("robot", "sawyer", ("robot", "sawyer", "libero")),
+    ("robot", 3, ("robot",)),
+    ("drawing", "crayon", ("drawing", "crayon")),
+    ("total", "many", ("total", "many")),
+    ("bddl_file_content", 7, ("bddl_file_content",)),
+    ("models", np.zeros(3), ("models",)),
+    ("anything", h5py.Reference(), ("anything", "neither text nor numbers")),
+    ("anything", b"\xff\xfe", ("anything", "damaged")),
+])  # fmt: skip
 def test_attributes_of_other_types_are_named(path, key, value, words):
     damaged(path, attribute(key, value))
     for read in (read_header, examine, recorded_robot, describe):
@@ -269,21 +254,11 @@ def test_attributes_of_json_are_checked(path, text, tmp_path):
     refused(path, "models", "JSON", read=describe)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("success", "no"),
-        ("success", 2),
-        ("success", np.nan),
-        ("fixtures", np.full((2, 7), np.nan)),
-        ("fixtures", np.zeros((2, 7))),
-        ("fixtures", np.zeros(7)),
-        ("fixtures", "there"),
-        ("failed_attempts", "many"),
-        ("failed_attempts", -1),
-        ("model_file", 3.0),
-    ],
-)
+@pytest.mark.parametrize(("key", "value"), [
+    ("success", "no"), ("success", 2), ("success", np.nan), ("fixtures", np.full((2, 7), np.nan)),
+    ("fixtures", np.zeros((2, 7))), ("fixtures", np.zeros(7)), ("fixtures", "there"), ("failed_attempts", "many"),
+    ("failed_attempts", -1), ("model_file", 3.0)
+])  # fmt: skip
 def test_attributes_of_a_demonstration_are_checked(path, key, value):
     damaged(path, attribute(key, value, "data/demo_1"))
     refused(path, "demo_1", key, read=read_episodes)
@@ -293,19 +268,16 @@ class _Scene:
     fixtures = ("stove",)
 
 
-@pytest.mark.parametrize(
-    ("xml", "words"),
-    [
-        ("<mujoco", "not XML"),
-        ('<x><body name="stove_main" pos="a b c"/></x>', "expected numbers"),
-        ('<x><body name="stove_main" pos="1 2"/></x>', "3 and 4 numbers"),
-        ('<x><body name="stove_main" pos="nan 2 3"/></x>', "3 and 4 numbers"),
-        ('<x><body name="stove_main" quat="0 0 0 0"/></x>', "expected a rotation"),
-        ('<x><replicate count="100000"/></x>', "element <replicate>"),
-        ("<x>" + "<geom/>" * 20_001 + "</x>", "over 20000 elements"),
-        ('<x><size nkey="1000000000"/></x>', "reserves nkey"),
-    ],
-)
+@pytest.mark.parametrize(("xml", "words"), [
+    ("<mujoco", "not XML"),
+    ('<x><body name="stove_main" pos="a b c"/></x>', "expected numbers"),
+    ('<x><body name="stove_main" pos="1 2"/></x>', "3 and 4 numbers"),
+    ('<x><body name="stove_main" pos="nan 2 3"/></x>', "3 and 4 numbers"),
+    ('<x><body name="stove_main" quat="0 0 0 0"/></x>', "expected a rotation"),
+    ('<x><replicate count="100000"/></x>', "element <replicate>"),
+    ("<x>" + "<geom/>" * 20_001 + "</x>", "over 20000 elements"),
+    ('<x><size nkey="1000000000"/></x>', "reserves nkey"),
+])  # fmt: skip
 def test_fixtures_of_a_stored_model_are_poses(xml, words):
     with pytest.raises(DemoError, match=words):
         read_fixture_poses(xml, _Scene(), "x.hdf5: demo_0/model_file")

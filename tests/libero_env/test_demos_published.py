@@ -37,35 +37,19 @@ VIDEO = {
     "dtype": "video",
     **IMAGE,
     "fps": 10.0,
-    "info": {
-        "video.height": 256,
-        "video.width": 256,
-        "video.codec": "av1",
-        "video.pix_fmt": "yuv420p",
-        "video.is_depth_map": False,
-        "video.fps": 10,
-        "video.channels": 3,
-        "has_audio": False,
-    },
-}
+    "info": {"video.height": 256, "video.width": 256, "video.codec": "av1", "video.pix_fmt": "yuv420p",
+     "video.is_depth_map": False, "video.fps": 10, "video.channels": 3, "has_audio": False},
+}  # fmt: skip
 FEATURES = {
-    "lerobot/libero": {
-        "observation.images.image": VIDEO,
-        "observation.images.image2": VIDEO,
-        "observation.state": {"dtype": "float32", "shape": [8], "names": ["state"], "fps": 10.0},
-        "action": {"dtype": "float32", "shape": [7], "names": ["actions"], "fps": 10.0},
-        "timestamp": {"dtype": "float32", **NUMBER},
-        **INDICES,
-    },
-    "physical-intelligence/libero": {
-        "image": {"dtype": "image", **IMAGE},
-        "wrist_image": {"dtype": "image", **IMAGE},
-        "state": {"dtype": "float32", "shape": [8], "names": ["state"]},
-        "actions": {"dtype": "float32", "shape": [7], "names": ["actions"]},
-        "timestamp": {"dtype": "float32", **NUMBER},
-        **INDICES,
-    },
-}
+    "lerobot/libero": {"observation.images.image": VIDEO, "observation.images.image2": VIDEO,
+     "observation.state": {"dtype": "float32", "shape": [8], "names": ["state"], "fps": 10.0},
+     "action": {"dtype": "float32", "shape": [7], "names": ["actions"], "fps": 10.0},
+     "timestamp": {"dtype": "float32", **NUMBER}, **INDICES},
+    "physical-intelligence/libero": {"image": {"dtype": "image", **IMAGE}, "wrist_image": {"dtype": "image", **IMAGE},
+     "state": {"dtype": "float32", "shape": [8], "names": ["state"]},
+     "actions": {"dtype": "float32", "shape": [7], "names": ["actions"]}, "timestamp": {"dtype": "float32", **NUMBER},
+     **INDICES},
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -136,13 +120,10 @@ def test_paths_are_those_of_the_two_versions(exported, episode):
     assert json.loads((root / "meta/stats.json").read_text()).keys() == old["features"].keys()
 
 
-@pytest.mark.parametrize(
-    "name, path, state, action",
-    [
-        ("lerobot/libero", "data/chunk-000/file-000.parquet", "observation.state", "action"),
-        ("physical-intelligence/libero", "data/chunk-000/episode_000000.parquet", "state", "actions"),
-    ],
-)
+@pytest.mark.parametrize("name, path, state, action", [
+    ("lerobot/libero", "data/chunk-000/file-000.parquet", "observation.state", "action"),
+    ("physical-intelligence/libero", "data/chunk-000/episode_000000.parquet", "state", "actions"),
+])  # fmt: skip
 def test_numbers_are_those_of_the_recording(exported, episode, name, path, state, action):
     table = parquet.read_table(exported[name] / path)
     np.testing.assert_array_equal(table[action].to_pylist(), episode.actions.astype(np.float32))

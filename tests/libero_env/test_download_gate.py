@@ -59,15 +59,12 @@ def test_names_that_lead_elsewhere_are_refused(place, name):
     assert entries(place) == ["a.zip"]
 
 
-@pytest.mark.parametrize(
-    ("files", "message"),
-    [
-        ((info("link", stat.S_IFLNK | 0o777),), "'link' is a link or a device"),
-        ((info("pipe", stat.S_IFIFO | 0o666),), "'pipe' is a link or a device"),
-        (("a", "A"), "A and a are the same file"),
-        (("a", "a/b"), "a is both a file and a folder"),
-    ],
-)
+@pytest.mark.parametrize(("files", "message"), [
+    ((info("link", stat.S_IFLNK | 0o777),), "'link' is a link or a device"),
+    ((info("pipe", stat.S_IFIFO | 0o666),), "'pipe' is a link or a device"),
+    (("a", "A"), "A and a are the same file"),
+    (("a", "a/b"), "a is both a file and a folder"),
+])  # fmt: skip
 def test_archives_with_more_than_plain_files_are_refused(place, files, message):
     (place.parent / "a.zip").write_bytes(zipped(*files))
     with pytest.raises(DownloadError, match=message):
@@ -94,20 +91,14 @@ def _bits(data: bytes, flag: bool = False, overlap: bool = False, method: int | 
     return bytes(changed)
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (_bits(zipped(), flag=True), "is encrypted"),
-        (_bits(zipped("a", "b"), overlap=True), "overlaps another file"),
-        (_bits(zipped(), method=97), "packed in an unknown way"),
-        (zipped()[:-10], "the archive is damaged"),
-        (
-            zipped().replace(b"\x00\x00\x00a/b.txt\xcb", b"\x00\x00\x00a/b.txt\xff", 1),
-            "the archive is damaged",
-        ),
-        (b"", "the archive is damaged"),
-    ],
-)
+@pytest.mark.parametrize(("data", "message"), [
+    (_bits(zipped(), flag=True), "is encrypted"),
+    (_bits(zipped("a", "b"), overlap=True), "overlaps another file"),
+    (_bits(zipped(), method=97), "packed in an unknown way"),
+    (zipped()[:-10], "the archive is damaged"),
+    (zipped().replace(b"\x00\x00\x00a/b.txt\xcb", b"\x00\x00\x00a/b.txt\xff", 1), "the archive is damaged"),
+    (b"", "the archive is damaged"),
+])  # fmt: skip
 def test_damaged_archives_are_one_line(place, data, message):
     (place.parent / "a.zip").write_bytes(data)
     with pytest.raises(DownloadError, match=message) as caught:
@@ -138,23 +129,11 @@ def test_an_archive_of_the_users_own_is_not_removed(place):
     assert (place / "x.zip").read_bytes() == b"mine"
 
 
-@pytest.mark.parametrize(
-    "url",
-    [
-        "file:///etc/passwd",
-        "ftp://127.0.0.1/x",
-        "http://[::1",
-        "http:///x",
-        "127.0.0.1/x",
-        "",
-        "http://a b/",
-        "http://127.0.0.1:99999/x",
-        "http://127.0.0.1:x/y",
-        "http://a..b/x",
-        "http://x\r\nHost: y/",
-        "data:text/plain,hello",
-    ],
-)
+@pytest.mark.parametrize("url", [
+    "file:///etc/passwd", "ftp://127.0.0.1/x", "http://[::1", "http:///x", "127.0.0.1/x", "", "http://a b/",
+    "http://127.0.0.1:99999/x", "http://127.0.0.1:x/y", "http://a..b/x", "http://x\r\nHost: y/",
+    "data:text/plain,hello"
+])  # fmt: skip
 def test_addresses_that_are_none(place, url):
     for attempt in (lambda: fetch(url, place / "x"), lambda: check_url(url)):
         with pytest.raises(DownloadError, match="not an http or https address"):
@@ -184,18 +163,15 @@ def test_an_encrypted_address_stays_encrypted():
         http._Redirects().http_error_302(request, io.BytesIO(), 302, "", {"Location": "http://127.0.0.1/x"})
 
 
-@pytest.mark.parametrize(
-    ("found", "message"),
-    [
-        (b"", "tried 2 times"),
-        (b"\x00\xff\r\n\r\n", "tried 2 times"),
-        (b"HTTP/1.1 200 OK\r\nContent-Length: -5\r\n\r\n", "does not say how long the file is"),
-        (b"HTTP/1.1 200 OK\r\nContent-Length: abc\r\n\r\nhello", "does not say how long the file is"),
-        (b"HTTP/1.1 200 OK\r\nConte", "does not say how long the file is"),
-        (b"HTTP/1.1 200 OK\r\nContent-Length: 99999999999999999999\r\n\r\nhello", "MiB free"),
-        (answer(b"hello", status="418 no"), "the server answers 418 no"),
-    ],
-)
+@pytest.mark.parametrize(("found", "message"), [
+    (b"", "tried 2 times"),
+    (b"\x00\xff\r\n\r\n", "tried 2 times"),
+    (b"HTTP/1.1 200 OK\r\nContent-Length: -5\r\n\r\n", "does not say how long the file is"),
+    (b"HTTP/1.1 200 OK\r\nContent-Length: abc\r\n\r\nhello", "does not say how long the file is"),
+    (b"HTTP/1.1 200 OK\r\nConte", "does not say how long the file is"),
+    (b"HTTP/1.1 200 OK\r\nContent-Length: 99999999999999999999\r\n\r\nhello", "MiB free"),
+    (answer(b"hello", status="418 no"), "the server answers 418 no"),
+])  # fmt: skip
 def test_answers_that_are_odd_end_in_one_line(place, found, message):
     with serve(found) as url, pytest.raises(DownloadError, match=message) as caught:
         fetch(f"{url}/x", place / "x", pause=0.0)
@@ -227,21 +203,18 @@ def test_a_range_of_another_place_starts_again(place):
         assert fetch(f"{url}/x", place / "x", pause=0.0).read_bytes() == b"hello"
 
 
-@pytest.mark.parametrize(
-    ("files", "message"),
-    [
-        ([("a", -1, "a" * 64)], r"a\.size is -1; expected at least 0"),
-        ([("a", 1 << 60, "a" * 64)], "expected at most"),
-        ([("a", "3", "a" * 64)], "size is '3'"),
-        ([("a", 3, "../x")], "digest is '../x'"),
-        ([("a", 3, "0")], "digest is '0'"),
-        ([(3, 3, "a" * 64)], "name"),
-        ([FILE, FILE], "are the same file"),
-        ([FILE, ("A/B.HDF5", *FILE[1:])], "are the same file"),
-        ([FILE, ("a", *FILE[1:])], "both a file and a folder"),
-        ([FILE] * 100_001, "more than 100000"),
-    ],
-)
+@pytest.mark.parametrize(("files", "message"), [
+    ([("a", -1, "a" * 64)], r"a\.size is -1; expected at least 0"),
+    ([("a", 1 << 60, "a" * 64)], "expected at most"),
+    ([("a", "3", "a" * 64)], "size is '3'"),
+    ([("a", 3, "../x")], "digest is '../x'"),
+    ([("a", 3, "0")], "digest is '0'"),
+    ([(3, 3, "a" * 64)], "name"),
+    ([FILE, FILE], "are the same file"),
+    ([FILE, ("A/B.HDF5", *FILE[1:])], "are the same file"),
+    ([FILE, ("a", *FILE[1:])], "both a file and a folder"),
+    ([FILE] * 100_001, "more than 100000"),
+])  # fmt: skip
 def test_listings_that_lie_are_refused(files, message):
     with pytest.raises(DownloadError, match=message) as caught:
         checked_listing(files, "here")

@@ -29,16 +29,12 @@ def test_the_signature_shows_the_options_with_their_default_values(environment):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda **options: LiberoEnv(TASK, **options),
-        lambda **options: BatchEnv(TASK, 2, **options),
-        lambda **options: SubprocEnv([{"task": TASK}], **options),
-        lambda **options: SubprocEnv([{"task": TASK, **options}]),
-    ],
-    ids=["LiberoEnv", "BatchEnv", "SubprocEnv", "specs of SubprocEnv"],
-)
+@pytest.mark.parametrize("make", [
+    lambda **options: LiberoEnv(TASK, **options),
+    lambda **options: BatchEnv(TASK, 2, **options),
+    lambda **options: SubprocEnv([{"task": TASK}], **options),
+    lambda **options: SubprocEnv([{"task": TASK, **options}]),
+], ids=["LiberoEnv", "BatchEnv", "SubprocEnv", "specs of SubprocEnv"])  # fmt: skip
 def test_an_unknown_option_is_an_error_that_names_the_nearest(make):
     with pytest.raises(UnknownNameError, match="camera_siz'.*'camera_size'.*control_delta"):
         make(camera_siz=(64, 64))

@@ -179,12 +179,8 @@ def test_refused_actions_change_nothing(env):
             env.step(action)
     assert digest(env) == before
     for action in (
-        torch.zeros(7),
-        [True] * 7,
-        np.zeros(7, object),
-        np.ma.masked_array(np.zeros(7)),
-        (0,) * 7,
-    ):
+        torch.zeros(7), [True] * 7, np.zeros(7, object), np.ma.masked_array(np.zeros(7)), (0,) * 7
+    ):  # fmt: skip
         env.step(action)
 
 

@@ -426,21 +426,10 @@ def test_the_elbow_is_not_straightened_further(view_of):
 
 @pytest.mark.sim
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "task_id, start",
-    [
-        ("libero_goal/3", 0),
-        ("libero_spatial/4", 16),
-        ("libero_90/5", 4),
-        ("libero_90/13", 12),
-        ("libero_90/19", 4),
-        ("libero_90/42", 7),
-        ("libero_90/62", 6),
-        ("libero_90/83", 3),
-        ("libero_90/86", 2),
-        ("libero_90/89", 3),
-    ],
-)
+@pytest.mark.parametrize("task_id, start", [
+    ("libero_goal/3", 0), ("libero_spatial/4", 16), ("libero_90/5", 4), ("libero_90/13", 12), ("libero_90/19", 4),
+    ("libero_90/42", 7), ("libero_90/62", 6), ("libero_90/83", 3), ("libero_90/86", 2), ("libero_90/89", 3)
+])  # fmt: skip
 def test_narrow_places_leaning_hands_and_small_knobs(task_id, start):
     task = get_task(task_id)
     style_seed, _ = np.random.SeedSequence([task.index, start]).spawn(2)

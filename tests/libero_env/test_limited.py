@@ -12,16 +12,13 @@ from libero_env.limited import call_limited, limited_process
 pytestmark = pytest.mark.unit
 
 
-@pytest.mark.parametrize(
-    ("function", "args", "message"),
-    [
-        (time.sleep, (60,), "f: reading it takes more than"),
-        (os._exit, (0,), "f: reading it ends the process"),
-        (os.abort, (), "f: reading it ends the process"),
-        (bytearray, (1 << 40,), "f: it needs more than 3 GiB"),
-        (int, ("x",), "f: it cannot be read .invalid literal"),
-    ],
-)
+@pytest.mark.parametrize(("function", "args", "message"), [
+    (time.sleep, (60,), "f: reading it takes more than"),
+    (os._exit, (0,), "f: reading it ends the process"),
+    (os.abort, (), "f: reading it ends the process"),
+    (bytearray, (1 << 40,), "f: it needs more than 3 GiB"),
+    (int, ("x",), "f: it cannot be read .invalid literal"),
+])  # fmt: skip
 def test_what_goes_wrong_is_said_in_one_line_and_the_next_call_works(monkeypatch, function, args, message):
     monkeypatch.setattr(limited, "SECONDS", 5.0)
     with limited_process():

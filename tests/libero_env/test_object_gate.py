@@ -79,21 +79,18 @@ def test_names_of_assets_never_become_paths(home, name):
     get_object("thing").spec.compile()
 
 
-@pytest.mark.parametrize(
-    ("around", "assets"),
-    [
-        ("", '<mesh name="m" file="../secret/m.stl"/>'),
-        ("", '<mesh name="m" file="{home}/secret/m.stl"/>'),
-        ("", '<mesh name="m" file="C:\\secret\\m.stl"/>'),
-        ("", '<mesh name="m" file="..\\secret\\m.stl"/>'),
-        ("", '<mesh name="m" file="linked.stl"/>'),
-        ("", '<mesh name="m" file="below/m.stl"/>'),
-        ("", '<mesh name="m" file="file:///etc/passwd"/>'),
-        ('<compiler meshdir="../secret"/>', '<mesh name="m" file="m.stl"/>'),
-        ('<compiler assetdir="{home}/secret"/>', '<mesh name="m" file="m.stl"/>'),
-        ('<include file="../secret/more.xml"/>', '<mesh name="m" file="m.stl"/>'),
-    ],
-)
+@pytest.mark.parametrize(("around", "assets"), [
+    ("", '<mesh name="m" file="../secret/m.stl"/>'),
+    ("", '<mesh name="m" file="{home}/secret/m.stl"/>'),
+    ("", '<mesh name="m" file="C:\\secret\\m.stl"/>'),
+    ("", '<mesh name="m" file="..\\secret\\m.stl"/>'),
+    ("", '<mesh name="m" file="linked.stl"/>'),
+    ("", '<mesh name="m" file="below/m.stl"/>'),
+    ("", '<mesh name="m" file="file:///etc/passwd"/>'),
+    ('<compiler meshdir="../secret"/>', '<mesh name="m" file="m.stl"/>'),
+    ('<compiler assetdir="{home}/secret"/>', '<mesh name="m" file="m.stl"/>'),
+    ('<include file="../secret/more.xml"/>', '<mesh name="m" file="m.stl"/>'),
+])  # fmt: skip
 def test_files_elsewhere_are_not_read(home, around, assets):
     (home / "own" / "linked.stl").symlink_to(home / "secret" / "m.stl")
     (home / "own" / "below").symlink_to(home / "secret")
@@ -117,62 +114,44 @@ def test_files_in_the_folder_are_found_as_mujoco_finds_them(home):
     assert read_mjcf(path).root.find("asset/mesh").get("file") == str(home / "own" / "parts" / "m.stl")
 
 
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        (
-            {"inside": '<replicate count="100000"><geom size=".01"/></replicate>'},
-            ":1: .*100001 elements <geom>",
-        ),
-        (
-            {"inside": '<replicate count="300"><replicate count="300"><site/></replicate></replicate>'},
-            "90000",
-        ),
-        ({"inside": "<body><joint/><geom size='.01'/></body>" * 101}, "101 elements <joint>; .* at most 100"),
-        ({"inside": "<frame>" * 200 + "</frame>" * 200}, ":3: elements within elements, more than 80 deep"),
-        ({"inside": '<composite type="cable" count="9 1 1"/>'}, ":3: <composite> in <body> is not used"),
-        ({"inside": '<flexcomp name="f" type="grid" count="300 300 30"/>'}, "<flexcomp> in <body>"),
-        ({"inside": '<attach model="x" prefix="y"/>'}, "<attach> in <body>"),
-        (
-            {"geom": '<geom type="box" size=".02 .02 .02"><plugin/></geom>'},
-            "<plugin> in <geom> .* it has no elements",
-        ),
-        ({"around": '<extension><plugin plugin="x"/></extension>'}, ":1: <extension>"),
-        ({"assets": '<hfield name="h" nrow="9999" ncol="9999" size="1 1 1 1"/>'}, ":2: <hfield>"),
-        ({"assets": '<model name="x" file="m.xml"/>'}, "<model> in <asset>"),
-        ({"assets": '<mseh name="x" file="m.stl"/>'}, "Did you mean 'mesh'"),
-        (
-            {"assets": '<texture name="t" type="2d" builtin="flat" width="60000" height="9"/>'},
-            "width .*60000",
-        ),
-        ({"assets": '<texture name="t" builtin="flat" width="8192" height="8192"/>'}, "width .* value 8192"),
-        (
-            {"assets": '<mesh name="m" vertex="nan 0 0 1 0 0 0 1 0 0 0 1"/>'},
-            "vertex of <mesh> has the value nan",
-        ),
-        ({"geom": '<geom size="nan"/>'}, ":3: size of <geom> has the value nan"),
-        ({"geom": '<geom size="1e30"/>'}, "value 1e[+]30; expected numbers up to 10"),
-        ({"geom": '<geom size="5"/>'}, "it reaches 5 m"),
-        ({"geom": '<geom size="1.5" mass="1"/>' * 20}, "20 collision geoms have 45 m.2 in all"),
-        ({"geom": '<geom size=".01"/>' * 1500}, "3000 geoms with their copies for display"),
-        ({"geom": '<geom size=".02" mass="1e308"/>'}, "mass of <geom> has the value 1e[+]308"),
-        ({"geom": '<geom size=".02" mass="1e9"/>'}, "its mass is 1e[+]09 kg"),
-        ({"geom": '<geom size=".02" rgba="red"/>'}, "rgba of <geom> is 'red'; expected numbers"),
-        ({"geom": '<geom size=".02" group="1.5"/>'}, "group of <geom> is '1.5'; expected a whole number"),
-        ({"geom": '<geom size=".02" typ="box"/>'}, "thing.xml:3: .*typ"),
-        ({"around": '<equality><weld body1="b"/></equality>'}, ":1: <weld> fixes the object to the world"),
-        ({"inside": '<body name="main"><geom size=".01"/></body>'}, "a part is named 'main'"),
-        ({"around": '<!DOCTYPE x [<!ENTITY y "z">]>'}, ":1: "),
-        ({"around": '<include file="thing.xml"/>'}, "included twice"),
-        ({"geom": PAINTED, "assets": '<texture name="t" file="big.png"/>' + PAINT}, "big.png"),
-        ({"geom": PAINTED, "assets": '<texture name="t" file="bomb.png"/>' + PAINT}, "bomb.png"),
-        ({"geom": MESH, "assets": '<mesh name="m" file="short.stl"/>'}, "short.stl"),
-        ({"geom": MESH, "assets": '<mesh name="m" file="empty.obj"/>'}, "is empty"),
-        ({"geom": MESH, "assets": '<mesh name="m" file="nothing.obj"/>'}, "mesh .*nothing.obj is missing"),
-        ({"geom": MESH, "assets": '<mesh name="m" file="wrong.msh"/>'}, "wrong.msh"),
-        ({"geom": MESH, "assets": '<mesh name="m" file="polygon.obj"/>'}, "thing.xml:2: "),
-    ],
-)
+@pytest.mark.parametrize(("parts", "message"), [
+    ({"inside": '<replicate count="100000"><geom size=".01"/></replicate>'}, ":1: .*100001 elements <geom>"),
+    ({"inside": '<replicate count="300"><replicate count="300"><site/></replicate></replicate>'}, "90000"),
+    ({"inside": "<body><joint/><geom size='.01'/></body>" * 101}, "101 elements <joint>; .* at most 100"),
+    ({"inside": "<frame>" * 200 + "</frame>" * 200}, ":3: elements within elements, more than 80 deep"),
+    ({"inside": '<composite type="cable" count="9 1 1"/>'}, ":3: <composite> in <body> is not used"),
+    ({"inside": '<flexcomp name="f" type="grid" count="300 300 30"/>'}, "<flexcomp> in <body>"),
+    ({"inside": '<attach model="x" prefix="y"/>'}, "<attach> in <body>"),
+    ({"geom": '<geom type="box" size=".02 .02 .02"><plugin/></geom>'}, "<plugin> in <geom> .* it has no elements"),
+    ({"around": '<extension><plugin plugin="x"/></extension>'}, ":1: <extension>"),
+    ({"assets": '<hfield name="h" nrow="9999" ncol="9999" size="1 1 1 1"/>'}, ":2: <hfield>"),
+    ({"assets": '<model name="x" file="m.xml"/>'}, "<model> in <asset>"),
+    ({"assets": '<mseh name="x" file="m.stl"/>'}, "Did you mean 'mesh'"),
+    ({"assets": '<texture name="t" type="2d" builtin="flat" width="60000" height="9"/>'}, "width .*60000"),
+    ({"assets": '<texture name="t" builtin="flat" width="8192" height="8192"/>'}, "width .* value 8192"),
+    ({"assets": '<mesh name="m" vertex="nan 0 0 1 0 0 0 1 0 0 0 1"/>'}, "vertex of <mesh> has the value nan"),
+    ({"geom": '<geom size="nan"/>'}, ":3: size of <geom> has the value nan"),
+    ({"geom": '<geom size="1e30"/>'}, "value 1e[+]30; expected numbers up to 10"),
+    ({"geom": '<geom size="5"/>'}, "it reaches 5 m"),
+    ({"geom": '<geom size="1.5" mass="1"/>' * 20}, "20 collision geoms have 45 m.2 in all"),
+    ({"geom": '<geom size=".01"/>' * 1500}, "3000 geoms with their copies for display"),
+    ({"geom": '<geom size=".02" mass="1e308"/>'}, "mass of <geom> has the value 1e[+]308"),
+    ({"geom": '<geom size=".02" mass="1e9"/>'}, "its mass is 1e[+]09 kg"),
+    ({"geom": '<geom size=".02" rgba="red"/>'}, "rgba of <geom> is 'red'; expected numbers"),
+    ({"geom": '<geom size=".02" group="1.5"/>'}, "group of <geom> is '1.5'; expected a whole number"),
+    ({"geom": '<geom size=".02" typ="box"/>'}, "thing.xml:3: .*typ"),
+    ({"around": '<equality><weld body1="b"/></equality>'}, ":1: <weld> fixes the object to the world"),
+    ({"inside": '<body name="main"><geom size=".01"/></body>'}, "a part is named 'main'"),
+    ({"around": '<!DOCTYPE x [<!ENTITY y "z">]>'}, ":1: "),
+    ({"around": '<include file="thing.xml"/>'}, "included twice"),
+    ({"geom": PAINTED, "assets": '<texture name="t" file="big.png"/>' + PAINT}, "big.png"),
+    ({"geom": PAINTED, "assets": '<texture name="t" file="bomb.png"/>' + PAINT}, "bomb.png"),
+    ({"geom": MESH, "assets": '<mesh name="m" file="short.stl"/>'}, "short.stl"),
+    ({"geom": MESH, "assets": '<mesh name="m" file="empty.obj"/>'}, "is empty"),
+    ({"geom": MESH, "assets": '<mesh name="m" file="nothing.obj"/>'}, "mesh .*nothing.obj is missing"),
+    ({"geom": MESH, "assets": '<mesh name="m" file="wrong.msh"/>'}, "wrong.msh"),
+    ({"geom": MESH, "assets": '<mesh name="m" file="polygon.obj"/>'}, "thing.xml:2: "),
+])  # fmt: skip
 def test_what_an_object_may_not_have_is_named_with_its_line(home, parts, message):
     own = home / "own"
     (own / "big.png").write_bytes(png(20000, 20000, zlib.compress(b"")))
@@ -253,26 +232,23 @@ def test_a_gltf_file_with_its_files_is_read(home):
     assert add_object(gltf(home, lambda content: None), name="thing").properties["watertight"]
 
 
-@pytest.mark.parametrize(
-    ("line", "materials", "message"),
-    [
-        ("mtllib ../secret/s.mtl", "", r"box\.obj: .*s\.mtl' is outside of the folder"),
-        ("mtllib {home}/secret/s.mtl", "", "outside of the folder"),
-        ("mtllib box.mtl", "map_Kd ../secret/s.png", r"box\.obj: .*s\.png' is outside of the folder"),
-        ("mtllib box.mtl", "map_Kd {home}/secret/s.png", "outside of the folder"),
-        ("mtllib box.mtl", "map_Kd linked.png", "outside of the folder"),
-        ("mtllib box.mtl", "map_Kd -s 1 1 1 nothing.png", "nothing.png is missing"),
-        ("mtllib box.mtl", "map_Kd noise.png", "not a picture"),
-        ("mtllib box.mtl", "map_Kd big.png", "400000000 pixels"),
-        ("mtllib box.mtl", "map_Kd short.png", "image file is truncated"),
-        ("mtllib box.mtl", "map_Kd script.eps", "not a picture"),
-        ('mtllib a"b', "", 'a"b is missing'),
-        ("v nan 0 0", "", "not finite"),
-        ("v 1e400 0 0", "", "not finite"),
-        ("f 1 2 99999", "", "cannot be read"),
-        ("f 1 2 3\n" * 1_000_001, "", "1000013 triangles; simplify it to 1000000"),
-    ],
-)
+@pytest.mark.parametrize(("line", "materials", "message"), [
+    ("mtllib ../secret/s.mtl", "", r"box\.obj: .*s\.mtl' is outside of the folder"),
+    ("mtllib {home}/secret/s.mtl", "", "outside of the folder"),
+    ("mtllib box.mtl", "map_Kd ../secret/s.png", r"box\.obj: .*s\.png' is outside of the folder"),
+    ("mtllib box.mtl", "map_Kd {home}/secret/s.png", "outside of the folder"),
+    ("mtllib box.mtl", "map_Kd linked.png", "outside of the folder"),
+    ("mtllib box.mtl", "map_Kd -s 1 1 1 nothing.png", "nothing.png is missing"),
+    ("mtllib box.mtl", "map_Kd noise.png", "not a picture"),
+    ("mtllib box.mtl", "map_Kd big.png", "400000000 pixels"),
+    ("mtllib box.mtl", "map_Kd short.png", "image file is truncated"),
+    ("mtllib box.mtl", "map_Kd script.eps", "not a picture"),
+    ('mtllib a"b', "", 'a"b is missing'),
+    ("v nan 0 0", "", "not finite"),
+    ("v 1e400 0 0", "", "not finite"),
+    ("f 1 2 99999", "", "cannot be read"),
+    ("f 1 2 3\n" * 1_000_001, "", "1000013 triangles; simplify it to 1000000"),
+])  # fmt: skip
 def test_meshes_name_files_of_their_folder_and_hold_what_is_usual(home, line, materials, message):
     own, secret = home / "own", home / "secret"
     for place in (own / "short.png", secret / "s.png"):
@@ -289,51 +265,37 @@ def test_meshes_name_files_of_their_folder_and_hold_what_is_usual(home, line, ma
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda g: g["buffers"][0].update(uri="../secret/x.bin"), "outside of the folder"),
-        (lambda g: g["buffers"][0].update(uri="%2e%2e/secret/x.bin"), "outside of the folder"),
-        (lambda g: g["buffers"][0].update(uri="http://127.0.0.1/x.bin"), "outside of the folder"),
-        (lambda g: g.update(images=[{"uri": "file:///etc/passwd"}]), "outside of the folder"),
-        (lambda g: g.update(images=[{"uri": "/etc/passwd"}]), "outside of the folder"),
-        (lambda g: g.update(images=[{"uri": "nothing.png"}]), "nothing.png is missing"),
-        (lambda g: g.update(images=3), "cannot be read"),
-        (lambda g: g["accessors"][0].update(count=10**9), "cannot be read"),
-        (lambda g: g["accessors"][0].update(count=-1), "cannot be read"),
-        (lambda g: g["nodes"][0].update(children=[1, 1]), "cannot be read"),
-        (lambda g: g.clear(), "cannot be read|no triangles"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda g: g["buffers"][0].update(uri="../secret/x.bin"), "outside of the folder"),
+    (lambda g: g["buffers"][0].update(uri="%2e%2e/secret/x.bin"), "outside of the folder"),
+    (lambda g: g["buffers"][0].update(uri="http://127.0.0.1/x.bin"), "outside of the folder"),
+    (lambda g: g.update(images=[{"uri": "file:///etc/passwd"}]), "outside of the folder"),
+    (lambda g: g.update(images=[{"uri": "/etc/passwd"}]), "outside of the folder"),
+    (lambda g: g.update(images=[{"uri": "nothing.png"}]), "nothing.png is missing"),
+    (lambda g: g.update(images=3), "cannot be read"),
+    (lambda g: g["accessors"][0].update(count=10**9), "cannot be read"),
+    (lambda g: g["accessors"][0].update(count=-1), "cannot be read"),
+    (lambda g: g["nodes"][0].update(children=[1, 1]), "cannot be read"),
+    (lambda g: g.clear(), "cannot be read|no triangles"),
+])  # fmt: skip
 def test_gltf_files_likewise(home, change, message):
     with pytest.raises(LiberoError, match=message) as caught:
         add_object(gltf(home, change), name="thing")
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "data", "message"),
-    [
-        ("a.stl", bytes(80) + struct.pack("<I", 2**31) + bytes(50), "no triangles|cannot be read"),
-        ("a.stl", bytes(80) + struct.pack("<I12fH", 1, *[float("nan")] * 12, 0), "not finite"),
-        ("a.stl", b"solid x\nfacet normal 0 0 1\nouter loop\nvertex nan 0 0\n", "no triangles"),
-        ("a.stl", b"", "is empty"),
-        (
-            "a.ply",
-            b"ply\nformat ascii 1.0\nelement vertex 2000000000\nend_header\n",
-            "cannot be read",
-        ),
-        (
-            "a.ply",
-            b"ply\nformat ascii 1.0\ncomment TextureFile ../secret/s.png\nend_header\n",
-            "outside of the folder",
-        ),
-        ("a.glb", b"glTF" + bytes(60), "cannot be read"),
-        ("a.glb", b"glTF", "cannot be read"),
-        ("a.gltf", b"[" * 100_000, "cannot be read"),
-        ("a.gltf", b"\xff\xfe", "cannot be read"),
-    ],
-)
+@pytest.mark.parametrize(("name", "data", "message"), [
+    ("a.stl", bytes(80) + struct.pack("<I", 2**31) + bytes(50), "no triangles|cannot be read"),
+    ("a.stl", bytes(80) + struct.pack("<I12fH", 1, *[float("nan")] * 12, 0), "not finite"),
+    ("a.stl", b"solid x\nfacet normal 0 0 1\nouter loop\nvertex nan 0 0\n", "no triangles"),
+    ("a.stl", b"", "is empty"),
+    ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 2000000000\nend_header\n", "cannot be read"),
+    ("a.ply", b"ply\nformat ascii 1.0\ncomment TextureFile ../secret/s.png\nend_header\n", "outside of the folder"),
+    ("a.glb", b"glTF" + bytes(60), "cannot be read"),
+    ("a.glb", b"glTF", "cannot be read"),
+    ("a.gltf", b"[" * 100_000, "cannot be read"),
+    ("a.gltf", b"\xff\xfe", "cannot be read"),
+])  # fmt: skip
 def test_other_formats_likewise(home, name, data, message):
     (home / "own" / name).write_bytes(data)
     with pytest.raises(LiberoError, match=message) as caught:
@@ -341,23 +303,20 @@ def test_other_formats_likewise(home, name, data, message):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"size": float("nan")}, "size is nan"),
-        ({"size": float("inf")}, "size is inf"),
-        ({"size": 1e-300}, "size is 1e-300; expected at least 0.001"),
-        ({"size": "big"}, "size is 'big'; expected a number"),
-        ({"mass": 1e300}, "mass is 1e[+]300; expected at most 10000"),
-        ({"density": -1.0}, "density is -1.0; expected above 0"),
-        ({"faces": 0}, "faces is 0; expected at least 1"),
-        ({"faces": 1.5}, "faces is 1.5; expected a whole number"),
-        ({"container": "no"}, "container is 'no'; expected true or false"),
-        ({"siz": 0.1}, "siz is an unknown key. Did you mean 'size'"),
-        ({"name": "../x"}, "not a valid name"),
-        ({"name": "class"}, "reserved word"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"size": float("nan")}, "size is nan"),
+    ({"size": float("inf")}, "size is inf"),
+    ({"size": 1e-300}, "size is 1e-300; expected at least 0.001"),
+    ({"size": "big"}, "size is 'big'; expected a number"),
+    ({"mass": 1e300}, "mass is 1e[+]300; expected at most 10000"),
+    ({"density": -1.0}, "density is -1.0; expected above 0"),
+    ({"faces": 0}, "faces is 0; expected at least 1"),
+    ({"faces": 1.5}, "faces is 1.5; expected a whole number"),
+    ({"container": "no"}, "container is 'no'; expected true or false"),
+    ({"siz": 0.1}, "siz is an unknown key. Did you mean 'size'"),
+    ({"name": "../x"}, "not a valid name"),
+    ({"name": "class"}, "reserved word"),
+])  # fmt: skip
 def test_options_are_checked_before_anything_is_made(home, options, message):
     with pytest.raises(LiberoError, match=message):
         add_object(home / "own" / "m.stl", **options)

@@ -284,12 +284,9 @@ def texture_of(model: mujoco.MjModel, texture: int) -> np.ndarray:
 def test_rest_orientations_are_those_of_the_initial_states():
     half = np.sqrt(0.5)
     expected = {
-        "ketchup": (0.5, 0.5, 0.5, 0.5),
-        "alphabet_soup": (0, 0, half, half),
-        "bbq_sauce": (half, 0, 0, half),
-        "butter": (0, 0, 0, 1),
-        "basket": (half, 0, 0, half),
-    }
+        "ketchup": (0.5, 0.5, 0.5, 0.5), "alphabet_soup": (0, 0, half, half), "bbq_sauce": (half, 0, 0, half),
+        "butter": (0, 0, 0, 1), "basket": (half, 0, 0, half)
+    }  # fmt: skip
     for name, quat in expected.items():
         assert get_object(name).rest_quat(np.random.default_rng(0)) == pytest.approx(np.array(quat))
     assert rest_quat({}) == pytest.approx(np.array([1.0, 0, 0, 0]))

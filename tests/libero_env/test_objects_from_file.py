@@ -353,27 +353,24 @@ def broken(tmp_path: Path, kind: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize(
-    ("kind", "options", "message"),
-    [
-        ("texture", {}, "skin.png is missing; put it there"),
-        ("mtl", {}, "mtl.mtl is missing; put it there"),
-        ("flat", {}, "it is flat"),
-        ("empty", {}, "empty.obj: "),
-        ("two", {}, "2 bodies"),
-        ("weightless", {}, "has no mass"),
-        ("xml", {}, "xml.xml:1: not valid XML"),
-        ("two", {"size": 0.1}, "defines size itself"),
-        ("fbx", {}, "unknown format '.fbx'; valid: .xml"),
-        ("address", {}, r"images\[0\].uri is 7; expected the name of a file"),
-        ("binary", {}, r"images\[0\].uri is 7"),
-        ("large", {"size": 3.0}, "too large"),
-        ("large", {"name": "milk"}, "--name my_milk"),
-        ("large", {"name": "Red Cup"}, "lower-case letters"),
-        ("large", {"collision": "cubes"}, "expected one of .decompose., .hull. or .boxes."),
-        ("absent", {}, "no such file"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "options", "message"), [
+    ("texture", {}, "skin.png is missing; put it there"),
+    ("mtl", {}, "mtl.mtl is missing; put it there"),
+    ("flat", {}, "it is flat"),
+    ("empty", {}, "empty.obj: "),
+    ("two", {}, "2 bodies"),
+    ("weightless", {}, "has no mass"),
+    ("xml", {}, "xml.xml:1: not valid XML"),
+    ("two", {"size": 0.1}, "defines size itself"),
+    ("fbx", {}, "unknown format '.fbx'; valid: .xml"),
+    ("address", {}, r"images\[0\].uri is 7; expected the name of a file"),
+    ("binary", {}, r"images\[0\].uri is 7"),
+    ("large", {"size": 3.0}, "too large"),
+    ("large", {"name": "milk"}, "--name my_milk"),
+    ("large", {"name": "Red Cup"}, "lower-case letters"),
+    ("large", {"collision": "cubes"}, "expected one of .decompose., .hull. or .boxes."),
+    ("absent", {}, "no such file"),
+])  # fmt: skip
 def test_what_cannot_be_used_is_named_with_its_remedy(tmp_path, kind, options, message):
     with pytest.raises(LiberoError, match=message):
         add_object(broken(tmp_path, kind), **options)

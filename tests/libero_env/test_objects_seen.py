@@ -14,15 +14,9 @@ SOLID, SEEN = 0, 1  # geom groups
 SPACING = 0.006  # between rays, metres
 BOOKS = ("black_book", "yellow_book")
 FURNITURE = (
-    *BOOKS,
-    "desk_caddy",
-    "rack",
-    "white_storage_box",
-    "wine_rack",
-    "wooden_shelf",
-    "wooden_tray",
-    "wooden_two_layer_shelf",
-)
+    *BOOKS, "desk_caddy", "rack", "white_storage_box", "wine_rack", "wooden_shelf", "wooden_tray",
+    "wooden_two_layer_shelf"
+)  # fmt: skip
 OPENINGS = {  # category -> (site of the region, the way into it from outside)
     "desk_caddy": [(f"{place}_contain_region", (0, 0, -1)) for place in ("left", "right", "front", "back")],
     "white_storage_box": [("bottom_side", (0, 1, 0)), ("bottom_side", (0, -1, 0))],

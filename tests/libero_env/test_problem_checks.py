@@ -125,22 +125,18 @@ PROBLEM = bddl.parse(TEXT)
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"language": 3}, "Problem: language is 3; expected a text"),
-        ({"language": "a\nb"}, "expected one line without ( ) and ;"),
-        ({"objects": ["plate"]}, "objects is ['plate']; expected keys with values"),
-        ({"fixtures": {"kitchen_table": 1}}, "fixtures.kitchen_table is 1; expected a text"),
-        ({"regions": [PROBLEM.regions[0]]}, "expected a tuple"),
-        ({"init": (Atom("On", ("bowl_1", "nowhere")),)}, "(On bowl_1 nowhere): nowhere is not declared"),
-        ({"goal": "Up bowl_1"}, "goal is 'Up bowl_1'; expected Expression"),
-        ({"scene_properties": {"floor": "a b)"}}, "expected one line without"),
-        ({"name": "a b"}, "the name 'a b' is not valid"),
-        ({"obj_of_interest": "bowl_1"}, "obj_of_interest is 'bowl_1'; expected a tuple"),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"language": 3}, "Problem: language is 3; expected a text"),
+    ({"language": "a\nb"}, "expected one line without ( ) and ;"),
+    ({"objects": ["plate"]}, "objects is ['plate']; expected keys with values"),
+    ({"fixtures": {"kitchen_table": 1}}, "fixtures.kitchen_table is 1; expected a text"),
+    ({"regions": [PROBLEM.regions[0]]}, "expected a tuple"),
+    ({"init": (Atom("On", ("bowl_1", "nowhere")),)}, "(On bowl_1 nowhere): nowhere is not declared"),
+    ({"goal": "Up bowl_1"}, "goal is 'Up bowl_1'; expected Expression"),
+    ({"scene_properties": {"floor": "a b)"}}, "expected one line without"),
+    ({"name": "a b"}, "the name 'a b' is not valid"),
+    ({"obj_of_interest": "bowl_1"}, "obj_of_interest is 'bowl_1'; expected a tuple"),
+], ids=str)  # fmt: skip
 def test_a_problem_made_in_python_is_checked(changes, message):
     with pytest.raises(InvalidInputError) as caught:
         dataclasses.replace(PROBLEM, **changes)
@@ -149,20 +145,17 @@ def test_a_problem_made_in_python_is_checked(changes, message):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    "make",
-    [
-        lambda: Region("a", "kitchen_table", ((0.0, 0.0, 1.0),)),
-        lambda: Region("a", "kitchen_table", (("0", 0.0, 1.0, 1.0),)),
-        lambda: Region("a", "kitchen_table", ((0.0, 0.0, math.nan, 1.0),)),
-        lambda: Region("a", "kitchen_table", rgba=(1.0, 0.0)),
-        lambda: Atom("On", ()),
-        lambda: Not("Up bowl_1"),
-        lambda: Or([Atom("Up", ("bowl_1",))]),
-        lambda: ForAll(("?x", "plate"), Atom("Up", ("?x",))),
-        lambda: And(tuple(Atom("Up", ("bowl_1",)) for _ in range(2000))),
-    ],
-)
+@pytest.mark.parametrize("make", [
+    lambda: Region("a", "kitchen_table", ((0.0, 0.0, 1.0),)),
+    lambda: Region("a", "kitchen_table", (("0", 0.0, 1.0, 1.0),)),
+    lambda: Region("a", "kitchen_table", ((0.0, 0.0, math.nan, 1.0),)),
+    lambda: Region("a", "kitchen_table", rgba=(1.0, 0.0)),
+    lambda: Atom("On", ()),
+    lambda: Not("Up bowl_1"),
+    lambda: Or([Atom("Up", ("bowl_1",))]),
+    lambda: ForAll(("?x", "plate"), Atom("Up", ("?x",))),
+    lambda: And(tuple(Atom("Up", ("bowl_1",)) for _ in range(2000))),
+])  # fmt: skip
 def test_parts_of_a_problem_are_checked_when_they_are_made(make):
     with pytest.raises(InvalidInputError):
         make()
@@ -196,23 +189,12 @@ def task(text: str) -> Task:
 
 
 @pytest.mark.sim
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("top_region", "upper_region", "wooden_cabinet_1 has no region 'upper_region'. Did you mean"),
-        (
-            "(On bowl_2 plate_1)",
-            "(On bowl_2 plate_1_lid)",
-            "plate_1 has no region 'lid'; expected plate_1 itself",
-        ),
-        (
-            "(Open wooden_cabinet_1_top_region)",
-            "(Turnon wooden_cabinet_1)",
-            "'turnon' of a wooden_cabinet is not",
-        ),
-        ("bowl_2", "wooden_cabinet_1_cabinet_top", "repeated name"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("top_region", "upper_region", "wooden_cabinet_1 has no region 'upper_region'. Did you mean"),
+    ("(On bowl_2 plate_1)", "(On bowl_2 plate_1_lid)", "plate_1 has no region 'lid'; expected plate_1 itself"),
+    ("(Open wooden_cabinet_1_top_region)", "(Turnon wooden_cabinet_1)", "'turnon' of a wooden_cabinet is not"),
+    ("bowl_2", "wooden_cabinet_1_cabinet_top", "repeated name"),
+])  # fmt: skip
 def test_what_the_models_lack_is_one_error_everywhere(old, new, message, tmp_path):
     text = TEXT.replace(old, new)
     if "lid" in new:

@@ -37,16 +37,11 @@ CAMERAS = (
     ("table", ViewChange(distance=1.37), [0.9023, 0.0, 1.9102], [0.638, 0.3048, 0.3048, 0.638]),
     ("table", ViewChange(turn=354, tilt=8), [0.6586, 0.0, 1.6104], [-0.689, -0.2775, -0.2409, -0.6246]),
     ("kitchen_table", ViewChange(300, 15), [0.2132, -0.3693, 1.7532], [-0.9184, -0.2991, -0.0802, -0.2461]),
-    (
-        "living_room_table",
-        ViewChange(300, 15),
-        [0.2723, -0.4716, 1.1115],
-        [-0.8985, -0.3546, -0.095, -0.2407],
-    ),
+    ("living_room_table", ViewChange(300, 15), [0.2723, -0.4716, 1.1115], [-0.8985, -0.3546, -0.095, -0.2407]),
     ("study_table", ViewChange(distance=1.37), [0.6283, 0.0, 1.9102], [0.638, 0.3048, 0.3048, 0.638]),
     ("floor", ViewChange(300, 15), [0.4525, -0.7837, 0.8872], [-0.8985, -0.3546, -0.095, -0.2407]),
     ("floor", ViewChange(turn=354, tilt=8), [0.8966, 0.0, 0.65], [-0.6708, -0.319, -0.2787, -0.6088]),
-)
+)  # fmt: skip
 JOINTS = {
     1: [0.02097405, -0.16687568, 0.02734903, -2.38028663, -0.00988726, 2.21686563, 0.85208136],
     250: [0.16418848, -0.29208442, 0.03368463, -2.30678939, 0.07081111, 2.25354254, 0.92685897],
@@ -82,14 +77,11 @@ def test_words_of_a_tasks_name_are_not_taken_for_an_ending():
     assert parse_plus_id(f"{base}_view_0_0_100_0_0_initstate_1").base == base
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        *(BASE, "", "_light_1", f"{BASE}_light_", f"{BASE}_light_x", f"{BASE}_table_\u0661"),
-        *(f"{BASE}_view_0_0_100_0_0", f"{BASE}_view_0_0_100_0_0_initstate_501"),
-        f"{BASE}_view_0_0_100_0_0_initstate_0_noise_51",
-    ],
-)
+@pytest.mark.parametrize("name", [
+    *(BASE, "", "_light_1", f"{BASE}_light_", f"{BASE}_light_x", f"{BASE}_table_\u0661"),
+    *(f"{BASE}_view_0_0_100_0_0", f"{BASE}_view_0_0_100_0_0_initstate_501"),
+    f"{BASE}_view_0_0_100_0_0_initstate_0_noise_51",
+])  # fmt: skip
 def test_what_is_no_id_is_told_in_one_line(name):
     with pytest.raises(InvalidInputError) as error:
         parse_plus_id(name)

@@ -84,18 +84,15 @@ def test_the_check_of_assets_reports_it(monkeypatch):
 
 @pytest.mark.sim
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "command",
-    [
-        "-m libero_env.cli tasks init-states libero_object",
-        "-m libero_env.cli tasks certify libero_object/0 --out {out}",
-        "-m libero_env.cli tasks certify libero_object/0 --jobs 2 --out {out}",
-        "-m libero_env.cli tasks preview libero_object/0 --out {out}/preview.png",
-        "-m libero_env.cli demos generate --benchmark libero_object --n 1 --workers 1",
-        "-m libero_env.cli demos generate --benchmark libero_object --n 1 --workers 2",
-        "train.py preset=smoke runs_dir={out}",
-    ],
-)
+@pytest.mark.parametrize("command", [
+    "-m libero_env.cli tasks init-states libero_object",
+    "-m libero_env.cli tasks certify libero_object/0 --out {out}",
+    "-m libero_env.cli tasks certify libero_object/0 --jobs 2 --out {out}",
+    "-m libero_env.cli tasks preview libero_object/0 --out {out}/preview.png",
+    "-m libero_env.cli demos generate --benchmark libero_object --n 1 --workers 1",
+    "-m libero_env.cli demos generate --benchmark libero_object --n 1 --workers 2",
+    "train.py preset=smoke runs_dir={out}",
+])  # fmt: skip
 def test_commands_end_with_one_line(command, no_robosuite, tmp_path):
     words = [word.format(out=tmp_path / "out") for word in command.split()]
     done = subprocess.run(

@@ -157,29 +157,21 @@ OBJECT = (
 MODEL = '<mujoco><worldbody><body name="main"><geom name="g0" size="0.02"/></body></worldbody></mujoco>'
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "line", "message"),
-    [
-        ("-0.03]", "deep]", 1, "bottom_offset.2 is 'deep'; expected a number"),
-        ("[0, 0, 0.03]", "[0, 0]", 2, "top_offset is [0, 0]; expected at least 3 entries"),
-        ("0, 0.03]", "0, -0.3]", 2, "its highest point is below its lowest"),
-        ("0.04", ".nan", 3, "horizontal_radius is nan; expected a finite number"),
-        ("0.04", "1e9", 3, "expected at most 10"),
-        ("{z: [0, 1]}", "{w: [0, 1]}", 4, "expected one of 'x', 'y' or 'z'"),
-        ("{z: [0, 1]}", "{z: [1, 0]}", 4, "is no range"),
-        ("{z: [0, 1]}", "{z: 1}", 4, "rotation.z is 1; expected a list"),
-        (
-            "horizontal_radius",
-            "horizontal_radus",
-            3,
-            "horizontal_radus is an unknown key. Did you mean 'horizontal_r",
-        ),
-        ("rotation: {z: [0, 1]}", "name: other", 4, "the name 'other' is not that of its folder thing"),
-        ("rotation: {z: [0, 1]}", "grasp: {width: null}", 4, "reason is missing"),
-        (OBJECT, "- 1\n", 1, "expected keys with values"),
-        (OBJECT, "a: [", 2, "not valid YAML"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "line", "message"), [
+    ("-0.03]", "deep]", 1, "bottom_offset.2 is 'deep'; expected a number"),
+    ("[0, 0, 0.03]", "[0, 0]", 2, "top_offset is [0, 0]; expected at least 3 entries"),
+    ("0, 0.03]", "0, -0.3]", 2, "its highest point is below its lowest"),
+    ("0.04", ".nan", 3, "horizontal_radius is nan; expected a finite number"),
+    ("0.04", "1e9", 3, "expected at most 10"),
+    ("{z: [0, 1]}", "{w: [0, 1]}", 4, "expected one of 'x', 'y' or 'z'"),
+    ("{z: [0, 1]}", "{z: [1, 0]}", 4, "is no range"),
+    ("{z: [0, 1]}", "{z: 1}", 4, "rotation.z is 1; expected a list"),
+    ("horizontal_radius", "horizontal_radus", 3, "horizontal_radus is an unknown key. Did you mean 'horizontal_r"),
+    ("rotation: {z: [0, 1]}", "name: other", 4, "the name 'other' is not that of its folder thing"),
+    ("rotation: {z: [0, 1]}", "grasp: {width: null}", 4, "reason is missing"),
+    (OBJECT, "- 1\n", 1, "expected keys with values"),
+    (OBJECT, "a: [", 2, "not valid YAML"),
+])  # fmt: skip
 def test_the_properties_of_an_object_have_types(tmp_path, old, new, line, message):
     own = tmp_path / "thing"
     own.mkdir()

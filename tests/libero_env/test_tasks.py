@@ -22,27 +22,15 @@ SCENE = {
     "problem": "LIBERO_Kitchen_Tabletop_Manipulation",
     "fixtures": {"kitchen_table": "kitchen_table", "stove_1": "flat_stove"},
     "objects": [{"black_bowl": 2}, "$thing"],
-    "regions": {
-        "kitchen_table": {
-            "stove_region": {"at": [0.1, 0.2], "half": [0.01, 0.02], "yaw": "pi"},
-            "front": {"ranges": [[0, 0, 1, 1]], "yaw": ["-pi/2", 0.0]},
-        },
-        "stove_1": {"cook_region": {}},
-    },
-    "init": [
-        "On stove_1 kitchen_table_stove_region",
-        "On ${thing}_1 black_bowl_2",
-        "On black_bowl_1 kitchen_table_front",
-        "On black_bowl_2 stove_1_cook_region",
-    ],
+    "regions": {"kitchen_table": {"stove_region": {"at": [0.1, 0.2], "half": [0.01, 0.02], "yaw": "pi"},
+     "front": {"ranges": [[0, 0, 1, 1]], "yaw": ["-pi/2", 0.0]}}, "stove_1": {"cook_region": {}}},
+    "init": ["On stove_1 kitchen_table_stove_region", "On ${thing}_1 black_bowl_2",
+     "On black_bowl_1 kitchen_table_front", "On black_bowl_2 stove_1_cook_region"],
     "obj_of_interest": ["${thing}_1"],
-}
+}  # fmt: skip
 TASK = {
-    "name": "cook_it",
-    "language": "cook it",
-    "with": {"thing": "plate"},
-    "goal": ["On plate_1 stove_1_cook_region"],
-}
+    "name": "cook_it", "language": "cook it", "with": {"thing": "plate"}, "goal": ["On plate_1 stove_1_cook_region"]
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("task", ALL_TASKS, ids=lambda task: task.id)
@@ -130,25 +118,20 @@ def test_orders_are_permutations(name):
         assert sorted(map(suite.tasks.index, suite.order(i))) == list(range(len(suite)))
 
 
-@pytest.mark.parametrize(
-    ("ask", "hint"),
-    [
-        (lambda: get_suite("libero_objects"), "Did you mean 'libero_object'? Valid: libero_10, libero_100, "),
-        (lambda: get_suite("libero_90").order(1), "task order of libero_90 1. Valid: 0"),
-        (lambda: get_suite("libero_object").order(21), "task order of libero_object 21"),
-        (lambda: get_suite("libero_object").order(-1), "Valid: 0 to 20"),
-        (lambda: get_task("libero_object/10"), "index of libero_object '10'"),
-        (lambda: get_task("LIBERO_OBJECT"), "unknown suite 'LIBERO_OBJECT'. Did you mean 'libero_object'?"),
-        (lambda: get_task("libero-object"), "unknown suite 'libero-object'. Did you mean 'libero_object'?"),
-        (lambda: get_task("libero_object-12"), "index of libero_object '12'. Valid: 0 to 9"),
-        (lambda: get_task("nope"), "Valid: libero_10/0 to libero_10/9, libero_100/0 to libero_100/99, "),
-        (lambda: get_task("libero_object/-1"), "index of libero_object '-1'"),
-        (
-            lambda: get_task("pick_up_the_milk_and_put_it_in_the_basket"),
-            "Did you mean 'pick_up_the_milk_and_place_it_in_the_basket'",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("ask", "hint"), [
+    (lambda: get_suite("libero_objects"), "Did you mean 'libero_object'? Valid: libero_10, libero_100, "),
+    (lambda: get_suite("libero_90").order(1), "task order of libero_90 1. Valid: 0"),
+    (lambda: get_suite("libero_object").order(21), "task order of libero_object 21"),
+    (lambda: get_suite("libero_object").order(-1), "Valid: 0 to 20"),
+    (lambda: get_task("libero_object/10"), "index of libero_object '10'"),
+    (lambda: get_task("LIBERO_OBJECT"), "unknown suite 'LIBERO_OBJECT'. Did you mean 'libero_object'?"),
+    (lambda: get_task("libero-object"), "unknown suite 'libero-object'. Did you mean 'libero_object'?"),
+    (lambda: get_task("libero_object-12"), "index of libero_object '12'. Valid: 0 to 9"),
+    (lambda: get_task("nope"), "Valid: libero_10/0 to libero_10/9, libero_100/0 to libero_100/99, "),
+    (lambda: get_task("libero_object/-1"), "index of libero_object '-1'"),
+    (lambda: get_task("pick_up_the_milk_and_put_it_in_the_basket"),
+     "Did you mean 'pick_up_the_milk_and_place_it_in_the_basket'"),
+])  # fmt: skip
 def test_unknown_names_are_answered_with_the_valid_ones(ask, hint):
     with pytest.raises(UnknownNameError, match="Valid: ") as caught:
         ask()

@@ -287,14 +287,11 @@ def test_results_name_it(pair):
     assert ours["backend"] == "warp" and ours["backend_device"] and ours["mujoco-warp"] and ours["warp-lang"]
 
 
-@pytest.mark.parametrize(
-    "options, told",
-    [
-        ({"backend": "warp,device=cuda:7"}, "there is no device 'cuda:7'; here are: cpu"),
-        ({"backend": WARP, "controller": "joint_position"}, "backend=mujoco has"),
-        ({"backend": WARP, "observations": ("segmentation_class",)}, "segmentation needs backend=mujoco"),
-    ],
-)
+@pytest.mark.parametrize("options, told", [
+    ({"backend": "warp,device=cuda:7"}, "there is no device 'cuda:7'; here are: cpu"),
+    ({"backend": WARP, "controller": "joint_position"}, "backend=mujoco has"),
+    ({"backend": WARP, "observations": ("segmentation_class",)}, "segmentation needs backend=mujoco"),
+])  # fmt: skip
 def test_what_it_does_not_offer_is_said_in_one_line(options, told):
     with pytest.raises(LiberoError, match=told) as caught:
         BatchEnv(TASK, 1, **options)
@@ -311,18 +308,15 @@ def test_appearances_need_the_other_back_end(pair):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    "text, error, told",
-    [
-        ("wrap", UnknownNameError, "warp"),
-        ("warp,devise=cpu", UnknownNameError, "device"),
-        ("warp,contacts=0", InvalidInputError, "from 1 to"),
-        ("warp,contacts=many", InvalidInputError, "whole number"),
-        ("warp,device=", InvalidInputError, "cuda:0"),
-        ("mujoco,device=cpu", InvalidInputError, "no settings"),
-        (7, InvalidInputError, "expected a text"),
-    ],
-)
+@pytest.mark.parametrize("text, error, told", [
+    ("wrap", UnknownNameError, "warp"),
+    ("warp,devise=cpu", UnknownNameError, "device"),
+    ("warp,contacts=0", InvalidInputError, "from 1 to"),
+    ("warp,contacts=many", InvalidInputError, "whole number"),
+    ("warp,device=", InvalidInputError, "cuda:0"),
+    ("mujoco,device=cpu", InvalidInputError, "no settings"),
+    (7, InvalidInputError, "expected a text"),
+])  # fmt: skip
 def test_a_back_end_that_is_not_valid_is_said(text, error, told):
     with pytest.raises(error, match=told):
         Backend.read(text)

@@ -13,17 +13,11 @@ pytestmark = pytest.mark.unit
 
 def task(name: str = "libero_goal/0", **changes) -> TaskResult:
     values = {
-        "task": name,
-        "name": "open_the_drawer",
-        "instruction": "open the drawer",
-        "init_states": (0, 1, 2),
-        "successes": (True, False, True),
-        "lengths": (40, 300, 52),
-        "atoms": ("(Open drawer)",),
-        "atoms_ever": ((True,), (False,), (True,)),
-        "atoms_at_end": ((True,), (False,), (True,)),
-        "errors": (None, "ServerError: closed", None),
-    }
+        "task": name, "name": "open_the_drawer", "instruction": "open the drawer", "init_states": (0, 1, 2),
+        "successes": (True, False, True), "lengths": (40, 300, 52), "atoms": ("(Open drawer)",),
+        "atoms_ever": ((True,), (False,), (True,)), "atoms_at_end": ((True,), (False,), (True,)),
+        "errors": (None, "ServerError: closed", None)
+    }  # fmt: skip
     return TaskResult(**(values | changes))
 
 
@@ -74,23 +68,20 @@ def with_task(**changes) -> str:
     return json.dumps(values)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (edited(format="libero-evaluation/2"), "libero-evaluation/2; this version reads"),
-        (edited(format="lerobot/1"), "has the format 'lerobot/1'; expected libero-evaluation/1"),
-        (json.dumps({"results": []}), "has no format"),
-        (edited()[:300], "broken or incomplete"),
-        (edited(tasks=[]), "no tasks"),
-        (json.dumps({"format": FORMAT}), "evaluated is missing; protocol is missing"),
-        (with_task(successes=[True]), "tasks.0: libero_goal/0: successes has 1 entries, init_states has 3"),
-        (with_task(successes=[1, 0, 1]), "tasks.0.successes.0 is 1; expected true or false"),
-        (with_task(init_states=[0, 1, 1]), "counted twice"),
-        (with_task(atoms_ever=[[True], [False], []]), "a column for each"),
-        (with_task(task="libero_spatial/4"), "tasks are counted twice: libero_spatial/4"),
-        (with_task(successes=[True, True, True]), "the file was edited"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    (edited(format="libero-evaluation/2"), "libero-evaluation/2; this version reads"),
+    (edited(format="lerobot/1"), "has the format 'lerobot/1'; expected libero-evaluation/1"),
+    (json.dumps({"results": []}), "has no format"),
+    (edited()[:300], "broken or incomplete"),
+    (edited(tasks=[]), "no tasks"),
+    (json.dumps({"format": FORMAT}), "evaluated is missing; protocol is missing"),
+    (with_task(successes=[True]), "tasks.0: libero_goal/0: successes has 1 entries, init_states has 3"),
+    (with_task(successes=[1, 0, 1]), "tasks.0.successes.0 is 1; expected true or false"),
+    (with_task(init_states=[0, 1, 1]), "counted twice"),
+    (with_task(atoms_ever=[[True], [False], []]), "a column for each"),
+    (with_task(task="libero_spatial/4"), "tasks are counted twice: libero_spatial/4"),
+    (with_task(successes=[True, True, True]), "the file was edited"),
+])  # fmt: skip
 def test_other_files_are_refused_by_name(tmp_path, text, message):
     (tmp_path / "eval.json").write_text(text)
     with pytest.raises(EvaluationFileError, match=r"eval\.json.*" + message):

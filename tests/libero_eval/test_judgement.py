@@ -87,32 +87,13 @@ def test_texts_name_what_is_shown_and_what_is_not(found):
     assert "not decided after 500 pairs" in text and "note: no control arm" in text
 
 
-@pytest.mark.parametrize(
-    ("changes", "field", "values"),
-    [
-        ({"protocol": PROTOCOL | {"settle_steps": 5}}, "protocol.settle_steps", "10 in a, 5 in b"),
-        (
-            {"environment": ENVIRONMENT | {"robot": "robosuite-1.4.1"}},
-            "environment.robot",
-            "libero in a, robosuite",
-        ),
-        (
-            {"environment": ENVIRONMENT | {"drawing": "faithful"}},
-            "environment.drawing",
-            "fast in a, faithful in b",
-        ),
-        (
-            {"environment": ENVIRONMENT | {"models": "original"}},
-            "environment.models",
-            "builtin in a, original in b",
-        ),
-        (
-            {"protocol": {**PROTOCOL, "horizon": {"libero_goal": 600}}},
-            "protocol.horizon.libero_goal",
-            "300 in a, 600",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("changes", "field", "values"), [
+    ({"protocol": PROTOCOL | {"settle_steps": 5}}, "protocol.settle_steps", "10 in a, 5 in b"),
+    ({"environment": ENVIRONMENT | {"robot": "robosuite-1.4.1"}}, "environment.robot", "libero in a, robosuite"),
+    ({"environment": ENVIRONMENT | {"drawing": "faithful"}}, "environment.drawing", "fast in a, faithful in b"),
+    ({"environment": ENVIRONMENT | {"models": "original"}}, "environment.models", "builtin in a, original in b"),
+    ({"protocol": {**PROTOCOL, "horizon": {"libero_goal": 600}}}, "protocol.horizon.libero_goal", "300 in a, 600"),
+])  # fmt: skip
 def test_results_made_differently_are_refused(changes, field, values):
     sides = [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, policy="b:b", **changes))]
     with pytest.raises(ComparisonError, match="cannot be compared") as error:
@@ -318,19 +299,16 @@ def test_commands(tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().out.strip() == "x/eval_info.json"
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["compare", "a"], "needs two results"),
-        (["compare", "a", "nothing"], "nothing does not exist"),
-        (["compare", "a", "old"], "the format is libero-evaluation/99"),
-        (["compare", "a", "nan"], "successes.3 is nan; expected true or false"),
-        (["compare", "--group", "a"], "--group NAME RESULT"),
-        (["power", "--base", "0.9", "--difference", "0.2"], "above 1"),
-        (["power", "a"], "takes two results, not 1"),
-        (["power", "--difference", "0.05", "--discordance", "0.01"], "is impossible"),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), [
+    (["compare", "a"], "needs two results"),
+    (["compare", "a", "nothing"], "nothing does not exist"),
+    (["compare", "a", "old"], "the format is libero-evaluation/99"),
+    (["compare", "a", "nan"], "successes.3 is nan; expected true or false"),
+    (["compare", "--group", "a"], "--group NAME RESULT"),
+    (["power", "--base", "0.9", "--difference", "0.2"], "above 1"),
+    (["power", "a"], "takes two results, not 1"),
+    (["power", "--difference", "0.05", "--discordance", "0.01"], "is impossible"),
+])  # fmt: skip
 def test_bad_input_is_one_line(words, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     written(tmp_path, a=drawn_result(0.9, 1), b=drawn_result(0.8, 2, policy="b:b"))

@@ -234,21 +234,18 @@ def test_requests_in_flight(in_flight):
     assert most == (in_flight or 5)
 
 
-@pytest.mark.parametrize(
-    ("answer", "message"),
-    [
-        ({"actions": np.full((4, 7), np.nan)}, "not finite .nan."),
-        ({"actions": np.zeros((4, 8))}, r"shape \(4, 8\); expected \(H, 7\) numbers with H >= 2"),
-        ({"actions": np.zeros((1, 7))}, "1 actions; the protocol executes 2"),
-        ({"actions": [["a"] * 7] * 2}, "dtype <U1"),
-        ({"actions": [[1.0], [2.0, 3.0]]}, "not an array"),
-        ({"actions": None}, "dtype object"),
-        ({"action": np.zeros((4, 7))}, r"\['action'\] and without `actions`"),
-        ([1, 2], "sent a list as actions; expected a map"),
-        (b"\xc1\x00garbage", "9 bytes that are not a message of openpi"),
-        ("Traceback ...\nValueError: no such key", "(?s)its traceback:.*no such key"),
-    ],
-)
+@pytest.mark.parametrize(("answer", "message"), [
+    ({"actions": np.full((4, 7), np.nan)}, "not finite .nan."),
+    ({"actions": np.zeros((4, 8))}, r"shape \(4, 8\); expected \(H, 7\) numbers with H >= 2"),
+    ({"actions": np.zeros((1, 7))}, "1 actions; the protocol executes 2"),
+    ({"actions": [["a"] * 7] * 2}, "dtype <U1"),
+    ({"actions": [[1.0], [2.0, 3.0]]}, "not an array"),
+    ({"actions": None}, "dtype object"),
+    ({"action": np.zeros((4, 7))}, r"\['action'\] and without `actions`"),
+    ([1, 2], "sent a list as actions; expected a map"),
+    (b"\xc1\x00garbage", "9 bytes that are not a message of openpi"),
+    ("Traceback ...\nValueError: no such key", "(?s)its traceback:.*no such key"),
+])  # fmt: skip
 def test_answers_that_are_not_valid_are_named(answer, message):
     with (
         policy_servers.openpi(lambda _: answer) as address,
@@ -430,22 +427,16 @@ def test_groot_observations_of_many_simulations():
     assert seen[0]["annotation.human.action.task_description"] == [TASK.language] * 2
 
 
-@pytest.mark.parametrize(
-    ("get_action", "message"),
-    [
-        (lambda **_: policy_servers.flat(np.full((1, 8, 7), np.inf)), r"not finite \(inf\)"),
-        (
-            lambda **_: policy_servers.flat(np.zeros((2, 8, 7))),
-            r"shapes \[\(2, 8, 1\)\]; expected \(1, H, 1\)",
-        ),
-        (lambda **_: policy_servers.flat(np.zeros((1, 1, 7))), "1 actions; the protocol executes 2"),
-        (lambda **_: [{"x": np.zeros((1, 8, 1))}, {}], r"answered \['x'\].*--use-sim-policy-wrapper"),
-        (lambda **_: "what?", "answered str without"),
-        (lambda **_: b"\xc1", "1 bytes that are not a message of GR00T"),
-        (lambda observation, options: {}["key"], r"failed \(get_action\): 'key'"),
-        (lambda **_: time.sleep(1), r"nothing within 0\.3 s \(get_action\)"),
-    ],
-)
+@pytest.mark.parametrize(("get_action", "message"), [
+    (lambda **_: policy_servers.flat(np.full((1, 8, 7), np.inf)), r"not finite \(inf\)"),
+    (lambda **_: policy_servers.flat(np.zeros((2, 8, 7))), r"shapes \[\(2, 8, 1\)\]; expected \(1, H, 1\)"),
+    (lambda **_: policy_servers.flat(np.zeros((1, 1, 7))), "1 actions; the protocol executes 2"),
+    (lambda **_: [{"x": np.zeros((1, 8, 1))}, {}], r"answered \['x'\].*--use-sim-policy-wrapper"),
+    (lambda **_: "what?", "answered str without"),
+    (lambda **_: b"\xc1", "1 bytes that are not a message of GR00T"),
+    (lambda observation, options: {}["key"], r"failed \(get_action\): 'key'"),
+    (lambda **_: time.sleep(1), r"nothing within 0\.3 s \(get_action\)"),
+])  # fmt: skip
 def test_groot_answers_that_are_not_valid_are_named(get_action, message):
     with (
         policy_servers.groot(policy_servers.groot_endpoints(get_action)) as address,

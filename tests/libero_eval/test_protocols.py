@@ -88,47 +88,28 @@ def test_the_digest_depends_on_values_not_on_names_and_sources(tmp_path):
 BAD = {
     "a field is missing": ("world: {env_seed: 7}", r"world\.models is missing"),
     "a section is missing": ("title: x", "world is missing"),
-    "unknown field": (
-        "extends: openpi\nworld: {env_sed: 7}",
-        r"world\.env_sed is an unknown key.*Did you mean 'env_seed'",
-    ),
-    "unknown section": (
-        "extends: openpi\nepisodes: {}",
-        "episodes is an unknown key.*Did you mean 'episode'",
-    ),
-    "crop without resize": (
-        "extends: openpi\npixels: {resize: none, resize_size: null, crop: 0.9}",
-        r"pixels\.crop is 0\.9, but pixels\.resize is none",
-    ),
-    "size without resize": (
-        "extends: openpi\npixels: {resize: none}",
-        r"pixels\.resize_size is \[224, 224\], but",
-    ),
-    "action without settling": (
-        "extends: openpi\nepisode: {settle_steps: 0}",
-        r"settle_action is .*settle_steps is 0",
-    ),
-    "horizon of a suite": (
-        "extends: openpi\nepisode: {horizon: {libero_goal: 300}}",
-        r"episode\.horizon has no value for libero_spatial, libero_object, libero_10, libero_90",
-    ),
+    "unknown field": ("extends: openpi\nworld: {env_sed: 7}",
+     r"world\.env_sed is an unknown key.*Did you mean 'env_seed'"),
+    "unknown section": ("extends: openpi\nepisodes: {}", "episodes is an unknown key.*Did you mean 'episode'"),
+    "crop without resize": ("extends: openpi\npixels: {resize: none, resize_size: null, crop: 0.9}",
+     r"pixels\.crop is 0\.9, but pixels\.resize is none"),
+    "size without resize": ("extends: openpi\npixels: {resize: none}", r"pixels\.resize_size is \[224, 224\], but"),
+    "action without settling": ("extends: openpi\nepisode: {settle_steps: 0}",
+     r"settle_action is .*settle_steps is 0"),
+    "horizon of a suite": ("extends: openpi\nepisode: {horizon: {libero_goal: 300}}",
+     r"episode\.horizon has no value for libero_spatial, libero_object, libero_10, libero_90"),
     "replan": ("extends: openpi\naction: {chunk: 4}", r"action\.replan is 5, but action\.chunk is 4"),
     "stored and seeded": ("extends: libero\nworld: {env_seed: 7}", r"world\.env_seed is 7, but .* stored"),
-    "order": (
-        "extends: openpi\nepisode: {reset_order: [set_init_state, reset]}",
-        "reset_order has reset after set_init_state",
-    ),
-    "template": (
-        "extends: openpi\nlanguage: {template: do}",
-        r"language\.template is 'do'; it must have {instr",
-    ),
+    "order": ("extends: openpi\nepisode: {reset_order: [set_init_state, reset]}",
+     "reset_order has reset after set_init_state"),
+    "template": ("extends: openpi\nlanguage: {template: do}", r"language\.template is 'do'; it must have {instr"),
     "state without source": ("extends: openpi\nproprioception: {source: none}", r"proprioception\.order is "),
     "source of nothing": ("extends: openpi\nsources: {worlds: x}", r"sources\.worlds is not a key"),
     "no mapping": ("- 1", "is not a protocol"),
     "no YAML": ("a: [", "not valid YAML"),
     "circle": ("extends: mine.yaml", "extend each other in a circle"),
     "unknown base": ("extends: opennpi", "extends: unknown protocol 'opennpi'. Did you mean 'openpi'"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("text, message", BAD.values(), ids=BAD)
@@ -223,15 +204,10 @@ def test_a_quaternion_and_its_negative_are_one_rotation_or_two():
         assert not convert(identity).any()
 
 
-@pytest.mark.parametrize(
-    "gripper, expected",
-    [
-        ("as_predicted", [-1.0, 0.2, 0.5, 1.0]),
-        ("sign", [-1.0, 1.0, 1.0, 1.0]),
-        ("open_sign", [1.0, 1.0, 0.0, -1.0]),
-        ("open_cut", [1.0, 1.0, 1.0, -1.0]),
-    ],
-)
+@pytest.mark.parametrize("gripper, expected", [
+    ("as_predicted", [-1.0, 0.2, 0.5, 1.0]), ("sign", [-1.0, 1.0, 1.0, 1.0]), ("open_sign", [1.0, 1.0, 0.0, -1.0]),
+    ("open_cut", [1.0, 1.0, 1.0, -1.0])
+])  # fmt: skip
 def test_gripper_maps(gripper, expected):
     predicted = np.zeros((4, 7))
     predicted[:, -1], predicted[:, 0] = [-1.0, 0.2, 0.5, 1.0], 0.3

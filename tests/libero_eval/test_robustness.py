@@ -49,16 +49,11 @@ def test_area_and_kept_are_those_of_the_trapezoids() -> None:
     assert camera.area.low < camera.area.value < camera.area.high
 
 
-@pytest.mark.parametrize(
-    ("rates", "half"),
-    [
-        ((1.0, 0.6, 0.4), 0.75),
-        ((1.0, 0.5, 0.5), 0.5),
-        ((0.8, 0.7, 0.6), math.inf),
-        ((0.8, 0.2, 0.8), 1 / 3),  # the first time
-        ((0.0, 0.0, 0.0), math.inf),  # nothing to lose
-    ],
-)
+@pytest.mark.parametrize(("rates", "half"), [
+    ((1.0, 0.6, 0.4), 0.75), ((1.0, 0.5, 0.5), 0.5), ((0.8, 0.7, 0.6), math.inf),
+    ((0.8, 0.2, 0.8), 1 / 3),  # the first time
+    ((0.0, 0.0, 0.0), math.inf),  # nothing to lose
+])  # fmt: skip
 def test_half_is_lost_where_the_line_first_falls_to_half(rates: tuple[float, ...], half: float) -> None:
     assert half_severity((0.0, 0.5, 1.0), np.array(rates)) == pytest.approx(half)
 

@@ -28,16 +28,8 @@ def make():
     return Still()
 """
 WORDS = [
-    "still_policy:make",
-    "--suite",
-    "libero_goal/1",
-    "--episodes",
-    "2",
-    "--horizon",
-    "2",
-    "--threads",
-    "1",
-]
+    "still_policy:make", "--suite", "libero_goal/1", "--episodes", "2", "--horizon", "2", "--threads", "1"
+]  # fmt: skip
 KINDS = ["--kinds", "noise", "robot", "--severities", "1", "0.5", "--pairs", "noise=0.5,robot=0.5"]
 
 
@@ -72,16 +64,13 @@ def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> N
     assert labels == ["first", "second"]
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["--kinds", "camra"], "Did you mean 'camera'"),
-        (["--severities", "2"], "--severities"),
-        (["--kinds", "noise", "--severities", "1", "--pairs", "noise=1,robot=1"], "must also be run alone"),
-        (["--pairs", "noise=1"], "expected two perturbations"),
-        (["--beside", "other=nowhere"], "nowhere holds no finished conditions"),
-    ],
-)
+@pytest.mark.parametrize(("words", "told"), [
+    (["--kinds", "camra"], "Did you mean 'camera'"),
+    (["--severities", "2"], "--severities"),
+    (["--kinds", "noise", "--severities", "1", "--pairs", "noise=1,robot=1"], "must also be run alone"),
+    (["--pairs", "noise=1"], "expected two perturbations"),
+    (["--beside", "other=nowhere"], "nowhere holds no finished conditions"),
+])  # fmt: skip
 def test_mistakes_take_one_line_before_anything_is_run(still, words, told, capsys) -> None:
     try:
         status = main(["robustness", *WORDS, *words, "--out", "found"])

@@ -127,25 +127,17 @@ def test_requests_that_are_refused(folder):
     bad = {
         "not a list": ([1], "not a list"),
         "lacks": ({k: v for k, v in good.items() if "joint" not in k}, "lacks observation/joint_states; it"),
-        "dtype": (
-            good | {"observation/agentview_rgb": np.zeros((32, 32, 3))},
-            "dtype float64; valid: uint8",
-        ),
+        "dtype": (good | {"observation/agentview_rgb": np.zeros((32, 32, 3))}, "dtype float64; valid: uint8"),
         "text": (good | {"observation/ee_pos": ["a", "b", "c"]}, "dtype <U1; valid: floats"),
-        "shape": (
-            good | {"observation/agentview_rgb": np.zeros((8, 8, 3), np.uint8)},
-            r"\(8, 8, 3\).*\(32, 32, 3\)",
-        ),
+        "shape": (good | {"observation/agentview_rgb": np.zeros((8, 8, 3), np.uint8)}, r"\(8, 8, 3\).*\(32, 32, 3\)"),
         "nan": (good | {"observation/ee_pos": np.full(3, np.nan)}, "not finite"),
         "prompt": (good | {"prompt": "dance"}, f"no task with prompt 'dance'.*{task.language}"),
         "task": (good | {"task": "../../secrets.bddl"}, "no task with prompt"),
         "other": (good | {"task": served.run.tasks[1].id}, "no task with prompt"),
         "seed": (good | {"seed": ["a"]}, r"seed is \['a'\]; valid: integers"),
-        "openpi": (
-            {"observation/image": obs["agentview_rgb"][0], "prompt": task.language},
-            "needs joint_states, which observation/image.*do not hold",
-        ),
-    }
+        "openpi": ({"observation/image": obs["agentview_rgb"][0], "prompt": task.language},
+         "needs joint_states, which observation/image.*do not hold"),
+    }  # fmt: skip
     for name, (message, error) in bad.items():
         with pytest.raises(PolicyError, match=error):
             served.session().infer(message)

@@ -74,16 +74,12 @@ def test_tasks_with_results_are_not_evaluated_again(tmp_path):
     assert evaluate(tmp_path, env=env).tasks[0] == first.tasks[0]
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"identity": {"policy": "moving"}},
-        {"protocol": QUICK.changed({"episode.horizon": 11})},
-        {"init_states": (3, 4, 9, 21)},
-        {"versions": {"mujoco": "4"}},
-    ],
-    ids=lambda c: next(iter(c)),
-)
+@pytest.mark.parametrize("changes", [
+    {"identity": {"policy": "moving"}},
+    {"protocol": QUICK.changed({"episode.horizon": 11})},
+    {"init_states": (3, 4, 9, 21)},
+    {"versions": {"mujoco": "4"}},
+], ids=lambda c: next(iter(c)))  # fmt: skip
 def test_results_of_another_evaluation_are_not_mixed_in(tmp_path, changes):
     evaluate(tmp_path)
     name = {"identity": "evaluated.policy", "versions": "simulation.mujoco"}.get(*changes, *changes)
@@ -284,13 +280,10 @@ def test_the_source_of_a_policy_is_part_of_its_identity(module, tmp_path):
 def test_errors_are_reported_in_one_line(module, tmp_path, capsys):
     for argv, message in (
         ([f"{module}:make"], "no tasks are given"),
-        (
-            [f"{module}:make", "--suite", "libero_object/3", "--protocol", "openvla"],
-            "Did you mean 'openvla-oft'?",
-        ),
+        ([f"{module}:make", "--suite", "libero_object/3", "--protocol", "openvla"], "Did you mean 'openvla-oft'?"),
         ([str(tmp_path / "no_run")], "no_run does not exist; give the directory of a run"),
         ([str(tmp_path)], "not a run directory"),
-    ):
+    ):  # fmt: skip
         assert cli.main(["eval", *argv]) == 2
         err = capsys.readouterr().err
         assert message in err and err.count("\n") == 1

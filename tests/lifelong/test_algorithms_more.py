@@ -22,14 +22,9 @@ from tests.harness.algorithms import SETTINGS, assert_resumed_equals_uninterrupt
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
 ALL = {
-    "agem": lambda: AGEM(memory=ReplayMemory(25)),
-    "derpp": lambda: DERpp(budget=25, alpha=0.5),
-    "lwf": LwF,
-    "mas": MAS,
-    "multitask": Multitask,
-    "si": SI,
-    "single_task": SingleTask,
-}
+    "agem": lambda: AGEM(memory=ReplayMemory(25)), "derpp": lambda: DERpp(budget=25, alpha=0.5), "lwf": LwF,
+    "mas": MAS, "multitask": Multitask, "si": SI, "single_task": SingleTask
+}  # fmt: skip
 
 
 class Distilled:

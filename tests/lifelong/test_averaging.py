@@ -72,16 +72,11 @@ def test_with_a_share_of_one_it_is_fine_tuning_to_the_bit_and_with_zero_nothing_
     sequences.assert_same(weights(frozen), first)
 
 
-@pytest.mark.parametrize(
-    ("share", "base", "expected"),
-    [
-        (None, 1, (1, 1 / 2, 1 / 3, 1 / 4)),
-        (None, 0, (1 / 2, 1 / 3, 1 / 4, 1 / 5)),  # the pretrained policy counts as one
-        (None, 2, (1, 1, 1 / 2, 1 / 3)),
-        (0.3, 1, (1, 0.3, 0.3, 0.3)),
-        (0.3, 0, (0.3, 0.3, 0.3, 0.3)),
-    ],
-)
+@pytest.mark.parametrize(("share", "base", "expected"), [
+    (None, 1, (1, 1 / 2, 1 / 3, 1 / 4)),
+    (None, 0, (1 / 2, 1 / 3, 1 / 4, 1 / 5)),  # the pretrained policy counts as one
+    (None, 2, (1, 1, 1 / 2, 1 / 3)), (0.3, 1, (1, 0.3, 0.3, 0.3)), (0.3, 0, (0.3, 0.3, 0.3, 0.3)),
+])  # fmt: skip
 def test_shares_of_the_tasks(share, base, expected) -> None:
     learner = Averaging(share=share, base_tasks=base)
     assert tuple(learner.share_of(k) for k in range(1, 5)) == expected

@@ -117,21 +117,18 @@ def test_any_flipped_byte_is_found(tmp_path):
     assert not silent
 
 
-@pytest.mark.parametrize(
-    "tree",
-    [
-        "[]",
-        '{"value": []}',
-        '{"tensor": "/gone"}',
-        '{"tensor": 3}',
-        '{"dict": [["a"]]}',
-        '{"dict": [[null, {"value": 1}]]}',
-        '{"dict": [["a", {"value": 1}], ["a", {"value": 2}]]}',
-        '{"list": {"value": 1}}',
-        '{"dict": [], "list": []}',
-        '{"list": [' * 200 + '{"value": 1}' + "]}" * 200,
-    ],
-)
+@pytest.mark.parametrize("tree", [
+    "[]",
+    '{"value": []}',
+    '{"tensor": "/gone"}',
+    '{"tensor": 3}',
+    '{"dict": [["a"]]}',
+    '{"dict": [[null, {"value": 1}]]}',
+    '{"dict": [["a", {"value": 1}], ["a", {"value": 2}]]}',
+    '{"list": {"value": 1}}',
+    '{"dict": [], "list": []}',
+    '{"list": [' * 200 + '{"value": 1}' + "]}" * 200,
+])  # fmt: skip
 def test_a_tree_that_was_not_written_here_is_refused(tmp_path, tree):
     path = tmp_path / "x.safetensors"
     write_forged(path, {"": torch.zeros(0)}, json.loads(tree))

@@ -146,14 +146,11 @@ def test_an_unknown_choice_lists_the_valid_ones(override):
         compose_run([override, "train.epochs=3"])
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"select": "worst"}, "expected one of 'best' or 'last'"),
-        ({"selection": "apart", "episodes": 40, "curve_episodes": 20}, "need 60 initial states"),
-        ({"episodes": 0}, "at least 1"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"select": "worst"}, "expected one of 'best' or 'last'"),
+    ({"selection": "apart", "episodes": 40, "curve_episodes": 20}, "need 60 initial states"),
+    ({"episodes": 0}, "at least 1"),
+])  # fmt: skip
 def test_invalid_evaluation_settings_are_named(change, message):
     with pytest.raises((ConfigError, InvalidInputError), match=message):
         EvalSettings(**change)

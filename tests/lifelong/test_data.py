@@ -141,16 +141,13 @@ def test_broken_files_raise_and_name_what_is_wrong(tmp_path: Path) -> None:
         read(whole)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"image_size": (8, 8)}, r"agentview_rgb.*image_size"),
-        ({"action_dim": 6}, r"actions is .*expected \(T, 6\)"),
-        ({"proprio": {"ee_pos": 3}}, r"ee_pos is missing; it has"),
-        ({"proprio": {"joint_states": 6}}, r"joint_states"),
-        ({"language_dim": 5}, r"language"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"image_size": (8, 8)}, r"agentview_rgb.*image_size"),
+    ({"action_dim": 6}, r"actions is .*expected \(T, 6\)"),
+    ({"proprio": {"ee_pos": 3}}, r"ee_pos is missing; it has"),
+    ({"proprio": {"joint_states": 6}}, r"joint_states"),
+    ({"language_dim": 5}, r"language"),
+])  # fmt: skip
 def test_demonstrations_that_do_not_fit_the_spec_are_refused(change: dict, message: str) -> None:
     demo = make_demo("demo_0", 3, np.random.default_rng(0))
     base = {"image_size": (6, 8), "language_dim": 4, "seq_len": 5}

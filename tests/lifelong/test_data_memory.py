@@ -342,16 +342,11 @@ def test_broken_files_are_refused_in_all_memories(path: Path) -> None:
             open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory=memory)
 
 
-@pytest.mark.parametrize(
-    ("gpu", "host", "expected"),
-    [
-        ((90, 100), (90, 100), "device"),
-        ((60, 100), (90, 100), "pinned"),  # 40 % of the GPU is left to training
-        ((60, 100), (44, 100), "disk"),
-        (None, (90, 100), "host"),
-        (None, (44, 100), "disk"),
-    ],
-)
+@pytest.mark.parametrize(("gpu", "host", "expected"), [
+    ((90, 100), (90, 100), "device"),
+    ((60, 100), (90, 100), "pinned"),  # 40 % of the GPU is left to training
+    ((60, 100), (44, 100), "disk"), (None, (90, 100), "host"), (None, (44, 100), "disk"),
+])  # fmt: skip
 def test_auto_chooses_by_what_is_free(monkeypatch, gpu, host, expected) -> None:
     gib = 2**30
     monkeypatch.setattr(loading, "host_memory", lambda: tuple(gib * n for n in host))

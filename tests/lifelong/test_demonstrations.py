@@ -66,15 +66,12 @@ def test_named_files_and_files_of_a_folder_are_found_by_the_task_that_they_state
         recorded.clear()
 
 
-@pytest.mark.parametrize(
-    ("kwargs", "words"),
-    [
-        ({"size": 16}, "16x16 pixels and data.image_size is 8; use data.image_size=16"),
-        ({"demos": 1}, "has 1 demonstrations and 2 are required; use data.demos=1"),
-        ({"perturb": "light=0.5"}, "was rendered under light=0.5"),
-        ({"generator": "teleoperation", "robot": "robosuite-1.4.1"}, "data.robot is libero"),
-    ],
-)
+@pytest.mark.parametrize(("kwargs", "words"), [
+    ({"size": 16}, "16x16 pixels and data.image_size is 8; use data.image_size=16"),
+    ({"demos": 1}, "has 1 demonstrations and 2 are required; use data.demos=1"),
+    ({"perturb": "light=0.5"}, "was rendered under light=0.5"),
+    ({"generator": "teleoperation", "robot": "robosuite-1.4.1"}, "data.robot is libero"),
+])  # fmt: skip
 def test_demonstrations_that_do_not_fit_are_refused_by_name(kwargs, words, tmp_path, recorded):
     path = own(tmp_path / "mine.hdf5", **kwargs)
     for data in (replace(settings(None), files=[str(path)]), settings(str(tmp_path))):

@@ -48,13 +48,10 @@ def counts_as_pairs(both: int, only_first: int, only_second: int, neither: int) 
     return pairs(np.isin(outcome, (0, 1)), np.isin(outcome, (0, 2)))
 
 
-@pytest.mark.parametrize(
-    ("cells", "confidence", "low", "high"),
-    [
-        ((1, 1, 7, 12), 0.95, -0.517, -0.026),  # Fagerland et al. 2014, airway hyper-responsiveness
-        ((0, 28, 25, 565), 0.90, -0.0148, 0.0247),  # R, PropCIs::scoreci.mp(25, 28, 618, 0.90)
-    ],
-)
+@pytest.mark.parametrize(("cells", "confidence", "low", "high"), [
+    ((1, 1, 7, 12), 0.95, -0.517, -0.026),  # Fagerland et al. 2014, airway hyper-responsiveness
+    ((0, 28, 25, 565), 0.90, -0.0148, 0.0247),  # R, PropCIs::scoreci.mp(25, 28, 618, 0.90)
+])  # fmt: skip
 def test_tangos_interval_is_the_published_one(cells, confidence, low, high):
     found = score_interval(Counts(*cells), confidence)
     assert (found.low, found.high) == pytest.approx((low, high), abs=6e-4 if confidence == 0.95 else 6e-5)
@@ -190,15 +187,12 @@ def test_the_sequential_test_stops_earlier_for_larger_differences():
     assert large.median < small.median and large.power == 1.0
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ((0.9, 0.2), "between 0 and 1"),
-        ((0.9, 0.0), "cannot be shown"),
-        ((0.9, 0.05, 0.01), "a discordance of 0.01 is impossible"),
-        ((0.9, 0.05, None, 0.01), "alpha < power"),
-    ],
-)
+@pytest.mark.parametrize(("values", "message"), [
+    ((0.9, 0.2), "between 0 and 1"),
+    ((0.9, 0.0), "cannot be shown"),
+    ((0.9, 0.05, 0.01), "a discordance of 0.01 is impossible"),
+    ((0.9, 0.05, None, 0.01), "alpha < power"),
+])  # fmt: skip
 def test_impossible_questions_are_refused(values, message):
     with pytest.raises(ConfigError, match=message):
         Question(*values)

@@ -19,13 +19,8 @@ ROOT = Path(__file__).parents[2]
 
 def torchrun(processes: int, *arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess:
     command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        str(processes),
-    ]
+        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)
+    ]  # fmt: skip
     env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     return subprocess.run(
         [*command, *arguments], cwd=cwd, env=env, capture_output=True, text=True, timeout=600, check=False

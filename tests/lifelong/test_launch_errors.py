@@ -90,15 +90,12 @@ def test_a_mistake_is_one_line_and_leaves_nothing_behind(words, own, capsys):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    "words",
-    [
-        "-m algo=l2,er seed=7 --config-dir own",
-        "algo=l2,er seed=7 -m -cd own",
-        "algo=l2,er --config-dir=own --multirun seed=7",
-        "--config-dir own algo=l2,er -m seed=7",
-    ],
-)
+@pytest.mark.parametrize("words", [
+    "-m algo=l2,er seed=7 --config-dir own",
+    "algo=l2,er seed=7 -m -cd own",
+    "algo=l2,er --config-dir=own --multirun seed=7",
+    "--config-dir own algo=l2,er -m seed=7",
+])  # fmt: skip
 def test_options_of_a_sweep_stand_anywhere(words, own, monkeypatch, capsys):
     ran = []
 
@@ -138,16 +135,10 @@ def test_a_single_run_takes_options_anywhere(own, capsys):
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    ("words", "noted"),
-    [
-        ("policy=bc_rnn_small", True),
-        ("policy=bc_vilt_small", True),
-        ("policy=bc_transformer_small", True),
-        ("policy=bc_rnn_small data.seq_len=2", False),
-        ("policy=bc_mlp_small", False),
-    ],
-)
+@pytest.mark.parametrize(("words", "noted"), [
+    ("policy=bc_rnn_small", True), ("policy=bc_vilt_small", True), ("policy=bc_transformer_small", True),
+    ("policy=bc_rnn_small data.seq_len=2", False), ("policy=bc_mlp_small", False)
+])  # fmt: skip
 def test_a_policy_with_a_history_that_is_given_single_frames_says_so(words, noted, here, monkeypatch, capsys):
     def learn(*args):
         raise ConfigError("the first task begins")

@@ -24,13 +24,8 @@ factory, configs = lerobot_module("policies.factory"), lerobot_module("configs.p
 LENGTHS = (9, 14)
 SMALL = {
     "act": {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "latent_dim": 8},
-    "diffusion": {
-        "down_dims": [32, 64],
-        "diffusion_step_embed_dim": 32,
-        "n_groups": 4,
-        "num_inference_steps": 3,
-    },
-}
+    "diffusion": {"down_dims": [32, 64], "diffusion_step_embed_dim": 32, "n_groups": 4, "num_inference_steps": 3},
+}  # fmt: skip
 
 
 def spec(steps: int = 8) -> PolicySpec:
@@ -41,12 +36,8 @@ def spec(steps: int = 8) -> PolicySpec:
 
 def policy(type: str = "act", steps: int = 8, **changes) -> LeRobotPolicy:
     given = {
-        "settings": SMALL[type],
-        "act_steps": None,
-        "statistics": "first",
-        "language": True,
-        "pretrained": None,
-    }
+        "settings": SMALL[type], "act_steps": None, "statistics": "first", "language": True, "pretrained": None
+    }  # fmt: skip
     torch.manual_seed(0)
     return LeRobotPolicy(spec=spec(steps), type=type, **(given | changes))
 
@@ -196,17 +187,12 @@ def test_chunks_do_not_depend_on_what_else_is_simulated() -> None:
     assert torch.allclose(one.act(part, draws(2)), together[1:2], atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        (
-            {"settings": {"dim_modle": 3}},
-            "policy.settings.dim_modle is not a setting of LeRobot's act; valid: .*dim_model",
-        ),
-        ({"settings": {"vision_backbone": "vgg"}}, "LeRobot refuses its settings: .*vgg"),
-        ({"settings": {"chunk_size": 4, "n_action_steps": 4}}, "set data.seq_len=4"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"settings": {"dim_modle": 3}},
+     "policy.settings.dim_modle is not a setting of LeRobot's act; valid: .*dim_model"),
+    ({"settings": {"vision_backbone": "vgg"}}, "LeRobot refuses its settings: .*vgg"),
+    ({"settings": {"chunk_size": 4, "n_action_steps": 4}}, "set data.seq_len=4"),
+])  # fmt: skip
 def test_settings_that_are_not_valid_are_named(changes, words) -> None:
     with pytest.raises(ConfigError, match=words):
         policy(**changes)

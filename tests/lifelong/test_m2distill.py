@@ -25,11 +25,8 @@ from tests.harness.policies import small_mlp, small_rnn, small_transformer, smal
 
 SMALL = FitSettings(epochs=1, batch_size=8, lr=1e-2, precision="fp32")
 POLICIES = {
-    "bc_transformer": small_transformer,
-    "bc_rnn": small_rnn,
-    "bc_vilt": small_vilt,
-    "bc_mlp": small_mlp,
-}
+    "bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt, "bc_mlp": small_mlp
+}  # fmt: skip
 KINDS = {"image", "language", "proprio", "policy"}
 
 
@@ -69,16 +66,10 @@ def moved(student: HistoryPolicy, pattern: str) -> None:
                 p.add_(0.1 * torch.randn(p.shape, generator=generator(1)))
 
 
-@pytest.mark.parametrize(
-    ("part", "kinds"),
-    [
-        ("language.linear", {"language", "policy"}),
-        ("proprio.linears", {"proprio", "policy"}),
-        ("encoders.", {"image", "policy"}),
-        ("transformer.", {"policy"}),
-        ("head.", {"policy"}),
-    ],
-)
+@pytest.mark.parametrize(("part", "kinds"), [
+    ("language.linear", {"language", "policy"}), ("proprio.linears", {"proprio", "policy"}),
+    ("encoders.", {"image", "policy"}), ("transformer.", {"policy"}), ("head.", {"policy"})
+])  # fmt: skip
 def test_each_distance_tells_of_its_own_modality(part, kinds):
     teacher, student, observation = pair()
     moved(student, part)

@@ -216,18 +216,11 @@ def test_videos_of_the_last_row_are_copied_and_measured_again_without_them(tmp_p
     assert "after learning 2 tasks" in last.with_suffix(".txt").read_text()
 
 
-@pytest.mark.parametrize(
-    ("cells", "measured", "defined"),
-    [
-        ("diagonal", [(0, 0), (1, 1), (2, 2)], {"fwt", "just_learned"}),
-        ("last_row", [(2, 0), (2, 1), (2, 2)], {"fwt", "final_success"}),
-        (
-            "diagonal_and_last_row",
-            [(0, 0), (1, 1), (2, 0), (2, 1), (2, 2)],
-            {"fwt", "final_success", "just_learned"},
-        ),
-    ],
-)
+@pytest.mark.parametrize(("cells", "measured", "defined"), [
+    ("diagonal", [(0, 0), (1, 1), (2, 2)], {"fwt", "just_learned"}),
+    ("last_row", [(2, 0), (2, 1), (2, 2)], {"fwt", "final_success"}),
+    ("diagonal_and_last_row", [(0, 0), (1, 1), (2, 0), (2, 1), (2, 2)], {"fwt", "final_success", "just_learned"}),
+])  # fmt: skip
 def test_only_the_cells_that_are_asked_for_are_measured(tmp_path, whole, cells, measured, defined, capsys):
     context, _ = learn(tmp_path / "some", Sequential(), cells=cells)
     expected = {k: v for k, v in outcomes(whole).items() if k[0] == "curve" or k[1:3] in measured}

@@ -20,13 +20,8 @@ from tests.harness.original_results import relative, update_difference, where_ow
 
 RECORDED = Path(__file__).parent / "data" / "original.npz"
 TENSORS = {
-    "loss": 1e-5,
-    "eval_loss": 1e-5,
-    "act_means": 1e-5,
-    "act_stds": 1e-5,
-    "act_logits": 1e-5,
-    "rates": 1e-12,
-}
+    "loss": 1e-5, "eval_loss": 1e-5, "act_means": 1e-5, "act_stds": 1e-5, "act_logits": 1e-5, "rates": 1e-12
+}  # fmt: skip
 
 
 def given() -> dict:

@@ -38,24 +38,14 @@ TRANSFORMER = {"layers": 1, "heads": 2, "head_dim": 8, "mlp_dim": 32}
 LSTM = partial(TemporalLSTM, hidden=16)
 PATCHES = partial(PatchEncoder, width=8, stem_stride=4, patch=4)
 SMALL = {
-    "transformer": (
-        BCTransformer,
-        {"embed_dim": 16, "encoder": RESNET, "temporal": partial(TemporalTransformer, **TRANSFORMER)},
-    ),
+    "transformer": (BCTransformer,
+     {"embed_dim": 16, "encoder": RESNET, "temporal": partial(TemporalTransformer, **TRANSFORMER)}),
     "mlp": (BCMLP, {"image_embed": 16, "text_embed": 8, "encoder": RESNET}),
     "rnn": (BCRNN, {"image_embed": 16, "text_embed": 8, "encoder": RESNET, "temporal": LSTM}),
     "rnn-window": (BCRNN, {"image_embed": 16, "encoder": RESNET, "temporal": LSTM, "memory": "window"}),
-    "vilt": (
-        BCViLT,
-        {
-            "patch_embed": 16,
-            "embed_dim": 16,
-            "encoder": PATCHES,
-            "spatial": partial(SpatialTransformer, **TRANSFORMER),
-            "temporal": partial(TemporalTransformer, **TRANSFORMER),
-        },
-    ),
-}
+    "vilt": (BCViLT, {"patch_embed": 16, "embed_dim": 16, "encoder": PATCHES,
+     "spatial": partial(SpatialTransformer, **TRANSFORMER), "temporal": partial(TemporalTransformer, **TRANSFORMER)}),
+}  # fmt: skip
 CONFIGS = Path(__file__).parents[2] / "configs"
 CHOICES = [
     f"{group}={file.stem}"
@@ -402,13 +392,9 @@ class TestFlow:
         assert torch.equal(actions[:, :4], other[:, :4])
         assert not torch.allclose(actions[:, 4], other[:, 4], atol=1e-5)
 
-    @pytest.mark.parametrize(
-        ("changes", "message"),
-        [
-            ({"chunk": 5}, "data.seq_len to 5 or more"),
-            ({"execute": 4}, "execute is 4"),
-        ],
-    )
+    @pytest.mark.parametrize(("changes", "message"), [
+        ({"chunk": 5}, "data.seq_len to 5 or more"), ({"execute": 4}, "execute is 4")
+    ])  # fmt: skip
     def test_invalid_sizes_are_refused(self, changes: dict, message: str) -> None:
         with pytest.raises(PolicyError, match=message):
             make_policy("transformer", head="flow", **changes)

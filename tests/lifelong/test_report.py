@@ -37,17 +37,9 @@ from lifelong.stats.methods import MethodRun, statistics
 from lifelong.stats.metrics import METRIC_NAMES, Curve
 
 GROCERIES = [
-    "alphabet soup",
-    "cream cheese",
-    "salad dressing",
-    "bbq sauce",
-    "ketchup",
-    "tomato sauce",
-    "butter",
-    "milk",
-    "chocolate pudding",
-    "orange juice",
-]
+    "alphabet soup", "cream cheese", "salad dressing", "bbq sauce", "ketchup", "tomato sauce", "butter", "milk",
+    "chocolate pudding", "orange juice"
+]  # fmt: skip
 # Algorithm -> success just after learning, and the share of it kept from one task to the next.
 CHARACTERS = {"sequential": (0.82, 0.35), "er": (0.74, 0.86), "ewc": (0.5, 0.6), "packnet": (0.68, 1.0)}
 
@@ -94,11 +86,8 @@ def make_run(
         for j in range(i + 1):
             log.append(_evaluation(rng, "matrix", i, best, j, level[j] * kept ** (i - j)))
         counted = {
-            "parameters": 1.2e6,
-            "parameters_trained": 1.1e6,
-            "flops_per_step": 3.4e10,
-            "flops_per_action": 5e7,
-        }
+            "parameters": 1.2e6, "parameters_trained": 1.1e6, "flops_per_step": 3.4e10, "flops_per_action": 5e7
+        }  # fmt: skip
         log.append(CostRecord(task=i, costs=counted))
         log.append(CostRecord(task=i, costs={"end_task_seconds": 0.7, "stored_bytes": 2e6 * (i + 1)}))
         log.append(TaskEndRecord(task=i, best_epoch=best, seconds=float(rng.uniform(200, 260))))

@@ -181,42 +181,27 @@ def _signed(text: str) -> str:
     return signed_line(json.loads(text)).decode().strip()
 
 
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("{not json", "not JSON"),
-        ('{"kind": "lost"}', "unknown kind of record 'lost'; valid: run, loss, eval"),
-        (_signed('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1}'), "seconds"),
-        (
-            _signed('{"kind": "loss", "task": "zero", "epoch": 1, "loss": 0.1, "seconds": 1}'),
-            "a 'loss' record: task is 'zero'; expected a whole number",
-        ),
-        (
-            _signed('{"kind": "task_end", "task": true, "best_epoch": 1, "seconds": 1}'),
-            "a 'task_end' record: task is True",
-        ),
-        ("[1, 2]", "unknown kind"),
-        ('{"kind": [1]}', "unknown kind"),
-        ("[" * 50_000, "not JSON"),
-        ("\0" * 40, "not JSON"),
-        (_signed('{"kind": "cost", "task": 0, "costs": {"bytes": "many"}}'), "costs.bytes is 'many'"),
-        (
-            _signed('{"kind": "loss", "task": -1, "epoch": 1, "loss": 0.1, "seconds": 1}'),
-            "task is -1; expected at least 0",
-        ),
-        (
-            _signed('{"kind": "loss", "task": 2, "epoch": 1, "loss": 0.1, "seconds": 1}'),
-            "task 2, of 2 from 0 on",
-        ),
-        (
-            '{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1, "seconds": 1e400}',
-            "not JSON compliant",
-        ),
-        (to_line(RUN[3]).decode().strip().replace("-3.25", "-3.26"), "does not have its checksum"),
-        (to_line(RUN[2]).decode().strip(), "repeats line 3"),
-        ("x" * (9 << 20), "longer than 4 MiB"),
-    ],
-)
+@pytest.mark.parametrize(("line", "message"), [
+    ("{not json", "not JSON"),
+    ('{"kind": "lost"}', "unknown kind of record 'lost'; valid: run, loss, eval"),
+    (_signed('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1}'), "seconds"),
+    (_signed('{"kind": "loss", "task": "zero", "epoch": 1, "loss": 0.1, "seconds": 1}'),
+     "a 'loss' record: task is 'zero'; expected a whole number"),
+    (_signed('{"kind": "task_end", "task": true, "best_epoch": 1, "seconds": 1}'),
+     "a 'task_end' record: task is True"),
+    ("[1, 2]", "unknown kind"),
+    ('{"kind": [1]}', "unknown kind"),
+    ("[" * 50_000, "not JSON"),
+    ("\0" * 40, "not JSON"),
+    (_signed('{"kind": "cost", "task": 0, "costs": {"bytes": "many"}}'), "costs.bytes is 'many'"),
+    (_signed('{"kind": "loss", "task": -1, "epoch": 1, "loss": 0.1, "seconds": 1}'),
+     "task is -1; expected at least 0"),
+    (_signed('{"kind": "loss", "task": 2, "epoch": 1, "loss": 0.1, "seconds": 1}'), "task 2, of 2 from 0 on"),
+    ('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1, "seconds": 1e400}', "not JSON compliant"),
+    (to_line(RUN[3]).decode().strip().replace("-3.25", "-3.26"), "does not have its checksum"),
+    (to_line(RUN[2]).decode().strip(), "repeats line 3"),
+    ("x" * (9 << 20), "longer than 4 MiB"),
+])  # fmt: skip
 def test_an_invalid_line_is_named_and_the_others_are_read(log: ResultLog, line: str, message: str):
     lines = log.path.read_text().splitlines()
     log.path.write_text("\n".join([*lines[:3], line, *lines[3:]]) + "\n")

@@ -20,11 +20,8 @@ from tests.harness.fakes import DeepPolicy
 from tests.harness.policies import small_mlp, small_rnn, small_transformer, small_vilt
 
 POLICIES = {
-    "bc_transformer": small_transformer,
-    "bc_rnn": small_rnn,
-    "bc_vilt": small_vilt,
-    "bc_mlp": small_mlp,
-}
+    "bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt, "bc_mlp": small_mlp
+}  # fmt: skip
 SMALL = FitSettings(epochs=1, batch_size=8, lr=1e-2, precision="fp32")
 
 

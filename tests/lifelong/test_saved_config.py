@@ -13,20 +13,17 @@ BOMB = "a: &a [1,1,1,1,1,1,1,1,1]\n" + "".join(
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (None, "No such file"),
-        (b"\x93NUMPY\x00\xff", "not UTF-8"),
-        (b"- 1\n- 2\n", "expected keys with values"),
-        (b"", "expected keys with values"),
-        (b"seed", "expected keys with values"),
-        (b"1: 2\n", "expected keys with values"),
-        (b"seed: [1\n", "not valid YAML"),
-        (b"!!python/object/apply:os.system ['true']\n", "not valid YAML"),
-        (BOMB.encode(), "alias"),
-    ],
-)
+@pytest.mark.parametrize(("content", "said"), [
+    (None, "No such file"),
+    (b"\x93NUMPY\x00\xff", "not UTF-8"),
+    (b"- 1\n- 2\n", "expected keys with values"),
+    (b"", "expected keys with values"),
+    (b"seed", "expected keys with values"),
+    (b"1: 2\n", "expected keys with values"),
+    (b"seed: [1\n", "not valid YAML"),
+    (b"!!python/object/apply:os.system ['true']\n", "not valid YAML"),
+    (BOMB.encode(), "alias"),
+])  # fmt: skip
 def test_what_is_no_configuration_is_told_in_one_line(content, said, tmp_path):
     file = tmp_path / "config.yaml"
     if content is not None:

@@ -31,21 +31,13 @@ RUNS = Path(__file__).parent / "data" / "saved_runs"
 EVERY = 5  # of the weights' numbers one is stored
 
 SHORT = (
-    *(
-        "preset=smoke",
-        "benchmark=libero_object",
-        "benchmark.tasks=2",
-        "data.demos=2",
-        "data.image_size=32",
-        "device=cpu",
-        "threads=1",
-        "progress=false",
-    ),
+    *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "data.demos=2", "data.image_size=32",
+     "device=cpu", "threads=1", "progress=false"),
     *("train.epochs=2", "train.steps_per_epoch=4", "train.batch_size=8"),
     *("eval.episodes=2", "eval.curve_episodes=1", "eval.every=1", "eval.horizon=20", "eval.record_every=0"),
     "eval.select=last",
     *("data.robot=robosuite-1.4.1", "data.drawing=fast"),
-)
+)  # fmt: skip
 ENCODER = (
     *("policy.encoder.width=8", "policy.encoder.stage_blocks=[1]", "policy.encoder.stem_stride=8"),
     "policy.encoder.keypoints=8",
@@ -62,19 +54,15 @@ RESNET_T = (
 COMMANDS = {
     "er": ("algo=er", "compat=libero", "algo.memory.budget=50", "algo.memory.batch_size=null", *RESNET_T),
     "ewc": ("algo=ewc", "algo.strength=null", "algo.estimator.windows=16", *RESNET_T),
-    "packnet": (
-        *("algo=packnet", "policy=bc_rnn_small", "policy/head=gmm_small"),
-        *("policy.image_embed=8", "policy.text_embed=8", *ENCODER, "policy.temporal.hidden=16"),
-        *("policy.head.hidden=16", "policy.head.modes=2"),
-    ),
-    "sequential": (
-        *("algo=sequential", "data.image_size=64", "data.seq_len=6"),
-        *("policy=bc_vilt_small", "policy/head=flow_small", "policy.head.hidden=16"),
-        *("policy.patch_embed=16", "policy.embed_dim=16", "policy.encoder.width=8", *TRANSFORMER),
-        *("policy.spatial.layers=1", "policy.spatial.heads=2", "policy.spatial.head_dim=8"),
-        "policy.spatial.mlp_dim=32",
-    ),
-}
+    "packnet": (*("algo=packnet", "policy=bc_rnn_small", "policy/head=gmm_small"),
+     *("policy.image_embed=8", "policy.text_embed=8", *ENCODER, "policy.temporal.hidden=16"),
+     *("policy.head.hidden=16", "policy.head.modes=2")),
+    "sequential": (*("algo=sequential", "data.image_size=64", "data.seq_len=6"),
+     *("policy=bc_vilt_small", "policy/head=flow_small", "policy.head.hidden=16"),
+     *("policy.patch_embed=16", "policy.embed_dim=16", "policy.encoder.width=8", *TRANSFORMER),
+     *("policy.spatial.layers=1", "policy.spatial.heads=2", "policy.spatial.head_dim=8"),
+     "policy.spatial.mlp_dim=32"),
+}  # fmt: skip
 every_run = pytest.mark.parametrize("name", COMMANDS)
 
 

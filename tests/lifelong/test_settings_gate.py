@@ -82,33 +82,27 @@ def test_an_unknown_key_anywhere_is_told_with_the_nearest(whole):
             assert f"{'.'.join(misspelt)} is an unknown key. Did you mean" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"seed": -1}, "seed is -1; expected at least 0"),
-        ({"seed": True}, "seed is True; expected a whole number"),
-        ({"seed": MISSING}, "seed is missing"),
-        ({"run_id": "../../x"}, "run_id: '../../x' is not a name"),
-        ({"trian": {}}, "trian is an unknown key. Did you mean 'train'?"),
-        ({"train": MISSING}, "train is missing; choose a file of that group with train=NAME"),
-        ({"train": {"lr": 1}}, "a file of that group is chosen with train=NAME"),
-        ({"train__betas": [2, 0]}, "train.betas.0 is 2; expected below 1"),
-        ({"train__precision": "bf61"}, "expected one of 'auto', 'bf16' or 'fp32'. Did you mean 'bf16'?"),
-        ({"algo__memory": 5}, "algo.memory is 5; expected a component"),
-        ({"algo__memory__budget": MISSING}, "algo.memory.budget is missing"),
-        ({"algo__memory___target_": "lifelong.data.fake.FakeWindows"}, "algo.memory._target_ names"),
-        ({"algo__memory___partial_": True}, "algo.memory builds a partial; expected a ReplayMemory"),
-        ({"algo___target_": "builtins.dict"}, "algo builds a dict; expected a Algorithm"),
-        ({"policy__head": "gmm"}, "a file of that group is chosen with policy/head=gmm"),
-        ({"policy__temporal___partial_": False}, "policy.temporal._partial_ is False; expected true"),
-        ({"policy__temporal___target_": "lifelong.nn.GMMHead"}, "policy.temporal.heads is an unknown key"),
-        (
-            {"policy__temporal": {"_target_": "lifelong.nn.GMMHead", "_partial_": True}},
-            "does not take dim, max",
-        ),
-        ({"policy__stochastic": {"_target_": "builtins.bool"}}, "policy.stochastic is {'_target_'"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"seed": -1}, "seed is -1; expected at least 0"),
+    ({"seed": True}, "seed is True; expected a whole number"),
+    ({"seed": MISSING}, "seed is missing"),
+    ({"run_id": "../../x"}, "run_id: '../../x' is not a name"),
+    ({"trian": {}}, "trian is an unknown key. Did you mean 'train'?"),
+    ({"train": MISSING}, "train is missing; choose a file of that group with train=NAME"),
+    ({"train": {"lr": 1}}, "a file of that group is chosen with train=NAME"),
+    ({"train__betas": [2, 0]}, "train.betas.0 is 2; expected below 1"),
+    ({"train__precision": "bf61"}, "expected one of 'auto', 'bf16' or 'fp32'. Did you mean 'bf16'?"),
+    ({"algo__memory": 5}, "algo.memory is 5; expected a component"),
+    ({"algo__memory__budget": MISSING}, "algo.memory.budget is missing"),
+    ({"algo__memory___target_": "lifelong.data.fake.FakeWindows"}, "algo.memory._target_ names"),
+    ({"algo__memory___partial_": True}, "algo.memory builds a partial; expected a ReplayMemory"),
+    ({"algo___target_": "builtins.dict"}, "algo builds a dict; expected a Algorithm"),
+    ({"policy__head": "gmm"}, "a file of that group is chosen with policy/head=gmm"),
+    ({"policy__temporal___partial_": False}, "policy.temporal._partial_ is False; expected true"),
+    ({"policy__temporal___target_": "lifelong.nn.GMMHead"}, "policy.temporal.heads is an unknown key"),
+    ({"policy__temporal": {"_target_": "lifelong.nn.GMMHead", "_partial_": True}}, "does not take dim, max"),
+    ({"policy__stochastic": {"_target_": "builtins.bool"}}, "policy.stochastic is {'_target_'"),
+])  # fmt: skip
 def test_what_is_wrong_is_said_with_key_value_and_what_is_valid(changes, said, whole):
     with pytest.raises(ConfigError, match=re.escape(said)) as error:
         checked(changed(whole, **changes))

@@ -42,22 +42,10 @@ TASKS = get_suite("libero_object").tasks[:2]
 NAMES = {"policy": "tiny", "benchmark": "libero_object", "algo": "sequential", "preset": "smoke"}
 TINY = (
     *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "algo=sequential", "threads=1"),
-    *(
-        "data.demos=2",
-        "data.image_size=32",
-        "train.epochs=1",
-        "train.steps_per_epoch=1",
-        "train.batch_size=2",
-    ),
-    *(
-        "eval.horizon=3",
-        "eval.episodes=2",
-        "eval.curve_episodes=1",
-        "eval.record_every=0",
-        "eval.sim_threads=1",
-    ),
+    *("data.demos=2", "data.image_size=32", "train.epochs=1", "train.steps_per_epoch=1", "train.batch_size=2"),
+    *("eval.horizon=3", "eval.episodes=2", "eval.curve_episodes=1", "eval.record_every=0", "eval.sim_threads=1"),
     *("policy.encoder.width=4", "policy.head.hidden=8", "progress=false", "augmentation=none"),
-)
+)  # fmt: skip
 LOOKS = "instruction=0.6,light=0.8"
 
 
@@ -149,14 +137,8 @@ def test_presets_and_mappings():
 @pytest.mark.unit
 def test_a_run_has_perturbations_of_every_task_or_none():
     values = {
-        "kind": "run",
-        "algo": "er",
-        "benchmark": "b",
-        "policy": "p",
-        "seed": 1,
-        "preset": "",
-        "tasks": ["t"],
-    }
+        "kind": "run", "algo": "er", "benchmark": "b", "policy": "p", "seed": 1, "preset": "", "tasks": ["t"]
+    }  # fmt: skip
     values |= {
         "instructions": ["t"],
         "config_digest": "",

@@ -136,18 +136,10 @@ def test_a_replay_memory_of_stages_reloads_by_window_ids() -> None:
         assert torch.equal(data[task].batch(window[None]).observation.proprio["x"][0], seen)
 
 
-@pytest.mark.parametrize(
-    ("later", "expected"),
-    [
-        (None, (50, 50, 50)),
-        (5, (50, 5, 5)),
-        (1, (50, 1, 1)),
-        (0.1, (50, 5, 5)),
-        (1.0, (50, 50, 50)),
-        (0.001, (50, 1, 1)),
-        ([10, 3], (50, 10, 3)),
-    ],
-)
+@pytest.mark.parametrize(("later", "expected"), [
+    (None, (50, 50, 50)), (5, (50, 5, 5)), (1, (50, 1, 1)), (0.1, (50, 5, 5)), (1.0, (50, 50, 50)),
+    (0.001, (50, 1, 1)), ([10, 3], (50, 10, 3))
+])  # fmt: skip
 def test_demonstrations_of_later_tasks(later, expected) -> None:
     assert StreamSettings(demos_later=later).demos(50, 3) == expected
     assert StreamSettings(demos_later=later if not isinstance(later, list) else later[:1]).demos(

@@ -36,13 +36,9 @@ def record(
 
 
 RUN = [
-    record(0, 0, POT, [10, 8]),
-    record(1, 0, POT, [9, 3]),
-    record(1, 1, TWO, [9, 5, 10], [0, 0, 10]),
-    record(2, 0, POT, [10, 1]),
-    record(2, 1, TWO, [8, 2, 10], [0, 0, 10]),
-    record(2, 2, POT, [10, 10]),
-]
+    record(0, 0, POT, [10, 8]), record(1, 0, POT, [9, 3]), record(1, 1, TWO, [9, 5, 10], [0, 0, 10]),
+    record(2, 0, POT, [10, 1]), record(2, 1, TWO, [8, 2, 10], [0, 0, 10]), record(2, 2, POT, [10, 10])
+]  # fmt: skip
 
 
 def test_every_atom_of_every_task():

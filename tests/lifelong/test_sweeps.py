@@ -162,17 +162,14 @@ def test_the_same_command_has_the_same_folder() -> None:
     assert "/" not in sweep_name(["policy/head=gmm,mse"], ["policy/head"])
 
 
-@pytest.mark.parametrize(
-    ("own", "suffix"),
-    [
-        ({"seed": "1", "algo": "er", "policy": "bc_mlp", "benchmark": "libero_goal"}, ""),
-        ({"train.lr": "0.001", "seed": "1"}, "lr0.001"),
-        ({"train.epochs": "20", "algo/estimator": "batch"}, "estimator-batch_epochs20"),
-        ({"a.x": "1", "b.x": "2"}, "a.x1_b.x2"),
-        ({"benchmark.tasks": "[0,4,7]", "hydra.launcher.n_jobs": "2"}, "tasks-0-4-7"),
-        ({"+algo.note": "a/b\\c d"}, "note-a-b-c-d"),
-    ],
-)
+@pytest.mark.parametrize(("own", "suffix"), [
+    ({"seed": "1", "algo": "er", "policy": "bc_mlp", "benchmark": "libero_goal"}, ""),
+    ({"train.lr": "0.001", "seed": "1"}, "lr0.001"),
+    ({"train.epochs": "20", "algo/estimator": "batch"}, "estimator-batch_epochs20"),
+    ({"a.x": "1", "b.x": "2"}, "a.x1_b.x2"),
+    ({"benchmark.tasks": "[0,4,7]", "hydra.launcher.n_jobs": "2"}, "tasks-0-4-7"),
+    ({"+algo.note": "a/b\\c d"}, "note-a-b-c-d"),
+])  # fmt: skip
 def test_runs_of_a_sweep_are_named_by_what_tells_them_apart(own, suffix) -> None:
     assert job_suffix(own) == suffix
 

@@ -21,41 +21,16 @@ pytestmark = pytest.mark.unit
 
 HOSTILE = [
     *("os.system", "subprocess.run", "builtins.open", "builtins.exec", "torch.load", "torch.hub.load"),
-    *(
-        "shutil.copyfile",
-        "importlib.import_module",
-        "pickle.loads",
-        "hydra.utils.instantiate",
-        "a",
-        "",
-        "..",
-        "os.",
-    ),
-    *(
-        "lifelong.checkpoints.save",
-        "lifelong.training.precision.subprocess.run",
-        "lifelong.results.records.os.system",
-    ),
+    *("shutil.copyfile", "importlib.import_module", "pickle.loads", "hydra.utils.instantiate", "a", "", "..", "os."),
+    *("lifelong.checkpoints.save", "lifelong.training.precision.subprocess.run",
+     "lifelong.results.records.os.system"),
     *("lifelong.nn.heads.torch.load", "lifelong.nn.heads.torch.nn.Linear", "lifelong.data.dataset.Path"),
-    *(
-        "libero_env.cli.main.main",
-        "libero_env.cli.__main__.main",
-        "lifelong.algorithms.er.ER.__init__",
-        "lifelong",
-    ),
-    *(
-        "lifelong.algorithms.er.ER.mro",
-        "lifelong.settings.build",
-        "lifelong.settings.configuration.find_target",
-    ),
+    *("libero_env.cli.main.main", "libero_env.cli.__main__.main", "lifelong.algorithms.er.ER.__init__", "lifelong"),
+    *("lifelong.algorithms.er.ER.mro", "lifelong.settings.build", "lifelong.settings.configuration.find_target"),
     *("lifelong.policies.base.Policy.__subclasses__", "lifelong.language.encoder.np.load", "lifelong.nn"),
-    *(
-        "libero_env.storage.atomic_path",
-        "libero_eval.user_policy.load_callable",
-        "lifelong.data.loading.Path",
-    ),
+    *("libero_env.storage.atomic_path", "libero_eval.user_policy.load_callable", "lifelong.data.loading.Path"),
     *("lifelong.tracking.__builtins__", "lifelong.nn.augmentation.ABC", "lifelong.launch.Job"),
-]
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -115,12 +90,8 @@ def test_a_strangers_run_executes_nothing(group, target, changed, tmp_path, monk
 def test_components_are_looked_at_too(changed, tmp_path, capsys):
     evil = {"_target_": "posix.mkdir", "path": str(tmp_path / "made")}
     for place in (
-        "policy__encoder",
-        "policy__stochastic",
-        "eval__episodes",
-        "data__views",
-        "language__model",
-    ):
+        "policy__encoder", "policy__stochastic", "eval__episodes", "data__views", "language__model"
+    ):  # fmt: skip
         for value in (evil, [evil], {"within": evil}):
             assert main(["eval", str(changed(**{place: value}))]) == 2
             assert capsys.readouterr().err.count("\n") == 1

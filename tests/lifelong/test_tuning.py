@@ -200,19 +200,16 @@ def test_lists_of_values_are_found_and_others_are_left() -> None:
     }
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["algo=dmpel"], "suggests no values"),
-        (["algo=ewc", "algo.strenght=1,2"], "Did you mean 'algo.strength'"),
-        (["algo=ewcc"], "Did you mean 'ewc'"),
-        (["algo=ewc", "algo.strength=-1,2"], "algo.strength"),
-        (["algo=ewc", "--stream", "61"], "one task"),
-        (["algo=ewc", "--stream", "61,990"], "unknown task"),
-        (["algo=multitask", "train.lr=1e-3,2e-3"], "several tasks together"),
-        (["algo=ewc", "algo.strength=[1"], "["),
-    ],
-)
+@pytest.mark.parametrize(("words", "told"), [
+    (["algo=dmpel"], "suggests no values"),
+    (["algo=ewc", "algo.strenght=1,2"], "Did you mean 'algo.strength'"),
+    (["algo=ewcc"], "Did you mean 'ewc'"),
+    (["algo=ewc", "algo.strength=-1,2"], "algo.strength"),
+    (["algo=ewc", "--stream", "61"], "one task"),
+    (["algo=ewc", "--stream", "61,990"], "unknown task"),
+    (["algo=multitask", "train.lr=1e-3,2e-3"], "several tasks together"),
+    (["algo=ewc", "algo.strength=[1"], "["),
+])  # fmt: skip
 def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> None:
     assert tune(*TINY, *words, "--steps", "1", "--beside", "--out", str(tmp_path)) != 0
     error = capsys.readouterr().err

@@ -36,17 +36,9 @@ def test_metrics_of_three_tasks_from_their_records():
     rows = [(16,), (10, 10), (4, 7, 12)]
     names = [f"task_{k}" for k in range(3)]
     records = [
-        start_record(
-            algo="er",
-            benchmark="b",
-            policy="p",
-            seed=1,
-            preset="",
-            tasks=names,
-            instructions=names,
-            config={},
-        )
-    ]
+        start_record(algo="er", benchmark="b", policy="p", seed=1, preset="", tasks=names, instructions=names,
+         config={}),
+    ]  # fmt: skip
     for task, (curve, row) in enumerate(zip(curves, rows, strict=True)):
         records += [evaluation("curve", task, 5 * i, task, wins) for i, wins in enumerate(curve)]
         best = (5, 10, 5)[task]

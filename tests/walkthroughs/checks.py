@@ -185,11 +185,8 @@ def _(ran: Ran) -> None:
 @check("1.1")
 def _(ran: Ran) -> None:
     paths = (
-        "benchmark_root_path",
-        "init_states_default_path",
-        "bddl_files_default_path",
-        "datasets_default_path",
-    )
+        "benchmark_root_path", "init_states_default_path", "bddl_files_default_path", "datasets_default_path"
+    )  # fmt: skip
     assert all(os.path.isdir(ran.names[path]) for path in paths)
 
 
@@ -428,11 +425,8 @@ def _(ran: Ran) -> None:
 @check("hdf5")
 def _(ran: Ran) -> None:
     for words in (
-        "Top-level keys: ['data']",
-        "agentview_rgb is a Dataset",
-        "Dtype: uint8",
-        "bddl_file_name: ",
-    ):
+        "Top-level keys: ['data']", "agentview_rgb is a Dataset", "Dtype: uint8", "bddl_file_name: "
+    ):  # fmt: skip
         assert words in ran.out
 
 

@@ -99,12 +99,9 @@ def small_model(_: Scope) -> Scope:
     before = model.linear.weight.detach().clone()
     optimizer = torch.optim.SGD(model.parameters(), lr=0.1)
     return {
-        "torch": torch,
-        "model": model,
-        "optimizer": optimizer,
-        "dataloader": [torch.ones(2, 3)] * 8,
-        "before": before,
-    }
+        "torch": torch, "model": model, "optimizer": optimizer, "dataloader": [torch.ones(2, 3)] * 8,
+        "before": before
+    }  # fmt: skip
 
 
 class Batches:

@@ -280,12 +280,8 @@ def main(source: str, job_file: str, out: str) -> None:
 
     torch.set_num_threads(1)
     parts = {
-        "learn": "base",
-        "with_dropout": "base",
-        "ewc": "ewc",
-        "packnet": "packnet",
-        "augmentation": "base",
-    }
+        "learn": "base", "with_dropout": "base", "ewc": "ewc", "packnet": "packnet", "augmentation": "base"
+    }  # fmt: skip
     found: dict = {}
     for part in str(job["parts"]).split():
         found |= globals()[part](configuration(root, job, parts[part]), job)

@@ -45,11 +45,8 @@ class Replay(PredictModelServer):
 
     def get_observation_spec(self):
         return {
-            "agentview": IMAGE_RGB,
-            "wrist": IMAGE_RGB,
-            "language": LANGUAGE,
-            "state": STATE_EEF_POS_AA_GRIP,
-        }
+            "agentview": IMAGE_RGB, "wrist": IMAGE_RGB, "language": LANGUAGE, "state": STATE_EEF_POS_AA_GRIP
+        }  # fmt: skip
 
 
 class Messages(logging.Handler):
