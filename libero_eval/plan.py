@@ -1,6 +1,7 @@
 """From a request to a result: what is to be run, the processes that run it, and a result that is run again."""
 
 import io
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, suppress
@@ -25,7 +26,7 @@ from libero_eval.protocols.environment import resolve_world
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import EvalRequest, Request
-from libero_eval.work.evaluation import Evaluation
+from libero_eval.work.evaluation import Evaluation, iso_time
 from libero_eval.work.progress import Progress
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError, ResultsError
@@ -64,11 +65,17 @@ def run(
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> EvaluationResult:
     """Run a planned evaluation in as many processes as the request names; see `evaluate`."""
-    count = min(request.workers, len(evaluation.units))
+    store, units = evaluation.store, evaluation.units
+    count = min(request.workers, len(units))
     remedy = "fewer --workers, --unit-starts or --videos, or a smaller --size"
     require_memory(evaluation.memory(count), f"an evaluation by {count} processes", remedy)
     if request.again:
-        evaluation.store.clear()
+        store.clear()
+    store.join(units)
+    done = store.done(units)
+    if len(done) == len(units):
+        count, when = 1, iso_time(max(one.finished for one in done.values()))
+        print(f"note: {store.path}: finished {when}, nothing was run; --again repeats it", file=sys.stderr)
     try:
         with policy_threads(evaluation), Workers(count - 1, _help, replace(request, again=False)) as workers:
             return Worker(
@@ -159,22 +166,32 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
         videos=request.videos,
         progress=sys.stderr.isatty() and request.workers == 1,
         versions=versions,
+        probe=policy.probe(protocol),
         policy_threads=request.policy_threads or (1 if policy.on_cpu else None),
     )
 
 
 def load_policy(request: Request) -> PolicyUnderTest:
     """Return the policy that is asked for: the expert, a server's, a user's own, or a run's."""
-    kind = _kind(request.policy_name)
-    if kind == "server":
-        from libero_eval.servers.policy import ServerPolicy
+    policy: PolicyUnderTest
+    match _kind(request.policy_name):
+        case "server":
+            from libero_eval.servers.policy import ServerPolicy
 
-        return ServerPolicy(request)
-    if kind == "module":
-        from libero_eval.user_policy import UserPolicy
+            policy = ServerPolicy(request)
+        case "module":
+            from libero_eval.user_policy import UserPolicy
 
-        return UserPolicy(request)
-    return ExpertPolicy(request) if kind == "expert" else RunPolicy(request)
+            policy = UserPolicy(request)
+        case "expert":
+            policy = ExpertPolicy(request)
+        case _:
+            policy = RunPolicy(request)
+    if request.name:
+        policy.identity = {**policy.identity, "name": request.name}
+        word = re.sub(r"[^\w.-]+", "_", request.name)
+        policy.out = policy.out.with_name(f"{policy.out.name}_{word}")
+    return policy
 
 
 def _kind(policy: str) -> str:
@@ -182,6 +199,11 @@ def _kind(policy: str) -> str:
         return "server"
     if Path(policy).exists():
         return "run"
+    if re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[\w.-]+):\d+(/.*)?", policy):
+        raise ConfigError(
+            f"{policy} is an address without the kind of its server: write ws://{policy} (openpi, libero serve), "
+            f"vla-eval://{policy} or gr00t://{policy}"
+        )
     return "expert" if policy == "expert" else "module" if ":" in policy else "run"
 
 
@@ -265,6 +287,7 @@ class _Evaluated(TypedDict, total=False):
     run: Annotated[str, Field(min_length=1)]
     policy: Annotated[str, Field(min_length=1)]
     server: Annotated[str, Field(min_length=1)]
+    name: Annotated[str, Field(min_length=1, max_length=100)]
     after: Annotated[int, Field(ge=0)] | None
     names: Literal["native", "original", "protocol"] | None
     seed: Annotated[int, Field(ge=0)]
@@ -287,7 +310,7 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
 
     Raises:
         ResultsError: The result does not say which policy it is of.
-        ConfigError: It is of a policy in a module that the user has not allowed, or of another backend.
+        ConfigError: It is of a policy in a module or on a server that the user has not allowed, or of another backend.
     """
     path = Path(request.policy_name)
     stated = {key: value for key, value in result.evaluated.items() if key in _Evaluated.__annotations__}
@@ -295,13 +318,14 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
     policy = next((evaluated[key] for key in ("run", "policy", "server") if key in evaluated), None)
     if policy is None:
         raise ResultsError(f"{path} does not say which policy it is of: {dict(result.evaluated)}")
-    _check_code(policy, request)
+    _check_allowed(policy, request)
     _check_backend(request, result)
     return replace(
         request,
         policy=policy,
         after=evaluated.get("after"),
         names=evaluated.get("names"),
+        name=evaluated.get("name"),
         seed=evaluated.get("seed", 0),
         suite=tuple(task.task for task in result.tasks),
         unit_starts=result.unit_starts or len(result.init_states),
@@ -321,15 +345,23 @@ def _check_backend(request: EvalRequest, result: EvaluationResult) -> None:
         raise ConfigError(f"--backend {asked}: the result is of backend={backend}, which it is repeated with")
 
 
-def _check_code(policy: str, request: EvalRequest) -> None:
-    """Refuse to run code that a result, which may be somebody else's, names: unless the user has allowed it."""
-    module, colon, _ = policy.partition(":")
-    package = module.partition(".")[0]
-    runs_code = bool(colon) and "://" not in policy and not Path(policy).exists()
-    if runs_code and not {module, package} & set(request.allow):
+def _check_allowed(policy: str, request: EvalRequest) -> None:
+    """Refuse code and servers that a result, which may be somebody else's, names: unless the user has allowed them.
+
+    A server would be sent pictures, and the key that is in the environment.
+    """
+    if "://" in policy:
+        host = policy.partition("://")[2].partition("/")[0]
+        names, what = [policy, host, host.rpartition(":")[0]], "which would be connected to"
+    elif ":" in policy and not Path(policy).exists():
+        module = policy.partition(":")[0]
+        names, what = [module.partition(".")[0], module], "whose code would be run"
+    else:
+        return
+    if not set(names) & set(request.allow):
         raise ConfigError(
-            f"{request.policy} is of the policy {policy}, whose code would be run; if you know and trust it, "
-            f"allow it with --allow {package}"
+            f"{request.policy} is of the policy {policy}, {what}; if you know and trust it, "
+            f"allow it with --allow {names[0]}"
         )
 
 

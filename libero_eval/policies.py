@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 # Initial states by which a checkpoint is chosen by default
 SELECTION = range(NUM_INIT_STATES - 20, NUM_INIT_STATES)
+PROBE_TOLERANCE = 0.01  # of actions in [-1, 1]: what another start of a server may change, by rounding
 
 
 class PolicyUnderTest(ABC):
@@ -77,6 +78,10 @@ class PolicyUnderTest(ABC):
         self, task: Task, states: Sequence[int], protocol: EvalProtocol
     ) -> AbstractContextManager[Actor]:
         """Return the context manager of the task's actor, which starts in the given initial states."""
+
+    def probe(self, protocol: EvalProtocol) -> tuple[float, ...] | None:
+        """Return what the policy answers to a fixed observation; None where `identity` is enough, or chance decides."""
+        return None
 
     def seeds(self, task: Task, states: Sequence[int]) -> list[tuple[int, ...]]:
         """Return the words from which the random numbers of each episode are made."""

@@ -47,6 +47,8 @@ class Request:
         size: Image size in pixels, for a policy that does not define it.
         names: What a policy of your own receives: this package's observations, the original's, or the protocol's inputs
             (default: native for upright images, otherwise original).
+        name: Name of the policy, such as pi0_step30000: part of its identity, and of the default folder. Needed where a
+            policy server does not say which policy it serves.
         videos: Record this number of episodes of each task.
         seed: Seed of stochastic policies.
         assets: `builtin`, `original`, or the folder of the original's models.
@@ -60,7 +62,7 @@ class Request:
         retries: Further attempts after an error.
         device: auto, cpu, cuda, cuda:1.
         allow: Packages of others whose classes a run's configuration, or a result that is run again, may name (default:
-            none; their code is executed).
+            none; their code is executed), and addresses of servers that a result may name.
         threads: Threads of the simulations; 0: all cores, shared by the workers.
         timeout: Seconds until a policy server must answer.
         in_flight: Requests that a policy server gets before it has answered (default: one for each episode of a batch).
@@ -80,6 +82,7 @@ class Request:
     horizon: Horizon | None = None
     size: Side | None = None
     names: Literal["native", "original", "protocol"] | None = None
+    name: Annotated[str, Field(min_length=1, max_length=100)] | None = None
     videos: Natural = 0
     seed: Seed = 0
     assets: str | None = None

@@ -1,11 +1,12 @@
 """A policy of the user's own: an object with `predict`, from `module:function`."""
 
+import ast
 import hashlib
 import importlib
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +29,7 @@ from lifelong.evaluation.actors import Actor
 from lifelong.evaluation.environments import Obs
 
 _WRITE = "write module:function, such as my_policy:make"
+_PROJECT = ("libero", "libero_env", "libero_eval", "lifelong")  # whose version is in the result
 _Side = Annotated[int, Field(ge=1, le=4096)]  # pixels
 ORIGINAL_NAMES = {
     "agentview_rgb": "agentview_image",
@@ -44,8 +46,8 @@ ORIGINAL_NAMES = {
 class UserPolicy(PolicyUnderTest):
     """A user-defined policy; see `CallableActor` for its interface.
 
-    Its module's source is part of its identity, and so is what it names in an attribute `identity`, plain data such as
-    the digest of its weights: results of different ones are not mixed.
+    Its identity is the source of its module and of those beside it that it imports, the arrays and networks that it
+    holds, and what it names in an attribute `identity`, plain data: results of different ones are not mixed.
     """
 
     def __init__(self, request: Request):
@@ -54,12 +56,11 @@ class UserPolicy(PolicyUnderTest):
         self.policy = load_callable(name)
         self.cameras = self._attribute("cameras", tuple[str, ...], ("agentview", "robot0_eye_in_hand"))
         self.observations = self._attribute("observations", tuple[str, ...], OBSERVATIONS)
-        self.identity = {
-            "policy": name,
-            "source": source_digest(name),
-            **self._attribute("identity", dict[str, Any], {}),
-            **({} if request.names is None else {"names": request.names}),
-        }
+        named = self._attribute("identity", dict[str, Any], {})
+        if "weights" not in named and (weights := weights_digest(self.policy)):
+            named = {"weights": weights, **named}
+        names = {} if request.names is None else {"names": request.names}
+        self.identity = {"policy": name, "source": source_digest(name.partition(":")[0]), **named, **names}
         self.out = Path("eval") / name.replace(":", ".")
 
     def protocol(self, base: EvalProtocol) -> EvalProtocol:
@@ -300,9 +301,79 @@ def _imported(module: str, text: str) -> ModuleType:
         ) from error
 
 
-def source_digest(text: str) -> str | None:
-    """Return the digest of the source of the module in `module:function`; None if it has no file of its own."""
-    source = getattr(sys.modules[text.partition(":")[0]], "__file__", None)
-    if source is None or not Path(source).is_file():
+def source_digest(module: str) -> str | None:
+    """Return the digest of the source of a module and of what it imports from its own folder, directly or not.
+
+    Nothing is imported for it. None for a module without a file.
+    """
+    file = getattr(sys.modules[module], "__file__", None)
+    if file is None or not Path(file).is_file():
         return None
-    return hashlib.sha256(Path(source).read_bytes()).hexdigest()[:16]
+    path = Path(file).resolve()
+    folder = path.parents[module.count(".") + (path.name == "__init__.py")]
+    sources = {module: path.read_bytes()}
+    waiting = [*_imports(sources[module], module, path)]
+    while waiting:
+        name = waiting.pop()
+        top, place = name.partition(".")[0], folder.joinpath(*name.split("."))
+        files = [one for one in (place.with_suffix(".py"), place / "__init__.py") if one.is_file()]
+        own = top == module.partition(".")[0] or not {"site-packages", "dist-packages"} & set(folder.parts)
+        if files and own and name not in sources and top not in _PROJECT:
+            sources[name] = files[0].read_bytes()
+            waiting += _imports(sources[name], name, files[0])
+    parts = [part for name in sorted(sources) for part in (name.encode(), sources[name])]
+    return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
+
+
+def _imports(source: bytes, name: str, path: Path) -> Iterator[str]:
+    """Yield the names of modules that a source may import, packages above them included."""
+    try:
+        nodes = list(ast.walk(ast.parse(source)))
+    except (SyntaxError, ValueError):  # it is not of Python
+        return
+    for node in nodes:
+        found = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+        if isinstance(node, ast.ImportFrom):
+            kept = name.count(".") + 1 - node.level + (path.name == "__init__.py")
+            base = [*(name.split(".")[:kept] if node.level else []), *([node.module] if node.module else [])]
+            found = [".".join(base), *(".".join([*base, one]) for one in found)]
+        for one in filter(None, found):
+            parts = one.split(".")
+            yield from (".".join(parts[: i + 1]) for i in range(len(parts)))
+
+
+def weights_digest(policy: Any) -> str | None:
+    """Return the digest of the arrays and networks that an object, its class and its module hold; None for none.
+
+    Attributes are followed a few steps.
+    """
+    digest = hashlib.sha256()
+    seen: dict[int, Any] = {}
+    kind = type(policy)
+    module = getattr(sys.modules.get(kind.__module__), "__dict__", {})
+    counts = [_add_arrays(part, digest, seen) for part in (policy, dict(vars(kind)), dict(module))]
+    return digest.hexdigest()[:16] if any(counts) else None
+
+
+def _add_arrays(value: Any, digest: Any, seen: dict[int, Any], left: int = 6) -> int:
+    """Add the arrays in an object to a digest, and return their number; what is kept in `seen` keeps its id."""
+    if id(value) in seen or not left or isinstance(value, type | ModuleType):
+        return 0
+    seen[id(value)] = value
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(value, torch.nn.Module):
+        value = value.state_dict()
+    if torch is not None and isinstance(value, torch.Tensor):  # NumPy has no bfloat16
+        value = value.detach().cpu()
+        value = value if value.is_sparse else value.contiguous().reshape(-1).view(torch.uint8).numpy()
+    if hasattr(value, "__array__") and hasattr(value, "dtype"):
+        try:
+            array = np.ascontiguousarray(value)
+            digest.update(f"{array.dtype} {array.shape}".encode())
+            digest.update(array.reshape(-1).view(np.uint8).data)
+        except (TypeError, ValueError, RuntimeError):  # of objects, or sparse
+            return 0
+        return 1
+    inside = value if isinstance(value, Mapping) else getattr(value, "__dict__", {})
+    parts = value if isinstance(value, list | tuple) else list(inside.values())
+    return sum([_add_arrays(part, digest, seen, left - 1) for part in parts])

@@ -75,12 +75,10 @@ class RobustnessOptions(RobustnessRequest):
     libero robustness --report er=eval/er sequential=eval/sequential: only the page, of what is there
 
     Attributes:
-        name: Name of the policy on the page (default: what names it).
         beside: Other policies' folders, NAME=DIR, which are drawn beside it.
         report: Only write the page of the first folder, NAME=DIR, with the others beside it.
     """
 
-    name: str | None = None
     beside: tuple[str, ...] = ()
     report: tuple[str, ...] = ()
 

@@ -137,10 +137,9 @@ def match(first: Group, second: Group) -> Matched:
 
 def same_policy(first: EvaluationResult, second: EvaluationResult) -> bool:
     """Return whether two results are of the same policy, apart from the seed: the same weights where they are known."""
-    weights = [r.evaluated.get("weights") for r in (first, second)]
-    if all(weights):
-        return weights[0] == weights[1]
-    a, b = ({k: v for k, v in r.evaluated.items() if k != "seed"} for r in (first, second))
+    known = all(r.evaluated.get("weights") for r in (first, second))
+    other = ("seed", *(("run", "after") if known else ()))
+    a, b = ({k: v for k, v in r.evaluated.items() if k not in other} for r in (first, second))
     return a == b
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.tasks import get_task
+from libero_env.text import shown
 from libero_eval.protocols.adapter import ACTION_DIM, ProtocolAdapter
 from libero_eval.servers.openpi import OpenpiClient
 from libero_eval.servers.serving import PREFIX
@@ -174,7 +175,7 @@ class ServedActor:
         expected = (len(next(iter(obs.values()))), 1, self.action_dim)
         address = self._client.address
         if not isinstance(actions, np.ndarray) or actions.dtype.kind != "f" or actions.shape != expected:
-            came = f"{actions.dtype} {actions.shape}" if isinstance(actions, np.ndarray) else repr(actions)
+            came = f"{actions.dtype} {actions.shape}" if isinstance(actions, np.ndarray) else shown(actions)
             raise ServerError(f"{address} sent as actions {came}; expected floats of shape {expected}")
         if not np.isfinite(actions).all():
             raise ServerError(f"{address} sent actions that are not finite")

@@ -8,12 +8,26 @@ import io
 import os
 import time
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field, with_config
+from typing_extensions import TypedDict
 
+from libero_env.text import shorten, shown
+from libero_env.validation import validate
 from libero_eval.protocols.adapter import PolicyInput
-from libero_eval.servers.transport import API_KEY, Codec, EpisodeStart, Limits, PolicyClient, need, refuse
+from libero_eval.servers.transport import (
+    API_KEY,
+    MAX_MESSAGE_BYTES,
+    Codec,
+    EpisodeStart,
+    Limits,
+    PolicyClient,
+    ending,
+    need,
+    refuse,
+)
 from lifelong.errors import CodecError, ServerError
 
 VIDEO = {"image": "agentview", "wrist_image": "robot0_eye_in_hand"}  # key -> camera
@@ -51,6 +65,14 @@ def _decode(values: Mapping) -> Any:
 GROOT = Codec("GR00T", _encode, _decode)
 
 
+@with_config(extra="allow")
+class _Modality(TypedDict, total=False):
+    """What a server says about a modality, as far as it matters here."""
+
+    modality_keys: Annotated[list[str], Field(max_length=100)]
+    delta_indices: Annotated[list[int], Field(max_length=1000)] | None
+
+
 class GrootClient(PolicyClient):
     """A GR00T server; its modality configuration is what it announces.
 
@@ -70,7 +92,7 @@ class GrootClient(PolicyClient):
 
     def __init__(self, address: str, limits: Limits = Limits()):  # noqa: B008 - frozen
         self.address, self.limits = address, limits
-        self._zmq = need("zmq")
+        self._zmq, _ = need("zmq"), need("msgpack")  # before anything is connected
         self._context = self._zmq.Context()
         self._socket: Any = None
         try:
@@ -128,24 +150,21 @@ class GrootClient(PolicyClient):
                 ) from error
 
     def _modalities(self) -> dict[str, Any]:
-        modalities = self._call("get_modality_config")
-        if not isinstance(modalities, Mapping):
-            raise ServerError(
-                f"{self.address} sent a {type(modalities).__name__} as its modality configuration"
-            )
+        where = f"{self.address}'s modality configuration"
+        modalities = validate(
+            dict[str, _Modality], self._call("get_modality_config"), source=where, error=ServerError
+        )
         for modality, valid in _KEYS.items():
-            config = modalities.get(modality)
-            config = config if isinstance(config, Mapping) else {}
-            keys = config.get("modality_keys")
+            config = modalities.get(modality, {})
+            keys, steps = config.get("modality_keys"), config.get("delta_indices")
             if not keys or not set(keys) <= set(valid):
                 raise ServerError(
-                    f"{self.address} has {modality} keys {keys}; LIBERO's are {', '.join(valid)}: "
+                    f"{self.address} has {modality} keys {shown(keys)}; LIBERO's are {', '.join(valid)}: "
                     "serve a policy of the embodiment libero_sim"
                 )
-            steps = config.get("delta_indices")
-            if modality in ("video", "state") and (steps is None or list(steps) != [0]):
-                raise ServerError(f"{self.address} wants {modality} of the steps {steps}; valid: [0]")
-        return dict(modalities)
+            if modality in ("video", "state") and steps != [0]:
+                raise ServerError(f"{self.address} wants {modality} of the steps {shown(steps)}; valid: [0]")
+        return modalities
 
     def _observation(self, inputs: Sequence[PolicyInput]) -> dict[str, Any]:
         """Return GR00T's observation: images (B, 1, H, W, 3), parts of the state (B, 1, D), instructions."""
@@ -163,12 +182,17 @@ class GrootClient(PolicyClient):
         actions = answer[0] if isinstance(answer, list | tuple) and answer else None
         lacking = [k for k in ACTION if not isinstance(actions, Mapping) or f"action.{k}" not in actions]
         if not isinstance(actions, Mapping) or lacking:
-            came = sorted(map(str, actions)) if isinstance(actions, Mapping) else type(answer).__name__
+            came = type(answer).__name__
+            if isinstance(actions, Mapping):
+                came = shorten(str(sorted(map(str, actions))))
             raise ServerError(
                 f"{self.address} answered {came} without {', '.join(f'action.{k}' for k in lacking)}; start it with "
                 "--use-sim-policy-wrapper"
             )
-        parts = [np.asarray(actions[f"action.{key}"]) for key in ACTION]
+        try:
+            parts = [np.asarray(actions[f"action.{key}"]) for key in ACTION]
+        except ValueError as error:
+            raise ServerError(f"{self.address} sent actions that are not arrays ({error})") from error
         shapes = sorted({part.shape for part in parts})
         if len(shapes) > 1 or len(shapes[0]) != 3 or (shapes[0][0], shapes[0][2]) != (count, 1):
             raise ServerError(
@@ -203,16 +227,16 @@ class GrootClient(PolicyClient):
             self._drop()
             raise
         if isinstance(answer, Mapping) and "error" in answer:
-            hint = ""
-            if "must contain a" in str(answer["error"]):
-                hint = "; start it with --use-sim-policy-wrapper"
-            raise ServerError(f"{self.address} failed ({endpoint}): {answer['error']}{hint}")
+            said = ending(answer["error"])
+            hint = "; start it with --use-sim-policy-wrapper" if "must contain a" in said else ""
+            raise ServerError(f"{self.address} failed ({endpoint}): {said}{hint}")
         return answer
 
     def _connected(self) -> Any:
         if self._socket is None:
             self._socket = self._context.socket(self._zmq.REQ)
             self._socket.setsockopt(self._zmq.LINGER, 0)
+            self._socket.setsockopt(self._zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
             self._socket.connect(self.address)
         return self._socket
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.text import plain
 from libero_eval.protocols.adapter import PolicyInput
 from libero_eval.servers.transport import Codec, Connection, WebSocketClient, array_of, refuse
 
@@ -43,7 +42,7 @@ class OpenpiClient(WebSocketClient):
     @staticmethod
     def stated(announced: Mapping[str, Any]) -> dict[str, Any]:
         """Return the metadata; names of protocols, such as `action.replan`, are taken as they are."""
-        return plain(announced)
+        return dict(announced)
 
     async def greet(self, connection: Connection) -> Mapping[str, Any]:
         """Return the metadata that the server sends first."""

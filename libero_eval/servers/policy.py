@@ -7,22 +7,23 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import numpy as np
+
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import Task, get_task
-from libero_env.text import plain
-from libero_eval.policies import PolicyUnderTest
+from libero_eval.policies import PROBE_TOLERANCE, PolicyUnderTest
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
 from libero_eval.protocols.environment import run_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
-from libero_eval.servers.actors import RemoteActor, ServedActor
+from libero_eval.servers.actors import RemoteActor, ServedActor, checked_actions
 from libero_eval.servers.groot import GrootClient
 from libero_eval.servers.openpi import OpenpiClient
-from libero_eval.servers.serving import FORMAT, PREFIX, SERVER
+from libero_eval.servers.serving import PREFIX, SERVER, announced_run
 from libero_eval.servers.transport import EpisodeStart, Limits, PolicyClient
 from libero_eval.servers.vla_eval import VlaEvalClient
 from lifelong.data.settings import CAMERAS
-from lifelong.errors import ProtocolError, ServerError
+from lifelong.errors import ConfigError, ProtocolError, ServerError
 from lifelong.evaluation.actors import Actor
 
 # scheme of an address -> kind of server, scheme of its transport
@@ -32,6 +33,7 @@ CLIENTS: dict[str, tuple[Any, str]] = {
     "vla-eval": (VlaEvalClient, "ws"),
     "gr00t": (GrootClient, "tcp"),
 }
+PROBED = {"ee_pos": 3, "gripper_states": 2}  # of the fixed observation: name -> size
 
 
 def checked_address(url: str, given: str) -> str:
@@ -60,10 +62,12 @@ class ServerPolicy(PolicyUnderTest):
     """A policy on a server: openpi's (`ws://`), vla-eval's (`vla-eval://`), GR00T's (`gr00t://`), or `libero serve`'s.
 
     What the server announces is part of the policy's identity, and is compared with the protocol before anything runs.
+    A server that announces neither `weights` nor `checkpoint` does not say which policy it serves: that must be named.
 
     Raises:
         UnknownNameError: The address is of no kind of server.
         ServerError: The server is not there, or is of another kind.
+        ConfigError: Nothing says which policy it serves.
     """
 
     def __init__(self, request: Request):
@@ -73,19 +77,21 @@ class ServerPolicy(PolicyUnderTest):
             self.announced, self._kind = client.announced, type(client)
         about = self.announced
         self.is_run = about.get("server") == SERVER  # a policy of this package
-        if self.is_run and about.get("format") != FORMAT:
-            raise ServerError(
-                f"{given} is of format {about.get('format')!r}; this version reads {FORMAT}: "
-                "serve the run with the version that evaluates it"
-            )
-        self.identity = {"server": given, "announced": plain(about)}
+        self.identity = {"server": given, "announced": about}
         self.out = Path("eval") / re.sub(r"\W+", "_", given).strip("_")
+        self._answer: np.ndarray | None = None
         if self.is_run:
-            self.selection = tuple(about["selection"])
-            self.tasks = tuple(get_task(name) for name in about["tasks"] if not name.startswith("file/"))
-            names = [key.removeprefix(PREFIX) for key in about["observation"]]
+            run = announced_run(about, given)
+            self.selection = run["selection"]
+            self.tasks = tuple(get_task(name) for name in run["tasks"] if not name.startswith("file/"))
+            names = [key.removeprefix(PREFIX) for key in run["observation"]]
             self._views = [name for name in names if name in CAMERAS]
             self.cameras = tuple(CAMERAS[view] for view in self._views)
+        elif not (request.name or about.get("weights") or about.get("checkpoint")):
+            raise ConfigError(
+                f"{given} does not say which policy it serves, so another one there would go unnoticed: "
+                "name it, such as --name pi0_step30000 (or let it announce `checkpoint`)"
+            )
 
     def protocol(self, base: EvalProtocol) -> EvalProtocol:
         """Return the protocol; see `PolicyUnderTest`. Of a served run it is the one that the run has in process.
@@ -102,7 +108,7 @@ class ServerPolicy(PolicyUnderTest):
                 about["horizon"],
                 about["settle_steps"],
                 about["robot"],
-                drawing=about.get("drawing"),
+                drawing=about["drawing"],
                 assets=self.request.assets,
             )
         base.check(self._kind.stated(about))
@@ -113,12 +119,39 @@ class ServerPolicy(PolicyUnderTest):
             )
         return base
 
+    def probe(self, protocol: EvalProtocol) -> tuple[float, ...] | None:
+        """Return what the server answers to a fixed observation, if it answers so twice; see `PolicyUnderTest`.
+
+        That of a served run has a digest of its weights.
+        """
+        if self.is_run:
+            return None
+        if self._answer is None:
+            with self._client() as client:
+                first, second = self._ask(client, protocol), self._ask(client, protocol)
+            self._answer = first if np.array_equal(first, second) else np.zeros(0)
+        return tuple(self._answer.tolist()) or None
+
+    def _ask(self, client: PolicyClient, protocol: EvalProtocol) -> np.ndarray:
+        """Return the actions that a server answers to a fixed observation in a new episode, rounded."""
+        task, draws = get_task("libero_goal/0"), np.random.default_rng(0)
+        obs = {name: draws.uniform(-0.5, 0.5, (1, size)) for name, size in PROBED.items()}
+        obs["ee_quat"] = np.array([[0.0, 1.0, 0.0, 0.0]])
+        for camera in protocol.pixels.cameras:
+            size = protocol.pixels.render_size or (128, 128)
+            obs[view_of(camera)] = draws.integers(0, 256, (1, *size, 3), np.uint8)
+        adapter, replan = ProtocolAdapter(protocol, task), protocol.action.replan
+        client.open([EpisodeStart(task, 0)])
+        answer = client.ask(dict(enumerate(adapter.inputs(obs))))[0]
+        client.finish(0, success=False)
+        return checked_actions(answer, replan, self.given).ravel().round(6)
+
     @contextmanager
     def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
         """Yield the actor of episodes, with connections of its own; see `PolicyUnderTest`.
 
         Raises:
-            ServerError: The server is not there any more, or announces something else than at first.
+            ServerError: The server is not there any more, or announces or answers something else than at first.
         """
         episodes = [EpisodeStart(task, state) for state in states]
         with self._client() as client:
@@ -126,15 +159,26 @@ class ServerPolicy(PolicyUnderTest):
             if self.is_run:
                 assert isinstance(client, OpenpiClient)
                 yield ServedActor(client, self.announced, episodes, self.seeds(task, states))
-            else:
-                views = tuple(map(view_of, protocol.pixels.cameras))
-                adapter, replan = ProtocolAdapter(protocol, task), protocol.action.replan
-                yield RemoteActor(client, adapter, episodes, views=views, replan=replan)
+                return
+            if self._answer is not None and self._answer.size:
+                off = np.abs(self._ask(client, protocol) - self._answer).max()
+                if off > PROBE_TOLERANCE:
+                    raise ServerError(
+                        f"{self.given} answers a fixed observation otherwise than at first, by up to {off:.3g}: "
+                        "another policy is served there now; evaluate it by itself"
+                    )
+            views = tuple(map(view_of, protocol.pixels.cameras))
+            adapter, replan = ProtocolAdapter(protocol, task), protocol.action.replan
+            yield RemoteActor(client, adapter, episodes, views=views, replan=replan)
 
     @contextmanager
     def _client(self) -> Iterator[PolicyClient]:
-        scheme, separator, rest = self.given.partition("://")
-        if not separator or scheme not in CLIENTS:
+        scheme, _, rest = self.given.partition("://")
+        if scheme in ("http", "https"):
+            raise ServerError(
+                f"{self.given}: no kind of server has http; write {scheme.replace('http', 'ws')}://{rest}"
+            )
+        if scheme not in CLIENTS:
             raise UnknownNameError("kind of server", scheme, CLIENTS)
         kind, transport = CLIENTS[scheme]
         limits = Limits(answer=self.request.timeout, in_flight=self.request.in_flight)

@@ -1,8 +1,8 @@
 """A run's policy for clients in openpi's protocol: the server, what it announces, and the episodes of a client.
 
 The metadata are sent first; each observation is answered by a map with `actions` and `server_timing`. An error is sent
-as text, its traceback, and ends the connection with code 1011. `GET /healthz` answers `OK`. Source: openpi
-`src/openpi/serving/websocket_policy_server.py`.
+as text, in one line, and ends the connection with code 1011; tracebacks are for the operator. `GET /healthz` answers
+`OK`. Source: openpi `src/openpi/serving/websocket_policy_server.py`.
 
 An episode begins with the first request on a connection, with another `prompt` or `task`, and with a request that has
 `reset: true`; nothing else. Each client has a history and, for stochastic policies, generators of its own.
@@ -11,7 +11,9 @@ An episode begins with the first request on a connection, with another `prompt` 
 import asyncio
 import copy
 import hmac
+import math
 import os
+import sys
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -21,15 +23,22 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from http import HTTPStatus
 from itertools import count
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import TypedDict
 
+from libero_env.errors import LiberoError
+from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.tasks import Task, get_suite, suite_names
+from libero_env.text import printable, shorten, shown
+from libero_env.validation import validate
 from libero_eval.servers.openpi import OPENPI
 from libero_eval.servers.transport import API_KEY, need
 from lifelong.algorithms.base import Algorithm
-from lifelong.errors import PolicyError
+from lifelong.data.settings import CAMERAS, LOW_DIM_KEYS
+from lifelong.errors import PolicyError, ServerError
 from lifelong.evaluation.actors import PolicyActor
 from lifelong.evaluation.restore import LoadedRun
 from lifelong.results.provenance import installed_versions
@@ -41,6 +50,67 @@ _SERVED = 5  # first word of the seeds of episodes whose client sends none
 # names of openpi's LIBERO observations, and what of a policy's inputs follows from them
 _OPENPI_IMAGES = {"agentview_rgb": "image", "eye_in_hand_rgb": "wrist_image"}
 _OPENPI_STATE = {"ee_pos": slice(0, 3), "gripper_states": slice(6, 8)}
+MAX_ROWS = 100  # of a request; a task has fifty initial states
+MAX_WORDS = 1000  # characters of an instruction
+
+
+class _Array(TypedDict):
+    dtype: str
+    shape: Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(min_length=1, max_length=3)]
+
+
+class _Actions(_Array):
+    chunk: int
+    replan: int
+
+
+class Announced(TypedDict):
+    """What `libero serve` announces to every client."""
+
+    server: str
+    format: int
+    versions: dict[str, str]
+    run: str
+    after: int
+    weights: Annotated[str, Field(min_length=1)]
+    protocol: str
+    horizon: int
+    settle_steps: int
+    drawing: str | None
+    robot: str
+    selection: tuple[Annotated[int, Field(ge=0, lt=NUM_INIT_STATES)], ...]
+    observation: dict[str, _Array]
+    images: str
+    actions: _Actions
+    gripper: str
+    openpi_names: bool
+    tasks: dict[str, str]
+    reset: str
+
+
+def announced_run(about: Mapping[str, Any], address: str) -> Announced:
+    """Return the metadata of `libero serve`, checked.
+
+    Raises:
+        ServerError: They are of another format, or something is missing or of another kind.
+    """
+    if about.get("format") != FORMAT:
+        raise ServerError(
+            f"{address} is of format {about.get('format')!r}; this version reads {FORMAT}: "
+            "serve the run with the version that evaluates it"
+        )
+    run: Announced = validate(Announced, about, source=f"the metadata of {address}", error=ServerError)
+    views = [key for key, one in run["observation"].items() if key.removeprefix(PREFIX) in CAMERAS]
+    known = {PREFIX + name for name in (*CAMERAS, *LOW_DIM_KEYS)}
+    if (
+        run["observation"].keys() - known
+        or not views
+        or any(len(run["observation"][v]["shape"]) != 3 for v in views)
+    ):
+        raise ServerError(
+            f"the metadata of {address}: observation must have images, and only {', '.join(sorted(known))}"
+        )
+    return run
 
 
 @dataclass(frozen=True)
@@ -134,36 +204,36 @@ class ServedPolicy:
         spec = self.run.policy.spec
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(spec.views, (*spec.image_size, 3))
         shapes |= {name: (size,) for name, size in spec.proprio.items()}
-        first = np.ndim(message.get(PREFIX + spec.views[0], 0))
-        rows = first == 4
+        rows = _array(message.get(PREFIX + spec.views[0], 0), PREFIX + spec.views[0]).ndim == 4
         obs = {name: _checked(message, name, shape, rows) for name, shape in shapes.items()}
         if len({len(value) for value in obs.values()}) > 1:
             raise PolicyError(
                 f"numbers of rows differ: { {name: len(value) for name, value in obs.items()} }"
             )
         task = self._task(message, before)
-        seeds = message.get("seed")
+        seeds, reset = message.get("seed"), message.get("reset", False)
         if seeds is not None:
             seeds = _seeds(seeds, len(next(iter(obs.values()))), rows)
-        return Request(obs, rows, task, bool(message.get("reset", False)), seeds)
+        if not isinstance(reset, bool | np.bool_):
+            raise PolicyError("reset is neither true nor false")
+        return Request(obs, rows, task, bool(reset), seeds)
 
     def _task(self, message: Mapping[str, Any], before: Task | None) -> Task:
         """Return the task that a request names by `task`, `suite/index`, or by its instruction, `prompt`.
 
         `instruction` is what the policy is told instead of the task's own words.
         """
-        prompt, name = message.get("prompt"), message.get("task")
+        prompt, name, words = (_words(message, key) for key in ("prompt", "task", "instruction"))
         if prompt is None and name is None and before is not None:
             return before
         by_id = {task.id: task for task in self.run.tasks}
-        if isinstance(name, str):
+        if name is not None:
             tasks = [by_id[name]] if name in by_id else [t for t in _tasks() if t.id == name]
         else:
             tasks = [t for t in self.run.tasks if t.language == prompt]
             tasks = tasks or [t for t in _tasks() if t.language == prompt]
         if len(tasks) == 1 and prompt in (None, tasks[0].language):
-            words = message.get("instruction")
-            return replace(tasks[0], language=words) if isinstance(words, str) else tasks[0]
+            return tasks[0] if words is None else replace(tasks[0], language=words)
         if len(tasks) > 1:
             ids = ", ".join(t.id for t in tasks)
             raise PolicyError(
@@ -259,19 +329,34 @@ def _tasks() -> list[Task]:
     return [task for name in suite_names() for task in get_suite(name).tasks]
 
 
+def _words(message: Mapping[str, Any], key: str) -> str | None:
+    """Return a text of a request; None if it has none."""
+    text = message.get(key)
+    if text is not None and not (isinstance(text, str) and len(text) <= MAX_WORDS):
+        raise PolicyError(f"{key} is not a text of at most {MAX_WORDS} characters")
+    return text
+
+
+def _array(value: Any, key: str) -> np.ndarray:
+    try:
+        return np.asarray(value)
+    except ValueError as error:
+        raise PolicyError(f"{key} is not an array ({error})") from None
+
+
 def _checked(message: Mapping[str, Any], name: str, shape: tuple[int, ...], rows: bool) -> np.ndarray:
     """Return an array of a request with a leading axis, (B, *shape)."""
     key, image = PREFIX + name, len(shape) == 3
     if key not in message:
-        names = ", ".join(sorted(str(k) for k in message)) or "nothing"
+        names = shorten(", ".join(sorted(str(k) for k in message)) or "nothing", 500)
         raise PolicyError(f"the request lacks {key}; it has {names}")
-    value = np.asarray(message[key])
+    value = _array(message[key], key)
     expected = f"({'B, ' if rows else ''}{', '.join(map(str, shape))})"
     wanted = "u" if image else "fiu"
     batch = value if rows else value[None]
     if value.dtype.kind not in wanted or (image and value.dtype != np.uint8):
         raise PolicyError(f"{key} has dtype {value.dtype}; valid: {'uint8' if image else 'floats'}")
-    if batch.shape[1:] != shape or not len(batch):
+    if batch.shape[1:] != shape or not 1 <= len(batch) <= MAX_ROWS:
         raise PolicyError(f"{key} has shape {value.shape}; this policy's is {expected}")
     if not image and not np.isfinite(batch).all():
         raise PolicyError(f"{key} has values that are not finite")
@@ -280,10 +365,10 @@ def _checked(message: Mapping[str, Any], name: str, shape: tuple[int, ...], rows
 
 def _seeds(seeds: Any, count: int, rows: bool) -> list[tuple[int, ...]]:
     """Return the words of each row's seed: a list of integers, or one such list for each row."""
-    words = np.asarray(seeds if rows else [seeds])
+    words = _array(seeds if rows else [seeds], "seed")
     if words.ndim != 2 or words.dtype.kind not in "iu" or len(words) != count or (words < 0).any():
         raise PolicyError(
-            f"seed is {seeds!r}; valid: integers from 0, as a list, or a list for each of {count} rows"
+            f"seed is {shown(seeds)}; valid: integers from 0, as a list, or a list for each of {count} rows"
         )
     return [tuple(map(int, row)) for row in words]
 
@@ -324,7 +409,9 @@ class PolicyServer:
             OSError: The port is taken.
         """
         serve = need("websockets.asyncio.server").serve
-        options = {"compression": None, "max_size": None, "process_request": self._respond}
+        row = sum(8 * math.prod(one["shape"]) for one in self._metadata["observation"].values())
+        most = (1 << 20) + MAX_ROWS * row  # of a request, [bytes]
+        options = {"compression": None, "max_size": most, "process_request": self._respond}
         async with serve(self._handle, self._host, self._port, **options) as server:
             on_ready(server.sockets[0].getsockname()[1])
             await server.serve_forever()
@@ -343,8 +430,8 @@ class PolicyServer:
                 last = time.perf_counter() - began
         except closed:
             return
-        except Exception:  # noqa: BLE001 - whatever went wrong is for the client to read
-            await self._fail(socket, traceback.format_exc())
+        except Exception as error:  # noqa: BLE001 - whatever went wrong ends this client only
+            await self._fail(socket, error)
         finally:
             await self._in_worker(session.close)
 
@@ -362,11 +449,19 @@ class PolicyServer:
     async def _in_worker(self, work: Callable[[], Any]) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self._worker, work)
 
-    async def _fail(self, socket: Any, text: str) -> None:
-        """Send an error and close the connection; the client may be gone."""
+    async def _fail(self, socket: Any, error: Exception) -> None:
+        """Send an error in one line, tell the operator, and close the connection; the client may be gone."""
+        told = isinstance(error, LiberoError)
+        text = (
+            f"{type(error).__name__}: {error}"
+            if told
+            else f"{type(error).__name__} in the server; its operator sees where"
+        )
+        seen = text if told else "".join(traceback.format_exception(error))
+        print(printable(f"client {socket.remote_address}: {seen}"), file=sys.stderr, flush=True)
         try:
             await socket.send(text)
-            await socket.close(1011, "Internal server error. Traceback included in previous frame.")
+            await socket.close(1011, "Internal server error. Its text is in the previous frame.")
         except need("websockets").exceptions.ConnectionClosed:
             return
 

@@ -5,12 +5,13 @@ Errors name the server. `libero_eval.servers` has one module for each kind of se
 
 import asyncio
 import importlib
+import itertools
 import math
 import os
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -18,14 +19,17 @@ import numpy as np
 
 from libero_env.errors import MissingPackageError
 from libero_env.tasks import Task
-from libero_env.text import plain, shorten
+from libero_env.text import json_safe, shorten
 from libero_eval.protocols.adapter import PolicyInput
 from lifelong.errors import CodecError, ConnectionLost, ServerError
 
 T = TypeVar("T")
 
 API_KEY = "LIBERO_API_KEY"  # environment variable with the key that servers ask for
-MAX_MESSAGE_BYTES = 256 << 20  # of a message that is received; policies send less than 1 MiB
+MAX_MESSAGE_BYTES = 4 << 20  # of an answer; chunks of actions have some kB
+MAX_PARTS = 10_000  # lists and maps of a message
+MAX_DEPTH = 30  # lists and maps within each other
+MAX_TEXT = 2000  # characters of a server's error that are shown, its last ones
 _END_SECONDS = 10.0  # for the thread of connections to end
 _FIRST_DELAY, _LONGEST_DELAY = 0.1, 5.0  # between attempts to connect, [s]
 _DISTRIBUTIONS = {"websockets": "websockets", "msgpack": "msgpack", "zmq": "pyzmq"}
@@ -84,14 +88,39 @@ class Codec:
         Raises:
             CodecError: The bytes are not a message of the protocol.
         """
+        parts = itertools.count(1)
+
+        def counted(value: Any) -> Any:
+            if next(parts) > MAX_PARTS:
+                raise ValueError(f"more than {MAX_PARTS} lists and maps")
+            return value
+
         try:
-            return need("msgpack").unpackb(data, object_hook=self.decode)
+            found = need("msgpack").unpackb(
+                data, object_hook=lambda value: self.decode(counted(value)), list_hook=counted
+            )
+            _check_depth(found)
         except Exception as error:  # noqa: BLE001 - bytes of a stranger: msgpack and NumPy raise many kinds
             start = bytes(data[:16]).hex(" ")
             raise CodecError(
-                f"{len(data)} bytes that are not a message of {self.name} ({type(error).__name__}: {error}); "
-                f"they begin with {start or 'nothing'}"
+                f"{len(data)} bytes that are not a message of {self.name} ({type(error).__name__}: "
+                f"{shorten(str(error), 200)}); they begin with {start or 'nothing'}"
             ) from error
+        return found
+
+
+def _check_depth(value: Any, left: int = MAX_DEPTH) -> None:
+    parts = value.values() if isinstance(value, Mapping) else value if isinstance(value, list) else ()
+    if parts and not left:
+        raise ValueError(f"lists and maps within each other, more than {MAX_DEPTH} deep")
+    for part in parts:
+        _check_depth(part, left - 1)
+
+
+def ending(text: Any) -> str:
+    """Return the end of a server's text for a message; it may have any size."""
+    said = str(text).strip()
+    return said if len(said) <= MAX_TEXT else f"... {said[-MAX_TEXT:]}"
 
 
 def refuse(dtype: np.dtype, kinds: str) -> None:
@@ -141,7 +170,7 @@ class PolicyClient(ABC):
 
     Attributes:
         address: URL of the server.
-        announced: What the server says about itself when it is first reached.
+        announced: What the server says about itself when it is first reached, plain data.
         codec: Encoding of the messages.
     """
 
@@ -185,10 +214,10 @@ class PolicyClient(ABC):
         Raises:
             ServerError: It does not.
         """
-        if not same(announced, first):
+        if announced != first:
             raise ServerError(
-                f"{self.address} announces {shorten(str(plain(announced)), 200)}, but at first "
-                f"{shorten(str(plain(first)), 200)}: another policy is served there now; evaluate it by itself"
+                f"{self.address} announces {shorten(str(announced), 200)}, but at first "
+                f"{shorten(str(first), 200)}: another policy is served there now; evaluate it by itself"
             )
 
     def image(self, given: PolicyInput, camera: str) -> np.ndarray:
@@ -202,15 +231,6 @@ class PolicyClient(ABC):
                 f"{self.address} needs images of {camera}; the protocol has {', '.join(given.images)} (pixels.cameras)"
             )
         return given.images[camera]
-
-
-def same(a: Any, b: Any) -> bool:
-    """Return whether two announcements are equal, arrays included."""
-    if isinstance(a, Mapping) and isinstance(b, Mapping):
-        return a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
-    if isinstance(a, list | tuple) and isinstance(b, list | tuple):
-        return len(a) == len(b) and all(map(same, a, b))
-    return type(a) is type(b) and np.array_equal(a, b)
 
 
 class LoopThread:
@@ -251,25 +271,31 @@ class Connection:
 
     def __init__(self, socket: Any, address: str, codec: Codec, limits: Limits):
         self._socket = socket
+        self._next: asyncio.Task[Any] | None = None  # the message that is waited for
         self.address, self.codec, self.limits, self.sent = address, codec, limits, 0
+
+    async def check_quiet(self) -> None:
+        """Check that no message is there that nobody has asked for; it would be taken for an answer to a later request.
+
+        Raises:
+            ServerError: There is one.
+        """
+        self._next = self._next or asyncio.ensure_future(self._socket.recv())
+        await asyncio.sleep(0)
+        if self._next.done() and not self._next.exception():
+            raise ServerError(f"{self.address} sent a message before it was asked; nothing of it is used")
 
     async def send(self, message: Any) -> None:
         """Send a message.
 
         Raises:
             CodecError: The protocol cannot carry it.
-            ServerError: The server takes nothing in time.
+            ServerError: The server takes nothing in time, or has sent what it was not asked for.
             ConnectionLost: The connection is broken.
         """
         data = self.codec.pack(message)
-        try:
-            await asyncio.wait_for(self._socket.send(data), self.limits.answer)
-        except TimeoutError as error:
-            raise ServerError(
-                f"{self.address} took no request within {self.limits.answer:g} s; --timeout sets the limit"
-            ) from error
-        except need("websockets").exceptions.ConnectionClosed as error:
-            raise self._lost(error) from error
+        await self.check_quiet()
+        await self._in_time(self._socket.send(data), "took no request", "")
         self.sent += 1
 
     async def receive(self, what: str) -> Any:
@@ -282,20 +308,26 @@ class Connection:
             ServerError: Nothing comes in time, or bytes that are not a message.
             ConnectionLost: The connection is broken.
         """
-        try:
-            data = await asyncio.wait_for(self._socket.recv(), self.limits.answer)
-        except TimeoutError as error:
-            raise ServerError(
-                f"{self.address} sent nothing within {self.limits.answer:g} s ({what}); --timeout sets the limit"
-            ) from error
-        except need("websockets").exceptions.ConnectionClosed as error:
-            raise self._lost(error) from error
+        waiting, self._next = self._next or self._socket.recv(), None
+        data = await self._in_time(waiting, "sent nothing", f" ({what})")
         if isinstance(data, str):
             return data
         try:
             return self.codec.unpack(data)
         except CodecError as error:
             raise ServerError(f"{self.address} sent {error} ({what})") from error
+
+    async def _in_time(self, work: Awaitable[T], failed: str, what: str) -> T:
+        try:
+            return await asyncio.wait_for(work, self.limits.answer)
+        except TimeoutError as error:
+            raise ServerError(
+                f"{self.address} {failed} within {self.limits.answer:g} s{what}; --timeout sets the limit"
+            ) from error
+        except need("websockets").exceptions.ConnectionClosed as error:
+            closing = error.rcvd or error.sent
+            why = f"closed with {closing.code} {closing.reason}".strip() if closing else "broken off"
+            raise ConnectionLost(f"the connection to {self.address} was {why}") from error
 
     async def receive_map(self, what: str) -> Mapping[str, Any]:
         """Return the next message, which must be a map; text is a traceback. See `receive`."""
@@ -308,19 +340,17 @@ class Connection:
             ServerError: It is something else; a text is the server's traceback.
         """
         if isinstance(message, str):
-            raise ServerError(f"{self.address} failed; its traceback:\n{message.rstrip()}")
+            raise ServerError(f"{self.address} failed; its traceback:\n{ending(message)}")
         if not isinstance(message, Mapping):
             raise ServerError(f"{self.address} sent a {type(message).__name__} as {what}; expected a map")
         return message
 
     async def close(self) -> None:
         """Close the connection; one that is broken is closed already."""
+        if self._next is not None:
+            self._next.cancel()
+            await asyncio.gather(self._next, return_exceptions=True)
         await self._socket.close()
-
-    def _lost(self, error: Any) -> ConnectionLost:
-        closing = error.rcvd or error.sent
-        why = f"closed with {closing.code} {closing.reason}".strip() if closing else "broken off"
-        return ConnectionLost(f"the connection to {self.address} was {why}")
 
 
 async def connect(address: str, codec: Codec, limits: Limits) -> Connection:
@@ -382,12 +412,14 @@ class WebSocketClient(PolicyClient):
     """
 
     def __init__(self, address: str, limits: Limits = Limits()):  # noqa: B008 - frozen
+        for package in ("websockets", "msgpack"):  # before anything is connected
+            need(package)
         self.address, self.limits = address, limits
         self._loop: LoopThread | None = LoopThread()
         self._connections: list[Connection] = []
         self._started: list[float] = []
         try:
-            self.announced = self._loop.run(self._first())
+            self.announced = json_safe(self._loop.run(self._first()))
         except BaseException:
             self.close()
             raise
@@ -427,6 +459,7 @@ class WebSocketClient(PolicyClient):
         outcome = {"metrics": {"success": success}, "elapsed_sec": round(seconds, 3)}
         connection = self._connections[simulation]
         self.run(self.end(connection, outcome))
+        self.run(connection.check_quiet())
         self.run(connection.close())
 
     def close(self) -> None:
@@ -452,7 +485,7 @@ class WebSocketClient(PolicyClient):
         for episode in episodes:
             connection = await connect(self.address, self.codec, self.limits)
             self._connections.append(connection)  # what is open is closed, also after an error
-            self.check_same(await self.greet(connection), self.announced)
+            self.check_same(json_safe(await self.greet(connection)), self.announced)
             await self.begin(connection, episode)
 
     async def _ask(self, inputs: Mapping[int, PolicyInput]) -> dict[int, Any]:
@@ -463,7 +496,7 @@ class WebSocketClient(PolicyClient):
                 answer = await self.infer(self._connections[simulation], given)
             if "actions" not in answer:
                 raise ServerError(
-                    f"{self.address} answered a map with {sorted(map(str, answer)) or 'nothing'} "
+                    f"{self.address} answered a map with {shorten(str(sorted(map(str, answer)) or 'nothing'))} "
                     f"and without `actions`, in {self.codec.name}'s protocol"
                 )
             return answer["actions"]

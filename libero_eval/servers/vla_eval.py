@@ -5,12 +5,16 @@ Source: vla-eval 0.8.0, `vla_eval/protocol`, `vla_eval/connection.py` and `vla_e
 
 import io
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from PIL import Image
+from pydantic import with_config
+from typing_extensions import TypedDict
 
+from libero_env.text import plain, shown
+from libero_env.validation import validate
 from libero_eval.protocols.adapter import PolicyInput
 from libero_eval.servers.transport import (
     Codec,
@@ -18,6 +22,7 @@ from libero_eval.servers.transport import (
     EpisodeStart,
     WebSocketClient,
     array_of,
+    ending,
     refuse,
 )
 from lifelong.errors import ProtocolMismatchError, ServerError
@@ -30,13 +35,38 @@ _ACTIONS = {
     "gripper": ("binary_close_positive", "raw"),
 }
 # `observation_params` are arguments of that benchmark
-_FIELDS: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    "seed": ("world.env_seed", int),
-    "env_seed": ("world.env_seed", int),  # goes before `seed`
-    "num_steps_wait": ("episode.settle_steps", int),
-    "max_steps": ("episode.horizon", int),
-    "absolute_action": ("world.delta", lambda value: not value),
+_FIELDS = {
+    "seed": "world.env_seed",
+    "env_seed": "world.env_seed",  # goes before `seed`
+    "num_steps_wait": "episode.settle_steps",
+    "max_steps": "episode.horizon",
 }
+MAX_PIXELS = 1 << 22
+
+
+@with_config(extra="allow")
+class _Params(TypedDict, total=False):
+    seed: int | None
+    env_seed: int | None
+    num_steps_wait: int | None
+    max_steps: int | None
+    absolute_action: bool | None
+    quat_no_antipodal: bool | None
+    send_state: bool | None
+    send_wrist_image: bool | None
+
+
+@with_config(extra="allow")
+class _Spec(TypedDict, total=False):
+    format: str | None
+
+
+@with_config(extra="allow")
+class _Hello(TypedDict, total=False):
+    """What a server says about itself, as far as it matters here."""
+
+    action_spec: dict[str, _Spec] | None
+    observation_params: _Params | None
 
 
 def _encode(value: np.ndarray | np.generic) -> Any:
@@ -55,7 +85,10 @@ def _encode(value: np.ndarray | np.generic) -> Any:
 
 def _decode(values: Mapping) -> Any:
     if "__image__" in values and values["format"] != "raw":
-        return np.array(Image.open(io.BytesIO(values["data"])))
+        image = Image.open(io.BytesIO(values["data"]), formats=["PNG"])  # other formats start other programs
+        if [image.height, image.width] != values["shape"][:2] or image.width * image.height > MAX_PIXELS:
+            raise ValueError(f"an image of {image.height} x {image.width} for shape {values['shape']}")
+        return np.array(image)
     if "__image__" in values or "__ndarray__" in values:
         refuse(np.dtype(values["dtype"]), "SUMm")
         return array_of(values["data"], values["dtype"], values["shape"])
@@ -80,18 +113,16 @@ class VlaEvalClient(WebSocketClient):
         wrong = [
             f"action_spec {name}: LIBERO takes {_ACTIONS[name][0]}, the server sends {spec.get('format')}"
             for name, spec in (announced.get("action_spec") or {}).items()
-            if name in _ACTIONS and isinstance(spec, Mapping) and spec.get("format") not in _ACTIONS[name]
+            if name in _ACTIONS and spec.get("format") not in _ACTIONS[name]
         ]
         if wrong:
             raise ProtocolMismatchError(
                 "the policy was made for another convention; nothing was run. " + "; ".join(wrong)
             )
         params = announced.get("observation_params") or {}
-        values = {
-            field: convert(params[name])
-            for name, (field, convert) in _FIELDS.items()
-            if params.get(name) is not None
-        }
+        values = {field: params[name] for name, field in _FIELDS.items() if params.get(name) is not None}
+        if params.get("absolute_action") is not None:
+            values["world.delta"] = not params["absolute_action"]
         if params.get("send_state") and "quat_no_antipodal" in params:
             rotation = "axis_angle" if params["quat_no_antipodal"] else "axis_angle_positive"
             values["proprioception.rotation"] = rotation
@@ -101,7 +132,8 @@ class VlaEvalClient(WebSocketClient):
         """Exchange hellos and return the server's."""
         hello = {"harness_version": VERSION, "protocol_version": 1, "benchmark": "libero"}
         await self._send(connection, "hello", hello)
-        return await self._receive(connection, "hello")
+        said = plain(await self._receive(connection, "hello"))
+        return validate(_Hello, said, source=f"{connection.address}'s hello", error=ServerError)
 
     async def begin(self, connection: Connection, episode: EpisodeStart) -> None:
         """Send the start of an episode with the task, as the harness does; the server does not answer."""
@@ -148,10 +180,10 @@ class VlaEvalClient(WebSocketClient):
         if message["type"] == "error":
             payload = message["payload"]
             text = payload.get("error", payload) if isinstance(payload, Mapping) else payload
-            raise ServerError(f"{connection.address} failed: {text}")
+            raise ServerError(f"{connection.address} failed: {ending(text)}")
         if message["type"] != kind or message["seq"] != connection.sent:
             raise ServerError(
-                f"{connection.address} sent {message['type']} with seq {message['seq']}; expected {kind} with "
-                f"{connection.sent}"
+                f"{connection.address} sent {shown(message['type'])} with seq {shown(message['seq'])}; expected "
+                f"{kind} with {connection.sent}"
             )
         return connection.as_map(message["payload"], f"payload of {kind}")

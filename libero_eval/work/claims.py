@@ -2,7 +2,8 @@
 
 A claim is a file that only one process can create (`O_EXCL`, which NFS keeps since version 3). Its holder touches it
 while it works. A claim is abandoned when it has not been touched for the length of a lease, or, at once, when its
-holder ran on this machine and is gone. Times are those of the file server, so that clocks may differ.
+holder ran on this machine and is gone. Times are those of the file server, so that clocks may differ; a claim that is
+more than a lease in the future, as after that clock was set back, is abandoned too.
 
 Claims save work, they do not guard results: two processes may both believe they hold a unit, for instance after one was
 suspended. Whoever publishes a unit's result first wins (see `libero_eval.work.store`).
@@ -12,17 +13,24 @@ import json
 import os
 import secrets
 import socket
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
+from pydantic import Field
+
+from libero_env.errors import InvalidInputError
 from libero_env.parallel import is_running, process_start, this_machine
+from libero_env.validation import validate
 
 LEASE = 120.0  # s; network file systems may show a time of modification that is a minute old
 BEATS = 8  # of a lease: how often a holder touches its claim
+MAX_BYTES = 64 << 20  # of a file in the folder of an evaluation
 
 
 @dataclass(frozen=True)
@@ -41,19 +49,9 @@ class Claim:
     unit: str
     host: str
     machine: str
-    pid: int
-    process_start: int | None
+    pid: Annotated[int, Field(ge=1, le=2**31 - 1)]
+    process_start: Annotated[int, Field(ge=0, le=2**63 - 1)] | None
     token: str
-
-    @property
-    def holder(self) -> str:
-        """The process as text, such as `node3:4711`."""
-        return f"{self.host}:{self.pid}"
-
-    @property
-    def is_gone(self) -> bool:
-        """Whether the holder ran on this machine and has ended. False where that cannot be known."""
-        return self.machine == this_machine() and not is_running(self.pid, self.process_start)
 
 
 @dataclass(frozen=True)
@@ -72,9 +70,16 @@ class Held:
     silent: float
     text: str
 
+    @property
+    def holder(self) -> str:
+        """The process as text, such as `node3:4711`."""
+        return f"{self.claim.host}:{self.claim.pid}" if self.claim else "a process that is starting"
+
     def is_abandoned(self, lease: float) -> bool:
         """Return whether nobody works on the unit any more."""
-        return self.silent > lease or (self.claim is not None and self.claim.is_gone)
+        claim = self.claim
+        gone = claim and claim.machine == this_machine() and not is_running(claim.pid, claim.process_start)
+        return abs(self.silent) > lease or bool(gone)
 
 
 class Claims:
@@ -167,16 +172,14 @@ class Claims:
 
     def _read(self, unit: str, now: float) -> Held | None:
         """Return a claim, or None if there is none. Opening the file makes NFS ask the server for its times."""
-        try:
-            with open(self._path(unit), encoding="utf-8") as stream:
-                touched, text = os.fstat(stream.fileno()).st_mtime, stream.read()
-        except FileNotFoundError:
+        found = _text_of(self._path(unit))
+        if found is None:
             return None
         try:
-            claim = Claim(**json.loads(text))
-        except (ValueError, TypeError):
+            claim = validate(Claim, parse(found[0]))
+        except InvalidInputError:  # its holder has only just begun to write it, or it is damaged
             claim = None
-        return Held(unit, claim, now - touched, text)
+        return Held(unit, claim, now - found[1], found[0])
 
     def _remove(self, held: Held) -> bool:
         """Remove a claim, but not another that has taken its place; return whether it is gone."""
@@ -187,7 +190,8 @@ class Claims:
         except FileNotFoundError:
             return True
         try:
-            if aside.read_text(encoding="utf-8") == held.text:
+            found = _text_of(aside)
+            if found is None or found[0] == held.text:
                 return True
             with suppress(OSError):
                 os.link(aside, path)
@@ -206,3 +210,45 @@ class Claims:
         finally:
             with suppress(OSError):
                 probe.unlink(missing_ok=True)
+
+
+def _text_of(path: Path) -> tuple[str, float] | None:
+    """Return the text of a claim, empty if it cannot be read, and when it was touched; None if there is none."""
+    try:
+        try:
+            return read_regular(path)
+        except InvalidInputError:
+            return "", path.lstat().st_mtime
+    except FileNotFoundError:
+        return None
+
+
+def read_regular(path: Path) -> tuple[str, float]:
+    """Return the text of a file in the folder of an evaluation, and when it was modified; it may be of a stranger.
+
+    Raises:
+        FileNotFoundError: There is none.
+        InvalidInputError: It is a pipe or device, too large, not text, or cannot be read.
+    """
+    try:
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
+            about = os.fstat(stream.fileno())
+            if not stat.S_ISREG(about.st_mode) or about.st_size > MAX_BYTES:
+                raise InvalidInputError(f"{path} is not a file of at most {MAX_BYTES >> 20} MiB")
+            return stream.read(MAX_BYTES).decode(), about.st_mtime
+    except FileNotFoundError:
+        raise
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInputError(f"{path} cannot be read ({error})") from None
+
+
+def parse(text: str) -> Any:
+    """Return the JSON of a text.
+
+    Raises:
+        InvalidInputError: It is not JSON.
+    """
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise InvalidInputError(f"not JSON ({error}): broken or incomplete") from None

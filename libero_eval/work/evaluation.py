@@ -53,6 +53,7 @@ class Evaluation:
         record_every: Number of control steps between two frames.
         progress: Whether to show progress bars.
         versions: Versions of the packages and models.
+        probe: What the policy answers to a fixed observation, where that repeats; another answer is another policy.
         policy_threads: Number of threads of the policy on the CPU, on which its bits depend; None where the policy is
             not one of this package, or runs elsewhere. Whoever runs the evaluation sets it.
         lease: Time after which a unit of a silent process is given to another, [s].
@@ -72,6 +73,7 @@ class Evaluation:
     record_every: int = 4
     progress: bool = False
     versions: Mapping[str, str] = field(default_factory=installed_versions)
+    probe: Sequence[float] | None = None
     policy_threads: int | None = None
     lease: float = LEASE
 
@@ -83,18 +85,16 @@ class Evaluation:
     @cached_property
     def store(self) -> WorkStore:
         """The folder of the results, which other processes may share."""
-        simulation = {k: v for k, v in self.versions.items() if k in DECISIVE}
         plan = {
             "format": PLAN_FORMAT,
             "evaluated": dict(self.identity),
             "protocol": self._resolved_protocol,
-            "init_states": self.init_states,
             "unit_starts": self.unit_starts,
             "errors_are_failures": self.errors_are_failures,
             "policy_threads": self.policy_threads,
-            "simulation": simulation,
+            "simulation": {k: v for k, v in self.versions.items() if k in DECISIVE},
         }
-        return WorkStore(self.out, plan, self.lease)
+        return WorkStore(self.out, plan, self.probe, self.lease)
 
     @property
     def _resolved_protocol(self) -> dict[str, Any]:
@@ -232,15 +232,15 @@ class Evaluation:
             actions=tuple(e.actions for e in done.episodes),
             attempts=attempts if any(attempts) else (),
         )
-        environment = describe_environment(env)
-        return UnitResult(result, environment, self.versions, this_process(), started, time.time())
+        environment, versions = describe_environment(env), dict(self.versions)
+        return UnitResult(result, environment, versions, this_process(), started, time.time())
 
     def _times(self, done: Mapping[str, UnitResult]) -> dict[str, Any]:
         spans = {unit: done[unit.name] for unit in self.units}
         results = spans.values()
         return {
-            "started": _iso(min(r.started for r in results)),
-            "finished": _iso(max(r.finished for r in results)),
+            "started": iso_time(min(r.started for r in results)),
+            "finished": iso_time(max(r.finished for r in results)),
             "busy_seconds": round(busy_seconds((r.started, r.finished) for r in results), 2),
             "seconds": {
                 task.id: round(sum(r.finished - r.started for u, r in spans.items() if u.task is task), 2)
@@ -267,5 +267,6 @@ def _acted_task(env: VectorEnv, unit: Unit) -> Task:
     return task if isinstance(task, Task) else unit.task
 
 
-def _iso(seconds: float) -> str:
+def iso_time(seconds: float) -> str:
+    """Return a time, seconds since the epoch, as text."""
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="seconds")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from libero_env.tasks.published import parse_plus_id
-from libero_env.text import duration
+from libero_env.text import duration, shorten
 from libero_eval.evaluation_file import FILE_NAME, TaskResult, overall
 from libero_eval.work.store import UnitResult, WorkStore, read_plan, read_unit
 from lifelong.stats.intervals import Estimate
@@ -100,20 +100,20 @@ def describe_status(path: Path) -> str:
         LifelongError: The folder holds no evaluation, or a broken file.
     """
     plan = read_plan(path)
-    store = WorkStore(path, plan)
-    files = {name: path / "units" / f"{name}.json" for name in plan["units"]}
-    done = {name: read_unit(file)[0] for name, file in files.items() if file.is_file()}
-    held, errors = store.claims.held(), store.errors()
+    store, units = WorkStore(path, plan), plan["units"]
+    files = {name: path / "units" / f"{name}.json" for name in units}
+    done = {name: read_unit(file)[0] for name, file in files.items() if file.exists()}
+    held = {name: one for name, one in store.held().items() if name in units}
+    errors = {name: one for name, one in store.errors().items() if name in units}
     lines = [
-        f"policy    {', '.join(f'{k} {v}' for k, v in plan['evaluated'].items())}",
-        f"progress  {measure_progress(plan['units'], done, len(held), len(errors))}",
+        f"policy    {', '.join(f'{k} {shorten(str(v))}' for k, v in plan['evaluated'].items())}",
+        f"progress  {measure_progress(units, done, len(held), len(errors))}",
     ]
     for name, claim in sorted(held.items()):
-        who = claim.claim.holder if claim.claim else "a process that is starting"
-        lines.append(f"running   {name} by {who}, seen {max(0.0, claim.silent):.0f} s ago")
+        lines.append(f"running   {name} by {claim.holder}, seen {max(0.0, claim.silent):.0f} s ago")
     for name, error in errors.items():
         lines.append(f"error     {name}, {error.attempts} attempts: {error.last}; see {error.path}")
-    if len(done) == len(files):
+    if len(done) == len(units):
         lines.append(f"result    {path / FILE_NAME}")
     elif not held:
         lines.append("stopped   no process works on it; the same command goes on")

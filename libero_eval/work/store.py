@@ -3,7 +3,7 @@
 Any number of processes share it. A unit's result is a file with the unit's name, which appears in one step and is never
 replaced: nothing is lost when a process is killed, and nothing can be counted twice.
 
-    evaluation.json   what is evaluated; a process that evaluates anything else is refused
+    evaluation.json   what is evaluated; a process that evaluates anything else is refused, unless it only adds to it
     units/            results, one file for each unit
     claims/           which process works on which unit
     errors/           errors of units, with tracebacks
@@ -20,15 +20,20 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import TypedDict
 
 from libero_env.errors import InvalidInputError
-from libero_env.storage import create_text, read_json, write_json
+from libero_env.storage import create_text, write_json
 from libero_env.tasks import Task
 from libero_env.text import flatten, json_safe, shorten, to_json
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, TaskResult
-from libero_eval.work.claims import LEASE, Claim, Claims, Held
+from libero_eval.policies import PROBE_TOLERANCE
+from libero_eval.work.claims import LEASE, Claim, Claims, Held, parse, read_regular
 from lifelong.errors import ConfigError, LifelongError, ResultsError
 from lifelong.results.provenance import utc_now
 
@@ -37,6 +42,8 @@ PLAN_FORMAT = "libero-evaluation-plan/1"
 UNIT_FORMAT = "libero-evaluation-unit/1"
 AGAIN = "name another folder with --out, or repeat the evaluation with --again"
 PARTS = (PLAN_NAME, FILE_NAME, "units", "claims", "errors")
+MAX_ERROR = 20_000  # characters of a traceback that is kept
+Seconds = Annotated[float, Field(ge=0, le=1e11)]  # since the epoch
 
 
 @dataclass(frozen=True)
@@ -80,6 +87,23 @@ def partition(tasks: Iterable[Task], init_states: Sequence[int], size: int) -> t
     return tuple(Unit(task, part) for task in tasks for part in parts)
 
 
+class Plan(TypedDict):
+    """Content of `evaluation.json`. Starts and tasks may be added to; everything else must be the same."""
+
+    format: str
+    evaluated: dict[str, Any]
+    protocol: dict[str, Any]
+    unit_starts: int
+    errors_are_failures: bool
+    policy_threads: int | None
+    simulation: dict[str, str]
+    init_states: tuple[Annotated[int, Field(ge=0)], ...]
+    tasks: tuple[str, ...]
+    units: dict[str, Annotated[int, Field(ge=1)]]  # name -> number of episodes
+    probe: tuple[float, ...] | None  # what the policy answers to a fixed observation, where that repeats
+    started: str
+
+
 @dataclass(frozen=True)
 class UnitResult:
     """The result of a unit.
@@ -94,11 +118,11 @@ class UnitResult:
     """
 
     result: TaskResult
-    environment: Mapping[str, Any]
-    versions: Mapping[str, str]
+    environment: dict[str, Any]
+    versions: dict[str, str]
     process: str
-    started: float
-    finished: float
+    started: Seconds
+    finished: Seconds
 
 
 @dataclass(frozen=True)
@@ -121,32 +145,48 @@ class WorkStore:
 
     Args:
         path: The folder.
-        plan: Plain data that define the evaluation: policy, protocol, initial states, units, simulation.
+        plan: Plain data that define the evaluation: policy, protocol, size of units, simulation.
+        probe: What the policy answers to a fixed observation, where that repeats.
         lease: Time after which a unit whose holder is silent is given to another process, [s].
     """
 
-    def __init__(self, path: Path, plan: Mapping[str, Any], lease: float = LEASE):
-        self.path, self._plan = path, json_safe(plan)
+    def __init__(
+        self,
+        path: Path,
+        plan: Mapping[str, Any],
+        probe: Sequence[float] | None = None,
+        lease: float = LEASE,
+    ):
+        self.path, self._plan, self._probe = path, json_safe(plan), probe
         self.claims = Claims(path / "claims", lease)
         self._results: dict[str, UnitResult] = {}
 
     def join(self, units: Sequence[Unit]) -> None:
-        """Start the evaluation, or join it.
+        """Start the evaluation, or join it; starts and tasks that are not in it yet are added.
 
         Raises:
             ConfigError: The folder holds another evaluation; the message names every difference.
             LifelongError: The folder cannot be written, or holds a broken file.
         """
+        growing = {
+            "init_states": sorted({start for unit in units for start in unit.init_states}),
+            "tasks": list(dict.fromkeys(unit.task.id for unit in units)),
+            "units": {unit.name: len(unit.init_states) for unit in units},
+        }
         with _named_errors(self.path, "the folder of the evaluation cannot be written"):
             self.path.mkdir(parents=True, exist_ok=True)
-            sizes = {unit.name: len(unit.init_states) for unit in units}
             file = self.path / PLAN_NAME
             if not file.exists():
-                create_text(file, to_json({**self._plan, "units": sizes, "started": utc_now()}))
+                begun = {"probe": self._probe, "started": utc_now()}
+                create_text(file, to_json({**self._plan, **growing, **begun}))
             stored = read_plan(self.path)
-            self._check_plan(stored)
-            if not sizes.keys() <= stored["units"].keys():  # more tasks than so far
-                write_json(file, stored | {"units": stored["units"] | sizes})
+            self._check_plan(stored, growing)
+            if stored["units"] != growing["units"]:
+                write_json(file, {**stored, **growing})
+
+    def is_whole(self, units: Iterable[Unit]) -> bool:
+        """Return whether these are all units of the evaluation: another process may have added to it."""
+        return {unit.name for unit in units} == read_plan(self.path)["units"].keys()
 
     def clear(self) -> None:
         """Remove the evaluation; videos and files of others stay.
@@ -155,9 +195,8 @@ class WorkStore:
             ConfigError: Another process works on it.
         """
         for held in self.claims.held().values():
-            who = held.claim.holder if held.claim else "a process"
             raise ConfigError(
-                f"{self.path}: {who} works on {held.unit}; end it before you repeat the evaluation"
+                f"{self.path}: {held.holder} works on {held.unit}; end it before you repeat the evaluation"
             )
         for name in PARTS:
             path = self.path / name
@@ -199,7 +238,7 @@ class WorkStore:
             "error": describe(error),
             "process": this_process(),
             "when": utc_now(),
-            "traceback": "".join(traceback.format_exception(error)),
+            "traceback": "".join(traceback.format_exception(error))[-MAX_ERROR:],
         }
         with _named_errors(path, "the error of a unit cannot be written"):
             write_json(path, {"unit": unit.name, "errors": [*_read_errors(path), entry]})
@@ -211,7 +250,7 @@ class WorkStore:
         for name in sorted(_names(self.path / "errors") - _names(self.path / "units")):
             path = self.path / "errors" / f"{name}.json"
             if entries := _read_errors(path):
-                errors[name] = UnitErrors(len(entries), str(entries[-1]["error"]), path)
+                errors[name] = UnitErrors(len(entries), entries[-1]["error"], path)
         return errors
 
     def take(self, units: Iterable[Unit]) -> tuple[Unit, Claim] | None:
@@ -241,15 +280,28 @@ class WorkStore:
     def _unit_path(self, unit: Unit) -> Path:
         return self.path / "units" / f"{unit.name}.json"
 
-    def _check_plan(self, stored: Mapping[str, Any]) -> None:
+    def _check_plan(self, stored: Plan, growing: Mapping[str, Any]) -> None:
+        """Check that the plan of the folder is the one here, or a part of it."""
         there, here = flatten({key: stored.get(key) for key in self._plan}), flatten(self._plan)
         different = [
             f"{name} is {_shown(there.get(name))} there and {_shown(here.get(name))} here"
             for name in sorted(there.keys() | here.keys())
             if there.get(name) != here.get(name)
         ]
+        if (then := stored["probe"]) is not None and self._probe is not None:
+            off = np.abs(np.subtract(then, self._probe)).max() if len(then) == len(self._probe) else np.inf
+            if off > PROBE_TOLERANCE:
+                different.append(
+                    f"the policy answers a fixed observation otherwise than then, by up to {off:.3g}"
+                )
         if different:
             raise ConfigError(f"{self.path} holds another evaluation: {'; '.join(different)}. Either {AGAIN}")
+        for name in ("tasks", "init_states"):
+            if lacking := [one for one in stored[name] if one not in growing[name]]:  # type: ignore[literal-required]
+                raise ConfigError(
+                    f"{self.path} holds also the {name} {_shown(lacking)}: an evaluation can grow, but not shrink. "
+                    f"Ask for these too, or {AGAIN}"
+                )
 
     def _digest(self, unit: Unit) -> str:
         parts = [self._plan, unit.task.bddl_text, unit.init_states]
@@ -272,37 +324,41 @@ def read_unit(path: Path) -> tuple[UnitResult, str]:
         LifelongError: The file is broken.
     """
     try:
-        values = read_json(path)
-        stated = values.get("format") if isinstance(values, dict) else None
-        if stated != UNIT_FORMAT:
-            raise InvalidInputError(f"the format is {stated!r}, not {UNIT_FORMAT!r}")
+        values = _of_format(path, UNIT_FORMAT)
         content = {f.name: values[f.name] for f in fields(UnitResult) if f.name in values}
         return validate(UnitResult, content), str(values.get("digest"))
-    except InvalidInputError as error:
+    except (OSError, InvalidInputError, LifelongError) as error:
         raise LifelongError(
             f"{path} is not a valid result of a unit ({error}); nothing of it is counted: remove it, and "
             "the unit is run again"
         ) from error
 
 
-def read_plan(path: Path) -> dict[str, Any]:
+def read_plan(path: Path) -> Plan:
     """Return what is evaluated in a folder, as `evaluation.json` has it.
 
     Raises:
-        LifelongError: There is no evaluation, or the file is broken.
+        LifelongError: There is no evaluation, or the file is broken, or of another version.
     """
     file = path / PLAN_NAME
     if not file.exists():
         raise LifelongError(f"{path} holds no evaluation: {file.name} is missing")
     try:
-        values = read_json(file)
+        return validate(Plan, _of_format(file, PLAN_FORMAT))
     except InvalidInputError as error:
-        raise LifelongError(f"{error}: {AGAIN}") from error
+        raise ConfigError(f"{file} is broken, or of another version ({error}): {AGAIN}") from error
+
+
+def _of_format(path: Path, wanted: str) -> dict[str, Any]:
+    """Return the content of a file with a format.
+
+    Raises:
+        InvalidInputError: It has another one, or cannot be read.
+    """
+    values = parse(read_regular(path)[0])
     stated = values.get("format") if isinstance(values, dict) else None
-    if stated != PLAN_FORMAT:
-        raise ConfigError(f"{file} has the format {stated!r}; this version reads {PLAN_FORMAT}: {AGAIN}")
-    if not all(isinstance(values.get(key), dict) for key in ("units", "evaluated")):
-        raise LifelongError(f"{file} lacks `units` or `evaluated`: it is broken; {AGAIN}")
+    if stated != wanted:
+        raise InvalidInputError(f"the format is {stated!r}, not {wanted!r}")
     return values
 
 
@@ -313,7 +369,7 @@ def this_process() -> str:
 
 def describe(error: BaseException) -> str:
     """Return an error in one line."""
-    text = " ".join(str(error).split())
+    text = shorten(" ".join(str(error)[:MAX_ERROR].split()), 1000)
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
@@ -334,10 +390,23 @@ def _names(folder: Path) -> set[str]:
         return set()
 
 
-def _read_errors(path: Path) -> list[Mapping[str, Any]]:
+class _Error(TypedDict):
+    error: str
+    process: str
+    when: str
+    traceback: str
+
+
+class _Errors(TypedDict):
+    unit: str
+    errors: list[_Error]
+
+
+def _read_errors(path: Path) -> list[_Error]:
+    """Return the errors in a file; a broken one says nothing that counts."""
     try:
-        return list(json.loads(path.read_text(encoding="utf-8"))["errors"])
-    except (OSError, ValueError, KeyError, TypeError):
+        return validate(_Errors, parse(read_regular(path)[0]))["errors"]
+    except (OSError, InvalidInputError):
         return []
 
 

@@ -49,18 +49,14 @@ class Worker:
         self._evaluation, self._store = evaluation, evaluation.store
         self._on_result, self._on_progress = on_result, on_progress
         self._on_error, self._on_wait = on_error, on_wait
+        self._names = {unit.name for unit in evaluation.units}
         self._attempts_before: dict[str, int] = {}
         self._announced: set[str] = set()
         self._succeeded, self._in_a_row, self._said = False, 0, -math.inf
         self._task: str | None = None
 
     def run(self) -> EvaluationResult:
-        """Evaluate units until all are done, whoever does them; write `eval.json` and return its content.
-
-        Raises:
-            ConfigError: The folder holds another evaluation.
-            EvaluationIncompleteError: Units ended with errors, and there is nothing else to do.
-        """
+        """Evaluate units until all are done, whoever does them; see `work`."""
         result = self.work(wait=True)
         assert result is not None
         return result
@@ -83,20 +79,25 @@ class Worker:
         with evaluation.pool() as self._pool:
             while len(done := self._look()) < len(evaluation.units):
                 self._on_wait(len(done))
-                errors, held = store.errors(), set(store.held())
+                errors, held = self._errors(), set(store.held())
                 choice = self._order(done, errors, held)
                 if taken := store.take(choice):
                     self._work(*taken)
                 elif not wait:
                     return None
-                elif choice or held:
+                elif choice or held & self._names:
                     self._say(done)
                     time.sleep(POLL)
                 elif len(store.done(evaluation.units)) == len(done):
                     raise self._incomplete(errors)
         result = evaluation.result(done)
-        result.write(evaluation.out / FILE_NAME)
+        if store.is_whole(evaluation.units):
+            result.write(evaluation.out / FILE_NAME)
         return result
+
+    def _errors(self) -> dict[str, UnitErrors]:
+        """Return the errors of the units that are not done; the folder may have those of others."""
+        return {name: errors for name, errors in self._store.errors().items() if name in self._names}
 
     def _look(self) -> Mapping[str, UnitResult]:
         """Return the units that are done; announce the tasks that are complete."""
@@ -185,7 +186,7 @@ class Worker:
             self._on_progress(self._progress(done))
 
     def _progress(self, done: Mapping[str, UnitResult]) -> Progress:
-        running, failed = len(self._store.held()), len(self._store.errors())
+        running, failed = len(self._names & self._store.held().keys()), len(self._errors())
         sizes = {unit.name: len(unit.init_states) for unit in self._evaluation.units}
         return measure_progress(sizes, done, running, failed)
 

@@ -1,7 +1,7 @@
 """How many episodes a difference in success needs, for policies evaluated in the same starts or in different ones."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -135,25 +135,17 @@ def unpaired_episodes(question: Question) -> int:
 def shown_difference(question: Question, pairs: int) -> float:
     """Return the smallest difference, in steps of 0.001, that so many pairs show with the power; NaN if none.
 
-    The discordance stays as it is, or that of independent outcomes; where it is smaller than the difference, it is
-    the difference.
+    The discordance is that of independent outcomes, or the given one as far as the rates of each difference allow it.
     """
     sign = math.copysign(1.0, question.difference)
     room = (1 - question.base) if sign > 0 else question.base
     for step in range(1, math.floor(1000 * room + 1e-9) + 1):
-        size = step / 1000
-        moved = Question(
-            question.base,
-            sign * size,
-            None if question.discordance is None else max(question.discordance, size),
-            question.power,
-            question.alpha,
-            question.tests,
-        )
-        if moved.discordance is not None and moved.discordance > moved.discordance_range[1]:
-            return math.nan
+        moved = replace(question, difference=sign * step / 1000, discordance=None)
+        if question.discordance is not None:
+            low, high = moved.discordance_range
+            moved = replace(moved, discordance=min(max(question.discordance, low), high))
         if paired_power(moved, pairs) >= question.power:
-            return size
+            return step / 1000
     return math.nan
 
 

@@ -148,7 +148,7 @@ def test_openpi_client_and_libero_serve(python, run, tmp_path):
     found = json.loads(done.stdout)
     np.testing.assert_allclose(found["actions"], wanted, atol=1e-6)
     assert found["timing"] == ["infer_ms", "prev_total_ms"] and found["server"] == "libero-lifelong"
-    assert "Traceback" in found["error"] and "the request lacks observation/agentview_rgb" in found["error"]
+    assert "PolicyError: the request lacks observation/agentview_rgb" in found["error"]
 
 
 def test_their_bytes_are_ours(python):

@@ -90,6 +90,7 @@ episode: {horizon: 7}
 pixels: {render_size: [64, 64]}
 action: {replan: 4}
 """
+PROBES = 3  # of a unit: twice when it is planned, once when it begins
 VLA_CARD = """
 title: vla-eval's, small and short
 extends: vla-eval
@@ -111,7 +112,7 @@ def card(tmp_path):
 
 def on_server(address: str, out, card: str, *more: str) -> int:
     words = ["--suite", "libero_goal/0", "--episodes", "2", "--threads", "1", "--protocol", card]
-    return cli.main(["eval", address, "--out", str(out), *words, *more])
+    return cli.main(["eval", address, "--out", str(out), *words, *(more or ("--name", "lift"))])
 
 
 def lift(count: int) -> np.ndarray:
@@ -131,7 +132,8 @@ def test_an_openpi_server_under_a_protocol(card, tmp_path, capsys):
     assert found["tasks"][0]["lengths"] == [7, 7] and found["protocol"]["action"]["replan"] == 3
     announced = {"action": {"replan": 3}, "model": "lift"}
     assert found["evaluated"]["server"] == address and found["evaluated"]["announced"] == announced
-    assert len(seen) == 2 * 3, "seven steps are three chunks"
+    assert len(seen) == PROBES + 2 * 3, "seven steps are three chunks"
+    seen = seen[PROBES:]
     first = seen[0]
     assert first["observation/image"].shape == first["observation/wrist_image"].shape == (56, 56, 3)
     assert first["observation/image"].std() > 5 and first["observation/state"].dtype == np.float64
@@ -157,6 +159,43 @@ def test_leaving_out_images_changes_none_that_are_sent(card, tmp_path, capsys, m
     assert found[0] == found[1] and len(set(found[0][0]["actions"])) == 2
 
 
+def test_another_policy_behind_the_same_address_gets_nothing_of_the_first(card, tmp_path, capsys):
+    """Also where the server says nothing about itself, and where the evaluation is finished."""
+    out, path, asked, height = tmp_path / "out", card(OPENPI_CARD), [], [1.0]
+
+    def answer(_):
+        asked.append(1)
+        return {"actions": lift(3) * height[0]}
+
+    with policy_servers.openpi(answer) as address:
+        assert on_server(address, out, path, "--timeout", "20") == 2
+        assert "does not say which policy it serves" in capsys.readouterr().err and not asked
+        assert on_server(address, out, path) == 0
+        whole, asked[:] = (out / "eval.json").read_text(), []
+        assert on_server(address, out, path) == 0
+        assert "nothing was run; --again repeats it" in capsys.readouterr().err and len(asked) == 2
+        height[0] = 0.5
+        assert on_server(address, out, path) == 2
+        assert "answers a fixed observation otherwise" in capsys.readouterr().err
+        height[0] = 1.0
+        assert on_server(address, out, path, "--name", "other") == 2
+        assert "evaluated.name is lift there and other here" in capsys.readouterr().err.replace(
+            '"', ""
+        ).replace("'", "")
+    assert (out / "eval.json").read_text() == whole
+
+
+def test_a_result_connects_to_no_server_that_was_not_allowed(card, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("LIBERO_API_KEY", "secret")
+    with policy_servers.openpi(lambda _: {"actions": lift(3)}) as address:
+        assert on_server(address, tmp_path / "out", card(OPENPI_CARD)) == 0
+    capsys.readouterr()
+    monkeypatch.setattr("libero_eval.servers.policy.OpenpiClient", None)
+    assert cli.main(["eval", str(tmp_path / "out" / "eval.json"), "--out", str(tmp_path / "again")]) == 2
+    error = capsys.readouterr().err
+    assert "which would be connected to" in error and f"--allow {address}" in error
+
+
 def test_an_openpi_connection_that_breaks_is_no_episode(card, tmp_path, capsys):
     counts = []
 
@@ -164,7 +203,7 @@ def test_an_openpi_connection_that_breaks_is_no_episode(card, tmp_path, capsys):
         await socket.send(OPENPI.pack({}))
         async for _ in socket:
             counts.append(1)
-            if len(counts) == 4:
+            if len(counts) == PROBES + 4:
                 socket.transport.abort()
                 return
             await socket.send(OPENPI.pack({"actions": lift(3)}))
@@ -172,7 +211,7 @@ def test_an_openpi_connection_that_breaks_is_no_episode(card, tmp_path, capsys):
     with policy_servers.web_socket(handler) as address:
         assert on_server(address, tmp_path / "out", card(OPENPI_CARD)) == 0
     result = json.loads((tmp_path / "out" / "eval.json").read_text())["tasks"][0]
-    assert result["init_states"] == [0, 1] and result["lengths"] == [7, 7] and len(counts) > 6
+    assert result["init_states"] == [0, 1] and result["lengths"] == [7, 7] and len(counts) > PROBES + 6
     assert not result.get("errors") and result["actions"][0] == result["actions"][1]
 
 
@@ -218,7 +257,8 @@ def test_a_vla_eval_server_under_a_protocol(card, tmp_path, capsys):
     with policy_servers.vla_eval(answer, {"observation_params": params}, heard) as address:
         assert on_server(address.replace("ws:", "vla-eval:"), tmp_path / "out", card(VLA_CARD)) == 0
     kinds = [m["type"] for m in heard]
-    assert kinds.count("observation") == 6 and kinds.count("episode_start") == kinds.count("episode_end") == 2
+    assert kinds.count("observation") == PROBES + 6
+    assert kinds.count("episode_start") == kinds.count("episode_end") == PROBES + 2
     sent = next(m["payload"] for m in heard if m["type"] == "observation")
     assert sent["images"]["wrist"].shape == (64, 64, 3) and sent["states"].shape == (8,)
     assert json.loads((tmp_path / "out" / "eval.json").read_text())["tasks"][0]["lengths"] == [3, 3]
@@ -233,7 +273,8 @@ def test_a_groot_server_under_a_protocol(card, tmp_path, capsys):
 
     with policy_servers.groot(policy_servers.groot_endpoints(get_action)) as address:
         assert on_server(address.replace("tcp:", "gr00t:"), tmp_path / "out", card(GROOT_CARD)) == 0
-    assert [len(o["state.gripper"]) for o in seen] == [2, 2] and seen[0]["video.image"].shape[1:3] == (1, 64)
+    assert [len(o["state.gripper"]) for o in seen] == [1] * PROBES + [2, 2]
+    assert seen[0]["video.image"].shape[1:3] == (1, 64)
     found = json.loads((tmp_path / "out" / "eval.json").read_text())
     assert found["tasks"][0]["lengths"] == [7, 7]
     assert found["evaluated"]["announced"]["action"]["modality_keys"][-1] == "gripper"
@@ -244,7 +285,11 @@ def test_what_a_server_does_wrong_ends_the_evaluation(tmp_path, capsys):
         assert cli.main(["eval", address, *EPISODES, "--out", str(tmp_path / "out")]) == 2
     assert "is of format 2; this version reads 1" in capsys.readouterr().err
     assert cli.main(["eval", "http://localhost:1", *EPISODES]) == 2
-    assert "unknown kind of server 'http'. Valid: gr00t, vla-eval, ws, wss" in capsys.readouterr().err
+    assert "no kind of server has http; write ws://localhost:1" in capsys.readouterr().err
+    assert cli.main(["eval", "localhost:8000", *EPISODES]) == 2
+    assert "an address without the kind of its server: write ws://localhost:8000" in capsys.readouterr().err
+    assert cli.main(["eval", "ftp://localhost:1", *EPISODES]) == 2
+    assert "unknown kind of server 'ftp'. Valid: gr00t, vla-eval, ws, wss" in capsys.readouterr().err
     with pytest.raises(SystemExit, match="2"):
         cli.main(["eval", address, "--in-flight", "0"])
     assert "--in-flight 0" in capsys.readouterr().err

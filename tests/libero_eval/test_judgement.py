@@ -47,6 +47,20 @@ def test_differences_are_those_of_the_same_starts(found):
     assert sum(p.difference.counts.discordant for p in first.tasks) == total.counts.discordant
 
 
+@pytest.mark.parametrize("wins", [(6, 1), (1, 1), (3, 0), (10, 10), (19, 1)])
+@pytest.mark.parametrize("turned", [False, True])
+def test_policies_that_never_win_the_same_start_are_compared(wins, turned):
+    """And those that never lose the same one: as many starts differ as the rates allow."""
+    a, b = wins[0] * [True] + (20 - wins[0]) * [False], (20 - wins[1]) * [False] + wins[1] * [True]
+    rows = [np.array(a) ^ turned, np.array(b) ^ turned]
+    sides = [
+        side(name, result_of(task_result("libero_goal/0", row), policy=f"{name}:make"))
+        for name, row in zip("ab", rows, strict=True)
+    ]
+    total = compare_groups(sides).comparisons[0].total.difference
+    assert total.value == pytest.approx(rows[0].mean() - rows[1].mean())
+
+
 def test_one_policy_twice_is_the_control_arm(found):
     assert [(c.first, c.second) for c in found.controls] == [("good", "good again")]
     assert [(c.first, c.second) for c in found.comparisons] == [("good", "bad"), ("bad", "good again")]

@@ -1,6 +1,8 @@
 """Clients of policy servers: formats, chunks, and servers that fail, are late or send what is not valid."""
 
 import asyncio
+import io
+import struct
 import sys
 import threading
 import time
@@ -9,12 +11,13 @@ from contextlib import closing, contextmanager
 import msgpack
 import numpy as np
 import pytest
+from PIL import Image
 
 from libero_env.errors import MissingPackageError
 from libero_env.tasks import get_suite
 from libero_eval.protocols.adapter import PolicyInput
 from libero_eval.servers.actors import RemoteActor, checked_actions
-from libero_eval.servers.groot import GROOT, GrootClient
+from libero_eval.servers.groot import ACTION, GROOT, GrootClient
 from libero_eval.servers.openpi import OPENPI, OpenpiClient
 from libero_eval.servers.transport import Connection, EpisodeStart, Limits, need
 from libero_eval.servers.vla_eval import VLA_EVAL, VlaEvalClient
@@ -298,6 +301,9 @@ def test_a_server_that_takes_no_request_and_one_that_sends_too_much(monkeypatch)
         async def send(self, data):
             await asyncio.sleep(60)
 
+        async def recv(self):
+            await asyncio.sleep(60)
+
     with pytest.raises(ServerError, match=r"ws://it took no request within 0\.1 s; --timeout"):
         asyncio.run(Connection(Full(), "ws://it", OPENPI, Limits(1, 0.1)).send({}))
     monkeypatch.setattr("libero_eval.servers.transport.MAX_MESSAGE_BYTES", 1000)
@@ -347,6 +353,133 @@ def test_a_server_that_changes_its_policy_is_refused():
         ask(address)
 
 
+def deep(count: int) -> bytes:
+    return b"\x81\xa1a" * count + b"\x01"
+
+
+def maps(count: int) -> bytes:
+    return b"\x81\xa7actions\xdd" + struct.pack(">I", count) + b"\x80" * count
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (deep(500), "within each other, more than 30 deep"),
+        (deep(31), "within each other, more than 30 deep"),
+        (maps(1 << 20), "more than 10000 lists and maps"),
+        ("X" * (1 << 20), r"its traceback:\n\.\.\. X{2000}$"),
+        ({"k" * 100_000: 1}, "without `actions`"),
+        ({str(i): 1 for i in range(10_000)}, "without `actions`"),
+        ({"actions": [["x" * 100_000] * 7] * 2}, "dtype"),
+    ],
+    ids=["deep", "deeper than allowed", "many maps", "long text", "long key", "many keys", "long values"],
+)
+def test_large_answers_end_in_a_short_message(answer, message):
+    with (
+        policy_servers.openpi(lambda _: answer) as address,
+        pytest.raises(ServerError, match=message) as caught,
+    ):
+        ask(address)
+    assert len(str(caught.value)) < 2500
+
+
+@pytest.mark.parametrize("when", ["before the first request", "twice", "at the end"])
+def test_answers_that_nobody_has_asked_for_are_refused(when):
+    """They would be taken for the answers to later requests, and every action come late."""
+
+    async def handler(socket):
+        answer, count = OPENPI.pack({"actions": np.zeros((1, 7))}), 0
+        await socket.send(OPENPI.pack({}))
+        if when == "before the first request":
+            await socket.send(answer)
+        async for _ in socket:
+            count += 1
+            await socket.send(answer)
+            if when == "twice" or (when == "at the end" and count == 2):
+                await socket.send(answer)
+
+    with (
+        policy_servers.web_socket(handler) as address,
+        remote(OpenpiClient(address, SHORT), replan=1) as actor,
+        pytest.raises(ServerError, match="sent a message before it was asked"),
+    ):
+        for step in range(2):
+            actor.act(observations(1, step))
+            time.sleep(0.1)  # of the simulation
+        actor.note(np.array([True]), np.array([True]))
+
+
+@pytest.mark.parametrize(
+    ("hello", "message"),
+    [
+        ({"action_spec": [1]}, r"action_spec is \[1\]; expected keys with values"),
+        ({"action_spec": "x"}, "action_spec"),
+        ({"action_spec": {"position": 5}}, "action_spec.position"),
+        ({"observation_params": [1]}, "observation_params"),
+        ({"observation_params": "x"}, "observation_params"),
+        *(({"observation_params": {"seed": x}}, "observation_params.seed") for x in ("abc", [1])),
+        ({"observation_params": {"max_steps": float("inf")}}, "observation_params.max_steps"),
+        ({"observation_params": {"max_steps": np.zeros(3)}}, "observation_params.max_steps"),
+    ],
+)
+def test_hellos_of_vla_eval_that_are_not_valid(hello, message):
+    with (
+        policy_servers.vla_eval(lambda _: {}, hello, []) as address,
+        pytest.raises(ServerError, match=message) as caught,
+    ):
+        VlaEvalClient(address, SHORT)
+    assert address in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "config", [5, [1], {"modality_keys": 5}, {"modality_keys": [["x"]]}, {"delta_indices": 5}]
+)
+@pytest.mark.parametrize("modality", ["video", "action"])
+def test_modalities_of_groot_that_are_not_valid(modality, config):
+    endpoints = policy_servers.groot_endpoints(None)
+    whole = endpoints["get_modality_config"]()
+    config = (
+        {"modality_keys": policy_servers.MODALITIES[modality], **config}
+        if isinstance(config, dict)
+        else config
+    )
+    endpoints["get_modality_config"] = lambda: whole | {modality: config}
+    with policy_servers.groot(endpoints) as address, pytest.raises(ServerError, match=modality) as caught:
+        GrootClient(address, SHORT)
+    assert address in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_images_of_servers_are_pngs_of_the_size_that_they_state():
+    """Other formats would start other programs."""
+    image = Image.fromarray(np.zeros((4, 6, 3), np.uint8))
+    for kind, shape in (("EPS", [4, 6, 3]), ("GIF", [4, 6, 3]), ("PNG", [6, 4, 3]), ("PNG", None)):
+        file = io.BytesIO()
+        image.save(file, kind)
+        message = {"__image__": True, "format": kind.lower(), "data": file.getvalue(), "shape": shape}
+        with pytest.raises(CodecError, match="not a message of vla-eval"):
+            VLA_EVAL.unpack(msgpack.packb(message))
+    file = io.BytesIO()
+    Image.new("1", (3000, 3000)).save(file, "PNG")
+    message = {"__image__": True, "format": "png", "data": file.getvalue(), "shape": [3000, 3000]}
+    with pytest.raises(CodecError, match="an image of 3000 x 3000"):
+        VLA_EVAL.unpack(msgpack.packb(message))
+
+
+def test_a_missing_package_is_named_before_anything_is_connected(monkeypatch):
+    asked = []
+
+    async def handler(socket):
+        asked.append(1)
+        await socket.wait_closed()
+
+    with policy_servers.web_socket(handler) as address:
+        for client, module in ((OpenpiClient, "msgpack"), (GrootClient, "msgpack"), (GrootClient, "zmq")):
+            with monkeypatch.context() as patch, pytest.raises(MissingPackageError, match=module):
+                patch.setitem(sys.modules, module, None)
+                client(address, SHORT)
+    assert not asked
+
+
 def test_vla_eval_episodes():
     heard, hello = [], {"harness_version": "0.8.0", "observation_params": {"send_wrist_image": True}}
     hello["observation_params"]["send_state"] = True
@@ -393,6 +526,8 @@ def test_vla_eval_errors_and_messages_out_of_order():
     async def handler(socket):
         async for data in socket:
             message = VLA_EVAL.unpack(data)
+            if message["type"] == "episode_start":
+                continue
             kind = "hello" if message["type"] == "hello" else "action"
             reply = {"type": kind, "payload": {}, "seq": 1, "timestamp": 0.0}
             await socket.send(VLA_EVAL.pack(reply))
@@ -400,7 +535,7 @@ def test_vla_eval_errors_and_messages_out_of_order():
     with (
         policy_servers.web_socket(handler) as address,
         remote(VlaEvalClient(address, SHORT)) as actor,
-        pytest.raises(ServerError, match="sent action with seq 1; expected action with 3"),
+        pytest.raises(ServerError, match="sent 'action' with seq 1; expected action with 3"),
     ):
         actor.act(observations(1, 0))
 
@@ -433,6 +568,8 @@ def test_groot_observations_of_many_simulations():
     (lambda **_: policy_servers.flat(np.zeros((1, 1, 7))), "1 actions; the protocol executes 2"),
     (lambda **_: [{"x": np.zeros((1, 8, 1))}, {}], r"answered \['x'\].*--use-sim-policy-wrapper"),
     (lambda **_: "what?", "answered str without"),
+    (lambda **_: {"error": "x" * 1_000_000}, r"failed \(get_action\): \.\.\. x{2000}$"),
+    (lambda **_: [{f"action.{k}": [[1], [2, 3]] for k in ACTION}, {}], "not arrays"),
     (lambda **_: b"\xc1", "1 bytes that are not a message of GR00T"),
     (lambda observation, options: {}["key"], r"failed \(get_action\): 'key'"),
     (lambda **_: time.sleep(1), r"nothing within 0\.3 s \(get_action\)"),

@@ -132,6 +132,14 @@ def test_requests_that_are_refused(folder):
         "shape": (good | {"observation/agentview_rgb": np.zeros((8, 8, 3), np.uint8)}, r"\(8, 8, 3\).*\(32, 32, 3\)"),
         "nan": (good | {"observation/ee_pos": np.full(3, np.nan)}, "not finite"),
         "prompt": (good | {"prompt": "dance"}, f"no task with prompt 'dance'.*{task.language}"),
+        "words": (good | {"instruction": "x" * 10_000_000}, "instruction is not a text of at most 1000"),
+        "no text": (good | {"prompt": np.zeros(3)}, "prompt is not a text"),
+        "reset": (good | {"reset": "no"}, "reset is neither true nor false"),
+        "ragged": (good | {"observation/agentview_rgb": [[1], [2, 3]]}, "agentview_rgb is not an array"),
+        "many": (
+            {k: np.repeat(v[None], 101, 0) for k, v in request(obs).items()} | {"prompt": task.language},
+            r"shape \(101,",
+        ),
         "task": (good | {"task": "../../secrets.bddl"}, "no task with prompt"),
         "other": (good | {"task": served.run.tasks[1].id}, "no task with prompt"),
         "seed": (good | {"seed": ["a"]}, r"seed is \['a'\]; valid: integers"),
@@ -195,7 +203,8 @@ def test_health_errors_and_keys_over_the_wire(folder, monkeypatch):
                 assert OPENPI.unpack(socket.recv())["server_timing"]["prev_total_ms"] > 0
                 socket.send(data)
                 text = socket.recv()
-                assert text.startswith("Traceback") and "Error" in text.splitlines()[-1]
+                assert re.match(r"(Codec|Policy)Error: ", text) and "\n" not in text
+                assert ".py" not in text and str(folder) not in text
                 with pytest.raises(ConnectionClosedError) as closed:
                     socket.recv()
                 assert closed.value.rcvd.code == 1011

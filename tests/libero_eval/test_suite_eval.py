@@ -19,7 +19,7 @@ from libero_eval.requests import EvalRequest
 from libero_eval.user_policy import ORIGINAL_NAMES, CallableActor, UserPolicy, as_original, load_callable
 from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
 from lifelong.stats.intervals import wilson_interval
-from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate
+from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate, evaluation
 
 pytestmark = pytest.mark.unit
 MODULE = """
@@ -77,14 +77,50 @@ def test_tasks_with_results_are_not_evaluated_again(tmp_path):
 @pytest.mark.parametrize("changes", [
     {"identity": {"policy": "moving"}},
     {"protocol": QUICK.changed({"episode.horizon": 11})},
-    {"init_states": (3, 4, 9, 21)},
     {"versions": {"mujoco": "4"}},
 ], ids=lambda c: next(iter(c)))  # fmt: skip
 def test_results_of_another_evaluation_are_not_mixed_in(tmp_path, changes):
     evaluate(tmp_path)
-    name = {"identity": "evaluated.policy", "versions": "simulation.mujoco"}.get(*changes, *changes)
+    name = {"identity": "evaluated.policy", "versions": "simulation.mujoco"}.get(*changes, "protocol")
     with pytest.raises(ConfigError, match=rf"another evaluation: {name}.* there and .* here.*--again"):
         evaluate(tmp_path, **changes)
+
+
+def test_an_evaluation_grows_by_starts_and_tasks_and_never_shrinks(tmp_path):
+    """What is done is kept, and the result is that of asking for all of it at once."""
+    first, counted = {"tasks": TASKS[:1], "init_states": (3, 4), "unit_starts": 2}, []
+    evaluate(tmp_path / "grown", **first)
+    kept = (tmp_path / "grown" / "units" / "libero_goal_00_starts_03_04.json").stat().st_mtime_ns
+
+    class Counting(Still):
+        def reset(self, instruction, num_envs):
+            counted.append((instruction, num_envs))
+
+    whole = evaluate(tmp_path / "grown", Counting(), unit_starts=2)
+    assert counted == [(TASKS[0].language, 2), (TASKS[1].language, 2), (TASKS[1].language, 2)]
+    assert whole == evaluate(tmp_path / "at_once", unit_starts=2) == EvaluationResult.read(tmp_path / "grown")
+    assert (tmp_path / "grown" / "units" / "libero_goal_00_starts_03_04.json").stat().st_mtime_ns == kept
+    for less in ({"tasks": TASKS[:1]}, {"init_states": (3, 4)}, {"init_states": (3, 4, 9, 21)}):
+        with pytest.raises(
+            ConfigError, match=r"grown holds also the (tasks|init_states) \[.*can grow, but not"
+        ):
+            evaluate(tmp_path / "grown", **{"unit_starts": 2, **less})
+    assert EvaluationResult.read(tmp_path / "grown") == whole
+
+
+def test_a_batch_that_was_not_full_is_run_again_when_an_evaluation_grows(tmp_path):
+    evaluate(tmp_path / "grown", init_states=(3, 4, 9), unit_starts=2)
+    found = evaluate(tmp_path / "grown", unit_starts=2)
+    assert found == evaluate(tmp_path / "at_once", unit_starts=2)
+
+
+def test_who_was_asked_for_less_does_not_write_the_result_of_the_whole(tmp_path):
+    less = evaluation(tmp_path, init_states=(3, 4), unit_starts=2)
+    less.store.join(less.units)
+    whole = evaluate(tmp_path, unit_starts=2)
+    result = less.result(less.store.done(less.units))
+    assert result.init_states == (3, 4) and not less.store.is_whole(less.units)
+    assert EvaluationResult.read(tmp_path) == whole
 
 
 def test_selection_and_reporting_states_are_disjoint():
@@ -275,6 +311,29 @@ def test_the_source_of_a_policy_is_part_of_its_identity(module, tmp_path):
     sys.modules.pop(module)
     second = UserPolicy(request).identity
     assert second["source"] != first["source"] and second["weights"] == "0123"
+
+
+def test_what_a_policy_imports_and_holds_is_part_of_its_identity(module, tmp_path):
+    """Another module beside it, or other weights with the same source, are another policy."""
+    file, beside, weights = (tmp_path / name for name in (f"{module}.py", f"{module}_net.py", "weights.npy"))
+    file.write_text(
+        f"import {module}_net\nimport numpy as np\n"
+        + file.read_text()
+        + f"\nPolicy.w = [np.load({str(weights)!r})]\n"
+    )
+
+    def identity(source: str, value: float):
+        beside.write_text(source)
+        np.save(weights, np.full(3, value))
+        for name in (module, f"{module}_net"):
+            sys.modules.pop(name, None)
+        return UserPolicy(EvalRequest(policy=f"{module}:make")).identity
+
+    first = identity("x = 1", 0.0)
+    assert identity("x = 1", 0.0) == first
+    code, held = identity("x = 10", 0.0), identity("x = 1", 1.0)
+    assert code["source"] != first["source"] and code["weights"] == first["weights"]
+    assert held["source"] == first["source"] and held["weights"] != first["weights"]
 
 
 def test_errors_are_reported_in_one_line(module, tmp_path, capsys):

@@ -225,6 +225,15 @@ def test_a_unit_that_two_processes_run_counts_once(tmp_path):
     assert other.store.done([unit])[unit.name].result == found.result, "the first one wins"
 
 
+def test_a_claim_from_the_future_is_abandoned(tmp_path):
+    """As after the clock of a file server was set back."""
+    claims = Claims(tmp_path, lease=60)
+    claims.take("a")
+    of_another_machine(tmp_path / "a.json")
+    os.utime(tmp_path / "a.json", (time.time() + 1e6,) * 2)
+    assert not claims.held() and claims.take("a").pid == os.getpid()
+
+
 # --- errors
 
 
@@ -307,12 +316,74 @@ def test_a_unit_file_that_is_cut_off_or_from_another_evaluation_is_not_counted(t
     assert again["result"] == values["result"]
 
 
+HOSTILE = {
+    "deep": b"[" * 100_000,
+    "binary": b"\xff\xfe\xfd",
+    "empty": b"",
+    "a number": b"5",
+    "a list": b"[1, 2]",
+    "wrong kinds": b'{"format": 5, "units": [], "errors": [5], "pid": "../1", "unit": {}}',
+}
+
+
+def damaged(text: str, **changes) -> bytes:
+    return json.dumps(json.loads(text) | changes).encode()
+
+
+def hostile_files(folder: Path, unit: str) -> dict[str, list[bytes]]:
+    """Contents that are not valid, by the file of an evaluation that they take the place of."""
+    units, plan = ((folder / name).read_text() for name in (f"units/{unit}.json", "evaluation.json"))
+    claim = {"unit": unit, "host": "h", "machine": this_machine(), "process_start": None, "token": "t"}
+    times = [1e300, float("inf"), float("nan"), -1e18, "now"]
+    return {
+        f"units/{unit}.json": [damaged(units, finished=t) for t in times]
+        + [damaged(units, environment=5), damaged(units, versions={"mujoco": {}})],
+        "evaluation.json": [
+            damaged(plan, units=u) for u in ({unit: "two"}, {unit: -1}, [unit], {unit: 1e300})
+        ]
+        + [damaged(plan, evaluated=[]), damaged(plan, init_states=["a"]), damaged(plan, probe="x")],
+        f"claims/{unit}.json": [
+            json.dumps(claim | {"pid": pid}).encode() for pid in (10**30, "../1", "a\0", -1, 0, 1.5, None)
+        ],
+        f"errors/{unit}.json": [b'{"unit": "x", "errors": [5]}', b'{"unit": "x", "errors": [{"error": 5}]}'],
+    }
+
+
+@pytest.mark.parametrize("file", ["units", "evaluation.json", "claims", "errors"])
+def test_hostile_files_in_the_folder_end_in_one_line_or_count_for_nothing(tmp_path, file):
+    plan = evaluation(tmp_path, **TWO, lease=60)
+    evaluate(tmp_path, **TWO)
+    unit = plan.units[0].name
+    name, contents = next((n, c) for n, c in hostile_files(tmp_path, unit).items() if n.startswith(file))
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    for content in [*HOSTILE.values(), *contents, "pipe", "device"]:
+        path.unlink(missing_ok=True)
+        if content == "pipe":
+            os.mkfifo(path)
+        elif content == "device":
+            path.symlink_to("/dev/zero")
+        else:
+            path.write_bytes(content)
+            os.utime(path, (time.time() - 70,) * 2)
+        if file in ("claims", "errors"):
+            (tmp_path / "units" / f"{unit}.json").unlink(missing_ok=True)
+            if content != "device":  # /dev/zero was not touched for a lease, or was
+                assert evaluate(tmp_path, **TWO, lease=60)
+            assert "4 of 4 units" in describe_status(tmp_path) or content == "device"
+            continue
+        for ask in (lambda: evaluate(tmp_path, **TWO), lambda: describe_status(tmp_path)):
+            with pytest.raises(LifelongError, match="remove it|--again") as caught:
+                ask()
+            assert "\n" not in str(caught.value) and len(str(caught.value)) < 1000
+
+
 def test_a_folder_of_another_version_or_of_something_else_is_refused(tmp_path):
     (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/7"}')
     with pytest.raises(ConfigError, match="libero-evaluation-plan/7"):
         evaluate(tmp_path)
     (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/1"}')
-    with pytest.raises(LifelongError, match="it is broken; name another folder"):
+    with pytest.raises(LifelongError, match="evaluated is missing.*: name another folder"):
         evaluate(tmp_path)
     with pytest.raises(LifelongError, match="holds no evaluation"):
         describe_status(tmp_path / "old")
@@ -321,11 +392,20 @@ def test_a_folder_of_another_version_or_of_something_else_is_refused(tmp_path):
 def test_every_difference_to_the_evaluation_of_the_folder_is_named(tmp_path):
     evaluate(tmp_path, **TWO)
     with pytest.raises(
-        ConfigError, match=r"init_states is \[3, 4, 9, 20\] there and \[3\] here; unit_starts is 2"
+        ConfigError, match="policy_threads is null there and 2 here; unit_starts is 2 there and 1 here"
     ):
-        evaluate(tmp_path, init_states=(3,), unit_starts=1)
-    with pytest.raises(ConfigError, match="policy_threads is null there and 2 here"):
-        evaluate(tmp_path, policy_threads=2, **TWO)
+        evaluate(tmp_path, policy_threads=2, unit_starts=1)
+
+
+@pytest.mark.parametrize(("then", "now"), [((0.1, 0.2), (0.1, 0.3)), ((0.1, 0.2), (0.1,))])
+def test_a_policy_that_answers_a_fixed_observation_otherwise_is_another_one(tmp_path, then, now):
+    evaluate(tmp_path, probe=then, **TWO)
+    evaluate(tmp_path, probe=tuple(one + 0.001 for one in then), **TWO)
+    evaluate(tmp_path, probe=None, **TWO)
+    with pytest.raises(
+        ConfigError, match="another evaluation: the policy answers a fixed observation otherwise"
+    ):
+        evaluate(tmp_path, probe=now, **TWO)
 
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
