@@ -72,7 +72,6 @@ def evaluate_one_task_success(
     Args:
         cfg: Configuration; `eval` has the number of episodes, their length, and how many run at once.
         algo: Algorithm whose policy acts, with torch's global generator seeded by `cfg.seed`.
-        task: Task of a benchmark.
         task_emb: Embedding of the instruction, (L,).
         task_id: Position in the benchmark.
         sim_states: `n_eval` lists to which the states [time, qpos, qvel] of each episode are appended.

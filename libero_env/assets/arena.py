@@ -43,7 +43,6 @@ class Workspace:
 
     Attributes:
         name: Fixture category, such as `kitchen_table`.
-        problem: Name of the problem class in task files.
         offset: Origin of the regions, (3,) [m].
         region_height: Height of the surface that objects stand on above `offset`, [m].
         zone_origin: Origin of the flat boxes over regions, which goals refer to, (3,) [m]. Its z is the centre of the
@@ -109,7 +108,6 @@ def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mappi
 
     Args:
         spec: Scene to extend.
-        workspace: Workspace of the scene.
         scene_properties: `:scene_properties` of the task file: `floor` and `wall` name the style of each, `scene` that
             of the whole scene. Styles that are not given are those of the workspace's file.
 
@@ -182,7 +180,6 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace, detailed: bool = False)
 
     Args:
         spec: Scene to extend.
-        workspace: Workspace of the scene.
         detailed: Whether it has robosuite's visual mesh of 33,000 triangles.
 
     Raises:

@@ -153,7 +153,6 @@ def download_files(
     Args:
         repo: Data set on the Hub.
         revision: Commit, tag or branch of the data set.
-        folder: Folder to write to.
         names: Files to download; None for all.
         replace: Whether to replace existing files of other contents.
         remedy: What to do where such a file exists and is not replaced.

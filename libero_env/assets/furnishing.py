@@ -186,7 +186,6 @@ def add_visual_mesh(
     Args:
         spec: Scene to extend.
         body: Body that carries the geom.
-        name: Name of the mesh and the geom.
         mesh: Mesh in the frame of the body, [m].
         material: Name of its material; None adds one with the furniture's palette.
     """

@@ -104,7 +104,6 @@ def restore_drawing(spec: mujoco.MjSpec, root: Path, workspace: Workspace, scene
     Args:
         spec: Complete scene.
         root: Asset folder.
-        workspace: Workspace of the scene.
         scene_file: File of its room.
 
     Raises:

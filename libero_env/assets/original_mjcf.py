@@ -27,7 +27,6 @@ def read_file(path: Path, within: Path | None = None) -> tuple[list[ET.Element],
     """Return the assets of a file, with absolute paths, and its world body, with default classes written out.
 
     Args:
-        path: File to read.
         within: Folder that files may be in which the file names; None for any.
 
     Raises:
@@ -95,7 +94,6 @@ def attachable_xml(category: str, assets: Iterable[ET.Element], body: ET.Element
 
     Args:
         category: Name of the category; it becomes the prefix of the assets' names.
-        assets: Assets of the file.
         body: Body of the object; it is changed.
 
     Raises:

@@ -25,8 +25,6 @@ class MeshSource(NamedTuple):
     """A mesh file and its pose in the frame of a body.
 
     Attributes:
-        name: Name of the mesh in its model.
-        file: Path of the file.
         pos: Position, (3,) [m].
         quat: Orientation, (4,) wxyz.
     """
@@ -86,7 +84,6 @@ def merge_and_simplify(
     Args:
         stem: Beginning of the name of the cache file.
         name: Name of the model; it distinguishes models whose meshes have the same names.
-        groups: Meshes to merge.
         faces: Approximate largest number of triangles of a merged mesh.
 
     Returns:

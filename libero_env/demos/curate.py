@@ -57,7 +57,6 @@ def examine(file: Path, *, threshold: float = NOOP_THRESHOLD) -> DemoStats:
     """Read a file completely and return what is in it.
 
     Args:
-        file: Demonstration file.
         threshold: As for `noop_steps`.
 
     Raises:
@@ -118,7 +117,6 @@ def filter_demos(
     kept.
 
     Args:
-        file: File to read.
         target: File to write; it must not exist.
         success_only: Whether to leave out demonstrations that did not reach the goal.
         without_noops: Whether to leave out the steps of `noop_steps`.

@@ -33,11 +33,7 @@ T = TypeVar("T")
 
 
 class DemoJob:
-    """A demonstration file to make, of which some demonstrations may be there.
-
-    Attributes:
-        path: File to write.
-    """
+    """A demonstration file to make, of which some demonstrations may be there."""
 
     path: Path
 
@@ -75,7 +71,6 @@ class RecordingJob(DemoJob):
 
     Attributes:
         config: What its demonstrations depend on.
-        path: File to write.
     """
 
     config: DemoConfig

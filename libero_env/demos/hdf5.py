@@ -256,7 +256,6 @@ def _check_heaps(file: Path, data: list[tuple[int, int]], base: int) -> None:
     """Check the global heaps of a file: on a damaged one the HDF5 library (2.0 and before) runs for ever.
 
     Args:
-        file: The file.
         data: Beginnings and ends of what cannot be a heap.
         base: Position of address 0 in the file.
     """

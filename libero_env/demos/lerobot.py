@@ -35,8 +35,6 @@ class PublishedExport(NamedTuple):
     """Size of an export in the layout of a published set.
 
     Attributes:
-        episodes: Number of episodes.
-        frames: Number of frames.
         failed: Demonstrations that did not reach the goal when they were run again, and were left out.
     """
 

@@ -49,7 +49,6 @@ def colour_statistics(counts: np.ndarray, frames: int) -> dict[str, list]:
 
     Args:
         counts: As from `colour_counts`, from which the statistics follow exactly.
-        frames: Number of frames.
     """
     levels, total, below = np.arange(256) / 255.0, counts.sum(axis=1), np.cumsum(counts, axis=1)
     mean = counts @ levels / total

@@ -77,7 +77,6 @@ def task_header(file: Path, task: Task | None) -> dict[str, Any]:
     """Return the attributes of a file as `read_header` does, with a task's text where they do not state that task.
 
     Args:
-        file: Demonstration file.
         task: Task that was recorded; None for the one that the file states.
     """
     header = read_header(file)
@@ -118,7 +117,6 @@ class StateRenderer:
 
     Args:
         task: Task whose scene is simulated.
-        config: What is rendered.
         assets: Where models come from, as for `LiberoEnv`.
         robot: Model of the arm, see `libero_env.assets.robot`.
     """
@@ -155,8 +153,6 @@ class StateRenderer:
         """Return a renderer in the scene of a file's demonstrations.
 
         Args:
-            file: Demonstration file.
-            config: What is rendered.
             assets: Where models come from, as for `LiberoEnv`.
             task: Task that was recorded; None for the one that the file names.
 

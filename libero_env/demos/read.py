@@ -200,7 +200,6 @@ def read_episodes(file: Path, *, check_values: bool = True) -> Iterator[Episode]
     """Read demonstrations one at a time with all that is recorded of them.
 
     Args:
-        file: Demonstration file.
         check_values: Whether numbers that are not finite or absurd are refused.
 
     Raises:

@@ -165,7 +165,6 @@ def record_chunk(config: DemoConfig, writer: DemoWriter, numbers: list[int]) -> 
 
     Args:
         config: What the demonstrations depend on.
-        writer: Writer of the file.
         numbers: Demonstrations to record.
 
     Raises:

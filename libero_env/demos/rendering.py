@@ -35,10 +35,8 @@ class RenderJob(DemoJob):
     """Demonstrations to be rendered under perturbations.
 
     Attributes:
-        file: File of the recorded demonstrations.
         task: Task that was recorded; its id names the draws.
         n: Number of demonstrations, the first of the file.
-        config: What is rendered.
         path: File to write: the recorded one where nothing is perturbed, or one in a folder named by the perturbations.
     """
 
@@ -151,9 +149,6 @@ def rerender(
     stopped.
 
     Args:
-        file: File to read.
-        target: File to write.
-        config: What is rendered.
         assets: Where models come from, as for `LiberoEnv`.
         task: Task that was recorded, which names the draws of perturbations; by default the one that the file states.
         limit: Largest number of demonstrations to write, the first of the file; None for all.
@@ -193,7 +188,6 @@ def rendered_header(file: Path, config: RenderConfig, task: Task) -> dict[str, A
     """Return the attributes of a file that is rendered again, with the instruction where perturbations reword it.
 
     Args:
-        file: File that is read.
         config: What is rendered; its drawing is named.
         task: Task that was recorded.
     """

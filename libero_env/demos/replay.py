@@ -73,7 +73,6 @@ def replay(
     """Replay demonstrations from their first state, with the fixtures at their recorded poses.
 
     Args:
-        file: Demonstration file.
         by: `action` executes the recorded actions; `state` puts the simulation into each recorded state, and executes
             the last action only.
         demos: Names of the demonstrations to replay; None for all.
@@ -134,10 +133,6 @@ def _replay_episode(renderer: StateRenderer, episode: Episode, by: str, keys: li
 
 def rerun_actions(file: Path, target: Path) -> Path:
     """Write a copy of demonstrations with the states that their actions lead to from the first recorded state.
-
-    Args:
-        file: File to read.
-        target: File to write.
 
     Returns:
         The new file.
@@ -209,7 +204,6 @@ def regenerate(file: Path, config: Regeneration, task: Task | None = None) -> It
     """Run the demonstrations of a file again; one that does not reach the goal is yielded with `success` False.
 
     Args:
-        file: Demonstration file.
         config: How they are run.
         task: Task that was recorded; None for the one that the file states.
 

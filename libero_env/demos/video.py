@@ -59,7 +59,6 @@ class Mp4Writer:
     Frame i is shown at exactly i / fps.
 
     Args:
-        path: File to write.
         fps: Frames per second.
         codec: How frames are encoded.
     """

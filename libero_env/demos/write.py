@@ -56,7 +56,6 @@ class DemoWriter:
     """Writes one demonstration file.
 
     Args:
-        path: File to write.
         header: Attributes of the group `data`; `make_header` makes those of the original.
     """
 
@@ -221,7 +220,6 @@ def make_header(
         problem_name: Name of the problem in the task file, such as `LIBERO_Floor_Manipulation`.
         language: The instruction.
         bddl_name: Path of the task file below `bddl_files`, such as `libero_object/pick_up_..._basket.bddl`.
-        bddl_text: Text of the task file.
         env_kwargs: Arguments of the original's environment: robots, controller, cameras, control frequency.
         extra: Further attributes.
     """

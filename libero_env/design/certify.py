@@ -58,7 +58,6 @@ class Certificate:
 
     Attributes:
         task: Suite and index, such as `libero_object/3`.
-        name: Name of the task.
         digest: Digest of what the outcomes depend on.
         outcomes: Outcomes in the order of the initial states.
     """
@@ -194,7 +193,6 @@ def write_results(
 
     Args:
         certificates: Results of the tasks.
-        out: Folder to write to.
         assets: Models that were used, as for `select_pack`.
         disturb: Whether the actions had noise; the names of the files state it.
     """

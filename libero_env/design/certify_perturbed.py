@@ -81,7 +81,6 @@ def certify_perturbed(
     """Run the expert on perturbed tasks, from the first initial states of each.
 
     Args:
-        tasks: Tasks of suites.
         perturbations: Perturbations, each by itself.
         starts: Number of initial states of each task, at most 50.
         redraws: Number of further draws where the expert fails.

@@ -30,7 +30,6 @@ def contact_sheet(
         task: Task of a suite, whose initial states are stored, or of a file, whose initial state i is that of seed i.
         path: File to write; its folder is created.
         starts: Number of initial states.
-        cameras: Names of cameras.
         size: Height and width of a picture, [pixels].
 
     Returns:
@@ -73,11 +72,8 @@ def compare_starts(
     """Write a PNG of an initial state as it is, and beside it with perturbations, a row for each camera.
 
     Args:
-        task: Task of a suite.
-        perturbations: Perturbations.
         path: File to write; its folder is created.
         start: Number of the initial state.
-        cameras: Names of cameras.
         size: Height and width of a picture, [pixels].
 
     Returns:
@@ -120,7 +116,6 @@ def expert_video(
         task: Task to perform.
         path: File to write, whose name ends in .webp, .gif or .mp4.
         start: Number of the initial state.
-        camera: Name of a camera.
         size: Height and width of the video, [pixels].
 
     Returns:

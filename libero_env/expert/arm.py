@@ -104,11 +104,7 @@ def joint_angles(view: StateView) -> np.ndarray:
 
 
 class ArmKinematics:
-    """Inverse kinematics that prefers the rest posture, as the controller does.
-
-    Args:
-        model: Model of a scene with the robot.
-    """
+    """Inverse kinematics that prefers the rest posture, as the controller does."""
 
     def __init__(self, model: mujoco.MjModel):
         self._model, self._data = model, mujoco.MjData(model)
@@ -125,7 +121,6 @@ class ArmKinematics:
 
         Args:
             start: Joint angles at the start, (7,), [rad].
-            poses: Poses of the grip site.
 
         Returns:
             The last joint angles, and the largest error of the poses: 0 where all are reached.
@@ -141,7 +136,6 @@ class ArmKinematics:
 
         Args:
             start: Joint angles at the start, (7,), [rad].
-            pose: Pose of the grip site.
 
         Returns:
             Joint angles (7,), [rad], and the error beyond the tolerances, [m]; 0.1 rad of orientation count as 1 cm.

@@ -88,9 +88,6 @@ class Expert:
     def act(self, view: StateView) -> np.ndarray:
         """Return the next action, (7,) in [-1, 1].
 
-        Args:
-            view: State of the simulation.
-
         Raises:
             UnsupportedGoalError: The goal needs a skill that does not exist.
         """

@@ -14,11 +14,7 @@ FINE, COARSE, DENSE = 0.004, 0.02, 0.005
 
 
 class Shapes:
-    """Points on the collision geoms of all objects and fixtures, computed once and shared by the experts of a task.
-
-    Args:
-        scene: Scene of the task.
-    """
+    """Points on the collision geoms of all objects and fixtures, computed once and shared by the experts of a task."""
 
     def __init__(self, scene: Scene):
         self._scene = scene

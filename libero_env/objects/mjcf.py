@@ -81,7 +81,6 @@ class Mjcf:
     """An MJCF file that passed.
 
     Attributes:
-        path: The file.
         root: Its elements, without those that are left out; files are named by absolute paths.
         text: The same as text for MuJoCo.
         omitted: Number of lights, cameras, actuators, sensors and keyframes that are left out.

@@ -23,11 +23,9 @@ def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float, camera
     """Return the view of a camera that was moved about the point of the workspace that it looks at, and stays upright.
 
     Args:
-        scene: Scene with the camera.
         axis_angle: Direction of the movement in the image: 0 moves the camera to its right, pi / 2 upwards, [rad].
         degrees: Angle between the rays from the point to the camera before and after.
         factor: Ratio of the distances from the point after and before.
-        camera: Name of the camera.
     """
     model = scene.model
     index = model.camera(camera).id

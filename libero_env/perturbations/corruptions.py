@@ -51,7 +51,6 @@ def corrupt(image: np.ndarray, kind: str, severity: int, rng: np.random.Generato
         image: Image (H, W, 3) uint8; LIBERO-Plus' images have their bottom row first.
         kind: `motion`, `gaussian`, `zoom`, `fog` or `glass`.
         severity: Severity, 1 to 10.
-        rng: Generator of random numbers.
 
     Raises:
         UnknownNameError: There is no such kind.
@@ -158,7 +157,6 @@ def _plasma(side: int, decay: float, rng: np.random.Generator) -> np.ndarray:
     Args:
         side: Side, a power of two.
         decay: Ratio of the roughness of a scale to that of the next finer one.
-        rng: Generator of random numbers.
     """
     field = np.zeros((side, side))
     step, roughness = side, _FOG_ROUGHNESS

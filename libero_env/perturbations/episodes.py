@@ -65,8 +65,6 @@ class PerturbedEpisodes:
     Args:
         changes: Perturbations and absolute changes, of `checked_perturbations`.
         task: Task without perturbations.
-        base: Scene of that task.
-        scene: Scene of the perturbed task.
         num: Number of simulations.
 
     Attributes:

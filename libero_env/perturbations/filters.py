@@ -161,11 +161,7 @@ class ActionDelay(ActionFilter):
 
 @dataclass(frozen=True)
 class ActionGain(ActionFilter):
-    """The movement of the arm is scaled; the gripper is not.
-
-    Attributes:
-        factor: Factor.
-    """
+    """The movement of the arm is scaled; the gripper is not."""
 
     factor: float
 

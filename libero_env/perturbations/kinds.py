@@ -24,7 +24,6 @@ class Episode:
     """What a filter knows of one episode.
 
     Attributes:
-        key: Key of its random numbers.
         step: Number of control steps since the start.
         memory: What the filter remembers, by names of its own.
     """
@@ -44,7 +43,6 @@ class StartChange(ABC):
         """Return the changed state, or None where it is not possible, such as with a collision.
 
         Args:
-            scene: Scene of the task.
             row: State [time, qpos, qvel, poses of the fixtures]; it is not changed.
         """
 

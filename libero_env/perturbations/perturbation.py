@@ -167,9 +167,7 @@ def perturb_task(task: Task, perturbations: Iterable[Perturbation], scene: Scene
     Suite, index and name stay, so that its results can be paired with those of the task without perturbations.
 
     Args:
-        task: Task.
         perturbations: Perturbations in the order in which they are applied.
-        scene: Compiled scene of the task.
 
     Raises:
         InvalidInputError: The task has no other goal.

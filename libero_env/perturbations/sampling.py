@@ -40,8 +40,6 @@ def sample_key(kind: str, seed: int, task: str, start: object = "", attempt: int
     """Return the key of a sample. Severity is not part of it: a more severe one goes further in the same direction.
 
     Args:
-        kind: Name of the kind.
-        seed: Seed of the perturbation.
         task: Id of the task without perturbations, such as `libero_goal/3`.
         start: Index of the initial state, or another name of the start; empty for samples of a whole task.
         attempt: Number of samples of these names that were not valid.

@@ -55,7 +55,6 @@ def parse_tree(text: str, file: str, first: int = 1) -> List:
     """Return the one list in a text; `;` starts a comment.
 
     Args:
-        text: Text to read.
         file: Name of its file for error messages.
         first: Line of the file that the text begins on, from 1.
 

@@ -50,7 +50,6 @@ def read_definition(path: Path, source: Source | None = None) -> tuple[dict[str,
     """Return the content of a task's or scene's YAML file, and where it stands.
 
     Args:
-        path: File to read.
         source: Definition that names the file as its scene; None for none.
 
     Raises:

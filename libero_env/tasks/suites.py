@@ -94,7 +94,6 @@ def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
 
     Args:
         files: BDDL and YAML files, in the order of the tasks.
-        name: Name of the suite.
 
     Returns:
         The suite; its tasks have its name and consecutive indices.
@@ -119,7 +118,6 @@ def write_task(task: Task, path: str | Path) -> Path:
     """Write a task as a BDDL file. Readers derive the instruction from the name of the file, as in the original.
 
     Args:
-        task: Task to write.
         path: File to write, whose name ends in .bddl; its folder is created.
 
     Returns:

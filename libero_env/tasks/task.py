@@ -15,7 +15,6 @@ def check_name(name: str, what: str = "task") -> str:
     """Return the name of a task or suite, which becomes that of files and folders, if it can be.
 
     Args:
-        name: Name to check.
         what: What it names, for the message.
 
     Raises:
@@ -94,7 +93,6 @@ class Suite:
 
     Attributes:
         name: Name of the suite, such as `libero_object`.
-        tasks: Tasks by index.
     """
 
     name: str

@@ -32,7 +32,6 @@ class Status:
         language: The instruction.
         progress: Whether each atom of the goal is true.
         step: Number of control steps in the episode.
-        recorded: Number of demonstrations that are recorded.
         target: Number of demonstrations to record.
     """
 
@@ -67,7 +66,6 @@ class Teleop:
     """Episodes of a task that a user drives.
 
     Args:
-        task: The task.
         device: Input device of the user.
         screen: What the user looks at.
         seed: Seed of the starts.

@@ -116,9 +116,6 @@ class Algorithm:
         """Return which tasks are learned together, stage after stage; by default one at a time.
 
         In the other hooks, in records and in file names, a stage has the index of its last task.
-
-        Args:
-            tasks: Number of tasks.
         """
         return tuple((task,) for task in range(tasks))
 
@@ -126,8 +123,6 @@ class Algorithm:
         """Prepare for a task, before the first step on it.
 
         Args:
-            task_index: Position of the task in the sequence.
-            dataset: Windows of the task.
             policy: Policy with the weights that the last task ended with.
         """
 
@@ -181,8 +176,6 @@ class Algorithm:
         """Finish a task, after its last phase.
 
         Args:
-            task_index: Position of the task in the sequence.
-            dataset: Windows of the task.
             policy: Policy with the task's final weights.
             generator: CPU generator of the task's end.
         """
@@ -200,7 +193,6 @@ class Algorithm:
         here and no layer has hooks; otherwise everything in `state_dict`, which is always right.
 
         Args:
-            task_index: Position of the task in the sequence.
             policy: Policy that `policy_for` yields for the task.
 
         Returns:

@@ -141,8 +141,6 @@ class RoutedExperts(FrozenBase):
         """Return what experts add to a layer's output, each on its rows; None where all rows use the base alone.
 
         Args:
-            name: Name of the layer.
-            layer: The layer.
             x: Its input.
             groups: Tasks, each with the rows (n,) its experts act on, None for all; one without experts adds nothing.
         """

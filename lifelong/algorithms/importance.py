@@ -50,7 +50,6 @@ class ImportanceEstimator:
         """Estimate the importance of a policy's weights for a task.
 
         Args:
-            dataset: Windows of the task.
             policy: Policy with the weights after the task; its mode is restored.
             generator: Generator of the windows' order, of their augmentation, and of what the objective draws.
             augment: Augmentation of training, for estimators that augment.

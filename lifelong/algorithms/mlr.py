@@ -195,7 +195,6 @@ def feature_parameters(policy: HistoryPolicy, batch: Batch) -> list[str]:
     """Return the names of the parameters that the features of frames depend on.
 
     Args:
-        policy: Policy.
         batch: Windows whose features are computed, one at least.
     """
     named = {name: p for name, p in policy.named_parameters() if p.requires_grad}
@@ -218,7 +217,6 @@ def describe(policy: HistoryPolicy, dataset: TaskWindows) -> tuple[Tensor, Tenso
     """Return directions of the features of a task, or of each of several that are learned together.
 
     Args:
-        policy: Policy.
         dataset: Windows of the task, of which at most 512 are used.
 
     Returns:

@@ -235,7 +235,6 @@ def compress(dataset: TaskWindows, order: Tensor, budget: int, quality: Quality)
     """Compress a task's windows, as many as have at most `budget` bytes together.
 
     Args:
-        dataset: Windows of the task.
         order: Indices of its windows, (n,) int64; the first ones are kept.
         budget: Largest number of bytes.
         quality: Quality of WebP.
@@ -302,7 +301,6 @@ class CompressedMemory(TaskMemory[CompressedWindows]):
         """Add a task.
 
         Args:
-            dataset: Windows of the task.
             generator: Draws which of its windows are kept.
 
         Raises:

@@ -35,7 +35,6 @@ class SequenceVLDataset:
         actions: (F, A) float32.
         last: Index of the last frame of each frame's demonstration, (F,) int64.
         language: Embedding of the instruction, (L,) float32.
-        task_id: Position in the task sequence.
         seq_len: Number of steps in a window, T.
         batch_device: Device of the batches; None for the device of the frames.
         pin_memory: Whether batches are gathered in page-locked memory first, so that they are copied to a GPU
@@ -66,7 +65,6 @@ class SequenceVLDataset:
             path: HDF5 file in the original's layout.
             spec: Views, readings, their sizes, and `seq_len`.
             language: Embedding of the instruction, (L,).
-            task_id: Position in the task sequence.
             reading: Further fields of `DemoSource`.
 
         Raises:

@@ -261,7 +261,6 @@ class DemoDatasets(Mapping[int, TaskWindows]):
         spec: Views, readings and their sizes.
         languages: Embeddings of the instructions, (K, L) for K tasks.
         data: How the files are read, and where frames are held.
-        device: Device of the batches.
         copies: Files of copies of each task's demonstrations, from which its windows are, too; () for none.
     """
 

@@ -94,7 +94,6 @@ class LatentMemory(TaskMemory[LatentWindows]):
         """Add a task's windows; when another one is added, the first ones stay.
 
         Args:
-            task: Position in the task sequence.
             latents: Latents in random order, (N, T, ...).
             actions: Actions of the same windows, (N, T, A).
 

@@ -43,8 +43,6 @@ def open_windows(
     Args:
         source: What is read.
         language: Embedding of the instruction, (L,).
-        task_id: Position in the task sequence.
-        device: Device of the batches.
         memory: One of `MEMORY`.
 
     Raises:

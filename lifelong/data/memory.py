@@ -87,7 +87,6 @@ class ReplayMemory(TaskMemory[Tensor]):
         """Add a task.
 
         Args:
-            dataset: Windows of the task.
             generator: Draws which of its windows are kept.
 
         Raises:

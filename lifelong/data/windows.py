@@ -37,7 +37,6 @@ def batches_in_order(dataset: WindowDataset, chunks: Sequence[Tensor]) -> Iterat
     """Yield the windows of each list of indices; those of the next one are read ahead, if the dataset can do that.
 
     Args:
-        dataset: The windows.
         chunks: Indices of the windows of each batch, (B,) int64.
     """
     for indices, following in zip_longest(chunks, chunks[1:]):
@@ -108,7 +107,6 @@ class WindowSubset:
     """Some of a dataset's windows.
 
     Attributes:
-        dataset: The dataset.
         chosen: Indices of its windows, (n,) int64.
     """
 

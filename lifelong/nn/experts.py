@@ -109,8 +109,6 @@ class Attachment:
         """Add something to the output of layers; do nothing where that is done already.
 
         Args:
-            policy: Policy with the layers.
-            layers: Layers by name.
             add: Function that returns what is added, given name, layer and input; None for nothing.
             encode: Function called in place of `policy.encode`.
 

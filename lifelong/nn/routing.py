@@ -86,7 +86,6 @@ def cluster_centres(x: Tensor, count: int, draws: torch.Generator, iterations: i
         x: Points (n, F).
         count: Number of clusters; fewer where there are fewer points.
         draws: CPU generator, which draws the first centres, each by its squared distance from those before it.
-        iterations: Number of iterations.
     """
     points = x.double()
     centres = points[torch.randint(len(points), (1,), generator=draws).to(x.device)]
@@ -139,7 +138,6 @@ class Discriminator:
 
         Args:
             samples: Inputs of the layer (n, tokens, D).
-            hidden: Number of hidden units.
             steps: Number of steps, of up to `_SAMPLES` samples each.
             lr: Learning rate.
             draws: CPU generator.

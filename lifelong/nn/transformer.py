@@ -42,7 +42,6 @@ def attend(qkv: Tensor, heads: int, mask: Tensor | None = None, dropout: float =
 
     Args:
         qkv: Queries, keys and values of all heads, (B, S, 3 * heads * head_dim).
-        heads: Number of heads.
         mask: Mask (S, S), True where a token attends; None: everywhere.
         dropout: Probability that an attention weight is dropped.
     """

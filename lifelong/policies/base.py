@@ -105,7 +105,6 @@ class Policy(nn.Module, ABC):
         What is noted must be in the policy's `state_dict`.
 
         Args:
-            dataset: Windows of the task.
             instruction: The instruction as text.
         """
 
@@ -168,12 +167,7 @@ def copy_weights(policy: nn.Module) -> dict[str, Tensor]:
 
 @contextmanager
 def in_mode(policy: nn.Module, *, training: bool) -> Iterator[None]:
-    """Put a policy in training or in evaluation mode within the context; its own mode is restored.
-
-    Args:
-        policy: Policy.
-        training: Whether the mode is that of training.
-    """
+    """Put a policy in training or in evaluation mode within the context; its own mode is restored."""
     before = policy.training
     policy.train(training)
     try:

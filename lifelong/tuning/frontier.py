@@ -240,7 +240,6 @@ def write_frontier(frontier: Frontier, path: Path, about: Mapping[str, Any]) -> 
 
     Args:
         frontier: What was measured.
-        path: File to write.
         about: What else is to be known: command, tasks, versions.
     """
     record = {
@@ -266,7 +265,6 @@ def write_tuned(outcome: Outcome, path: Path, about: str) -> None:
 
     Args:
         outcome: The chosen value.
-        path: File to write.
         about: Where it comes from; a comment at the top.
 
     Raises:

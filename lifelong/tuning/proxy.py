@@ -242,7 +242,6 @@ def scaled(settings: FitSettings, steps: int) -> FitSettings:
     """Return settings with about this number of steps a task, and a warm-up of the same share of them.
 
     Args:
-        settings: Settings of a run.
         steps: Number of steps; what is over after all epochs have the same number is left out.
     """
     per_epoch = max(1, steps // settings.epochs)

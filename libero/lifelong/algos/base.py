@@ -80,7 +80,6 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
     for each task `learn_one_task` calls `start_task`, `observe` on each batch (`eval_observe` at epoch 0), `end_task`.
 
     Args:
-        n_tasks: Number of tasks of the sequence.
         cfg: Configuration, with `shape_meta` of `get_dataset`.
         policy_kwargs: Further arguments of the policy's class.
 

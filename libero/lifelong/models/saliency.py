@@ -22,7 +22,6 @@ class PerturbationAttention:
         model: Policy; `forward(data)` returns a distribution of actions, or actions.
         image_size: H, W of the images that `patch_size` refers to.
         patch_size: Height and width of a blurred place, and the distance between places, in pixels.
-        device: Device of the model.
     """
 
     def __init__(

@@ -35,7 +35,6 @@ def lint_task(task: Task, pack: Pack | None = None, *, starts: int = STARTS) -> 
     """Return the findings about a task; lines are those of the text that `libero tasks show` prints.
 
     Args:
-        task: Task to check.
         pack: Models to use; None is `select_pack()`.
         starts: Number of initial states to check; 0 simulates nothing.
     """

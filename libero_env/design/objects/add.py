@@ -35,7 +35,6 @@ class Added:
 
     Attributes:
         name: Its category.
-        folder: Folder with its files.
         properties: Content of `object.yaml`.
         notes: Assumptions that were made, and what should be checked.
     """

@@ -54,7 +54,6 @@ def read_mesh(path: Path, *, size: float | None, up: str | None, notify: Notify)
     """Return the surfaces of a mesh file, z up, the origin at the centre of their bounds.
 
     Args:
-        path: File to read.
         size: Desired longest side, [m]; None keeps that of the file, whose unit is guessed.
         up: Axis of the file that points up, `z` or `y`; None is the convention of the format.
         notify: Function that receives a message about each assumption.

@@ -79,9 +79,7 @@ def store_mesh(path: Path, name: str, directory: Path, options: Options, notify:
     """Write the files of an object that is made from a mesh.
 
     Args:
-        path: File to read.
         name: Category.
-        directory: Folder to write to.
         options: Options of the conversion.
         notify: Function that receives a message about each assumption and each problem.
 

@@ -36,7 +36,6 @@ def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notif
     Args:
         path: MJCF file to read.
         name: Category.
-        directory: Folder to write to.
         container: Whether to add a region `contain_region` if the object has none.
         notify: Function that receives a message about omitted elements.
 

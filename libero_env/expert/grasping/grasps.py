@@ -309,7 +309,6 @@ def grip_cost(cloud: np.ndarray, grasp: Grasp) -> float:
 
     Args:
         cloud: Points on the body, world frame, (N, 3).
-        grasp: Grasp of the body.
     """
     u, v, depth = _between_pads(cloud, grasp.pos_world, grasp.mat).T
     if not len(u):
@@ -327,7 +326,6 @@ def collision_cost(voxels: Voxels, obstacles: np.ndarray, grasp: Grasp) -> float
     Args:
         voxels: Voxels of the scene; only the height of the table counts.
         obstacles: Points on obstacles near the grasp, (M, 3).
-        grasp: Grasp of a body.
     """
     depth = kernels.open_hand_collision_depth(obstacles, grasp.pos_world, grasp.mat)
     lowest = float((grasp.pos_world + HAND @ grasp.mat.T)[:, 2].min())

@@ -173,7 +173,6 @@ def grasp_knob(view: StateView, part: Part, delta: float) -> HandleGrasp:
     The hand leans along the knob where the wrist would be bent back, close to the arm's base.
 
     Args:
-        view: State of the simulation.
         part: Knob.
         delta: Angle by which it is to be turned, [rad].
 
@@ -210,7 +209,6 @@ def grasp_handle(
     The cost counts collisions of the hand, the posture of the arm, and rotation of the hand.
 
     Args:
-        view: State of the simulation.
         part: Part that moves.
         handle: Handle of the part.
         delta: Motion of the joint, [m] or [rad].
@@ -256,7 +254,6 @@ def table_penetration(surface_height: float, pose: Pose, opened: bool) -> float:
 
     Args:
         surface_height: Height of the table, [m].
-        pose: Pose of the grip site.
         opened: Whether the fingers are open.
     """
     outer = (GRIPPER.half_opening if opened else 0.0) + GRIPPER.tip_thickness

@@ -25,8 +25,6 @@ class Part:
     """A body that one joint moves.
 
     Attributes:
-        joint: Index of the joint in the model.
-        body: Index of the body in the model.
         slides: Whether the joint is a slide; otherwise it is a hinge.
     """
 
@@ -60,7 +58,6 @@ class Part:
         """Return a pose that is fixed to the part after the joint has moved.
 
         Args:
-            view: State of the simulation.
             pose: Pose now.
             delta: Motion of the joint, [m] or [rad].
             rotation: Angle by which the pose rotates on its path, [rad]; None for that of the part.
@@ -81,7 +78,6 @@ class Part:
         """Return poses that are fixed to the part after the joint has moved.
 
         Args:
-            view: State of the simulation.
             pos: Positions now, (N, 3).
             mat: Orientations now, (N, 3, 3).
             delta: Motion of the joint, [m] or [rad].
@@ -126,7 +122,6 @@ def find_handle(view: StateView, part: Part, direction: float) -> Handle:
     """Return what sticks out furthest where the part opens.
 
     Args:
-        view: State of the simulation.
         part: Part that moves.
         direction: Sign of the joint's motion that opens the part.
     """
@@ -152,7 +147,6 @@ def find_inner_side(view: StateView, part: Part, direction: float) -> Handle:
     """Return the side of a door that is pushed to open it further, near its upper edge.
 
     Args:
-        view: State of the simulation.
         part: Door that is ajar.
         direction: Sign of the joint's motion that opens the door.
     """
@@ -174,7 +168,6 @@ def opening_direction(view: StateView, part: Part, direction: float, points: np.
     """Return the direction in which the outer end of a part moves, unit vector (3,).
 
     Args:
-        view: State of the simulation.
         part: Part that moves.
         direction: Sign of the joint's motion.
         points: Points on the part, world frame, (N, 3).
@@ -205,7 +198,6 @@ def nearby_points(
     """Return points on objects and fixtures near `centre` (3,), fewer further away, world frame, (N, 3).
 
     Args:
-        view: State of the simulation.
         centre: Middle of the space, (3,).
         names: Names of objects and fixtures.
         excluded_body: Index of a body that is left out.

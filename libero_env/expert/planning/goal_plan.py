@@ -36,10 +36,6 @@ def plan_goal(goal: Expression, view: StateView) -> tuple[Step, ...]:
     that give access to a place or an object; place objects, each after the object that carries it; close what has
     received something.
 
-    Args:
-        goal: Goal of a task.
-        view: State of the simulation.
-
     Raises:
         UnsupportedGoalError: No skill reaches an atom of the goal.
     """

@@ -24,8 +24,6 @@ class PickPlan:
     """Where to grasp an object and where to release it.
 
     Attributes:
-        grasp: Grasp of the object.
-        place: Pose of the object at its place.
         object_pose: Pose of the object now.
         drop_height: Height above the place at which the object is released, [m].
         cost: Cost of the plan; lower is better.
@@ -81,7 +79,6 @@ class PickSearch:
         grasp_spacing: Distance between grasps below which only the best is kept, [m].
         obstacle_radius: Distance from an object beyond which nothing is in the hand's way, [m].
         collision_limit: Cost of the best grasp from which on more tilted approaches are searched.
-        places: Number of places.
         places_per_group: Number of places with the same orientation of the object and the same depth.
         depth_step: Difference in depth, along the entry, that makes a different group, [m].
         entry_directions: Number of directions of tilted approaches.
@@ -130,7 +127,6 @@ def first_reachable(
     """Return the first plan that the arm reaches, or the one with the smallest error; and the error.
 
     Args:
-        view: State of the simulation.
         shapes: Shapes of the scene, with the arm's kinematics.
         plans: Plans, best first.
         flip: Whether the hand may also be rotated by half a turn.

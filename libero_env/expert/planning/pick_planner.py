@@ -28,8 +28,6 @@ def plan_pick(
     """Return the best plan to make an atom true; the result is deterministic.
 
     Args:
-        view: State of the simulation.
-        shapes: Shapes of the scene.
         atom: (On object place), (In object region) or (Stack object place).
         slot: (k, n): the object is number k of n that go to this place.
         failures: Attempts that failed before; others are preferred.

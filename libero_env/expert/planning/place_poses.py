@@ -69,7 +69,6 @@ class Placement:
     """An object that is to be placed, and the scene around it.
 
     Attributes:
-        view: State of the simulation.
         atom: Atom to make true: (On object place), (In object region) or (Stack object place).
         slot: (k, n): the object is number k of n that go to this place; each leaves room for the others.
         cloud: Points on the object, world frame, (N, 3).

@@ -25,8 +25,6 @@ class Drag(Skill):
 
     Args:
         atom: Atom to make true.
-        style: Motion style.
-        shapes: Shapes of the scene.
     """
 
     NOISE_SCALES = {"reach": 1.0, "carry": 0.3}

@@ -38,8 +38,6 @@ class DropIntoContainer(Skill):
     Args:
         atom: Atom to make true.
         container: Name of the object that the region belongs to.
-        style: Motion style.
-        shapes: Shapes of the scene.
     """
 
     NOISE_SCALES = {"reach": 1.0, "carry": 0.7}

@@ -44,8 +44,6 @@ class PickPlace(Skill):
 
     Args:
         atom: Atom to make true.
-        style: Motion style.
-        shapes: Shapes of the scene.
         slot: (k, n): the object is number k of n that go to the same place.
     """
 
@@ -160,7 +158,6 @@ class PickPlace(Skill):
         A tilted hand joins its approach above the obstacles; one that comes nearly level descends before the grasp.
 
         Args:
-            view: State of the simulation.
             goal: Position of the grip site at the grasp, (3,).
             back: Direction against the approach, (3,).
             lift: Distance back along the approach, [m].

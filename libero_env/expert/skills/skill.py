@@ -24,7 +24,6 @@ class Skill:
 
     Args:
         atom: Atom to make true.
-        style: Motion style.
 
     Attributes:
         phase: Name of the phase, such as `reach`.
@@ -121,7 +120,6 @@ class Skill:
         """Return the action towards a pose of the grip site, in this motion style.
 
         Args:
-            view: State of the simulation.
             pos: Target position of the grip site, (3,).
             mat: Target orientation of the grip site, (3, 3).
             gripper: Seventh entry of the action.
@@ -179,7 +177,6 @@ def funnel_lift(slope: float, distance: float, angle: float, largest: float) -> 
     """Return how far a hand stays back from its target, so that it approaches within a funnel, [m].
 
     Args:
-        slope: Slope of the funnel.
         distance: Lateral distance from the target beyond the tolerance, [m].
         angle: Angle from the target orientation beyond the tolerance, [rad].
         largest: Height of the funnel, [m].

@@ -69,8 +69,6 @@ class Transport:
         view: State in which the object has been grasped.
         atom: Atom to make true.
         plan: Where the object is released.
-        style: Motion style.
-        shapes: Shapes of the scene.
         exit_pose: Pose to go to first, away from where something blocked the way.
     """
 
@@ -105,7 +103,6 @@ class Transport:
         """Return the next target of the hand, or how the transport ended.
 
         Args:
-            view: State of the simulation.
             velocity: Velocity of the grip site, (3,), [m/s].
 
         Returns:
@@ -176,7 +173,6 @@ class Transport:
         """Move over the place and down a funnel; between walls, only once the object is in their middle.
 
         Args:
-            view: State of the simulation.
             goal: Position of the grip site at the place, (3,).
             turn: Angle to the orientation at the place, [rad].
             below: Extent of object and hand below the grip site, [m].

@@ -93,7 +93,6 @@ class Part:
         mass: Mass, [kg].
         com: Centre of mass in the frame of the body, (3,) [m].
         inertia: Ixx, Iyy, Izz, Ixy, Ixz, Iyz about `com`, [kg m^2]; empty for a body without mass.
-        boxes: Collision shapes.
         sites: Named regions.
         parent: Name of the parent body; "" for the root.
         pos: Origin in the frame of the parent, (3,) [m].
@@ -117,7 +116,6 @@ class Physics:
     """Physics and placement of one category, SI units; `ObjectModel` documents the fields that are not listed.
 
     Attributes:
-        root: Root body.
         parts: Name -> body below the root.
         friction: Friction of collision shapes that do not set their own, (3,).
         solref: As `friction`, for MuJoCo's `solref`.

@@ -54,7 +54,6 @@ class Distribution:
 
     Attributes:
         title: Its name.
-        key: Key of the configuration file that names a folder.
         variable: Environment variable that does.
         package: Distribution that has its files.
         folder: Folder of the files in `site-packages`.
@@ -172,7 +171,6 @@ def lacking(variant: PlusVariant | None, problem: Problem, categories: Iterable[
 
     Args:
         variant: Variant of LIBERO-Plus, or None.
-        problem: Its problem.
         categories: Those of objects that have a model.
     """
     if variant is not None and variant.scenery in _PICTURES:
