@@ -19,10 +19,7 @@ from lifelong.results.results import Results
 from lifelong.results.run_directory import BROKEN_SUFFIX, CheckpointFolder, RunDirectory, read_saved_config
 from lifelong.results.summary import summarize
 
-_COMPARED = (
-    *("finished", "tasks_learned", "success_matrix", "curves", "losses", "best_epochs"),
-    "metrics",
-)
+_COMPARED = (*("finished", "tasks_learned", "success_matrix", "curves", "losses", "best_epochs"), "metrics")
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,7 @@ from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
-from lifelong.data.demonstrations import (
-    DemoDatasets,
-    check_folder,
-    demo_copies,
-    find_demos,
-    perturb_demos,
-)
+from lifelong.data.demonstrations import DemoDatasets, check_folder, demo_copies, find_demos, perturb_demos
 from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError
 from lifelong.evaluation.environments import (

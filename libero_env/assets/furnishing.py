@@ -200,13 +200,7 @@ def add_visual_mesh(
         usertexcoord=mesh.texcoords.ravel(),
     )
     added.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    body.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_MESH,
-        meshname=name,
-        material=material,
-        **VISUAL_GEOM,
-    )
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=material, **VISUAL_GEOM)
 
 
 @cache

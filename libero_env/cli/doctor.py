@@ -15,12 +15,7 @@ from pathlib import Path
 
 from libero_env.assets.pack import BUILTIN, VARIABLE, chosen_assets, facade_assets, pack_of
 from libero_env.assets.published import find_distribution
-from libero_env.assets.robot import (
-    ROBOSUITE_REMEDY,
-    ROBOSUITE_VERSION,
-    robosuite_assets,
-    robosuite_version,
-)
+from libero_env.assets.robot import ROBOSUITE_REMEDY, ROBOSUITE_VERSION, robosuite_assets, robosuite_version
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.paths import cache_dir, config_file, demos_dir, read_config
 from libero_env.storage import check_trusted

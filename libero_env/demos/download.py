@@ -28,11 +28,7 @@ def remote_files(names: Sequence[str]) -> list[str]:
 
 
 def download_demos(
-    names: Sequence[str],
-    dest: Path | None = None,
-    *,
-    revision: str = REVISION,
-    overwrite: bool = False,
+    names: Sequence[str], dest: Path | None = None, *, revision: str = REVISION, overwrite: bool = False
 ) -> list[Path]:
     """Download demonstrations, or what is missing of them; `HF_ENDPOINT` names another server than the Hub.
 

@@ -16,12 +16,7 @@ from gymnasium.vector.utils import batch_space
 from pydantic import Field
 
 from libero_env.envs.batch import LiberoVectorEnv
-from libero_env.envs.checks import (
-    ResetRequest,
-    checked_actions,
-    checked_index,
-    checked_indices,
-)
+from libero_env.envs.checks import ResetRequest, checked_actions, checked_index, checked_indices
 from libero_env.envs.config import EnvConfig, show_options
 from libero_env.envs.worker import Failure, Worker, open_libero, shut_down, wait_for
 from libero_env.errors import InvalidInputError, LiberoError

@@ -41,10 +41,7 @@ def atomic_write_npz(target: Path, arrays: Mapping[str, Any], *, fsync: bool = F
     content = bytearray(stream.getvalue())
     content[-2:] = _SEAL_BYTES.to_bytes(2, "little")  # length of the comment
     seal = _SEAL + hashlib.sha256(content).hexdigest().encode()
-    with (
-        atomic_path(target, fsync=fsync) as temporary,
-        open(temporary, "wb", opener=open_for_owner) as file,
-    ):
+    with atomic_path(target, fsync=fsync) as temporary, open(temporary, "wb", opener=open_for_owner) as file:
         file.write(content)
         file.write(seal)
 

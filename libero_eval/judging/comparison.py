@@ -22,13 +22,7 @@ from libero_eval.judging.comparability import (
 )
 from libero_eval.judging.group_scores import GroupScores, group_scores
 from lifelong.errors import ConfigError, ResultsError
-from lifelong.stats.episodes import (
-    ALPHA,
-    Difference,
-    SequentialTest,
-    difference,
-    sequential_test,
-)
+from lifelong.stats.episodes import ALPHA, Difference, SequentialTest, difference, sequential_test
 from lifelong.stats.intervals import Estimate, holm, wilson_interval
 from lifelong.stats.power import Question, shown_difference
 

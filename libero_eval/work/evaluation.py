@@ -210,12 +210,7 @@ class Evaluation:
             )
 
     def _unit_result(
-        self,
-        unit: Unit,
-        done: Rollouts,
-        env: VectorEnv,
-        started: float,
-        errors: tuple[str | None, ...] = (),
+        self, unit: Unit, done: Rollouts, env: VectorEnv, started: float, errors: tuple[str | None, ...] = ()
     ) -> UnitResult:
         attempts = tuple(e.attempts for e in done.episodes)
         result = TaskResult(

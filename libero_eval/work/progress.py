@@ -44,10 +44,7 @@ class Progress:
 
     def __str__(self) -> str:
         """Return one line, such as `12 of 50 units, 120 of 500 episodes, 1,830 an hour, 12 min left, 3 running`."""
-        parts = [
-            f"{self.done} of {self.units} units",
-            f"{self.episodes_done} of {self.episodes} episodes",
-        ]
+        parts = [f"{self.done} of {self.units} units", f"{self.episodes_done} of {self.episodes} episodes"]
         if math.isfinite(self.per_hour):
             parts += [f"{self.per_hour:,.0f} an hour"]
             parts += [f"{duration(self.seconds_left)} left"] if self.done < self.units else []

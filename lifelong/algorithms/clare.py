@@ -9,11 +9,7 @@ from torch import Tensor, nn
 from lifelong.algorithms.frozen_base import RoutedExperts
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
-from lifelong.nn.experts import (
-    Add,
-    adaptable_modules,
-    matrix_of,
-)
+from lifelong.nn.experts import Add, adaptable_modules, matrix_of
 from lifelong.nn.routing import Discriminator, groups_of_rows
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.types import Count, Natural, NonNegative, Positive, Width

@@ -9,11 +9,7 @@ from torch import Tensor, nn
 from lifelong.algorithms.frozen_base import RoutedExperts
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
-from lifelong.nn.experts import (
-    adapted_layers,
-    rows_per_sample,
-    weights_of,
-)
+from lifelong.nn.experts import adapted_layers, rows_per_sample, weights_of
 from lifelong.nn.routing import cluster_centres, groups_of_rows, nearest_key
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.types import Count, Natural, NonNegative, Observation, Width
@@ -44,10 +40,7 @@ class IsCiL(RoutedExperts):
     * Linear layers and convolutions have adapters; an LSTM stays as in the base.
     """
 
-    state_form = {
-        **RoutedExperts.state_form,
-        "prototypes": {int: Tensor},
-    }
+    state_form = {**RoutedExperts.state_form, "prototypes": {int: Tensor}}
 
     def __init__(
         self,

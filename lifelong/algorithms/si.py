@@ -84,11 +84,7 @@ class SI(Anchored):
 
     def state_dict(self) -> dict[str, Any]:
         """Return importance and anchor, and the path of the task being learned."""
-        return {
-            "anchor": super().state_dict(),
-            "omega": dict(self._omega),
-            "way": dict(self._displacement),
-        }
+        return {"anchor": super().state_dict(), "omega": dict(self._omega), "way": dict(self._displacement)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned."""

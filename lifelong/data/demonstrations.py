@@ -284,11 +284,7 @@ class DemoDatasets(Mapping[int, TaskWindows]):
     def _windows(self, path: Path, task: int) -> TaskWindows:
         source = DemoSource(path, self.spec, self.counts[task], self.data.pairing, self.data.labels)
         return open_windows(
-            source,
-            language=self.languages[task],
-            task_id=task,
-            device=self.device,
-            memory=self.data.memory,
+            source, language=self.languages[task], task_id=task, device=self.device, memory=self.data.memory
         )
 
     def __iter__(self) -> Iterator[int]:

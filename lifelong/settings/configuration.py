@@ -146,11 +146,7 @@ def plain_data(config: DictConfig) -> dict[str, Any]:
 
 
 def _build(
-    node: Any,
-    at: Path,
-    allowed: Sequence[str] | None,
-    more: Mapping[str, Any],
-    completed: Sequence[str] = (),
+    node: Any, at: Path, allowed: Sequence[str] | None, more: Mapping[str, Any], completed: Sequence[str] = ()
 ) -> Any:
     """Build the object of a node.
 

@@ -82,12 +82,7 @@ def _add_collision(body: mujoco.MjsBody, part: Part, physics: Physics, numbers: 
 
 
 def _add_visual(
-    spec: mujoco.MjSpec,
-    body: mujoco.MjsBody,
-    category: str,
-    appearance: Appearance,
-    *,
-    suffix: str,
+    spec: mujoco.MjSpec, body: mujoco.MjsBody, category: str, appearance: Appearance, *, suffix: str
 ) -> None:
     root, mesh = body.name == ROOT_BODY, appearance.mesh
     prefix = (category if root else f"{category}_{body.name}") + suffix

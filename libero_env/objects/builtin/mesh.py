@@ -269,10 +269,7 @@ def _section(ring: Ring, segments: int, center: Sequence[float]) -> tuple[np.nda
     cosine, sine = np.round(np.cos(angle), 12), np.round(np.sin(angle), 12)
     x = np.sign(cosine) * np.abs(cosine) ** bend * ring.depth + center[0]
     y = np.sign(sine) * np.abs(sine) ** bend * ring.width + center[1]
-    return (
-        np.column_stack([x, y, np.full_like(u, ring.z)]),
-        np.column_stack([u, np.full_like(u, ring.v)]),
-    )
+    return (np.column_stack([x, y, np.full_like(u, ring.z)]), np.column_stack([u, np.full_like(u, ring.v)]))
 
 
 def _band(low: int, high: int, segments: int) -> np.ndarray:

@@ -277,12 +277,7 @@ def _tasks(suite: str, folder: Path) -> tuple[PublishedTask, ...]:
 
 
 def _task(
-    suite: str,
-    index: int,
-    variant: PlusVariant | None,
-    base: Task,
-    folder: Path,
-    categories: Collection[str],
+    suite: str, index: int, variant: PlusVariant | None, base: Task, folder: Path, categories: Collection[str]
 ) -> PublishedTask:
     """Return a task of a suite; `variant` is None in LIBERO-PRO."""
     origin, states = _SUITES[suite], folder / "init_files"
