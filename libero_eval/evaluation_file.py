@@ -61,8 +61,8 @@ class TaskResult(Episodes):
 
     def __post_init__(self) -> None:
         errors = self.shape_errors()
-        if len(set(self.init_states)) != len(self.init_states):
-            errors.append(f"an initial state is counted twice: {list(self.init_states)}")
+        if len(set(self.starts)) != len(self.starts):
+            errors.append(f"an initial state is counted twice: {list(self.starts)}")
         if errors:
             raise EvaluationFileError(f"{self.task}: {errors[0]}")
 
@@ -81,16 +81,21 @@ class TaskResult(Episodes):
         return cls(first.task, first.name, first.instruction, atoms=first.atoms, **rows)
 
     @property
+    def starts(self) -> tuple[int, ...]:
+        """Initial states of all episodes, also of those that do not count; these are the last."""
+        return (*self.init_states, *(start for start, _ in self.simulation_errors))
+
+    @property
     def suite(self) -> str:
         """Name of the task's suite."""
         return self.task.partition("/")[0]
 
     @property
     def success(self) -> Estimate:
-        """Success rate with Wilson's interval."""
+        """Success rate with Wilson's interval; NaN in [0, 1] if no episode counts."""
         wins, count = sum(self.successes), len(self.successes)
         low, high = wilson_interval(wins, count)
-        return Estimate(wins / count, float(low), float(high))
+        return Estimate(wins / count if count else float("nan"), float(low), float(high))
 
     @property
     def steps(self) -> float:
@@ -116,7 +121,7 @@ class EvaluationResult:
         times: When and how long it was run; not part of `outcomes`.
 
     Raises:
-        EvaluationFileError: There are no tasks, or one is counted twice.
+        EvaluationFileError: There are no tasks, one is counted twice, or no episode of one counts.
     """
 
     evaluated: Mapping[str, Any]
@@ -132,6 +137,10 @@ class EvaluationResult:
         names = [result.task for result in self.tasks]
         if not names:
             raise EvaluationFileError("there are no tasks")
+        if lost := [result.task for result in self.tasks if not result.init_states]:
+            raise EvaluationFileError(
+                f"simulation errors ended all episodes of {', '.join(lost)}: nothing counts"
+            )
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise EvaluationFileError(f"tasks are counted twice: {', '.join(twice)}")
 

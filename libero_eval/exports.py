@@ -15,7 +15,7 @@ def export_vla_eval(result: EvaluationResult, folder: Path) -> list[Path]:
     """Write `SUITE_aggregate.json` for each suite, as `vla-eval export` (0.8.0) writes it for a benchmark.
 
     An episode's number is its initial state, as in vla-eval's own LIBERO benchmark. Failures to run an episode count
-    as failures in both.
+    as failures in both; episodes that a simulation error ended are left out.
 
     Raises:
         ResultsError: A file cannot be written.

@@ -21,6 +21,7 @@ from typing import Annotated, Literal
 import torch
 from pydantic import Field
 
+from libero_env.errors import SimulationError
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.validation import validate_arguments
 from lifelong.algorithms.base import Algorithm
@@ -104,6 +105,9 @@ def failure_share(policy: Policy, run: LoadedRun, task: int, env: VectorEnv, epi
         task: Position of the task.
         env: Environment of the task, with a simulation for each rollout.
         episodes: Number of rollouts, which start in the first initial states.
+
+    Raises:
+        SimulationError: A simulation has failed.
     """
     done = rollout(
         policy,
@@ -116,6 +120,8 @@ def failure_share(policy: Policy, run: LoadedRun, task: int, env: VectorEnv, epi
         device=run.device,
         precision=run.eval.precision,
     )
+    if done.failed:
+        raise SimulationError(done.failed)
     return 1 - done.rate
 
 

@@ -24,6 +24,7 @@ from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
+from libero_env.errors import SimulationError
 from libero_env.storage import atomic_path, atomic_write_text
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import PolicyActor, observe
@@ -305,6 +306,8 @@ def _run_episode(run: LoadedRun, task: int, start: int, horizon: int) -> tuple[l
     with closing(run.environment(task, 1, horizon)) as env, run.acting(run.tasks[task]) as policy:
         actor = RecordingActor(policy, language, run.device, run.eval.precision, draws)
         done = run_episodes(actor, env, [start], horizon=horizon, settle_steps=run.eval.settle_steps)
+    if done.failed:
+        raise SimulationError(done.failed)
     return [{"images": o.images, **o.proprio} for o in actor.seen], done.episodes[0].success
 
 

@@ -21,6 +21,7 @@ from libero._adapters.batches import image_tensor, map_tensors
 from libero._adapters.files import generated_paths
 from libero.lifelong.utils import available_device, safe_device
 from libero_env.envs.batch import BatchEnv
+from libero_env.errors import SimulationError
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.tasks import Task, get_suite, read_task, suite_names
@@ -116,6 +117,8 @@ def rollouts(
                 policy = _PolicyActor(actor, cfg, task_emb, tuple(cfg.data.obs.modality.rgb))
                 horizon = int(cfg.eval.max_steps)
                 part = run_episodes(policy, env, rows, horizon=horizon, settle_steps=SETTLE_STEPS)
+                if part.failed:
+                    raise SimulationError(part.failed)
                 episodes += part.episodes
     return episodes
 

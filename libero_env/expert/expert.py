@@ -168,7 +168,7 @@ def run_experts(
     states: list[list[np.ndarray]] = [[] for _ in experts]  # of each simulation, step by step
     executed: list[list[np.ndarray]] = [[] for _ in experts]
     chosen: list[list[np.ndarray]] = [[] for _ in experts]
-    success = np.zeros(len(experts), bool)
+    success, errors = np.zeros(len(experts), bool), dict[int, str]()
     for _ in range(max_steps):
         running = map(int, np.flatnonzero(env.running[: len(experts)]))
         live = [i for i in running if not experts[i].failure_reason]
@@ -181,7 +181,8 @@ def run_experts(
             states[i].append(env.simulations.physics_state(i))
             executed[i].append(actions[i].copy())
             chosen[i].append(action)
-        success = env.step(actions)[-1]["success"][: len(experts)]
+        infos = env.step(actions)[-1]
+        success, errors = infos["success"][: len(experts)], infos.get("errors", {})
     return [
         Attempt(
             success=bool(success[i]),
@@ -189,7 +190,9 @@ def run_experts(
             actions=np.array(executed[i]),
             expert_actions=np.array(chosen[i]),
             retries=expert.retries,
-            reason="" if success[i] else expert.failure_reason or _last_phase(expert, len(executed[i])),
+            reason=""
+            if success[i]
+            else expert.failure_reason or errors.get(i) or _last_phase(expert, len(executed[i])),
             fixtures=env.simulations.fixtures[i].copy(),
         )
         for i, expert in enumerate(experts)

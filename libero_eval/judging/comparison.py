@@ -143,6 +143,13 @@ def compare_groups(
     if twice := sorted({name for name in labels if labels.count(name) > 1}):
         raise ConfigError(f"two policies are called {', '.join(twice)}; write NAME=RESULT to name them")
     notes = check_comparable([*groups, *(control or ())], allow)
+    notes += [
+        f"{group.label}, {task.task}: {task.error_note}"
+        for group in groups
+        for result in group.results
+        for task in result.tasks
+        if task.error_note
+    ]
     rivals: list[tuple[Group, Group]] = []
     controls = [control] if control else []
     for a, b in combinations(groups, 2):

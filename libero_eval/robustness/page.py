@@ -14,7 +14,7 @@ from libero_env.perturbations import KINDS
 from libero_env.storage import atomic_write_text, write_json
 from libero_env.text import text_table
 from libero_eval.judging.page import interval_text, p_text
-from libero_eval.robustness.results import Axis, Robustness, name_of
+from libero_eval.robustness.results import Axis, Outcomes, Robustness, name_of
 from lifelong.errors import ResultsError
 from lifelong.report.figures import (
     INK,
@@ -71,6 +71,7 @@ def render(policy: Robustness) -> str:
     lines = [
         f"{policy.label}: success in percent by severity, 0 is without perturbation",
         text_table(rows),
+        *([f"starts: {len(policy.outcomes.starts)}{lost}"] if (lost := _lost_text(policy.outcomes)) else []),
         *(
             f"{name_of(pair.condition)}: {100 * pair.success.value:.0f}, expected {100 * pair.expected:.0f}, "
             f"excess {100 * pair.excess.value:+.0f} {interval_text(pair.excess)}".replace("+-", "-")
@@ -102,7 +103,7 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         title=f"Robustness of {first.label}",
         facts=[
             ("tasks", f"{len(outcomes.tasks)} of {suites}"),
-            ("starts", f"{len(outcomes.starts)} a task"),
+            ("starts", f"{len(outcomes.starts)} a task" + _lost_text(outcomes)),
             ("conditions", str(len(outcomes.conditions))),
             ("episodes", str(outcomes.successes.size)),
         ],
@@ -134,6 +135,10 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
 def severity_text(severity: float) -> str:
     """Format a severity; a dash where it is infinite."""
     return f"{severity:.2f}" if math.isfinite(severity) else "–"
+
+
+def _lost_text(outcomes: Outcomes) -> str:
+    return f", {outcomes.lost} left out, where a simulation error ended an episode" if outcomes.lost else ""
 
 
 def _severities_text(e: Estimate) -> str:

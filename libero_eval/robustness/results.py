@@ -70,15 +70,17 @@ class Outcomes:
 
     Attributes:
         tasks: T tasks.
-        starts: S starts of each task.
+        starts: S starts of each task: those from which no simulation error ended an episode in any condition.
         conditions: C conditions; the first is the base.
         successes: (C, T, S) outcomes.
+        lost: Number of other starts.
     """
 
     tasks: tuple[str, ...]
     starts: tuple[int, ...]
     conditions: tuple[Condition, ...]
     successes: NDArray[np.bool_]
+    lost: int = 0
 
     @classmethod
     def of(cls, results: Mapping[Condition, EvaluationResult]) -> "Outcomes":
@@ -93,16 +95,30 @@ class Outcomes:
         if () not in results:
             raise ResultsError("there is no result without perturbations, with which the others are compared")
         base = results[()]
-        tasks, starts = tuple(task.task for task in base.tasks), base.init_states
+        tasks = tuple(task.task for task in base.tasks)
+        lost = {
+            start for result in results.values() for t in result.tasks for start, _ in t.simulation_errors
+        }
+        starts = tuple(start for start in base.init_states if start not in lost)
+        if not starts:
+            raise ResultsError("simulation errors ended an episode from each start: nothing can be paired")
         conditions = ((), *sorted(condition for condition in results if condition))
         for condition in conditions:
-            episodes = {(t.task, t.init_states) for t in results[condition].tasks}
-            if episodes != {(task, starts) for task in tasks}:
+            episodes = {(t.task, tuple(sorted(t.starts))) for t in results[condition].tasks}
+            if episodes != {(task, tuple(sorted(base.init_states))) for task in tasks}:
                 raise ResultsError(
                     f"{name_of(condition)} was not run in the same tasks and starts as the base: they cannot be paired"
                 )
-        by_task = [{t.task: t.successes for t in results[c].tasks} for c in conditions]
-        return cls(tasks, starts, conditions, np.array([[row[t] for t in tasks] for row in by_task]))
+        won = [
+            {
+                (t.task, s): won
+                for t in results[c].tasks
+                for s, won in zip(t.init_states, t.successes, strict=True)
+            }
+            for c in conditions
+        ]
+        outcomes = [[[row[task, start] for start in starts] for task in tasks] for row in won]
+        return cls(tasks, starts, conditions, np.array(outcomes), len(base.init_states) - len(starts))
 
     @cached_property
     def rates(self) -> Floats:

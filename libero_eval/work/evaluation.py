@@ -22,7 +22,7 @@ from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.work.claims import LEASE
 from libero_eval.work.progress import busy_seconds
 from libero_eval.work.store import PLAN_FORMAT, Unit, UnitResult, WorkStore, describe, partition, this_process
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, EvaluationIncompleteError
 from lifelong.evaluation.actors import Actor, WatchesWorld
 from lifelong.evaluation.environments import EnvPool, VectorEnv, common_environment, describe_environment
 from lifelong.evaluation.rollout import Episode, Rollouts, run_episodes, save_animation
@@ -175,11 +175,17 @@ class Evaluation:
 
         Raises:
             ConfigError: A unit is missing.
+            EvaluationIncompleteError: Simulation errors ended all episodes of a task.
         """
         tasks = [self.task_result(task, done) for task in self.tasks]
         units = [done[unit.name] for unit in self.units if unit.name in done]
         if len(units) != len(self.units):
             raise ConfigError(f"{len(units)} of {len(self.units)} units are done: there is no result yet")
+        if lost := next((task for task in tasks if task is not None and not task.init_states), None):
+            raise EvaluationIncompleteError(
+                f"simulation errors ended all episodes of {lost.task}, which has no success: "
+                f"{lost.simulation_errors[0][1]}"
+            )
         return EvaluationResult(
             evaluated=self.identity,
             protocol=self._resolved_protocol,
@@ -212,20 +218,16 @@ class Evaluation:
     def _unit_result(
         self, unit: Unit, done: Rollouts, env: VectorEnv, started: float, errors: tuple[str | None, ...] = ()
     ) -> UnitResult:
-        attempts = tuple(e.attempts for e in done.episodes)
+        attempts = tuple(e.attempts for e in done.counted)
+        kept = tuple(e for e, ran in zip(errors, done.episodes, strict=False) if not ran.simulation_error)
         result = TaskResult(
             task=unit.task.id,
             name=unit.task.name,
             instruction=_acted_task(env, unit).language,
-            init_states=tuple(e.init_state for e in done.episodes),
-            successes=tuple(e.success for e in done.episodes),
-            lengths=tuple(e.length for e in done.episodes),
-            atoms=done.atoms,
-            atoms_ever=tuple(e.ever for e in done.episodes),
-            atoms_at_end=tuple(e.at_end for e in done.episodes),
-            errors=errors if any(errors) else (),
-            actions=tuple(e.actions for e in done.episodes),
+            errors=kept if any(kept) else (),
+            actions=tuple(e.actions for e in done.counted),
             attempts=attempts if any(attempts) else (),
+            **done.columns(),
         )
         environment, versions = describe_environment(env), dict(self.versions)
         return UnitResult(result, environment, versions, this_process(), started, time.time())
@@ -250,6 +252,7 @@ class Evaluation:
         for frames, episode in zip(done.recordings, filmed, strict=False):
             if frames:
                 outcome = "success" if episode.success else "failure"
+                outcome = "simulation_error" if episode.simulation_error else outcome
                 name = (
                     f"{unit.task.suite}_{unit.task.index:02d}_start_{episode.init_state:02d}_{outcome}.webp"
                 )

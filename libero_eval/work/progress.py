@@ -66,7 +66,7 @@ def measure_progress(
     """
     recent = sorted(done.values(), key=lambda unit: unit.finished)[-RECENT:]
     busy = busy_seconds((unit.started, unit.finished) for unit in recent)
-    count = sum(len(unit.result.init_states) for unit in recent)
+    count = sum(len(unit.result.starts) for unit in recent)
     return Progress(
         units=len(units),
         done=sum(name in done for name in units),
@@ -126,6 +126,7 @@ def table_row(result: TaskResult) -> str:
     steps = f"{result.steps:.0f}" if math.isfinite(result.steps) else "-"
     raised = sum(error is not None for error in result.errors)
     note = f"  ({raised} ended with an error)" if raised else ""
+    note += f"  ({result.error_note})" if result.error_note else ""
     return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}{note}"
 
 
@@ -143,7 +144,9 @@ def total_rows(results: Sequence[TaskResult]) -> list[str]:
 
 def _total_row(name: str, results: Sequence[TaskResult]) -> str:
     wins, episodes = sum(sum(r.successes) for r in results), sum(len(r.successes) for r in results)
-    return f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(overall(results))}"
+    failed = sum(len(r.simulation_errors) for r in results)
+    note = f"  ({failed} of {episodes + failed} ended by a simulation error, not counted)" if failed else ""
+    return f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(overall(results))}{note}"
 
 
 def _percent(e: Estimate) -> str:

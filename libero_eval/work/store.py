@@ -310,7 +310,7 @@ class WorkStore:
     def _read_unit(self, unit: Unit) -> UnitResult:
         path = self._unit_path(unit)
         result, digest = read_unit(path)
-        if digest != self._digest(unit) or result.result.init_states != unit.init_states:
+        if digest != self._digest(unit) or sorted(result.result.starts) != sorted(unit.init_states):
             raise ConfigError(
                 f"{path} was made by another evaluation or another version of the task: {AGAIN}"
             )

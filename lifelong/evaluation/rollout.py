@@ -36,6 +36,8 @@ class Episode:
         at_end: Whether each atom held at the end.
         actions: Digest of the actions, (length, 7) float64: two episodes agree to the bit where it is the same.
         attempts: Number of draws of each perturbation that were not valid; empty without perturbations.
+        simulation_error: Why the simulation failed and ended the episode, which is neither a success nor a failure;
+            empty otherwise.
     """
 
     init_state: int
@@ -46,6 +48,7 @@ class Episode:
     at_end: tuple[bool, ...] = ()
     actions: str = ""
     attempts: tuple[int, ...] = ()
+    simulation_error: str = ""
 
 
 @dataclass(frozen=True)
@@ -72,9 +75,43 @@ class Rollouts:
         return self.recordings[0] if self.recordings else ()
 
     @property
+    def counted(self) -> tuple[Episode, ...]:
+        """Episodes that no error of the simulation has ended."""
+        return tuple(e for e in self.episodes if not e.simulation_error)
+
+    @property
+    def failed(self) -> dict[int, str]:
+        """Error of the simulation that has ended an episode, by the episode's index, as `SimulationError` takes it."""
+        return {
+            i: f"{e.simulation_error} (initial state {e.init_state})"
+            for i, e in enumerate(self.episodes)
+            if e.simulation_error
+        }
+
+    @property
     def rate(self) -> float:
-        """Share of successes."""
-        return sum(e.success for e in self.episodes) / len(self.episodes)
+        """Share of successes in the episodes that count.
+
+        Raises:
+            SimulationError: There are none: all simulations have failed.
+        """
+        if not self.counted:
+            raise SimulationError(self.failed)
+        return sum(e.success for e in self.counted) / len(self.counted)
+
+    def columns(self) -> dict[str, Any]:
+        """Return the fields of `lifelong.results.records.Episodes`."""
+        return {
+            "init_states": tuple(e.init_state for e in self.counted),
+            "successes": tuple(e.success for e in self.counted),
+            "lengths": tuple(e.length for e in self.counted),
+            "atoms": self.atoms,
+            "atoms_ever": tuple(e.ever for e in self.counted),
+            "atoms_at_end": tuple(e.at_end for e in self.counted),
+            "simulation_errors": tuple(
+                (e.init_state, e.simulation_error) for e in self.episodes if e.simulation_error
+            ),
+        }
 
 
 def rollout(
@@ -144,7 +181,8 @@ def run_episodes(
 
     Each step is one call of the actor on all simulations. Finished simulations keep their row, so that the results of
     the others do not depend on when they finished, but they are neither stepped nor rendered. Images that nobody sees
-    are not rendered: those of settling, and those between the observations of an actor that executes chunks.
+    are not rendered: those of settling, and those between the observations of an actor that executes chunks. A
+    simulation that fails ends its own episode only, see `Episode.simulation_error`.
 
     Args:
         actor: Actor that answers observations with actions.
@@ -160,7 +198,6 @@ def run_episodes(
 
     Raises:
         ConfigError: The numbers of simulations and of initial states differ.
-        SimulationError: A simulation has diverged: its episode is neither a success nor a failure.
     """
     if env.num_envs != len(init_states):
         raise ConfigError(
@@ -198,13 +235,12 @@ def run_episodes(
         bar.set_postfix(done=int(tracker.over.sum()), refresh=False)
     bar.close()
     _draw(env, True)
-    if tracker.errors:
-        raise SimulationError(
-            {i: f"{reason} (initial state {init_states[i]})" for i, reason in tracker.errors.items()}
-        )
     _tell(actor, tracker)
     done = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
-    episodes = tuple(replace(one, attempts=tries) for one, tries in zip(done, attempts, strict=True))
+    episodes = tuple(
+        replace(one, attempts=tries, simulation_error=tracker.errors.get(i, ""))
+        for i, (one, tries) in enumerate(zip(done, attempts, strict=True))
+    )
     return Rollouts(episodes, time.perf_counter() - started, tracker.atoms, tuple(map(tuple, recordings)))
 
 
@@ -248,7 +284,7 @@ class EpisodeTracker:
         """Step all simulations with (B, A) actions and return their observations."""
         obs, _, terminated, truncated, info = self._env.step(actions)
         self.success = self.success | (np.asarray(info["success"], bool) & ~self.over)
-        self.errors |= info.get("errors", {})
+        self.errors |= {i: why for i, why in info.get("errors", {}).items() if not self.over[i]}
         self._now = np.where(self.over[:, None], self._now, self._progress(info))
         self._ever = self._ever | self._now
         self.over = self.over | terminated | truncated

@@ -105,7 +105,7 @@ def load_run(path: Path) -> Run:
     if not results.finished:
         so_far = f"{learned} of {len(record.tasks)} tasks are learned"
         notes.insert(0, f"This run is not finished: {so_far}, and the metrics are over these.")
-    remarks = (*notes, *resume_notes(results), *results.problems)
+    remarks = (*notes, *resume_notes(results), *results.error_notes, *results.problems)
     return Run(path, results, record, config, text, remarks, learned, metrics)
 
 

@@ -104,6 +104,8 @@ class LossRecord:
 class Episodes:
     """Outcomes of episodes on one task.
 
+    An episode that a simulation error ended is neither a success nor a failure: only `simulation_errors` has it.
+
     Attributes:
         init_states: Initial state of each episode.
         successes: Whether each reached the goal.
@@ -111,6 +113,7 @@ class Episodes:
         atoms: Atoms of the goal, such as `(On plate_1 stove_1)`; empty if they were not measured.
         atoms_ever: Whether each atom held at any time after the policy began to act, (episodes, atoms).
         atoms_at_end: Whether each atom held at the end, (episodes, atoms).
+        simulation_errors: Initial state and reason of each episode that a simulation error ended.
     """
 
     init_states: tuple[Count, ...]
@@ -119,6 +122,7 @@ class Episodes:
     atoms: tuple[str, ...] = ()
     atoms_ever: tuple[tuple[bool, ...], ...] = ()
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
+    simulation_errors: tuple[tuple[Count, str], ...] = ()
 
     OPTIONAL: ClassVar[tuple[str, ...]] = ()  # further columns, with an entry for each episode or none at all
     OF_ATOMS: ClassVar[tuple[str, ...]] = ("atoms_ever", "atoms_at_end")
@@ -126,7 +130,7 @@ class Episodes:
     def shape_errors(self) -> list[str]:
         """Return what is wrong with the sizes of the columns."""
         count, errors = len(self.init_states), []
-        if not count:
+        if not count and not self.simulation_errors:
             errors.append("there are no episodes")
         for name in ("successes", "lengths", *self.OPTIONAL, *self.OF_ATOMS):
             entries = getattr(self, name)
@@ -141,6 +145,12 @@ class Episodes:
     def rate(self) -> float:
         """Success rate of the episodes."""
         return sum(self.successes) / len(self.successes)
+
+    @property
+    def error_note(self) -> str:
+        """Number of episodes that simulation errors ended, as text; empty if there are none."""
+        failed, count = len(self.simulation_errors), len(self.simulation_errors) + len(self.init_states)
+        return f"{failed} of {count} ended by a simulation error, not counted" if failed else ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,6 +186,8 @@ class EvalRecord(Episodes):
 
     def __post_init__(self) -> None:
         errors = self.shape_errors()
+        if not self.init_states:
+            errors.append("no episode counts")
         if self.phase not in get_args(Phase):
             errors.append(f"phase of an evaluation is 'curve', 'matrix' or 'shift', not {self.phase!r}")
         if (self.phase == "shift") != bool(self.shift):
@@ -187,7 +199,7 @@ class EvalRecord(Episodes):
     def outcome(self) -> tuple[Any, ...]:
         """What the rollouts came to, without where and when they were run."""
         atoms = (self.atoms, self.atoms_at_start, self.atoms_ever, self.atoms_at_end)
-        return (self.successes, self.lengths, self.init_states, *atoms)
+        return (self.successes, self.lengths, self.init_states, self.simulation_errors, *atoms)
 
 
 @dataclass(frozen=True, kw_only=True)

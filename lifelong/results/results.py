@@ -83,6 +83,16 @@ class Results:
         runs = (r for r in reversed(self.of(EvalRecord)) if r.same_as is None)
         return next((r for r in runs if r.decided_by == decided_by != ""), None)
 
+    @property
+    def error_notes(self) -> list[str]:
+        """A sentence for each evaluation in which simulation errors ended episodes."""
+        return [
+            f"After learning task {r.learned + 1}, {r.phase} of task {r.task + 1}: {r.error_note} "
+            f"({'; '.join(f'start {start}: {why}' for start, why in r.simulation_errors[:3])})."
+            for r in self.of(EvalRecord)
+            if r.simulation_errors and r.same_as is None
+        ]
+
     def episodes(self) -> tuple[int, int]:
         """Return the numbers of episodes that were run, and that were copied from those they would have repeated."""
         counts = [(r.same_as is not None, len(r.successes)) for r in self.of(EvalRecord)]
@@ -261,12 +271,20 @@ def _matrix(
 
 
 def _curve(evaluations: Iterable[EvalRecord]) -> Curve:
-    """Return a learning curve; if points have other starts than the first, episodes correspond by their number."""
+    """Return a learning curve; if points have other starts than the first, episodes correspond by their number.
+
+    The outcomes of a start are left out of all points where a simulation error ended an episode from it in one.
+    """
     records = list(evaluations)
-    count = min((len(r.successes) for r in records), default=0)
+    lost = {start for r in records for start, _ in r.simulation_errors}
+    outcomes = [
+        [won for start, won in zip(r.init_states, r.successes, strict=True) if start not in lost]
+        for r in records
+    ]
+    count = min(map(len, outcomes), default=0)
     return Curve(
         np.array([r.epoch for r in records], dtype=np.int64),
         np.array([r.rate for r in records], dtype=float),
         np.array([len(r.successes) for r in records], dtype=np.int64),
-        np.array([r.successes[:count] for r in records], dtype=float)[..., None] if records else None,
+        np.array([row[:count] for row in outcomes], dtype=float)[..., None] if records else None,
     )

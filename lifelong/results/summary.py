@@ -4,7 +4,8 @@ results.json     the success matrix, learning curves, metrics and times of a run
 episodes.csv.gz  one row an episode: the method's label, seed and order of the run, `transfer` (how its forward transfer
                  is estimated), `together` (numbers of tasks learned together), the evaluation (`phase` curve or matrix,
                  `row`: position of the task learned last, `epoch` trained on it), the task (`position` in the sequence,
-                 and its name), `start` (initial state), `success` (0 or 1), `length` [control steps]
+                 and its name), `start` (initial state), `success` (0 or 1), `length` [control steps]; episodes that a
+                 simulation error ended are left out
 """
 
 import csv
@@ -33,7 +34,16 @@ COLUMNS = (
     *("method", "seed", "order", "transfer", "together", "phase", "row", "epoch", "position", "task"),
     *("start", "success", "length"),
 )
-_OF_EPISODES = ("phase", "learned", "epoch", "task", "init_states", "successes", "lengths")
+_OF_EPISODES = (
+    "phase",
+    "learned",
+    "epoch",
+    "task",
+    "init_states",
+    "successes",
+    "lengths",
+    "simulation_errors",
+)
 
 
 def write_summary(path: Path | str, results: Results, config: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,15 +14,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from libero_env.errors import SimulationError
 from libero_env.perturbations import format_perturbations
 from libero_env.storage import atomic_path, atomic_write_text
 from libero_env.timing import CONTROL_PERIOD
 from lifelong.context import RunContext
-from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
+from lifelong.evaluation.rollout import rollout, save_animation
 from lifelong.policies.base import Policy
 from lifelong.results.provenance import all_conditions
 from lifelong.results.records import EvalRecord, Phase, RunRecord
+from lifelong.results.results import Results
 from lifelong.seeding import ROLLOUT
+from lifelong.sequence.recovery import say
 
 
 class Evaluator:
@@ -62,6 +65,8 @@ class Evaluator:
             if record is None:
                 record = self._measured(acting, decided_by, phase, learned, task, epoch)
         self._log.append(record)
+        for note in Results((record,)).error_notes:
+            say(context, note)
         return record
 
     def _shift(self, phase: Phase) -> str:
@@ -123,11 +128,24 @@ class Evaluator:
             label=f"rollouts on task {task + 1}",
             progress=bool(context.progress),
         )
+        if not done.counted:
+            raise SimulationError(done.failed)
+        record = EvalRecord(
+            shift=shift,
+            phase=phase,
+            learned=learned,
+            epoch=epoch,
+            task=task,
+            seconds=done.seconds,
+            atoms_at_start=tuple(e.at_start for e in done.counted),
+            decided_by="" if done.random else decided_by,
+            **done.columns(),
+        )
         if done.frames:
-            path, success = self._video(learned, task), done.episodes[0].success
+            path = self._video(learned, task)
             save_animation(done.frames, path, seconds_per_frame=CONTROL_PERIOD * context.eval.record_every)
-            self._write_caption(path, learned, task, success)
-        return _record(done, phase, learned, epoch, task, "" if done.random else decided_by, shift)
+            self._write_caption(path, record)
+        return record
 
     def _is_filmed(self, phase: Phase, learned: int, task: int) -> bool:
         last = len(self._context.tasks) - 1
@@ -144,12 +162,16 @@ class Evaluator:
         if source != path:
             with atomic_path(path) as part:
                 shutil.copyfile(source, part)
-        self._write_caption(path, learned, original.task, original.successes[0])
+        self._write_caption(path, replace(original, learned=learned))
         return True
 
-    def _write_caption(self, path: Path, learned: int, task: int, success: bool) -> None:
-        outcome = "success" if success else "failure"
-        caption = f"{self._context.instructions[task]}: {outcome}, after learning {learned + 1} tasks"
+    def _write_caption(self, path: Path, record: EvalRecord) -> None:
+        """Write what a video shows: the first of the episodes."""
+        won = dict(zip(record.init_states, record.successes, strict=True))
+        first = self._context.eval.init_states("matrix")[0]
+        outcome = {True: "success", False: "failure", None: "simulation error"}[won.get(first)]
+        said = self._context.instructions[record.task]
+        caption = f"{said}: {outcome}, after learning {record.learned + 1} tasks"
         atomic_write_text(path.with_suffix(".txt"), caption + "\n")
 
 
@@ -182,24 +204,3 @@ def _feed(found: Any, value: Any) -> None:
             _feed(found, part)
     else:
         found.update(f"{value!r}\0".encode())
-
-
-def _record(
-    rollouts: Rollouts, phase: Phase, learned: int, epoch: int, task: int, decided_by: str, shift: str
-) -> EvalRecord:
-    return EvalRecord(
-        shift=shift,
-        phase=phase,
-        learned=learned,
-        epoch=epoch,
-        task=task,
-        successes=tuple(e.success for e in rollouts.episodes),
-        lengths=tuple(e.length for e in rollouts.episodes),
-        init_states=tuple(e.init_state for e in rollouts.episodes),
-        seconds=rollouts.seconds,
-        atoms=rollouts.atoms,
-        atoms_at_start=tuple(e.at_start for e in rollouts.episodes),
-        atoms_ever=tuple(e.ever for e in rollouts.episodes),
-        atoms_at_end=tuple(e.at_end for e in rollouts.episodes),
-        decided_by=decided_by,
-    )

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from libero_env.envs.env import LiberoEnv
-from libero_env.errors import ActionError, LiberoError, UnknownNameError
+from libero_env.errors import ActionError, LiberoError, SimulationError, UnknownNameError
 from libero_env.geometry import quat_to_axis_angle
 from tests.harness.recorded import OPEN, write_actions
 
@@ -165,3 +165,11 @@ def test_bad_settings_are_named(plugin, envs):
     env.reset(seed=[0])
     with pytest.raises(ActionError, match="finite"):
         env.step(np.full((1, 7), np.nan))
+
+
+def test_a_simulation_that_fails_is_no_failure_of_the_policy(envs):
+    env = envs(2)
+    env.reset(seed=[0, 1])
+    env._envs.simulations.fields["qvel"][1, 12] = np.nan
+    with pytest.raises(SimulationError, match="simulation 1: it has diverged"):
+        env.step(np.zeros((2, 7)))

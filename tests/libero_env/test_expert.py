@@ -441,6 +441,24 @@ def test_narrow_places_leaning_hands_and_small_knobs(task_id, start):
 
 
 @pytest.mark.sim
+def test_an_attempt_whose_simulation_diverges_fails_for_that_reason_and_the_other_goes_on():
+    class Breaking(Expert):
+        def act(self, view):
+            if view is env.views[0] and env.simulations.time(0) > 0.07:
+                env.simulations.fields["qvel"][0, 12] = np.nan
+            return super().act(view)
+
+    env = BatchEnv("libero_goal/1", 2, cameras=())
+    env.reset(options={"init_state": 0})
+    broken, whole = run_experts(
+        env, [Breaking(env.task, np.random.default_rng(0)) for _ in range(2)], max_steps=9
+    )
+    env.close()
+    assert "diverged" in broken.reason and not broken.success and (len(broken), len(whole)) == (3, 9)
+    assert whole.reason.startswith("in phase")
+
+
+@pytest.mark.sim
 @pytest.mark.parametrize(
     "task_id", ["libero_goal/1", "libero_goal/5", "libero_spatial/0", "libero_90/73", "libero_90/65"]
 )

@@ -78,6 +78,7 @@ def with_task(**changes) -> str:
     (with_task(successes=[True]), "tasks.0: libero_goal/0: successes has 1 entries, init_states has 3"),
     (with_task(successes=[1, 0, 1]), "tasks.0.successes.0 is 1; expected true or false"),
     (with_task(init_states=[0, 1, 1]), "counted twice"),
+    (with_task(simulation_errors=[[2, "it has diverged"]]), "counted twice"),
     (with_task(atoms_ever=[[True], [False], []]), "a column for each"),
     (with_task(task="libero_spatial/4"), "tasks are counted twice: libero_spatial/4"),
     (with_task(successes=[True, True, True]), "the file was edited"),

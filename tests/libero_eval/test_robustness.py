@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -101,6 +102,22 @@ def test_results_are_paired_by_task_and_start() -> None:
         Outcomes.of({(): result(8), B: result(2, tuple(range(1, 11)))})
     with pytest.raises(ResultsError, match="without perturbations"):
         Outcomes.of({B: result(2)})
+
+
+def test_a_start_from_which_a_simulation_error_ended_an_episode_is_left_out_of_all_conditions_and_told(
+    tmp_path,
+) -> None:
+    whole, half = result(8), result(2)
+    first, second = half.tasks
+    rows = {name: getattr(first, name)[:9] for name in ("init_states", "successes", "lengths")}
+    broken = replace(first, **rows, simulation_errors=((9, "it has diverged"),))
+    found = Outcomes.of({(): whole, B: replace(half, tasks=(broken, second))})
+    assert found.starts == tuple(range(9)) and found.lost == 1 and found.successes.shape == (2, 2, 9)
+    assert found.rates.tolist() == [8 / 9, 2 / 9]
+    policy, told = Robustness("er", found, (), {}), "9 a task, 1 left out, where a simulation error"
+    assert told in write_robustness([policy], tmp_path).read_text() and "starts: 9, 1 left out" in render(
+        policy
+    )
 
 
 def test_the_page_and_the_text_say_the_same_numbers(tmp_path) -> None:

@@ -15,7 +15,13 @@ import pytest
 
 from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.work.claims import Claims, this_machine
-from libero_eval.work.progress import busy_seconds, describe_status, measure_progress
+from libero_eval.work.progress import (
+    busy_seconds,
+    describe_status,
+    measure_progress,
+    table_row,
+    total_rows,
+)
 from libero_eval.work.store import Unit, partition
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError, EvaluationIncompleteError, LifelongError, ResultsError
@@ -291,6 +297,42 @@ def test_errors_are_failures_only_where_the_protocol_says_so(tmp_path):
     assert alone.outcomes == result.outcomes
     with pytest.raises(RuntimeError, match="socket"):  # no episode has ever run: that is no failed one
         evaluate(tmp_path / "down", Raising(0, 1), errors_are_failures=True)
+
+
+class Diverging(Countdown):
+    """Simulations with one initial state fail in the first step."""
+
+    start = 9
+
+    def step(self, actions):
+        obs, rewards, terminated, truncated, info = super().step(actions)
+        failed = self.goal == self.start
+        errors = {int(i): "it has diverged" for i in np.flatnonzero(failed)}
+        return obs, rewards, terminated, truncated | failed, info | {"errors": errors}
+
+
+@pytest.mark.parametrize("changes", [{}, {"unit_starts": 1}, {"errors_are_failures": True}])
+def test_an_episode_that_a_simulation_error_ended_is_told_and_is_no_failure(tmp_path, changes):
+    result = evaluate(tmp_path / "it", env=lambda task, count: Diverging(count), **changes)
+    without = evaluate(tmp_path / "without", init_states=(3, 4, 20))
+    for task, other in zip(result.tasks, without.tasks, strict=True):
+        assert task.simulation_errors == ((9, "it has diverged"),) and task.errors == ()
+        assert replace(task, simulation_errors=()) == other and task.success.value == 2 / 3
+        assert table_row(task).endswith("(1 of 4 ended by a simulation error, not counted)")
+    assert total_rows(result.tasks)[0].endswith("(2 of 8 ended by a simulation error, not counted)")
+    assert result.outcomes != without.outcomes and EvaluationResult.read(tmp_path / "it") == result
+    kept = evaluate(tmp_path / "it", env=None, **changes)  # nothing is run again
+    assert kept == result and not (tmp_path / "it" / "errors").exists()
+
+
+def test_a_task_of_which_no_episode_counts_has_no_result_and_the_others_are_run(tmp_path):
+    def env(task, count):
+        return (Diverging if task is TASKS[0] else Countdown)(count)
+
+    for _ in range(2):
+        with pytest.raises(EvaluationIncompleteError, match="all episodes of libero_goal/0.*it has diverged"):
+            evaluate(tmp_path, env=env, init_states=(9,))
+        assert len(list((tmp_path / "units").iterdir())) == 2 and not (tmp_path / "eval.json").exists()
 
 
 # --- bad input

@@ -120,12 +120,25 @@ def test_the_pool_closes_the_least_recently_used_and_all_at_the_end():
     assert first.closed and third.closed
 
 
-def test_a_simulation_that_diverges_is_neither_a_success_nor_a_failure():
-    class Diverging(Countdown):
-        def step(self, actions):
-            *rest, info = super().step(actions)
-            return (*rest, {**info, "errors": {1: "it has diverged"}})
+class Diverging(Countdown):
+    """Simulations with initial state 7 fail in the second step, and report it until the end, as a `BatchEnv` does."""
 
-    with pytest.raises(SimulationError, match=r"simulation 1: it has diverged \(initial state 7\)") as caught:
-        rollout(Forward(), Diverging(2), [3, 7], language=torch.zeros(2), horizon=5, settle_steps=0)
-    assert list(caught.value.failed) == [1]
+    def step(self, actions):
+        obs, rewards, terminated, truncated, info = super().step(actions)
+        failed = (self.goal == 7) & (self.done >= 2)
+        truncated, self.running = self.running & failed, self.running & ~failed
+        errors = {int(i): "it has diverged" for i in np.flatnonzero(failed)}
+        return obs, rewards, terminated, truncated, {"success": info["success"] & ~failed, "errors": errors}
+
+
+def test_a_simulation_that_fails_ends_its_own_episode_which_does_not_count():
+    arguments = {"language": torch.zeros(2), "horizon": 5, "settle_steps": 0}
+    done = rollout(Forward(), Diverging(3), [3, 7, 0], record_every=1, **arguments)
+    without = rollout(Forward(), Countdown(2), [3, 0], **arguments)
+    assert [e.simulation_error for e in done.episodes] == ["", "it has diverged", ""]
+    assert done.counted == without.episodes and done.rate == 0.5 and done.episodes[1].length == 2
+    assert done.columns() == without.columns() | {"simulation_errors": ((7, "it has diverged"),)}
+    none = rollout(Forward(), Diverging(1), [7], **arguments)
+    with pytest.raises(SimulationError, match=r"simulation 0: it has diverged \(initial state 7\)") as caught:
+        none.rate  # noqa: B018 - a property
+    assert list(caught.value.failed) == [0]

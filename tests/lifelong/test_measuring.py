@@ -38,10 +38,10 @@ class Camera(FakeEnv):
         return super().reset(**given)
 
 
-def learn(path, algorithm, *, policy=None, tasks=TASKS, **settings):
+def learn(path, algorithm, *, policy=None, tasks=TASKS, env=Camera, **settings):
     """Learn the sequence; return its context and the tasks of the episodes that were run."""
     episodes = []
-    env = type("Counted", (Camera,), {"episodes": episodes})
+    env = type("Counted", (env,), {"episodes": episodes})
     context = run_context(path, "sequential", tasks)
     context = replace(
         context,
@@ -87,6 +87,42 @@ def test_what_is_frozen_is_run_once_and_recorded_as_without_reuse(tmp_path, name
     assert results.episodes() == (9, 9) and summarize(results)["episodes"] == {"run": 9, "copied": 9}
     metrics = [lifelong_metrics(c.directory.log.read().scores()) for c in (reusing, whole)]
     np.testing.assert_equal(*(asdict(m) for m in metrics))
+
+
+class Diverging(Camera):
+    """The second simulation of the second task fails at once."""
+
+    def step(self, actions):
+        obs, rewards, terminated, truncated, info = super().step(actions)
+        failed = (np.arange(self.num_envs) == 1) & (self.task == 1)
+        info |= {
+            "success": info["success"] & ~failed,
+            "errors": {1: "it has diverged"} if failed.any() else {},
+        }
+        return obs, rewards, terminated & ~failed, truncated | failed, info
+
+
+def test_a_simulation_error_ends_neither_the_run_nor_other_episodes_and_is_told(tmp_path, capsys):
+    context, _ = learn(tmp_path / "it", Sequential(), env=Diverging, curve="none", select="last")
+    whole, _ = learn(tmp_path / "whole", Sequential(), curve="none", select="last")
+    records = [c.directory.log.read().of(EvalRecord) for c in (context, whole)]
+    for found, other in zip(*records, strict=True):
+        if found.task != 1:
+            assert found.outcome == other.outcome
+            continue
+        lost = found.simulation_errors[0][0]
+        assert (
+            found.init_states == tuple(s for s in other.init_states if s != lost) and len(found.lengths) == 2
+        )
+        assert found.error_note == "1 of 3 ended by a simulation error, not counted"
+    results = context.directory.log.read()
+    assert results.success_matrix()[1].tolist() == [[3, 0, 0], [3, 2, 0], [3, 2, 3]]
+    notes = results.error_notes
+    assert len(notes) == 2 and notes[0] in capsys.readouterr().out, notes
+    report = write_report([tmp_path / "it"], tmp_path / "report.html")
+    assert notes[0] in report.read_text()
+    errors = [one["simulation_errors"] for one in summarize(results)["evaluations"]]
+    assert errors == [(), (), ((lost, "it has diverged"),), (), ((lost, "it has diverged"),), ()]
 
 
 def test_nothing_is_copied_where_the_weights_move(tmp_path):

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from lerobot_env_libero_lifelong.settings import ROBOT_STATE, Settings
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.subproc import SubprocEnv
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, SimulationError
 from libero_env.geometry import quat_to_mat
 from libero_env.init_states.original_resets import OriginalResets
 from libero_env.init_states.store import NUM_INIT_STATES, load_original_states
@@ -101,8 +101,11 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
 
         Raises:
             ActionError: The shape is wrong, or a value is not finite.
+            SimulationError: A simulation has failed; LeRobot would count its episode as a failure of the policy.
         """
         obs, rewards, _, _, info = self._open().step(actions)
+        if "errors" in info:
+            raise SimulationError(info["errors"])
         reached = np.asarray(info["success"], bool)
         return self._observation(obs), rewards, reached, np.zeros(self.num_envs, bool), self._info(info)
 
