@@ -110,8 +110,15 @@ def restore_drawing(spec: mujoco.MjSpec, root: Path, workspace: Workspace, scene
         LiberoError: The file is missing.
     """
     _restore_cameras_and_lights(spec, workspace, read_file(scene_file)[1])
-    _restore_meshes(spec, root)
-    _restore_textures(spec)
+    solid = {g.meshname for g in spec.geoms if g.contype or g.conaffinity or g.group == 0}
+    for mesh in spec.meshes:  # their vertices are rounded in the frame that MuJoCo gives them by default
+        if mesh.name not in solid and mesh.file and Path(mesh.file).is_relative_to(root):
+            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_LEGACY
+    if hasattr(
+        mujoco, "mjtColorSpace"
+    ):  # after 3.3.2, which converts no colours of files that are tagged as sRGB
+        for texture in spec.textures:
+            texture.colorspace = mujoco.mjtColorSpace.mjCOLORSPACE_LINEAR
 
 
 def _restore_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace, world: ET.Element) -> None:
@@ -134,21 +141,6 @@ def _restore_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace, world
             specular=_numbers(light, "specular"),
             directional=light.get("directional") == "true",
         )
-
-
-def _restore_meshes(spec: mujoco.MjSpec, root: Path) -> None:
-    """Give visual meshes the frame that MuJoCo gives them by default: their vertices are rounded in it."""
-    solid = {g.meshname for g in spec.geoms if g.contype or g.conaffinity or g.group == 0}
-    for mesh in spec.meshes:
-        if mesh.name not in solid and mesh.file and Path(mesh.file).is_relative_to(root):
-            mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_LEGACY
-
-
-def _restore_textures(spec: mujoco.MjSpec) -> None:
-    """Read colours as MuJoCo 3.3.2 does: later versions convert those of files that are tagged as sRGB."""
-    if hasattr(mujoco, "mjtColorSpace"):
-        for texture in spec.textures:
-            texture.colorspace = mujoco.mjtColorSpace.mjCOLORSPACE_LINEAR
 
 
 def _numbers(element: ET.Element, key: str) -> list[float]:

@@ -19,8 +19,7 @@ from libero_env.objects.xml_file import explain, parse_xml, place_of
 
 REMEDY = "`libero assets check` lists what is missing, `libero assets download` downloads it"
 _BODY_TAGS = ("body", "geom", "inertial", "joint", "site")
-_ASSET_TAGS = ("material", "mesh", "texture")
-_REFERENCES = ("material", "mesh", "texture")
+_ASSETS = ("material", "mesh", "texture")  # elements, and attributes that refer to them
 
 
 def read_file(path: Path, within: Path | None = None) -> tuple[list[ET.Element], ET.Element]:
@@ -65,7 +64,7 @@ def written_out(root: ET.Element, path: Path) -> tuple[list[ET.Element], ET.Elem
     for element in root.findall("asset/*"):
         if "file" in element.attrib and element.tag == "mesh":
             element.attrib.setdefault("name", Path(element.attrib["file"]).stem)
-        if element.tag in _ASSET_TAGS:
+        if element.tag in _ASSETS:
             assets.setdefault((element.tag, element.get("name", "")), element)
     return list(assets.values()), world
 
@@ -113,7 +112,9 @@ def attachable_xml(category: str, assets: Iterable[ET.Element], body: ET.Element
     ET.SubElement(body, "site", {"name": "default_site", "pos": "0 0 0", **hidden})
     assets = used_assets(assets, body)
     for element in (*assets, *body.iter()):
-        _prefix(element, f"{category}_")
+        for key in ("name", *_ASSETS) if element.tag in _ASSETS else _ASSETS:
+            if key in element.attrib:
+                element.set(key, f"{category}_{element.attrib[key]}")
     return to_xml(category, assets, [body])
 
 
@@ -135,7 +136,7 @@ def used_assets(assets: Iterable[ET.Element], *parts: ET.Element) -> list[ET.Ele
     Raises:
         LiberoError: A required file is missing.
     """
-    needed = {(kind, element.get(kind)) for part in parts for element in part.iter() for kind in _REFERENCES}
+    needed = {(kind, element.get(kind)) for part in parts for element in part.iter() for kind in _ASSETS}
     needed |= {("texture", a.get("texture")) for a in assets if (a.tag, a.get("name")) in needed}
     used = [a for a in assets if (a.tag, a.get("name")) in needed or a.get("type") == "skybox"]
     for asset in used:
@@ -170,10 +171,3 @@ def _keep(body: ET.Element, tags: Iterable[str]) -> None:
 def _group(site: ET.Element) -> int:
     rgba = site.get("rgba", "0.5 0.5 0.5 1").split()
     return int(site.get("group", "0")) if float(rgba[-1]) > 0 else HIDDEN_GROUP
-
-
-def _prefix(element: ET.Element, prefix: str) -> None:
-    keys = ("name", *_REFERENCES) if element.tag in _ASSET_TAGS else _REFERENCES
-    for key in keys:
-        if key in element.attrib:
-            element.set(key, prefix + element.attrib[key])

@@ -133,13 +133,14 @@ def load_robosuite(path: Path) -> mujoco.MjSpec:
 
 def _replace_visuals(spec: mujoco.MjSpec, name: str) -> None:
     """Replace the visual meshes by simplified ones, one for each body and colour."""
-    groups: dict[_VisualKey, list[mujoco.MjsGeom]] = defaultdict(list)
+    groups: dict[_VisualKey, list[MeshSource]] = defaultdict(list)
     visuals = [g for g in spec.geoms if g.group == 1 and g.type == mujoco.mjtGeom.mjGEOM_MESH]
     for geom in visuals:
         rgba = spec.material(geom.material).rgba if geom.material else geom.rgba
-        groups[geom.parent.name, tuple(np.round(rgba, 3))].append(geom)
-    sources = tuple(tuple(_source(spec, geom) for geom in geoms) for geoms in groups.values())
-    meshes = merge_and_simplify("panda", name, sources, _FACES_PER_GEOM)
+        file = spec.mesh(geom.meshname).file
+        source = MeshSource(geom.meshname, file, tuple(geom.pos), tuple(geom.quat))
+        groups[geom.parent.name, tuple(np.round(rgba, 3))].append(source)
+    meshes = merge_and_simplify("panda", name, tuple(map(tuple, groups.values())), _FACES_PER_GEOM)
     for i, (body, rgba) in enumerate(groups):
         vertices, faces = meshes[i]
         if len(faces):
@@ -157,7 +158,3 @@ def _replace_visuals(spec: mujoco.MjSpec, name: str) -> None:
     used = {g.meshname for g in spec.geoms}
     for item in [*(m for m in spec.meshes if m.name not in used), *spec.materials]:
         delete(spec, item)
-
-
-def _source(spec: mujoco.MjSpec, geom: mujoco.MjsGeom) -> MeshSource:
-    return MeshSource(geom.meshname, spec.mesh(geom.meshname).file, tuple(geom.pos), tuple(geom.quat))

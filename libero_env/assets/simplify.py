@@ -76,6 +76,7 @@ def _simplified(file: str, scale: tuple[float, ...], faces: int) -> Arrays | Non
     return (stored["a0"], stored["a1"], stored["a2"], stored["a3"]) if len(stored["a1"]) else None
 
 
+@lru_cache(maxsize=8)
 def merge_and_simplify(
     stem: str, name: str, groups: tuple[tuple[MeshSource, ...], ...], faces: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -91,13 +92,8 @@ def merge_and_simplify(
     """
     parts = [(source.name, *source.pos, *source.quat) for sources in groups for source in sources]
     digest = hashlib.sha256(repr((_MERGE_CACHE_VERSION, faces, name, parts)).encode()).hexdigest()[:16]
-    return _merged(cache_dir() / "meshes" / f"{stem}-{digest}.npz", groups, faces)
+    path = cache_dir() / "meshes" / f"{stem}-{digest}.npz"
 
-
-@lru_cache(maxsize=8)
-def _merged(
-    path: Path, groups: tuple[tuple[MeshSource, ...], ...], faces: int
-) -> list[tuple[np.ndarray, np.ndarray]]:
     def make() -> dict[str, np.ndarray]:
         meshes = [_merge(sources, faces) for sources in groups]
         return {key: array for i, (v, f) in enumerate(meshes) for key, array in ((f"v{i}", v), (f"f{i}", f))}

@@ -313,6 +313,13 @@ def read_values(group: h5py.Group, key: str, where: str, *, check: bool = True) 
     return values
 
 
+def demo_states(file: Path, name: str) -> np.ndarray:
+    """Return the states (T, 1 + nq + nv) of a demonstration; empty where it has none."""
+    with open_demo_file(file) as handle:
+        states = read_values(handle["data"][name], "states", f"{file}: {name}")
+    return np.zeros(0) if states is None else states
+
+
 def reached_goal(group: h5py.Group, where: str, ends: Iterable[np.ndarray | None]) -> bool:
     """Return whether a demonstration reached its goal: what its attribute says, or that its rewards or dones end so.
 

@@ -29,7 +29,6 @@ from libero_env.paths import demos_dir
 from libero_env.tasks import Task, get_suite
 
 _WAIT_SECONDS = 600.0  # between two lines about the process that is waited for
-T = TypeVar("T")
 
 
 class DemoJob:

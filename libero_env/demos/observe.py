@@ -172,11 +172,7 @@ class StateRenderer:
         Raises:
             DemoError: The states or the fixtures do not fit the scene.
         """
-        self.place_fixtures(fixture_poses(episode, self.scene, where))
-
-    def place_fixtures(self, fixtures: np.ndarray) -> None:
-        """Put the fixtures at the given poses, (nfixtures, 7) pos and quat wxyz, from the next state on."""
-        self.env.simulations.fixtures[0] = fixtures
+        self.env.simulations.fixtures[0] = fixture_poses(episode, self.scene, where)
 
     def render_states(
         self, states: np.ndarray, fixtures: np.ndarray, name: str = ""
@@ -191,7 +187,7 @@ class StateRenderer:
         Returns:
             Observations, name to (T, ...), and robot states, (T, 9), which no perturbation changes.
         """
-        self.place_fixtures(fixtures)
+        self.env.simulations.fixtures[0] = fixtures
         frames, robot_states = [], []
         for frame in self._frames(states, name):
             frames.append(frame)

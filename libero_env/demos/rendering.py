@@ -3,7 +3,7 @@
 import hashlib
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.demos.config import MASK_NAMES, PERTURBED_HEADER, RenderConfig
-from libero_env.demos.contents import demo_names, demo_number, json_attribute, read_values
+from libero_env.demos.contents import demo_names, demo_number, demo_states, json_attribute
 from libero_env.demos.generate import DemoJob, claim_incomplete, number_of_processes, run_each
 from libero_env.demos.hdf5 import open_demo_file
 from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task, task_header
@@ -67,11 +67,13 @@ class RenderJob(DemoJob):
             DemoError: What is there is broken, or of other demonstrations.
         """
         rendered, missing = self.writer.recorded_states(), set()
-        for number, states in self._recorded_states(n):
-            if number not in rendered:
+        with open_demo_file(self.file) as handle:
+            names = demo_names(handle, self.file)[:n]
+        for name in names:
+            if (number := demo_number(name)) not in rendered:
                 missing.add(number)
-            elif not np.array_equal(rendered[number], states):
-                raise DemoError(f"{self.path} has another demo_{number} than {self.file}")
+            elif not np.array_equal(rendered[number], demo_states(self.file, name)):
+                raise DemoError(f"{self.path} has another {name} than {self.file}")
         return missing
 
     def render(self) -> None:
@@ -85,13 +87,6 @@ class RenderJob(DemoJob):
         except DemoError as error:
             self.discard(error)
         rerender(self.file, self.path, self.config, task=self.task, limit=self.n, progress=False)
-
-    def _recorded_states(self, n: int) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield the number of each of the first `n` recorded demonstrations with its states."""
-        with open_demo_file(self.file) as handle:
-            for name in demo_names(handle, self.file)[:n]:
-                states = read_values(handle["data"][name], "states", f"{self.file}: {name}")
-                yield demo_number(name), np.zeros(0) if states is None else states
 
 
 def ensure_rendered(

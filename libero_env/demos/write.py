@@ -20,9 +20,9 @@ from libero_env.demos.contents import (
     check_demo,
     demo_names,
     demo_number,
+    demo_states,
     file_attributes,
     is_image,
-    read_values,
     value_fault,
 )
 from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
@@ -74,12 +74,7 @@ class DemoWriter:
 
     def recorded_states(self) -> dict[int, np.ndarray]:
         """Return the states (T, 1 + nq + nv) of each recorded demonstration, by its number."""
-        by_number = {}
-        for file, name in list(self._sources()):
-            with open_demo_file(file) as handle:
-                states = read_values(handle["data"][name], "states", f"{file}: {name}")
-            by_number[demo_number(name)] = np.zeros(0) if states is None else states
-        return by_number
+        return {demo_number(name): demo_states(file, name) for file, name in list(self._sources())}
 
     def discard_parts(self) -> None:
         """Remove the parts that an interrupted recording left."""

@@ -104,25 +104,14 @@ def find(name: str) -> Path | None:
     return directory if name.isidentifier() and (directory / PROPERTIES).is_file() else None
 
 
-def folder_of(name: str) -> Path:
-    """Return the folder of a user-defined object.
-
-    Raises:
-        UnknownNameError: The object does not exist; the message lists the existing ones.
-    """
-    directory = find(name)
-    if directory is None:
-        raise UnknownNameError(f"user-defined object in {objects_dir()}", name, names())
-    return directory
-
-
 def remove(name: str) -> Path:
     """Remove a user-defined object and return the folder that it was in.
 
     Raises:
         UnknownNameError: The object does not exist; the message lists the existing ones.
     """
-    directory = folder_of(name)
+    if (directory := find(name)) is None:
+        raise UnknownNameError(f"user-defined object in {objects_dir()}", name, names())
     if directory.is_symlink():
         directory.unlink()  # the link, not what it leads to
     else:

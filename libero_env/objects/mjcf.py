@@ -253,16 +253,14 @@ def _check_values(node: ET.Element) -> None:
                 shown = text if len(text) < 60 else f"{text[:60]}..."
                 _refuse(node, f"{key} of <{node.tag}> is {shown!r}; expected numbers")
             continue  # a word, such as a type
-        _check_numbers(node, key, numbers)
+        largest = _LARGEST_RESOLUTION if node.tag == "texture" else _LARGEST_LENGTH.get(key, _LARGEST_NUMBER)
+        if not (np.abs(numbers) <= largest).all():
+            wrong = next(value for value in numbers if not abs(value) <= largest)
+            _refuse(
+                node, f"{key} of <{node.tag}> has the value {wrong:g}; expected numbers up to {largest:g}"
+            )
         if key in _WHOLE and (numbers.size != 1 or numbers[0] != round(numbers[0])):
             _refuse(node, f"{key} of <{node.tag}> is {text!r}; expected a whole number")
-
-
-def _check_numbers(node: ET.Element, key: str, numbers: np.ndarray) -> None:
-    largest = _LARGEST_RESOLUTION if node.tag == "texture" else _LARGEST_LENGTH.get(key, _LARGEST_NUMBER)
-    if not np.isfinite(numbers).all() or np.abs(numbers).max(initial=0.0) > largest:
-        wrong = next(value for value in numbers if not abs(value) <= largest)
-        _refuse(node, f"{key} of <{node.tag}> has the value {wrong:g}; expected numbers up to {largest:g}")
 
 
 def _check_counts(root: ET.Element) -> None:

@@ -1,7 +1,7 @@
 """Kinds that change the problem: what the task says, and which objects are there. A perturbed task is a task."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -200,17 +200,13 @@ def _unnamed(task: Task, scene: Scene) -> list[str]:
     there, used = scene.pack.categories(), _words(task)
     return [
         category
-        for category, words in _distractor_words().items()
+        for category, words in read_yaml("perturbations/data/distractors.yaml")["categories"].items()
         if category not in known and category in there and not used & set(words or category.split("_"))
     ]
 
 
 def _words(task: Task) -> set[str]:
     return set(f"{task.language} {task.bddl_language}".lower().split())
-
-
-def _distractor_words() -> Mapping[str, list[str]]:
-    return read_yaml("perturbations/data/distractors.yaml")["categories"]
 
 
 def _free_name(category: str, taken: Iterable[str]) -> str:
@@ -259,17 +255,14 @@ def _groups(problem: Problem) -> list[list[str]]:
         counts[problem.objects[name]] > 1 for atom in atoms for name in atom.args if name in problem.objects
     ):
         return [list(roots)]
-    on_table = any(_is_place(problem, name) for atom in atoms for name in atom.args[1:])
+    on_table = any(
+        (region := problem.region(name)) and region.ranges for atom in atoms for name in atom.args[1:]
+    )
     fixed = {name for atom in atoms for name in _objects_of(problem, atom.args[1:])}
     if on_table:  # such as `to the right of the plate`: what is named beside it is a landmark
         words = set(problem.language.lower().split())
         fixed |= {n for n, c in problem.objects.items() if words & set(c.split("_")) and n not in taken}
     return [[name] for name in roots if name not in fixed]
-
-
-def _is_place(problem: Problem, name: str) -> bool:
-    region = problem.region(name)
-    return region is not None and bool(region.ranges)
 
 
 def _objects_of(problem: Problem, names: Sequence[str]) -> list[str]:

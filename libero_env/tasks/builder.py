@@ -421,6 +421,8 @@ class _Merge:
 
 def _problem(content: _Content, language: str, trace: Trace) -> Problem:
     """Return the problem of what all definitions say together."""
+    from libero_env.assets.arena import load_workspace
+
     source = trace.source
     if not content.goal:
         raise InvalidInputError(
@@ -454,7 +456,7 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
         if interest is None:
             interest = entities_in_goal(goal, regions, objects, content.fixtures)
         return Problem(
-            name=content.texts.get("problem") or _problem_class(content, source),
+            name=content.texts.get("problem") or load_workspace(content.workspace(source)[1]).problem,
             language=language,
             fixtures=content.fixtures,
             objects=objects,
@@ -477,13 +479,6 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
         key = str(error.path[0]) if error.path else "goal"
         where = source.at(_KEYS_OF.get(key, key))
         raise InvalidInputError(f"{where}: {str(error).removeprefix('Problem: ')}") from None
-
-
-def _problem_class(content: _Content, source: Source) -> str:
-    """Return the name of the problem class of the workspace."""
-    from libero_env.assets.arena import load_workspace
-
-    return load_workspace(content.workspace(source)[1]).problem
 
 
 def _placed_by(atom: str) -> str | None:

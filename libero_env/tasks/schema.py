@@ -133,10 +133,6 @@ def _support(text: str) -> str:
     return text
 
 
-def _at(value: Any) -> Any:
-    return {"at": value} if isinstance(value, list) else value
-
-
 def _placed(place: Any) -> Any:
     if isinstance(place, dict) and not ("at" in place or place.get("ranges")):
         raise ValueError("it has neither at nor ranges; expected [x, y] or {at: [x, y], half: h}")
@@ -151,7 +147,7 @@ _Place = Annotated[
         custom_error_type="place",
         custom_error_message="[x, y], {at: [x, y], half: h}, or the name of what it is on",
     ),
-    BeforeValidator(_at),
+    BeforeValidator(lambda value: {"at": value} if isinstance(value, list) else value),
 ]
 
 

@@ -318,7 +318,7 @@ def test_truncated_caches_of_meshes_stop_no_model(tmp_path, monkeypatch, lines):
     for size in (None, 500):
         for cached in (tmp_path / "cache").glob("meshes/*.npz"):
             cached.write_bytes(cached.read_bytes()[:size])
-        simplify._merged.cache_clear()
+        simplify.merge_and_simplify.cache_clear()
         simplify._simplified.cache_clear()
         merged = simplify.merge_and_simplify("ball", "ball", sources, 300)
         found.append([*merged[0], *simplify._simplified(str(file), (1.0, 1.0, 1.0), 300)])

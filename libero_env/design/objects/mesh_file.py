@@ -1,6 +1,7 @@
 """Reading of mesh files (OBJ, GLB, glTF, STL, PLY) as surfaces: upright, in metres, centred at the origin."""
 
 import json
+import os
 import shlex
 from collections.abc import Callable
 from contextlib import suppress
@@ -142,7 +143,7 @@ class _NamedFiles:
         with suppress(ValueError, IndexError):
             names.append(shlex.split(names[-1])[-1])  # the name of a texture comes after its options
         try:
-            known = next((one for one in names if _is_file(folder / one.replace("\\", "/"))), names[-1])
+            known = next((one for one in names if os.path.isfile(folder / one.replace("\\", "/"))), names[-1])
             file = file_inside(folder, known, str(self._path))
             if file.suffix.lower() in Image.registered_extensions():
                 with Image.open(file, formats=PICTURES) as image:
@@ -161,13 +162,6 @@ class _NamedFiles:
     def keys(self) -> tuple[str, ...]:
         """Return no names: files are only read by the name that the mesh file has."""
         return ()
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):
-        return False
 
 
 def _surface(part: Any, path: Path) -> Surface:

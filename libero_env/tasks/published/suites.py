@@ -109,18 +109,6 @@ def find_folder(source: Distribution) -> Path | None:
     return folder if (folder / "bddl_files").is_dir() else None
 
 
-def require_folder(source: Distribution) -> Path:
-    """Return the folder of a published suite.
-
-    Raises:
-        MissingPackageError: Its files are not here; the message says what brings them.
-        InvalidInputError: As `find_folder`.
-    """
-    if (folder := find_folder(source)) is None:
-        raise MissingPackageError(f"the files of {source.title} are not installed", source.remedy)
-    return folder
-
-
 @dataclass(frozen=True)
 class PublishedTask(Task):
     """A variant of a task of LIBERO.
@@ -248,7 +236,9 @@ def published_suite(name: str) -> Suite:
     if whole not in _SUITES:
         raise UnknownNameError("suite", whole, _SUITES)
     source = _SUITES[whole].source
-    tasks = _tasks(whole, require_folder(source))
+    if (folder := find_folder(source)) is None:
+        raise MissingPackageError(f"the files of {source.title} are not installed", source.remedy)
+    tasks = _tasks(whole, folder)
     if not colon:
         return Suite(name, tasks)
     valid = (*(KINDS if source is PLUS else ()), AVAILABLE)
