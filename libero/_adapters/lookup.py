@@ -1,7 +1,7 @@
 """Entries of the original's registries by name, and its modules that have no file here."""
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from libero_env.errors import UnknownNameError
@@ -26,3 +26,18 @@ def alias_modules(package: str, modules: str) -> None:
     for name in modules.split():
         sys.modules[f"{package}.{name}"] = whole
         setattr(whole, name, whole)
+
+
+def answers(table: Mapping[str, Callable[[Any], Any]]) -> Callable[[type], type]:
+    """Return a decorator that gives a class a read-only property for each entry of a table.
+
+    Args:
+        table: Name of the original or of robosuite -> function of the instance that returns its value.
+    """
+
+    def decorated(cls: type) -> type:
+        for name, function in table.items():
+            setattr(cls, name, property(function))
+        return cls
+
+    return decorated

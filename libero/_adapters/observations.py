@@ -66,6 +66,13 @@ def _kinds(value: object) -> tuple[str, ...]:
     return kinds
 
 
+def quat_xyzw(mat: np.ndarray) -> np.ndarray:
+    """Return a rotation matrix, (3, 3), as robosuite's quaternion xyzw, (4,) float32, whose w is not negative."""
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.ravel(mat))
+    return np.roll(quat if quat[0] >= 0 else -quat, -1).astype(np.float32)
+
+
 @dataclass
 class Observer:
     """Observes a simulation as the original does.
@@ -136,7 +143,8 @@ class Observer:
             mujoco.mju_mulQuat(relative, inverse, quat)
             values[f"{name}_pos"], values[f"{name}_quat"] = pos.copy(), np.roll(quat, -1)
             values[f"{name}_to_robot0_eef_pos"] = rotation @ (pos - grip_pos)
-            values[f"{name}_to_robot0_eef_quat"] = np.roll(relative if relative[0] >= 0 else -relative, -1)
+            relative = np.roll(relative if relative[0] >= 0 else -relative, -1)
+            values[f"{name}_to_robot0_eef_quat"] = relative.astype(np.float32)
         return values
 
     def _pictures(self) -> dict[str, np.ndarray]:

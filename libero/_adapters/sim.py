@@ -181,8 +181,7 @@ class MjSim:
     """The simulation of an environment.
 
     Attributes:
-        model, data: Model and state with names.
-        glowing: Function that returns the sites to be drawn, of objects that are turned on.
+        model, data: Model and state with names. Sites are drawn while their alpha is above 0.
 
     Args:
         simulations: One simulation.
@@ -196,7 +195,6 @@ class MjSim:
         self._simulations = simulations
         self.model = MjModel(simulations.model, xml)
         self.data = MjData(self.model, simulations.data(0))
-        self.glowing: Callable[[], Iterable[int]] = tuple
         self._renderers: dict[tuple[int, int], Renderer] = {}
         self._faithful = faithful
 
@@ -265,7 +263,7 @@ class MjSim:
         target = RenderTarget(
             camera, depth_buffer=buffer, **{"segmentation" if segmentation else "rgb": image}
         )
-        sites = self._segmented_sites() if segmentation and hidden_sites else self.glowing()
+        sites = self._sites(segmentation and hidden_sites)
         renderer.render(self.data._data, [target], sites)
         if segmentation:
             image = self._elements(image)
@@ -278,10 +276,17 @@ class MjSim:
         index = np.where(numbers > ngeom, numbers - 1 - ngeom, numbers - 1)
         return np.stack([kind, index], axis=-1).astype(np.int32)
 
-    def _segmented_sites(self) -> list[int]:
-        """Return the sites that are not transparent, of the groups that the original shows."""
-        model = self.model
-        return np.flatnonzero((model.site_rgba[:, 3] != 0) & (model.site_group < _SHOWN_SITE_GROUPS)).tolist()
+    def _sites(self, hidden: bool) -> list[int]:
+        """Return the sites that are shown, or those that are not transparent, of the groups that the original shows."""
+        alpha = self.model.site_rgba[:, 3]
+        seen = (alpha != 0) if hidden else (alpha > 0)
+        return np.flatnonzero(seen & (self.model.site_group < _SHOWN_SITE_GROUPS)).tolist()
+
+    def show_sites(self, names: Iterable[str], visible: bool) -> None:
+        """Show or hide sites: as in robosuite, the alpha of a hidden one is negative."""
+        for name in names:
+            rgba = self.model.site_rgba[self.model.site_name2id(name)]
+            rgba[3] = abs(rgba[3]) if visible else -abs(rgba[3])
 
     def _renderer(self, height: int, width: int) -> Renderer:
         if (height, width) not in self._renderers:
@@ -302,6 +307,10 @@ class Domain(Protocol):
     """One simulation of a task file; see `libero.libero.envs.bddl_base_domain.BDDLBaseDomain`."""
 
     scene: Scene
+    objects_dict: dict[str, Any]
+    fixtures_dict: dict[str, Any]
+    control_freq: float
+    initialization_noise: Any
     simulations: ClientSimulations
     sim: MjSim
     view: StateView

@@ -7,6 +7,7 @@ import importlib.metadata
 import importlib.util
 from collections import defaultdict
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -95,8 +96,10 @@ def add_panda(
     arm, gripper = load_robosuite(root / _ARM_FILE), load_robosuite(root / _GRIPPER_FILE)
     _set_wrist_collision(arm, robot)
     if detailed:
+        unnamed = count()
         for geom in (g for part in (arm, gripper) for g in part.geoms if g.group == 1):
             geom.mass = 0.0
+            geom.name = geom.name or f"g{next(unnamed)}_vis"  # as robosuite calls them
     else:
         _replace_visuals(arm, "arm")
         _replace_visuals(gripper, "gripper")

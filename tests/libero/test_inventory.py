@@ -275,8 +275,9 @@ def test_site_objects_and_zones():
     assert not site.in_box(np.zeros(3), eye, np.array([0.15, 0.0, 0.0]))
     assert site.under(np.zeros(3), eye, np.array([0.05, 0.0, 0.05]))
     zone = TargetZone(zone_size=(0.1, 0.05))
-    assert zone.in_box(np.zeros(3), np.array([0.05, 0.0, 0.0]))
-    assert zone.on_top(np.zeros(3), np.array([0.05, 0.0, 0.01]))
+    assert zone.in_box(np.zeros(3), eye, np.array([0.05, 0.0, 0.0]))
+    assert not zone.in_box(np.zeros(3), eye, np.array([0.15, 0.0, 0.0]))
+    assert zone.on_top(np.zeros(3), eye, np.array([0.15, 0.1, 0.1]))
 
 
 def test_samplers():

@@ -2,17 +2,17 @@
 
 import re
 from collections import UserDict
-from collections.abc import Mapping, MutableMapping
-from functools import cached_property, partial
-from operator import attrgetter
+from collections.abc import Callable, Mapping, MutableMapping
+from functools import cached_property, partial, partialmethod
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from libero._adapters.lookup import lookup
+from libero._adapters.lookup import answers, lookup
 from libero._adapters.models import STATES, accept_plain_files, assets_folder, facade_pack, model_of
+from libero._adapters.sim import MjSim
 from libero_env.objects import ObjectModel, get_object
 from libero_env.objects import register_object as register_model
 from libero_env.objects.builtin import builtin_names
@@ -68,8 +68,37 @@ def get_object_dict() -> MutableMapping[str, Any]:
     return OBJECTS_DICT
 
 
+def _joints(item: "BaseObject") -> list[str]:
+    """Return the names of its joints; the free joint, if any, is the first."""
+    joints = [name for name in item._names(item.model.spec.joints) if name != f"{item.name}_joint0"]
+    return joints if item._fixed else [f"{item.name}_joint0", *joints]
+
+
+_NAMES: dict[str, Callable[[Any], Any]] = {  # lengths in m, quaternions wxyz
+    "naming_prefix": lambda item: f"{item.name}_",
+    "root_body": lambda item: f"{item.name}_main",
+    "bodies": lambda item: item._names(item.model.spec.bodies[1:]),
+    "joints": _joints,
+    "sites": lambda item: item._names(item.model.spec.sites),
+    "actuators": lambda item: item._names(item.model.spec.actuators),
+    "sensors": lambda item: item._names(item.model.spec.sensors),
+    "contact_geoms": lambda item: item._names(g for g in item.model.spec.geoms if g.contype or g.conaffinity),
+    "visual_geoms": lambda item: item._names(g for g in item.model.spec.geoms if g.group == 1),
+    "important_sites": lambda item: {"obj": f"{item.name}_default_site"},
+    "important_geoms": lambda item: {},
+    "important_sensors": lambda item: {},
+    "bottom_offset": lambda item: np.array(item.model.bottom_offset),
+    "top_offset": lambda item: np.array(item.model.top_offset),
+    "horizontal_radius": lambda item: np.float64(item.model.horizontal_radius),
+    "init_quat": lambda item: item.model.rest_quat(),
+}
+
+
+@answers(_NAMES)
 class BaseObject:
     """An instance of a category in a scene: names of its elements, rotation at rest, and joint ranges.
+
+    `is_open`, `is_close`, `turn_on` and `turn_off` tell whether a joint position is in the range of that state.
 
     Attributes:
         name: Name of the instance, such as `milk_1`.
@@ -90,61 +119,33 @@ class BaseObject:
         """Model that scenes attach."""
         raise NotImplementedError
 
-    naming_prefix = property(lambda self: f"{self.name}_", doc="Prefix of the names of its elements.")
-    root_body = property(lambda self: f"{self.name}_main", doc="Name of its root body.")
-    bodies = property(lambda self: self._names(self.model.spec.bodies[1:]), doc="Names of its bodies.")
-    bottom_offset = property(lambda self: np.array(self.model.bottom_offset))
-    top_offset = property(lambda self: np.array(self.model.top_offset))
-    sites = property(lambda self: self._names(self.model.spec.sites), doc="Names of its sites.")
-    horizontal_radius = property(attrgetter("model.horizontal_radius"), doc="Radius to keep free, m.")
-    init_quat = property(lambda self: self.model.rest_quat(), doc="Orientation at rest, wxyz (4,).")
+    horizontal_radius: Any
+    _fixed = False
 
-    @property
-    def joints(self) -> list[str]:
-        """Names of its joints; the free joint, if any, is the first."""
-        joints = [name for name in self._names(self.model.spec.joints) if name != f"{self.name}_joint0"]
-        return joints if self._fixed else [f"{self.name}_joint0", *joints]
-
-    @property
-    def important_sites(self) -> dict[str, str]:
-        """Site -> name in the scene."""
-        return {name.removeprefix(self.naming_prefix): name for name in self.sites}
-
-    @property
-    def contact_geoms(self) -> list[str]:
-        """Names of its collision geoms."""
-        return self._names(g for g in self.model.spec.geoms if g.contype or g.conaffinity)
-
-    @property
-    def visual_geoms(self) -> list[str]:
-        """Names of its visual geoms."""
-        return self._names(g for g in self.model.spec.geoms if g.group == 1)
+    def set_sites_visibility(self, sim: MjSim, visible: bool) -> None:
+        """Show or hide its sites."""
+        sim.show_sites(self.sites, visible)
 
     def get_xml(self) -> str:
         """Return the object as MJCF."""
         return self.model.spec.to_xml()
 
-    def is_open(self, qpos: float) -> bool:
-        """Return whether a joint position is in the open range."""
-        return bool(reaches_state(self.model, qpos, "open"))
-
-    def is_close(self, qpos: float) -> bool:
-        """Return whether a joint position is in the closed range."""
-        return bool(reaches_state(self.model, qpos, "close"))
-
-    def turn_on(self, qpos: float) -> bool:
-        """Return whether a joint position is in the range of on."""
-        return bool(reaches_state(self.model, qpos, "turnon"))
-
-    def turn_off(self, qpos: float) -> bool:
-        """Return whether a joint position is in the range of off."""
-        return bool(reaches_state(self.model, qpos, "turnoff"))
-
-    _fixed = False
-
     def _names(self, elements: Any) -> list[str]:
         # a model that is part of a scene has the prefix already
         return [f"{self.name}_{element.name.removeprefix(self.naming_prefix)}" for element in elements]
+
+
+def _reaches(item: BaseObject, qpos: float, *, state: str) -> bool:
+    return bool(reaches_state(item.model, qpos, state))
+
+
+for _name, _state in (
+    ("is_open", "open"),
+    ("is_close", "close"),
+    ("turn_on", "turnon"),
+    ("turn_off", "turnoff"),
+):
+    setattr(BaseObject, _name, partialmethod(_reaches, state=_state))
 
 
 class BuiltinObject(BaseObject):

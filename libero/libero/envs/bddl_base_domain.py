@@ -4,18 +4,18 @@ import os
 import warnings
 import weakref
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from inspect import signature
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
-from libero._adapters.lookup import lookup
+from libero._adapters.lookup import answers, lookup
 from libero._adapters.models import facade_pack
-from libero._adapters.observations import Observer, RobosuiteMethods, cameras
-from libero._adapters.sim import ClientSimulations, MjSim, Window
+from libero._adapters.observations import Observer, RobosuiteMethods, cameras, quat_xyzw
+from libero._adapters.sim import ClientSimulations, MjSim, MjSimState, Window
+from libero.libero import get_assets_path
 from libero.libero.envs import bddl_utils as BDDLUtils
 from libero.libero.envs.bddl_utils import task_file
 from libero.libero.envs.object_states import BaseObjectState, ObjectState, SiteObjectState
@@ -36,6 +36,7 @@ from libero_env.errors import (
 from libero_env.init_states.original_resets import OriginalResets
 from libero_env.init_states.placement import Start, sample_settled
 from libero_env.mujoco_compat import mujoco
+from libero_env.objects.model import GLOW_GROUP
 from libero_env.paths import read_config
 from libero_env.sim.controller import ControllerState
 from libero_env.sim.predicates import evaluate, glowing_sites
@@ -55,6 +56,47 @@ WITHOUT_EFFECT = """
     visualization_sites_list workspace_name workspace_offset z_offset
 """.split()  # noqa: SIM905
 
+# Those of them that are attributes of robosuite's environments, and their defaults.
+_KEPT: dict[str, Any] = {
+    **{"env_configuration": "default", "has_offscreen_renderer": True, "render_collision_mesh": False},
+    **{"render_visual_mesh": True, "render_gpu_device_id": -1, "renderer": "mujoco", "renderer_config": None},
+    **{"object_property_initializers": None, "hard_reset": True},
+}
+_FLOOR_OFFSET = (0.0, 0.0, -0.035)  # the original's origin of regions on the floor, m
+
+_NAMES: dict[str, Callable[[Any], Any]] = {
+    **{
+        f"camera_{column}s": lambda env, column=column: [
+            getattr(camera, column) for camera in env.camera_list
+        ]
+        for column in ("height", "width", "depth")
+    },
+    "camera_segmentations": lambda env: [list(camera.segmentations) or None for camera in env.camera_list],
+    "num_cameras": lambda env: len(env.camera_list),
+    "num_robots": lambda env: len(env.robots),
+    "robot_names": lambda env: [robot.name for robot in env.robots],
+    "robot_configs": lambda env: [
+        {name: getattr(robot, name) for name in _CONFIGURED} for robot in env.robots
+    ],
+    "model_timestep": lambda env: env.sim.model.opt.timestep,
+    "control_timestep": lambda env: 1.0 / env.control_freq,
+    "deterministic_reset": lambda env: False,
+    "viewer": lambda env: env.window,
+    "viewer_get_obs": lambda env: False,
+    "sim_state_initial": lambda env: MjSimState(0.0, env.sim.model.qpos0.copy(), np.zeros(env.sim.model.nv)),
+    "custom_asset_dir": lambda env: get_assets_path(),
+    "visualization_sites_list": lambda env: [s.object_name for s in env.tracking_object_states_change],
+    "language_instruction": lambda env: env.problem.language,
+    "action_spec": lambda env: env.robots[0].action_limits,
+    "action_dim": lambda env: env.robots[0].action_dim,
+    "_action_dim": lambda env: env.robots[0].action_dim,
+    "_visualizations": lambda env: {"env", "robots", "grippers"},
+    "_eef_xpos": lambda env: env.sim.data.site_xpos[env.robots[0].eef_site_id].copy(),
+    "_eef_xmat": lambda env: env.sim.data.site_xmat[env.robots[0].eef_site_id].reshape(3, 3).copy(),
+    "_eef_xquat": lambda env: quat_xyzw(env._eef_xmat),
+}
+_CONFIGURED = ("controller_config", "mount_type", "initialization_noise", "control_freq", "gripper_type")
+
 
 class EpisodeOverError(LiberoError, ValueError):
     """`step` was called after the horizon."""
@@ -73,6 +115,7 @@ def _check_horizon(horizon: Any) -> None:
         raise InvalidInputError(f"horizon is {shown(horizon)}; expected at least 1")
 
 
+@answers(_NAMES)
 class BDDLBaseDomain(RobosuiteMethods):
     """One simulation of a task file.
 
@@ -150,7 +193,9 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.use_object_obs, self.use_camera_obs = use_object_obs, use_camera_obs
         self.reward_scale, self.reward_shaping = reward_scale, reward_shaping
         self.horizon, self.ignore_done, self.render_camera = horizon, ignore_done, render_camera
-        self.window = Window(render_camera) if has_renderer else None
+        self.window, self.has_renderer = Window(render_camera) if has_renderer else None, has_renderer
+        vars(self).update({key: kwargs.get(key, value) for key, value in _KEPT.items()})
+        self._xml_processor: Callable[[str], str] | None = None
         self.initialization_noise = initialization_noise
         self.placement_initializer = placement_initializer
         sizes = camera_heights, camera_widths
@@ -201,12 +246,10 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.sim = MjSim(self.simulations, self.get_xml, faithful=self.drawing == FAITHFUL)
         self.view = StateView(self.scene, self.simulations, 0)
         self.simulations.domain = weakref.ref(self)
-        self._glowing: set[int] = set()
-        self.sim.glowing = lambda: self._glowing
 
     def _setup_references(self, controller_configs: Any, robots: Any) -> None:
         scene = self.scene
-        self.workspace_name, self.workspace_offset = scene.workspace_name, scene.workspace.offset
+        self._setup_workspace()
         self.objects_dict, self.fixtures_dict = scene_objects(scene), scene_fixtures(scene)
         self.object_sites_dict = scene_sites(scene)
         self.objects, self.fixtures = list(self.objects_dict.values()), list(self.fixtures_dict.values())
@@ -215,17 +258,31 @@ class BDDLBaseDomain(RobosuiteMethods):
             name: ObjectState(self, name, is_fixture=name in scene.fixtures) for name in scene.entities
         }
         for name, site in self.object_sites_dict.items():
-            fixed = site.parent_name not in scene.objects
-            self.object_states_dict[name] = SiteObjectState(self, name, site.parent_name, is_fixture=fixed)
+            self.object_states_dict[name] = SiteObjectState(self, name, site.parent_name)
         states = self.object_states_dict.values()
-        self.tracking_object_states_changes = [s for s in states if getattr(s, "has_turnon_affordance", 0)]
+        self.tracking_object_states_change = [s for s in states if getattr(s, "has_turnon_affordance", 0)]
         self.robots = [SingleArm(self, controller_of(controller_configs), robots)]
-        self.model = TaskModel(scene, self.sim.model._model, self.get_xml)
+        parts = [*self.objects, *self.fixtures]
+        self.model = TaskModel(scene, self.sim.model._model, self.get_xml, parts, self.robots[0].robot_model)
+        self.visualize(dict.fromkeys(self._visualizations, False))
         drawn = self.camera_list if self.use_camera_obs else ()
         observed = list(scene.objects) if self.use_object_obs else []
         self.observer = Observer(self.sim, observed, drawn, self.model.segments)
         self._observables = self._setup_observables()
         self._add_placement_initializer()
+
+    def _setup_workspace(self) -> None:
+        """Set what the original's problem classes say of table or floor, such as `kitchen_table_full_size`."""
+        workspace = self.scene.workspace
+        thickness = workspace.parameters["table_thickness"]
+        self.workspace_name, self.workspace_offset = self.scene.workspace_name, workspace.offset
+        self.z_offset = 0.01 - thickness
+        if workspace.name == "floor":
+            self.workspace_offset, self.z_offset = _FLOOR_OFFSET, self.z_offset - _FLOOR_OFFSET[2]
+        else:
+            length_width = (0.7, 1.6) if workspace.mount is None else (1.0, 1.2)
+            setattr(self, f"{workspace.name}_full_size", (*length_width, thickness))
+        setattr(self, f"{workspace.name}_offset", self.workspace_offset)
 
     # Episodes -----------------------------------------------------------------------------------------------
 
@@ -237,8 +294,11 @@ class BDDLBaseDomain(RobosuiteMethods):
     def reset(self) -> "OrderedDict[str, np.ndarray]":
         """Sample an initial state and observe it; raise a PlacementError if the objects do not fit."""
         self._check_open()
+        if self._xml_processor is not None:
+            self._rebuild(self._xml_processor(self.get_xml()))
         self._reset_internal()
         self.timestep, self.cur_time, self.done = 0, 0.0, False
+        self.visualize(dict.fromkeys(self._visualizations, False))
         return self._get_observations(force_update=True)
 
     def _reset_internal(self) -> None:
@@ -252,7 +312,6 @@ class BDDLBaseDomain(RobosuiteMethods):
                 joint = self.scene.pose_address(name)
                 qpos[joint : joint + 7] = [*pos, *quat]
         self.restart(np.concatenate([[0.0], qpos, np.zeros(self.scene.model.nv), start.fixtures.ravel()]))
-        self._glowing = set()
 
     def _sample(self) -> Start:
         """Return a settled initial state; the arm holds its pose, whatever the controller."""
@@ -323,8 +382,8 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def _post_process(self) -> None:
         """Update the states of objects that can be turned on; as in the original, they begin to glow only now."""
-        self._glowing = glowing_sites(self.view)
-        for state in self.tracking_object_states_changes:
+        self.set_visualization()
+        for state in self.tracking_object_states_change:
             state.update_state()
 
     def reward(self, action: Any = None) -> float:
@@ -357,15 +416,25 @@ class BDDLBaseDomain(RobosuiteMethods):
             self._update_observables(force=True)
         return OrderedDict(self._observations)
 
+    def observation_spec(self) -> "OrderedDict[str, np.ndarray]":
+        """Return the last observation, as robosuite does."""
+        return self._get_observations()
+
     def get_robot_state_vector(self, obs: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return fingers, grip position and hand orientation of an observation, (9,)."""
         return np.concatenate([obs[f"robot0_{key}"] for key in ("gripper_qpos", "eef_pos", "eef_quat")])
 
     def visualize(self, vis_settings: Mapping[str, bool]) -> None:
-        """Do nothing: helper sites are never shown."""
+        """Show or hide sites of objects and fixtures (`env`), of the arm (`robots`) and of the gripper (`grippers`)."""
+        for item in self.model.mujoco_objects:
+            item.set_sites_visibility(self.sim, vis_settings["env"])
+        self.robots[0].visualize(vis_settings)
 
     def set_visualization(self) -> None:
-        """Do nothing: sites glow while their object is on."""
+        """Show the sites that glow while their object is on."""
+        names, on = self.sim.model.site_names, glowing_sites(self.view)
+        for site in np.flatnonzero(self.sim.model.site_group == GLOW_GROUP).tolist():
+            self.sim.show_sites([names[site]], site in on)
 
     # Properties and helpers ---------------------------------------------------------------------------------
 
@@ -377,11 +446,6 @@ class BDDLBaseDomain(RobosuiteMethods):
         """Return the object, fixture or region of this name; raise an UnknownNameError if there is none."""
         entities = {**self.objects_dict, **self.fixtures_dict, **self.object_sites_dict}
         return lookup(entities, "object, fixture or region", object_name)
-
-    language_instruction = property(attrgetter("problem.language"), doc="Instruction in the task file.")
-    action_spec = property(lambda self: self.robots[0].action_limits, doc="Lowest and highest action.")
-    action_dim = property(lambda self: self.robots[0].action_dim, doc="Length of an action.")
-    _visualizations = property(lambda self: {"env", "robots", "grippers"})
 
     def get_xml(self) -> str:
         """Return the scene as MJCF without textures, with the present poses of the fixtures."""
@@ -405,25 +469,31 @@ class BDDLBaseDomain(RobosuiteMethods):
         """
         poses = read_fixture_poses(xml_string, self.scene)
         try:
-            spec = scene_spec(self.problem, self.scene.pack, drawing=self.drawing, robot=self.robot)
-            model = compile_stored(xml_string, spec)
+            self._rebuild(xml_string)
         except DemoError as error:
             warnings.warn(f"{error}; only the poses of the fixtures are taken from it", stacklevel=2)
             for name, pose in poses.items():
                 self.sim.model.body_pos[self.obj_body_id[name]] = pose[:3]
                 self.sim.model.body_quat[self.obj_body_id[name]] = pose[3:]
-        else:
-            self._check_names(model)
-            self.sim.free()
-            self.scene, self._xml = replace(self.scene, model=model), xml_string
-            self._simulate(model)
-            self._setup_references(self._controller_configs, self._robots)
         self.sim.reset()
         self.sim.data.qpos[: len(REST_QPOS)] = REST_QPOS
         self.sim.forward()
         present = self.view.eef_pos[None], self.view.eef_mat.reshape(1, 9)
         self.simulations.controller_state.restart(np.zeros(1, np.int64), *present)
         self.timestep, self.cur_time, self.done = 0, 0.0, False
+
+    def _rebuild(self, xml_string: str) -> None:
+        spec = scene_spec(self.problem, self.scene.pack, drawing=self.drawing, robot=self.robot)
+        model = compile_stored(xml_string, spec)
+        self._check_names(model)
+        self.sim.free()
+        self.scene, self._xml = replace(self.scene, model=model), xml_string
+        self._simulate(model)
+        self._setup_references(self._controller_configs, self._robots)
+
+    def set_xml_processor(self, processor: Callable[[str], str] | None) -> None:
+        """Let a function change the scene, as MJCF, at each reset; None for none."""
+        self._xml_processor = processor
 
     def _check_names(self, model: mujoco.MjModel) -> None:
         """Raise a LiberoError unless a model has the joints and sites of the task, in their order."""
@@ -442,6 +512,11 @@ class BDDLBaseDomain(RobosuiteMethods):
     def edit_model_xml(self, xml_str: str) -> str:
         """Return a stored model with the paths of this machine."""
         return postprocess_model_xml(xml_str)
+
+    def clear_objects(self, object_names: str | Sequence[str]) -> None:
+        """Move objects out of sight."""
+        for name in [object_names] if isinstance(object_names, str) else object_names:
+            self.sim.data.set_joint_qpos(f"{name}_joint0", (10, 10, 10, 1, 0, 0, 0))
 
     def close(self) -> None:
         """Free the simulation, its GL contexts and its window. Idempotent."""

@@ -165,7 +165,7 @@ class SegmentationRenderEnv(OffScreenRenderEnv):
     def __init__(self, camera_segmentations: Any = "instance", **kwargs: Any):
         super().__init__(camera_segmentations=camera_segmentations, **kwargs)
         names = list(self.env.model.instances_to_ids)
-        self.segmentation_robot_id = names.index("Panda0")
+        self.segmentation_robot_id = names.index(self.robots[0].robot_model.name)
         self.segmentation_id_mapping = dict(enumerate(names[: self.segmentation_robot_id]))
         self.instance_to_id = {name: i + 1 for i, name in self.segmentation_id_mapping.items()}
 

@@ -1,18 +1,18 @@
 """A compiled task as objects of the original: instances, regions, and the instance of each geom."""
 
 from collections.abc import Callable, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
 
 from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObject
 from libero.libero.envs.objects import SiteObject
+from libero.libero.envs.robots import Panda
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.builtin import builtin_names
 from libero_env.objects.model import ObjectModel
 from libero_env.sim.scene import Scene
-
-_ROBOT_PARTS = {"Panda0": "robot0_", "RethinkMount0": "mount0_", "PandaGripper0": "gripper0_"}
 
 
 def scene_objects(scene: Scene) -> dict[str, BaseObject]:
@@ -62,26 +62,38 @@ class TaskModel:
     """Instance and class of each geom and site.
 
     Attributes:
+        mujoco_objects, mujoco_robots: Objects and fixtures; the arm.
         instances_to_ids, classes_to_ids: Name -> `geom` and `site` -> indices.
-        geom_ids_to_instances, geom_ids_to_classes: Index -> name.
+        geom_ids_to_instances, geom_ids_to_classes, site_ids_to_instances, site_ids_to_classes: Index -> name.
         segments: `instance` and `class` -> number of each geom, (ngeom + 1,), from 1; 0 is everything else.
     """
 
-    def __init__(self, scene: Scene, model: mujoco.MjModel, xml: Callable[[], str]):
-        self.mujoco_model = model
+    def __init__(
+        self,
+        scene: Scene,
+        model: mujoco.MjModel,
+        xml: Callable[[], str],
+        objects: Sequence[BaseObject],
+        robot: Panda,
+    ):
+        self.mujoco_model, self.mujoco_objects, self.mujoco_robots = model, list(objects), [robot]
         self._xml = xml
-        bodies, robot = {name: scene.bodies[name] for name in scene.entities}, _robot_bodies(model)
+        bodies = {name: scene.bodies[name] for name in scene.entities}
+        parts = {part.name: part for part in (robot, *robot.models)}
+        own = {name: [model.body(body).id for body in part.bodies] for name, part in parts.items()}
         categories = {name: item.category for name, item in scene.entities.items()}
         classes = {name: getattr(OBJECTS_DICT.get(c), "__name__", c) for name, c in categories.items()}
-        classes |= {name: name.removesuffix("0") for name in robot}
-        self.instances_to_ids = {name: _ids(model, indices) for name, indices in (bodies | robot).items()}
+        classes |= {name: type(part).__name__ for name, part in parts.items()}
+        self.instances_to_ids = {name: _ids(model, indices) for name, indices in (bodies | own).items()}
         self.classes_to_ids: dict[str, dict[str, list[int]]] = {}
         for name, ids in self.instances_to_ids.items():
             of_class = self.classes_to_ids.setdefault(classes[name], {"geom": [], "site": []})
             for kind in ids:
                 of_class[kind] += ids[kind]
-        self.geom_ids_to_instances = _inverse(self.instances_to_ids)
-        self.geom_ids_to_classes = _inverse(self.classes_to_ids)
+        for kind, what in product(("geom", "site"), ("instances", "classes")):
+            ids = getattr(self, f"{what}_to_ids")
+            names = {index: name for name, kinds in ids.items() for index in kinds[kind]}
+            setattr(self, f"{kind}_ids_to_{what}", names)
         ids_of = {"instance": self.instances_to_ids, "class": self.classes_to_ids}
         self.segments = {kind: _numbers(ids, model.ngeom) for kind, ids in ids_of.items()}
 
@@ -90,24 +102,10 @@ class TaskModel:
         return self._xml()
 
 
-def _robot_bodies(model: mujoco.MjModel) -> dict[str, list[int]]:
-    """Return the bodies of each part of the robot that has geoms."""
-    names = [model.body(b).name for b in range(model.nbody)]
-    parts = {
-        part: [b for b, name in enumerate(names) if name.startswith(prefix)]
-        for part, prefix in _ROBOT_PARTS.items()
-    }
-    return {part: bodies for part, bodies in parts.items() if np.isin(model.geom_bodyid, bodies).any()}
-
-
 def _ids(model: mujoco.MjModel, bodies: Sequence[int] | np.ndarray) -> dict[str, list[int]]:
     """Return the geoms and sites of bodies."""
     owners = {"geom": model.geom_bodyid, "site": model.site_bodyid}
     return {kind: np.flatnonzero(np.isin(owner, bodies)).tolist() for kind, owner in owners.items()}
-
-
-def _inverse(ids: dict[str, dict[str, list[int]]]) -> dict[int, str]:
-    return {geom: name for name, kinds in ids.items() for geom in kinds["geom"]}
 
 
 def _numbers(ids: dict[str, dict[str, list[int]]], ngeom: int) -> np.ndarray:

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from libero._adapters.lookup import alias_modules
+from libero._adapters.observations import quat_xyzw
 from libero._adapters.sim import Domain
-from libero_env.mujoco_compat import mujoco
 from libero_env.sim.predicates import evaluate
 from libero_env.tasks.problem import Atom
 
@@ -19,6 +19,7 @@ class BaseObjectState:
         object_name: Name of the object or fixture, or address of the region.
         parent_name: For a region the object or fixture that it belongs to, otherwise `object_name`.
         is_fixture: Whether it, or its parent, is a fixture.
+        query_dict: All objects or all fixtures, by name.
         object_state_type: `object` or `site`.
     """
 
@@ -29,7 +30,7 @@ class BaseObjectState:
     ):
         self.env, self.object_name, self.is_fixture = env, object_name, is_fixture
         self.parent_name = parent_name or object_name
-        self.query_dict: dict[str, Any] = {}
+        self.query_dict: dict[str, Any] = env.fixtures_dict if is_fixture else env.objects_dict
 
     def _holds(self, predicate: str, *names: str) -> bool:
         return evaluate(Atom(predicate, names), self.env.view)
@@ -99,11 +100,13 @@ class SiteObjectState(BaseObjectState):
 
     object_state_type = "site"
 
+    def __init__(self, env: Domain, object_name: str, parent_name: str | None, is_fixture: bool = False):
+        super().__init__(env, object_name, parent_name, parent_name in env.fixtures_dict)
+
     def get_geom_state(self) -> dict[str, np.ndarray]:
-        """Return `pos` (3,), m, and `quat` (4,), wxyz, in the world frame."""
-        quat = np.empty(4)
-        mujoco.mju_mat2Quat(quat, self.env.view.site_mat(self.object_name).ravel())
-        return {"pos": self.env.view.site_pos(self.object_name), "quat": quat}
+        """Return `pos` (3,), m, and `quat` (4,), xyzw as in the original, in the world frame."""
+        view, name = self.env.view, self.object_name
+        return {"pos": view.site_pos(name), "quat": quat_xyzw(view.site_mat(name))}
 
     def check_contact(self, other: BaseObjectState) -> bool:
         """Return True: contact does not matter for a region."""

@@ -136,15 +136,12 @@ class TargetZone(BuiltinObject):
         self.size = np.array([*zone_size[:2], zone_height], np.float64)
         self.pos = np.array([*zone_centroid_xy[:2], z_offset], np.float64)
 
-    def in_box(self, this_position: Any, other_position: Any) -> bool:
-        """Return whether a point is in the box of the zone."""
-        return bool((np.abs(np.asarray(other_position) - np.asarray(this_position)) < self.size).all())
+    _box, in_box, under = SiteObject._box, SiteObject.in_box, SiteObject.under
 
-    def on_top(self, this_position: Any, other_position: Any, other_height: float = 0.02) -> bool:
-        """Return whether a point is above the zone, by less than `other_height`, m."""
-        delta = np.asarray(other_position) - np.asarray(this_position)
-        inside = (np.abs(delta[:2]) < self.size[:2]).all()
-        return bool(inside and self.size[2] - 0.005 < delta[2] < other_height)
+    def on_top(self, this_position: Any, this_mat: Any, other_position: Any) -> bool:
+        """Return whether a point is beyond the upper corner of the box of half size |R size|, as in the original."""
+        reach = np.abs(np.asarray(this_mat) @ self.size)
+        return bool((np.asarray(other_position) > np.asarray(this_position) + reach).all())
 
 
 send_to_workers(__name__, "OBJECTS_DICT", "VISUAL_CHANGE_OBJECTS_DICT")
