@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from multiprocessing import connection
 from pathlib import Path
@@ -29,6 +29,15 @@ _DAMAGED = (EOFError, pickle.UnpicklingError, ValueError, LookupError, TypeError
 T = TypeVar("T")
 LONGEST_SILENCE = 4 * 3600.0  # [s] for one piece of work of a pool; the longest take minutes
 LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
+PICTURE_SECONDS = (
+    120.0  # [s] for the first picture of one of several processes; seconds where cores are shared
+)
+NO_PICTURE = 76  # exit status of a worker that did not draw it in time
+NO_PICTURE_TEXT = (
+    "no first picture: in some drivers several processes that draw by EGL on one GPU hang for ever (mujoco#3444). Give "
+    "--workers 1 (before a training: libero demos generate --workers 1), or set MUJOCO_GL=osmesa. What is finished is "
+    "kept"
+)
 
 
 _tables: dict[str, dict[Any, Any]] = {}  # "module:name" of a table -> its entries that are not a user's
@@ -95,7 +104,9 @@ def _same(own: Any, value: Any) -> bool:
     return isinstance(own, dict) and own == value
 
 
-def spawn_pool(workers: int, *, initializer: Callable[[], None] | None = None) -> ProcessPoolExecutor:
+def spawn_pool(
+    workers: int, *, initializer: Callable[[], None] | None = None, picture_seconds: float = PICTURE_SECONDS
+) -> ProcessPoolExecutor:
     """Return a pool of processes that start with a new interpreter and end when this process ends.
 
     They are spawned, not forked: an OpenGL context that a fork inherits hangs. As a context manager, the pool is waited
@@ -104,9 +115,11 @@ def spawn_pool(workers: int, *, initializer: Callable[[], None] | None = None) -
     Args:
         workers: Number of processes.
         initializer: Function of a module that each process calls when it starts.
+        picture_seconds: See `limit_first_picture`.
     """
     spawn = multiprocessing.get_context("spawn")
-    return _Pool(workers, mp_context=spawn, initializer=_start_worker, initargs=(initializer, user_entries()))
+    arguments = initializer, user_entries(), picture_seconds
+    return _Pool(workers, mp_context=spawn, initializer=_start_worker, initargs=arguments)
 
 
 def check_main_guard() -> None:
@@ -126,11 +139,14 @@ class _Pool(ProcessPoolExecutor):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
+        processes = list((self._processes or {}).values())
         if kind is not None and issubclass(kind, KeyboardInterrupt | SilentWorkersError):
-            for process in list((self._processes or {}).values()):  # Python 3.14 has kill_workers
+            for process in processes:  # Python 3.14 has kill_workers
                 process.kill()
         self.shutdown(wait=True, cancel_futures=kind is not None)
         if kind is not None and issubclass(kind, BrokenExecutor):
+            if any(process.exitcode == NO_PICTURE for process in processes):
+                raise LiberoError(NO_PICTURE_TEXT) from error
             raise LiberoError(
                 "a worker process ended, for the reason above or killed by the system if memory was short; what is "
                 "finished is kept. The same command goes on; fewer workers need less memory"
@@ -191,11 +207,12 @@ def run_each(
                         other.cancel()
 
 
-def _start_worker(initializer: Callable[[], None] | None, entries: bytes) -> None:
+def _start_worker(initializer: Callable[[], None] | None, entries: bytes, picture_seconds: float) -> None:
     for name in ("SIGINT", "SIGHUP"):  # a terminal sends them to all its processes; the parent ends this one
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     end_with_parent()
+    limit_first_picture(picture_seconds)
     add_entries(entries)
     if initializer is not None:
         initializer()
@@ -214,6 +231,44 @@ def end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+_picture_limit: tuple[float, bool] | None = None  # seconds, and whether this process tells that it gives up
+
+
+def limit_first_picture(seconds: float | None = PICTURE_SECONDS, *, told_here: bool = False) -> None:
+    """Have this process end where its first picture takes too long; called where other processes draw, too.
+
+    Args:
+        seconds: Largest time, [s]; None: no limit any more.
+        told_here: Whether this process prints `NO_PICTURE_TEXT`; otherwise whoever sees its status `NO_PICTURE` does.
+    """
+    global _picture_limit
+    _picture_limit = None if seconds is None else (seconds, told_here)
+
+
+@contextmanager
+def first_picture() -> Iterator[None]:
+    """Draw within the limit of `limit_first_picture`, if there is one; the first picture ends it."""
+    if _picture_limit is None:
+        yield
+        return
+    timer = threading.Timer(_picture_limit[0], _give_up, _picture_limit[1:])
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+        limit_first_picture(None)
+    finally:
+        timer.cancel()
+
+
+def _give_up(told_here: bool) -> None:
+    """End this process, whose drawing thread is in the driver and cannot be interrupted."""
+    if told_here:
+        sys.stdout.flush()
+        print(f"error: {NO_PICTURE_TEXT}", file=sys.stderr, flush=True)
+    os._exit(2 if told_here else NO_PICTURE)
 
 
 def cpu_count() -> int:

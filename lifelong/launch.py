@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.cli import ending
 from libero_env.errors import LiberoError
-from libero_env.parallel import end_with_parent
+from libero_env.parallel import end_with_parent, limit_first_picture
 from libero_env.text import printable, suggest
 from lifelong import experiment
 from lifelong.composition import REFUSALS, compose_first, config_folders, explained, swept
@@ -163,6 +163,7 @@ class Job:
         if self.ranks is not None:
             return self._run(config, self.ranks)
         end_with_parent()
+        limit_first_picture(told_here=True)
         with ending.interruptible(), process_group() as ranks:
             return self._run(config, ranks)
 

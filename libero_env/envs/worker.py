@@ -371,7 +371,8 @@ def wait_for(
         if not ready:
             break
     for i in waiting:
-        failures[i] = Failure(f"no answer within {timeout:g} s", True, late=True)
+        reason = f"no answer within {timeout:g} s (drivers that hang with several EGL renderers need MUJOCO_GL=osmesa)"
+        failures[i] = Failure(reason, True, late=True)
     return answers, failures
 
 

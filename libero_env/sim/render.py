@@ -18,6 +18,7 @@ import numpy as np
 
 from libero_env.errors import RenderError, UnknownNameError
 from libero_env.mujoco_compat import forget_opengl, mujoco
+from libero_env.parallel import first_picture
 from libero_env.sim.appearance import SceneAppearance
 from libero_env.sim.culling import Culling
 
@@ -192,6 +193,16 @@ class Renderer:
         Raises:
             RenderError: No OpenGL backend works here, or the context belongs to another thread or process.
         """
+        with first_picture():
+            self._render(data, targets, glowing_sites, appearance)
+
+    def _render(
+        self,
+        data: mujoco.MjData,
+        targets: Sequence[RenderTarget],
+        glowing_sites: Iterable[int],
+        appearance: SceneAppearance | None,
+    ) -> None:
         if self._gl is None:
             self._gl, self._owner = self._open(), (os.getpid(), threading.current_thread())
             _watch_forks()

@@ -10,7 +10,15 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from libero_env.errors import LiberoError
-from libero_env.parallel import end_with_parent, user_entries, with_entries
+from libero_env.parallel import (
+    NO_PICTURE,
+    NO_PICTURE_TEXT,
+    PICTURE_SECONDS,
+    end_with_parent,
+    limit_first_picture,
+    user_entries,
+    with_entries,
+)
 from libero_env.text import printable
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.work.claims import Claim
@@ -204,10 +212,18 @@ class Workers:
         count: Number of processes.
         function: Function that each of them calls.
         argument: Argument of the function; it is pickled.
+        picture_seconds: See `libero_env.parallel.limit_first_picture`.
     """
 
-    def __init__(self, count: int, function: Callable[[Any], None], argument: Any):
+    def __init__(
+        self,
+        count: int,
+        function: Callable[[Any], None],
+        argument: Any,
+        picture_seconds: float = PICTURE_SECONDS,
+    ):
         self._count, self._function, self._argument = count, function, argument
+        self._picture_seconds = picture_seconds
         self._context = multiprocessing.get_context("spawn")  # an OpenGL context that a fork inherits hangs
         self._processes: list[BaseProcess] = []
         self._deaths, self._done = 0, 0
@@ -222,7 +238,12 @@ class Workers:
 
         Args:
             done: Number of units that are done. Where it does not grow, the processes are killed by what they run.
+
+        Raises:
+            LiberoError: One has hung in its first picture.
         """
+        if any(process.exitcode == NO_PICTURE for process in self._processes):
+            raise LiberoError(NO_PICTURE_TEXT)
         if done > self._done:
             self._deaths, self._done = 0, done
         for i, process in enumerate(self._processes):
@@ -239,10 +260,13 @@ class Workers:
                 return
 
     def __enter__(self) -> "Workers":
+        if self._count:
+            limit_first_picture(self._picture_seconds, told_here=True)
         self._processes = [self._start() for _ in range(self._count)]
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
+        limit_first_picture(None)
         for process in self._processes:
             if kind is None:
                 process.join(_PATIENCE)
@@ -254,11 +278,13 @@ class Workers:
             process.join(_PATIENCE)
 
     def _start(self) -> BaseProcess:
-        process = self._context.Process(target=_call, args=(user_entries(), self._function, self._argument))
+        arguments = (self._picture_seconds, user_entries(), self._function, self._argument)
+        process = self._context.Process(target=_call, args=arguments)
         process.start()
         return process
 
 
-def _call(entries: bytes, function: Callable[[Any], None], argument: Any) -> None:
+def _call(picture_seconds: float, entries: bytes, function: Callable[[Any], None], argument: Any) -> None:
     end_with_parent()
+    limit_first_picture(picture_seconds)
     with_entries(entries, function, argument)

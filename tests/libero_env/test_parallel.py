@@ -1,10 +1,19 @@
 """Pools of processes that hang."""
 
+import subprocess
+import sys
 import time
 
 import pytest
 
-from libero_env.parallel import SilentWorkersError, as_finished, spawn_pool
+from libero_env.errors import LiberoError
+from libero_env.parallel import (
+    NO_PICTURE_TEXT,
+    SilentWorkersError,
+    as_finished,
+    spawn_pool,
+)
+from tests.harness.drawing import draw
 
 pytestmark = pytest.mark.unit
 
@@ -17,3 +26,36 @@ def test_a_pool_that_finishes_nothing_is_ended():
         assert [future.result() for future in as_finished([pool.submit(abs, -3)])] == [3]
         hung = pool.submit(time.sleep, 600.0)
         list(as_finished([hung], silence=0.3))
+
+
+@pytest.mark.sim
+def test_a_pool_whose_first_picture_hangs_is_ended_and_says_why():
+    done = []
+    with (
+        pytest.raises(
+            LiberoError, match=r"no first picture: .*mujoco#3444.*--workers 1.*MUJOCO_GL=osmesa.*is kept"
+        ),
+        spawn_pool(2, picture_seconds=0.01) as pool,
+    ):
+        futures = [pool.submit(draw, hangs) for hangs in (True, True)]
+        done = [future.result() for future in as_finished(futures)]
+    assert done == []
+    with spawn_pool(1, picture_seconds=100) as pool:
+        assert pool.submit(draw, False).result() == 8 * 8 * 3, "the limit ends with the first picture"
+        assert pool.submit(_limited).result() is False
+
+
+def _limited() -> bool:
+    from libero_env import parallel
+
+    return parallel._picture_limit is not None
+
+
+@pytest.mark.sim
+def test_a_process_that_nobody_watches_says_so_itself():
+    code = (
+        "from libero_env.parallel import limit_first_picture; from tests.harness.drawing import draw; "
+        "limit_first_picture(0.01, told_here=True); draw(hangs=True)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2 and done.stderr.splitlines() == [f"error: {NO_PICTURE_TEXT}"]

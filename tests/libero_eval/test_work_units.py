@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from libero_env.errors import LiberoError
 from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.work.claims import Claims, this_machine
 from libero_eval.work.progress import (
@@ -25,6 +26,7 @@ from libero_eval.work.progress import (
 from libero_eval.work.store import Unit, partition
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError, EvaluationIncompleteError, LifelongError, ResultsError
+from tests.harness.drawing import draw
 from tests.harness.evaluations import TASKS, Countdown, Still, evaluate, evaluation
 
 pytestmark = pytest.mark.unit
@@ -535,6 +537,14 @@ def test_a_killed_process_is_replaced_while_there_is_progress(capfd):
             time.sleep(0.01)
         workers.supervise(done=0)
         assert workers.pids == [], "it has ended by itself"
+
+
+@pytest.mark.sim
+def test_workers_whose_first_picture_hangs_end_the_evaluation_in_one_line():
+    with pytest.raises(LiberoError, match="no first picture"), Workers(1, draw, True, 0.01) as workers:
+        while workers.pids:
+            time.sleep(0.01)
+        workers.supervise(done=0)
 
 
 def test_units_are_plain_values():
