@@ -95,9 +95,7 @@ def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
     assert main(["eval", "my_policy:make", *tiny]) == 0
     assert "eval/my_policy.make/eval.json" in capsys.readouterr().out
     (reading,) = re.findall(
-        r"^```python\n(from libero_eval.evaluation_file.*?)^```",
-        text(DOCS / "evaluating.md"),
-        re.M | re.S,
+        r"^```python\n(from libero_eval.evaluation_file.*?)^```", text(DOCS / "evaluating.md"), re.M | re.S
     )
     exec(compile(reading, "evaluating.md", "exec"), {})  # noqa: S102
     assert "libero_object/0 Estimate(value=0.0" in capsys.readouterr().out

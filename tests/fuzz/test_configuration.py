@@ -64,15 +64,7 @@ KEYS = sorted(
         for path in paths_in(OmegaConf.to_container(composed("preset=smoke", choice)))
         if all(isinstance(key, str) for key in path)
     }
-    | {
-        "foo",
-        "train.foo",
-        "policy.head_hidden",
-        "algo._args_",
-        "policy._partial_",
-        "a.b.c",
-        "hydra",
-    }
+    | {"foo", "train.foo", "policy.head_hidden", "algo._args_", "policy._partial_", "a.b.c", "hydra"}
 )
 OVERRIDES = st.one_of(
     st.builds(

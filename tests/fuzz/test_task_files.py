@@ -47,11 +47,7 @@ DEFINITIONS = [
      "tasks": [{"name": "a", "goal": "Up plate_1"}, {"name": "b", "goal": "Up akita_black_bowl_1"}]},
     {"scene": "scene.yaml", "goal": "Up milk_1", "with": {"other": "butter"}},
 ]  # fmt: skip
-SCENE = {
-    "scene": "base.yaml",
-    "objects": ["$other"],
-    "place": {"$other": [0, 0.2]},
-}
+SCENE = {"scene": "base.yaml", "objects": ["$other"], "place": {"$other": [0, 0.2]}}
 BASE = {
     "fixtures": {"floor": "floor"},
     "objects": ["milk"],

@@ -10,9 +10,7 @@ def make_batch(features: Tensor, actions: Tensor, task: int = 0, ids: Tensor | N
     """(B, D) features as proprioception, (B, A) actions; T = 1, one black 1x1 view."""
     size = len(features)
     observation = Observation(
-        torch.zeros(size, 1, 1, 1, 1, 3, dtype=torch.uint8),
-        {"x": features[:, None]},
-        torch.zeros(size, 2),
+        torch.zeros(size, 1, 1, 1, 1, 3, dtype=torch.uint8), {"x": features[:, None]}, torch.zeros(size, 2)
     )
     ids = torch.arange(size) if ids is None else ids
     return Batch(observation, actions[:, None], torch.full((size,), task), ids)

@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 
-from libero_env.storage import (
-    atomic_folder,
-    atomic_path,
-    atomic_write_npz,
-    atomic_write_text,
-    create_text,
-)
+from libero_env.storage import atomic_folder, atomic_path, atomic_write_npz, atomic_write_text, create_text
 
 pytestmark = pytest.mark.unit
 

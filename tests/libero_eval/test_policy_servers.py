@@ -153,12 +153,7 @@ def test_openpi_observations_and_chunks():
             assert not actions[over].any()
         client.close()
     assert adapter.asked == [[0, 1, 2], [0, 2], [0, 2]], "only running simulations without actions"
-    assert set(seen[0]) == {
-        "observation/image",
-        "observation/wrist_image",
-        "observation/state",
-        "prompt",
-    }
+    assert set(seen[0]) == {"observation/image", "observation/wrist_image", "observation/state", "prompt"}
     assert seen[0]["observation/image"].dtype == np.uint8 and seen[0]["prompt"] == TASK.language
 
 
@@ -179,8 +174,7 @@ class Drawing:
 
 
 @pytest.mark.parametrize(
-    ("settle", "record", "drawn"),
-    [(0, 0, {0, 3, 6}), (2, 0, {2, 5, 8}), (0, 4, {0, 3, 4, 6, 8})],
+    ("settle", "record", "drawn"), [(0, 0, {0, 3, 6}), (2, 0, {2, 5, 8}), (0, 4, {0, 3, 4, 6, 8})]
 )
 def test_only_images_that_are_seen_are_drawn(settle, record, drawn):
     answer = lambda observation: {"actions": chunk(observation["observation/state"], 3)}  # noqa: E731

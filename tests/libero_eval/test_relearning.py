@@ -13,14 +13,7 @@ import torch
 
 from libero_eval import relearning
 from libero_eval.cli import runs
-from libero_eval.relearning import (
-    RelearnSettings,
-    Trial,
-    error_on,
-    failure_share,
-    relearn,
-    steps_until,
-)
+from libero_eval.relearning import RelearnSettings, Trial, error_on, failure_share, relearn, steps_until
 from lifelong.algorithms import Sequential
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.report.page import write_report

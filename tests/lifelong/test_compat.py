@@ -250,12 +250,7 @@ def test_compat_libero_sets_every_choice(name, preset):
 PAPER = {  # what `preset=paper compat=libero` sets beside algorithms
     "language": {"model": "bert", "pad_to": 25, "numbered": False},
     "data": {"pairing": "stored"},
-    "train": {
-        "lr_every": "epoch",
-        "last_batch": "short",
-        "statistics_first": True,
-        "precision": "fp32",
-    },
+    "train": {"lr_every": "epoch", "last_batch": "short", "statistics_first": True, "precision": "fp32"},
     "eval": {"precision": "fp32", "selection": "reporting", "select": "best"},
     "policy": {"stochastic": True, "normalise_proprio": False, "standardise_language": False},
 }

@@ -174,10 +174,7 @@ def test_a_carried_state_is_emptied_every_seq_len_steps() -> None:
 
 
 def test_without_a_memory_each_action_follows_from_its_frame_alone() -> None:
-    policy, long = (
-        make_policy("rnn-none", head="gmm").eval(),
-        fake_batch(SPEC, 2, generator(), steps=8),
-    )
+    policy, long = (make_policy("rnn-none", head="gmm").eval(), fake_batch(SPEC, 2, generator(), steps=8))
     actions = act_through(policy, long.observation)
     for step in (0, 3, 7):
         alone = act_through(policy, steps(long.observation, slice(step, step + 1)))

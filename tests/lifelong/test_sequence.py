@@ -5,12 +5,7 @@ import pytest
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.training.costs import COSTS
 from tests.harness.algorithms import assert_resumed_equals_uninterrupted
-from tests.harness.sequences import (
-    ALGORITHMS,
-    TASKS,
-    run_context,
-    sequence,
-)
+from tests.harness.sequences import ALGORITHMS, TASKS, run_context, sequence
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

@@ -355,14 +355,7 @@ def test_compiled_training_on_a_gpu(mode, parts):
         settings = FitSettings(
             epochs=12, batch_size=6, lr=1e-3, precision="fp32", compile=compile, accumulate=accumulate
         )
-        fit(
-            policy,
-            Pictures(),
-            Sequential(),
-            settings=settings,
-            seed=(1,),
-            on_epoch=ends.append,
-        )
+        fit(policy, Pictures(), Sequential(), settings=settings, seed=(1,), on_epoch=ends.append)
         losses.append([end.loss for end in ends[1:]])
     assert losses[1] == pytest.approx(losses[0], rel=1e-3)
 

@@ -50,13 +50,7 @@ def main() -> None:
     policy = Replay(recorded["actions"])
     before, after = config.get_env_processors()
     result = rollout(
-        env,
-        policy,
-        before,
-        after,
-        lambda batch: batch,
-        lambda action: action,
-        seeds=[1000, 1001],
+        env, policy, before, after, lambda batch: batch, lambda action: action, seeds=[1000, 1001]
     )
     frames = np.stack(env.call("render"))
     env.close()
