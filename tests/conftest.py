@@ -13,3 +13,11 @@ def shared() -> Path:
     if not (path / "official").is_dir():
         pytest.skip(f"the original's data are not at {path} (set LIBERO_SHARED)")
     return path
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as `unit` every test that is not marked as `sim`."""
+    for item in items:
+        if item.get_closest_marker("sim") is None:
+            item.add_marker("unit")

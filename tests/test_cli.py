@@ -22,8 +22,6 @@ from libero_env.errors import MAX_LISTED, UnknownNameError
 from libero_env.tasks import bddl, get_suite, get_task
 from lifelong.cli.runs import check_torch
 
-pytestmark = pytest.mark.unit
-
 ROOT = Path(__file__).parents[1]
 
 

@@ -43,7 +43,6 @@ def test_options_are_recorded(file):
         assert demo["obs/agentview_depth"].shape[1:] == (16, 24) and "eye_in_hand_rgb" not in demo["obs"]
 
 
-@pytest.mark.unit
 def test_images_have_the_size_that_a_run_reads():
     request = cli_demos.RecordingRequest(task="libero_goal/3", training=("preset=laptop",))
     (config,) = cli_demos.demo_configs(request)

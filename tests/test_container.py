@@ -4,10 +4,6 @@ import re
 import tomllib
 from pathlib import Path
 
-import pytest
-
-pytestmark = pytest.mark.unit
-
 ROOT = Path(__file__).parents[1]
 TEXT = re.sub(r"\\\n", " ", (ROOT / "Dockerfile").read_text())
 

@@ -104,7 +104,6 @@ def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
     monkeypatch.delitem(sys.modules, "my_policy")
 
 
-@pytest.mark.unit
 def test_the_algorithm_of_the_guide():
     code, config = blocks(GUIDE, "python")[0], yaml.safe_load(blocks(GUIDE, "yaml")[0])
     names: dict = {}
@@ -165,7 +164,6 @@ def check_line(line: str) -> None:
         assert words[0] in known, line
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
 def test_command_lines_are_valid(page):
     for line in lines(page):
@@ -175,7 +173,6 @@ def test_command_lines_are_valid(page):
             raise AssertionError(f"{page.name}: {line}") from error
 
 
-@pytest.mark.unit
 def test_a_wrong_command_line_is_found():
     for line in (
         "libero tasks lost", "python train.py algo=ewx", "python train.py train.epoch=3", "libreo doctor"
@@ -189,12 +186,10 @@ def written() -> str:
     return "\n".join(text(page) for page in PAGES if page.name not in GENERATED)
 
 
-@pytest.mark.unit
 def test_every_command_is_shown():
     assert not [name for name in ALL if not re.search(rf"\blibero {re.escape(name)}\b", written())]
 
 
-@pytest.mark.unit
 def test_every_command_and_argument_is_in_the_reference():
     page = generate().command_reference()
     for name, command in ALL.items():
@@ -218,7 +213,6 @@ OPTIONS = [
 ]
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("group", sorted({group for group, _ in OPTIONS}))
 def test_every_option_of_a_group_is_shown(group):
     for folder in ("compat/libero", "tuned"):  # chosen by compat, or by the policy's head
@@ -229,7 +223,6 @@ def test_every_option_of_a_group_is_shown(group):
     assert not {option for g, option in OPTIONS if g == group} - said
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("algo", [option for group, option in OPTIONS if group == "algo"])
 def test_every_algorithm_has_a_section_that_names_its_keys(algo):
     page = text(DOCS / "algorithms.md")
@@ -240,7 +233,6 @@ def test_every_algorithm_has_a_section_that_names_its_keys(algo):
     assert not missing
 
 
-@pytest.mark.unit
 def test_hooks_of_the_guide_are_those_of_algorithms():
     shown = text(DOCS / "algorithms.md").split("## Your own")[1]
     hooks = (
@@ -251,7 +243,6 @@ def test_hooks_of_the_guide_are_those_of_algorithms():
         assert hook in shown
 
 
-@pytest.mark.unit
 def test_every_key_is_in_the_reference_with_its_meaning():
     page = generate().configuration_reference()
     for group, option in OPTIONS:
@@ -281,7 +272,6 @@ def shown_keys(column: int) -> Iterator[list[str]]:
     yield rest
 
 
-@pytest.mark.unit
 def test_keys_of_the_migration_guide_exist():
     for words in shown_keys(1):
         load_config(*words)
@@ -289,7 +279,6 @@ def test_keys_of_the_migration_guide_exist():
         composes(*words)
 
 
-@pytest.mark.unit
 def test_extras_and_variables_are_told():
     page = text(DOCS / "install.md")
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"][
@@ -305,7 +294,6 @@ def test_extras_and_variables_are_told():
     assert not [name for name in {*extras, *variables} if f"\n| `{name}` |" not in page]
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", GUIDE], ids=lambda page: page.stem)
 def test_what_a_page_names_exists(page):
     content = text(page)
@@ -315,7 +303,6 @@ def test_what_a_page_names_exists(page):
     assert not [path for path in named if not path.exists()]
 
 
-@pytest.mark.unit
 def test_every_page_is_in_the_navigation():
     def pages(node) -> Iterator[str]:
         for part in node if isinstance(node, list) else node.values():
@@ -355,7 +342,6 @@ def anchors(page: Path) -> set[str]:
     return set(re.findall(r'\bid="([^"]+)"', page.read_text(encoding="utf-8")))
 
 
-@pytest.mark.unit
 def test_the_gallery_is_whole():
     text = generate().gallery()
     shown = re.findall(r'src="([^"]+)"', text)
@@ -372,12 +358,10 @@ def test_the_gallery_is_whole():
         assert re.search(f'"{re.escape(path)}"[^>]*><br>{task.index}: {task.language} \\|', text), task.id
 
 
-@pytest.mark.unit
 def test_every_kind_of_perturbation_is_shown():
     assert all(f"| `{kind}` |" in generate().perturbation_table() for kind in KINDS)
 
 
-@pytest.mark.unit
 def test_tests_that_are_named_exist():
     pages = [*PAGES, *ROOT.glob("experiments/*/README.md")]
     named = {m for page in pages for m in re.findall(r"(tests/[\w/]+\.py)::(\w+)", page.read_text())}

@@ -91,7 +91,6 @@ def here(tmp_path, monkeypatch) -> Path:
         del sys.modules[name]
 
 
-@pytest.mark.unit
 def test_a_fault_of_ours_is_a_traceback_and_a_request(monkeypatch, capsys):
     monkeypatch.setattr("libero_env.tasks.get_task", int)  # ValueError, of none of the user's code
     assert cli.main(["tasks", "show", "libero_goal/0"]) == ending.DEFECT
@@ -100,7 +99,6 @@ def test_a_fault_of_ours_is_a_traceback_and_a_request(monkeypatch, capsys):
     assert "fault of libero-lifelong" in found and "libero doctor" in found
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("number", [errno.EACCES, errno.ENOSPC, errno.EROFS, errno.EMFILE])
 def test_what_the_system_refuses_is_one_line(number, monkeypatch, capsys):
     error = OSError(number, os.strerror(number), "some/file")
@@ -108,7 +106,6 @@ def test_what_the_system_refuses_is_one_line(number, monkeypatch, capsys):
     assert capsys.readouterr().err == f"error: some/file: {os.strerror(number)}\n"
 
 
-@pytest.mark.unit
 def test_errors_by_kind(capsys):
     assert ending.report(MemoryError("Unable to allocate 7.45 TiB")) == ending.MISTAKE
     assert "not enough memory (Unable to allocate 7.45 TiB)" in capsys.readouterr().err
@@ -124,7 +121,6 @@ def test_errors_by_kind(capsys):
     )
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(("policy", "message"), [
     ("ending_nowhere:make", "there is no module ending_nowhere, neither in the current folder ("),
     ("ending_nowhere:make", ") nor installed; type the command in the folder of ending_nowhere.py"),
@@ -163,7 +159,6 @@ def test_a_policy_that_raises_shows_its_own_frames(here, capsys):
     assert "error: Policy.predict returned a list that is not an array of numbers" in capsys.readouterr().err
 
 
-@pytest.mark.unit
 def test_an_error_keeps_its_type_where_it_is_caught():
     with pytest.raises(ValueError, match="mine") as found, code_of("the policy"):
         raise ValueError("mine")
@@ -173,7 +168,6 @@ def test_an_error_keeps_its_type_where_it_is_caught():
     assert not hasattr(ours.value, "__notes__")
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(
     "words", [["--debug", "tasks", "show", "nope"], ["tasks", "show", "nope", "--debug"]]
 )
@@ -183,7 +177,6 @@ def test_debug_shows_the_traceback_of_a_mistake(words, here, capsys):
     assert found.startswith("Traceback") and "\nerror: unknown task 'nope'" in found
 
 
-@pytest.mark.unit
 def test_debug_reaches_train(here, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["train.py"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
@@ -204,7 +197,6 @@ class Own(Algorithm):
 """
 
 
-@pytest.mark.unit
 def test_an_algorithm_of_the_user_shows_its_own_frames(here, monkeypatch, capsys):
     Path("ending_algorithm.py").write_text(OWN_ALGORITHM)
     Path("algo").mkdir()
@@ -220,7 +212,6 @@ def test_an_algorithm_of_the_user_shows_its_own_frames(here, monkeypatch, capsys
     assert not Path("runs").exists()
 
 
-@pytest.mark.unit
 def test_mistyped_options_are_one_line(capsys):
     for words in (["eval", "--sise", "3"], ["tasks", "list", "--order", "x"]):
         with pytest.raises(SystemExit, match="2"):
@@ -229,7 +220,6 @@ def test_mistyped_options_are_one_line(capsys):
         assert found.startswith("error: ") and found.count("\n") == 1 and "--help" in found
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("words", [
     ["eval", "m:f", "--size", "0"],
     ["eval", "m:f", "--seed", "-1"],
@@ -267,7 +257,6 @@ def test_numbers_out_of_range_are_one_line(words, capsys):
     assert found.startswith("error: ") and option in found and found.count("\n") == 1
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(("words", "message"), [
     (["tasks", "show", "a\0"], "null character"),
     (["tasks", "show", ""], "the word after show is empty"),
@@ -285,7 +274,6 @@ def test_names_that_are_none(words, message, here, capsys):
     assert not list(here.parent.glob("*.yaml"))
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("address", [
     "ws://", "ws://host:99999", "ws://[::1", "ws://host:0x", "ws://a b:1", "vla-eval://", "gr00t://", "gr00t://host"
 ])  # fmt: skip
@@ -317,7 +305,6 @@ def test_warnings_of_mujoco_are_logged_once_and_make_no_file(here, caplog):
     assert not (here / "MUJOCO_LOG.TXT").exists()
 
 
-@pytest.mark.unit
 def test_a_new_task_may_have_any_instruction_of_one_line(here, capsys):
     language = "put: [the 'bowl'] #1 on the plate"
     assert cli.main(["tasks", "new", "mine", "--language", language]) == 0
@@ -326,7 +313,6 @@ def test_a_new_task_may_have_any_instruction_of_one_line(here, capsys):
     assert "expected one line without ( ) and ;" in capsys.readouterr().err
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("name", ["libero", "openpi"])  # one horizon, and one for each suite
 def test_the_memory_of_an_evaluation_is_estimated(name, tmp_path):
     task = get_task("libero_goal/0")
@@ -334,7 +320,6 @@ def test_the_memory_of_an_evaluation_is_estimated(name, tmp_path):
     assert 6e8 < plan.memory(1) < 2e9 and plan.memory(3) == 3 * plan.memory(1)
 
 
-@pytest.mark.unit
 def test_memory_is_looked_at_before_it_is_asked_for(monkeypatch):
     assert memory.available_memory() > 10**6
     monkeypatch.setattr(memory, "available_memory", lambda: 10**9)
@@ -357,7 +342,6 @@ def heeded():
         signal.signal(number, handler)
 
 
-@pytest.mark.unit
 def test_signals_interrupt_once_and_keep_what_is_ignored(heeded):
     def handlers() -> list[object]:
         return [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
@@ -379,7 +363,6 @@ def test_signals_interrupt_once_and_keep_what_is_ignored(heeded):
         signal.signal(signal.SIGHUP, before[2])
 
 
-@pytest.mark.unit
 def test_a_killed_worker_is_told():
     with (
         pytest.raises(LiberoError, match="a worker process ended.*The same command goes on"),

@@ -21,7 +21,6 @@ WORKERS = ("original_training.py", "original_worker.py", "robomimic_loader.py")
 COMMANDS = [p for p in SCRIPTS if "__main__" in p.read_text(encoding="utf-8") and p.name not in WORKERS]
 RECORDS = EXPERIMENTS / "algorithms" / "records"
 PAGES = sorted(RECORDS.parent.glob("*/comparison.json"))
-pytestmark = pytest.mark.unit
 
 
 def imported(tree: ast.AST) -> Iterator[tuple[str, str | None]]:

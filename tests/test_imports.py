@@ -15,8 +15,6 @@ import libero_env
 import libero_eval
 import lifelong
 
-pytestmark = pytest.mark.unit
-
 ROOT = Path(__file__).parents[1]
 NEEDS_EXTRA = "libero_env.sim.mjwarp."  # modules of the back end `warp`, whose package looks for GPUs
 ENV_SIDE = sorted(

@@ -17,12 +17,10 @@ PICTURES = {"1_quick_walkthrough": 4, "2_scenes_and_tasks": 2, "3_custom_objects
 LARGEST = 300_000  # bytes
 
 
-@pytest.mark.unit
 def test_every_notebook_is_listed():
     assert sorted(PICTURES) == sorted(path.stem for path in (ROOT / "notebooks").glob("*.ipynb"))
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("name", PICTURES)
 def test_notebooks_are_small_and_sound(name):
     path = ROOT / "notebooks" / f"{name}.ipynb"

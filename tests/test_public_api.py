@@ -12,8 +12,6 @@ import libero_env
 import libero_eval
 import lifelong
 
-pytestmark = pytest.mark.unit
-
 OFFERED = {
     "libero_env": {*("BatchEnv", "Expert", "LiberoEnv", "LiberoError", "SubprocEnv", "Suite", "Task",
      "UnknownNameError"), *("ensure_demos", "get_suite", "get_task", "make_task", "read_demos", "read_task"),

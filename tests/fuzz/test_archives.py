@@ -14,8 +14,6 @@ from libero._adapters.downloads import check_url, unpack
 from libero_env.assets.downloads import checked_listing
 from tests.harness.fuzz import examples, survive
 
-pytestmark = pytest.mark.unit
-
 PARTS = st.sampled_from(
     ["a", "b", "A", "..", ".", "", "c.hdf5", "con", "é", "x" * 300, "a b", "C:", "*", "\\", "\n", "~"]
 )

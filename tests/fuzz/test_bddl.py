@@ -79,7 +79,6 @@ def changed_bddl(draw, texts=(*TEXTS, SMALL, SMALL)):
     return "".join(tokens)
 
 
-@pytest.mark.unit
 @given(text=changed_bddl())
 @examples(short=150, long=10000)
 def test_any_text_is_parsed_or_refused_with_a_line(text):
@@ -95,7 +94,6 @@ def test_any_text_is_parsed_or_refused_with_a_line(text):
     survive("BDDL, parser", attempt)
 
 
-@pytest.mark.unit
 @given(text=changed_bddl())
 @examples(short=30, long=2000)
 def test_any_text_has_findings(text):

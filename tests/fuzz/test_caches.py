@@ -9,8 +9,6 @@ from libero_env.errors import BrokenFileError
 from libero_env.storage import atomic_write_npz, cached_arrays, read_npz, read_record, write_record
 from tests.harness.fuzz import examples, survive
 
-pytestmark = pytest.mark.unit
-
 RNG = np.random.default_rng(5)
 ARRAYS = {
     "a": RNG.normal(size=(7, 9)),

@@ -4,7 +4,6 @@ import json
 import tempfile
 from pathlib import Path
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,8 +15,6 @@ from lifelong.results.run_directory import CheckpointFolder
 from tests.harness.checkpoints import write_forged
 from tests.harness.fuzz import examples, survive
 from tests.harness.sequences import assert_same
-
-pytestmark = pytest.mark.unit
 
 TREE = {
     "run": None,

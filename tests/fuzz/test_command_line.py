@@ -17,8 +17,6 @@ from lifelong.report.figures import Line, Panel, as_svg, forgetting_figure, heat
 from lifelong.report.tables import page_template
 from tests.harness.fuzz import examples, survive
 
-pytestmark = pytest.mark.unit
-
 # commands that only read what they are given: none of the files exists
 VALID = [
     ["tasks", "list", "libero_object", "--order", "3"],

@@ -22,8 +22,6 @@ from tests.harness.configs import composed
 from tests.harness.fuzz import examples, survive
 from tests.harness.runs import make_run
 
-pytestmark = pytest.mark.unit
-
 BEGINS = "a run begins"
 CHOICES = [
     *("algo=er", "algo=agem", "algo=ewc", "algo=packnet", "algo=lora", "algo=dmpel", "algo=iscil", "algo=clare"),

@@ -5,7 +5,6 @@ import io
 import json
 from dataclasses import fields
 
-import pytest
 import yaml
 from hypothesis import given
 
@@ -23,8 +22,6 @@ from libero_eval.requests import EvalRequest
 from tests.harness.fuzz import examples, survive
 from tests.harness.mutations import changed_text, mutated
 from tests.harness.results import drawn_result
-
-pytestmark = pytest.mark.unit
 
 CARD = json_safe(load_protocol("openpi").resolved())
 VALID = [

@@ -5,7 +5,6 @@ from functools import lru_cache
 
 import h5py
 import numpy as np
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,8 +16,6 @@ from libero_env.demos.read import demo_lengths, read_demos, read_episodes
 from lifelong.data import DemoSource, SequenceVLDataset
 from lifelong.types import PolicySpec
 from tests.harness.fuzz import examples, survive
-
-pytestmark = pytest.mark.unit
 
 SPEC = PolicySpec(
     views=("agentview_rgb",), image_size=(4, 4), proprio={"ee_pos": 3}, language_dim=2, seq_len=3

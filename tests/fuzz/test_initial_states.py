@@ -14,8 +14,6 @@ from hypothesis import strategies as st
 from libero_env.init_states.pickles import read_states, write_states
 from tests.harness.fuzz import examples, survive
 
-pytestmark = pytest.mark.unit
-
 ROWS = np.random.default_rng(3).normal(size=(4, 6))
 NUMBERS = st.sampled_from((0, 1, -1, 2, 7, 255, 1 << 15, (1 << 31) - 1, 1 << 40, 1 << 200, -(1 << 63)))
 NAMES = st.sampled_from(

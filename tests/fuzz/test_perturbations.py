@@ -1,7 +1,6 @@
 """Texts and values of perturbations, of any kind: they are perturbations, or refused in one line."""
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -10,8 +9,6 @@ from libero_env.perturbations import KINDS, Perturbation, format_perturbations, 
 from libero_env.perturbations.instructions import edit_distance, reword
 from libero_env.tasks import get_suite
 from tests.harness.fuzz import examples, survive
-
-pytestmark = pytest.mark.unit
 
 NUMBER = st.one_of(st.floats().map(repr), st.integers().map(str), st.text(max_size=5), st.just("0.5"))
 PART = st.builds(

@@ -4,7 +4,6 @@ import json
 import tempfile
 from pathlib import Path
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -25,8 +24,6 @@ from lifelong.results.records import (
 from lifelong.results.summary import summarize
 from lifelong.stats.metrics import lifelong_metrics
 from tests.harness.fuzz import examples, survive
-
-pytestmark = pytest.mark.unit
 
 NAMES = ["first", "second"]
 START = start_record(

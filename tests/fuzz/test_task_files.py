@@ -16,8 +16,6 @@ from libero_eval.protocols.files import load_protocol
 from tests.harness.fuzz import examples, survive
 from tests.harness.mutations import changed_text, hostile, mutated
 
-pytestmark = pytest.mark.unit
-
 PLACES = {
     "wooden_cabinet_1": {"at": [0, -0.3], "yaw": "pi"},
     "akita_black_bowl_1": [0, 0],

@@ -1,13 +1,10 @@
 """YAML texts of any kind, read with their line numbers."""
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from libero_env.storage import parse_yaml_text
 from tests.harness.fuzz import examples, survive
-
-pytestmark = pytest.mark.unit
 
 PIECES = [
     *("a: ", "b: 1\n", "- ", "[", "]", "{", "}", "&x ", "*x", "<<: *x\n", "!!set ", "!!binary "),

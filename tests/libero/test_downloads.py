@@ -17,8 +17,6 @@ from libero_env.demos.download import REPO, REVISION, download_demos, remote_fil
 from libero_env.errors import UnknownNameError
 from tests.harness.hub import serve_hub
 
-pytestmark = pytest.mark.unit
-
 FILE = "libero_object/pick_up_the_alphabet_soup_and_place_it_in_the_basket_demo.hdf5"
 CONTENT = bytes(range(256)) * 4000
 

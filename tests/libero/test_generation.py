@@ -18,7 +18,7 @@ from libero_env.errors import BDDLError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl, get_suite
 from libero_env.tasks.problem import And, Atom, Or, differences
 
-pytestmark = [pytest.mark.unit, pytest.mark.usefixtures("registries")]
+pytestmark = pytest.mark.usefixtures("registries")
 
 
 @pytest.fixture

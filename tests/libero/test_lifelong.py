@@ -22,8 +22,6 @@ from libero.lifelong.datasets import (
 from libero_env.errors import LiberoError
 from tests.harness.facade_learning import LANGUAGE, SIZE, tiny, write_demos
 
-pytestmark = pytest.mark.unit
-
 NAMES = {
     "libero.lifelong.datasets": "get_dataset SequenceVLDataset GroupedTaskDataset TruncatedSequenceDataset",
     "libero.lifelong.algos": """Sequential SingleTask Multitask ER AGEM EWC PackNet get_algo_class get_algo_list

@@ -22,8 +22,6 @@ from libero.lifelong.models.policy_head import GMMHead
 from libero_env.errors import LiberoError
 from tests.harness.facade_learning import tiny, windows, write_demos
 
-pytestmark = pytest.mark.unit
-
 GROUPS = ("base", "single_task", "er", "agem", "ewc", "packnet")
 
 

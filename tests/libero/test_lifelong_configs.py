@@ -22,8 +22,6 @@ from libero.lifelong.models.modules import (
 )
 from libero.lifelong.models.policy_head import HEADS
 
-pytestmark = pytest.mark.unit
-
 GROUPS = ("data", "eval", "lifelong", "policy", "train")
 PARTS = sorted(p.relative_to(CONFIGS / "policy") for p in CONFIGS.glob("policy/*/*.yaml"))
 NETWORKS = {

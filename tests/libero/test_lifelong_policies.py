@@ -18,8 +18,6 @@ from libero_env.errors import LiberoError
 from lifelong.types import Observation
 from tests.harness.facade_learning import TINY, TINY_TRANSFORMER, windows, write_demos
 
-pytestmark = pytest.mark.unit
-
 VIEWS = ("agentview_rgb", "eye_in_hand_rgb")
 SHAPES = {
     "ac_dim": 7,

@@ -16,8 +16,6 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states.pickles import read_states, write_states
 from libero_env.tasks import bddl
 
-pytestmark = pytest.mark.unit
-
 
 def test_importing_neither_writes_nor_prompts(tmp_path):
     code = (

@@ -51,7 +51,6 @@ def collected(tmp_path_factory):
     return writer.finish()
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("path", THIN, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_files_run_their_modules(path, capsys, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
@@ -66,7 +65,6 @@ def test_files_run_their_modules(path, capsys, monkeypatch):
         assert "--help" in capsys.readouterr().out
 
 
-@pytest.mark.unit
 def test_a_script_as_a_process(tmp_path):
     command = [sys.executable, str(ROOT / "benchmark_scripts" / "shasum_files.py"), str(tmp_path / "nothing")]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
@@ -105,7 +103,6 @@ def test_create_dataset(collected, tmp_path, capsys):
     assert "error: create_dataset.py: " in capsys.readouterr().err
 
 
-@pytest.mark.unit
 def test_get_dataset_info(collected, tmp_path, capsys):
     assert demonstrations.get_dataset_info(["--dataset", str(collected), "--verbose"]) == 0
     out = capsys.readouterr().out
@@ -125,7 +122,6 @@ def test_get_dataset_info(collected, tmp_path, capsys):
     assert "not in [-1, 1]" in out
 
 
-@pytest.mark.unit
 def test_check_dataset_integrity(collected, tmp_path, capsys):
     assert demonstrations.check_dataset_integrity([str(collected), "--num-demos", "2"]) == 0
     assert "1 of 1 files are complete" in capsys.readouterr().out
@@ -138,7 +134,6 @@ def test_check_dataset_integrity(collected, tmp_path, capsys):
     assert demonstrations.check_dataset_integrity([str(tmp_path / "empty")]) == 2
 
 
-@pytest.mark.unit
 def test_get_affordance_info(capsys):
     assert tasks.get_affordance_info(["flat_stove", "basket", "milk"]) == 0
     assert capsys.readouterr().out == "flat_stove: cook_region\nbasket: contain_region\n"
@@ -146,7 +141,6 @@ def test_get_affordance_info(capsys):
     assert "Did you mean 'flat_stove'" in capsys.readouterr().err
 
 
-@pytest.mark.unit
 def test_create_libero_task_example(tmp_path, capsys):
     assert tasks.create_libero_task_example(["--folder", str(tmp_path)]) == 0
     paths = capsys.readouterr().out.split()
@@ -191,7 +185,6 @@ def test_templates_work_unchanged(tmp_path, capsys, monkeypatch):
     env.close()
 
 
-@pytest.mark.unit
 def test_missing_options_of_templates_are_asked_for(tmp_path, monkeypatch, capsys):
     answers = iter(["object", "my box", "object", "MyBox"])
     monkeypatch.setattr("builtins.input", lambda question: next(answers))
@@ -207,7 +200,6 @@ def test_missing_options_of_templates_are_asked_for(tmp_path, monkeypatch, capsy
     assert files.create_template(["-t", "object", "-n", "MyBox", "-o", str(tmp_path), "--overwrite"]) == 0
 
 
-@pytest.mark.unit
 def test_config_copy(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert files.config_copy([]) == 0
@@ -219,7 +211,6 @@ def test_config_copy(tmp_path, capsys, monkeypatch):
     assert files.config_copy(["elsewhere"]) == files.config_copy(["--overwrite"]) == 0
 
 
-@pytest.mark.unit
 def test_download_libero_datasets(tmp_path, monkeypatch, capsys):
     asked = []
     monkeypatch.setattr(
@@ -232,7 +223,6 @@ def test_download_libero_datasets(tmp_path, monkeypatch, capsys):
     assert demonstrations.download_libero_datasets(["--download-dir", str(tmp_path)]) == 1
 
 
-@pytest.mark.unit
 def test_check_task_suites(monkeypatch, capsys, tmp_path):
     assert tasks.check_task_suites(["libero_goal"]) == 0
     assert capsys.readouterr().out == "libero_goal: 10 tasks, 0 faults\n"
@@ -260,7 +250,6 @@ def test_render_single_task(collected, tmp_path, capsys):
     assert "libero_goal has 0 to 9" in capsys.readouterr().err
 
 
-@pytest.mark.unit
 def test_shasum_files(tmp_path, capsys):
     (tmp_path / "a.txt").write_text("hello")
     assert files.shasum_files([str(tmp_path)]) == 0
@@ -319,7 +308,6 @@ def test_collecting_scripts(tmp_path, monkeypatch, capsys):
     assert "LIBERO-100 has 0 to 99" in capsys.readouterr().err
 
 
-@pytest.mark.unit
 def test_videos(tmp_path, recwarn):
     """Success tints the last picture green; odd sizes, which MP4 has no room for, become a GIF."""
     from libero.libero.utils.video_utils import VideoWriter
@@ -336,7 +324,6 @@ def test_videos(tmp_path, recwarn):
     assert "writing GIF" in str(recwarn.pop(UserWarning).message)
 
 
-@pytest.mark.unit
 def test_small_functions():
     from libero.libero.utils import Timer
     from libero.libero.utils.utils import postprocess_model_xml, process_image_input, update_env_kwargs

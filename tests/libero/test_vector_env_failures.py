@@ -14,8 +14,6 @@ from libero._adapters.workers import CALL_TIMEOUT, WorkerError
 from libero.libero.envs import DummyVectorEnv, SubprocVectorEnv
 from libero_env.errors import ClosedEnvironmentError, InvalidInputError
 
-pytestmark = pytest.mark.unit
-
 SEED = int(os.environ.get("LIBERO_FUZZ_SEED", "0"))  # other moments of the kills
 
 

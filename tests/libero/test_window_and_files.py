@@ -9,7 +9,6 @@ NAME = "open_the_middle_drawer_of_the_cabinet.bddl"
 BLIND = {"use_camera_obs": False, "has_offscreen_renderer": False}
 
 
-@pytest.mark.unit
 def test_a_task_file_is_found_by_its_name(tmp_path, suite):
     there = tmp_path / NAME
     assert task_file(NAME).endswith(f"/libero_goal/{NAME}")

@@ -14,8 +14,6 @@ from libero_env.cli.main import main
 from libero_env.errors import LiberoError, UnknownNameError
 from tests.harness.hub import serve_hub
 
-pytestmark = pytest.mark.unit
-
 LARGE = bytes(range(256)) * 4096  # 1 MiB
 FILES = {
     "README.md": b"# Assets\n",

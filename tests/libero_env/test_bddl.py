@@ -12,8 +12,6 @@ from libero_env.tasks.problem import And, Atom, ForAll, Not, Or, Problem, Region
 from libero_env.tasks.sexpr import number
 from tests.libero_env.compare_bddl import all_tasks
 
-pytestmark = pytest.mark.unit
-
 TEXT = """
 (define (problem LIBERO_Kitchen_Tabletop_Manipulation)  ; a comment
   (:domain robosuite)

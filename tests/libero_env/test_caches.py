@@ -71,7 +71,6 @@ def lines(caplog):
     return lambda: [record.getMessage() for record in caplog.records]
 
 
-@pytest.mark.unit
 def test_arrays_are_made_once_and_every_reader_knows_them(path, source, lines):
     for _ in range(2):
         assert_same(source.get(path))
@@ -106,7 +105,6 @@ def damage(path: Path, how: str) -> None:
 KINDS = ("empty", "truncated", "bit", "zeros", "text", "other", "not finite", "objects", "without a checksum")
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("how", KINDS)
 def test_a_broken_file_is_made_again_with_one_line(path, source, lines, how):
     source.get(path)
@@ -118,7 +116,6 @@ def test_a_broken_file_is_made_again_with_one_line(path, source, lines, how):
     assert line.startswith(str(path)) and line.endswith("it is made again")
 
 
-@pytest.mark.unit
 def test_a_file_that_unpacks_to_more_than_memory_is_refused(path):
     path.parent.mkdir(parents=True)
     header = np.lib.format.magic(1, 0) + b"\x76\x00"
@@ -133,7 +130,6 @@ def test_a_file_that_unpacks_to_more_than_memory_is_refused(path):
         read_npz(path)
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("kind", ["file", "no permission", "link to nowhere"])
 def test_without_a_place_for_it_everything_works_with_one_line(tmp_path, source, lines, kind):
     root = tmp_path / "cache"
@@ -151,7 +147,6 @@ def test_without_a_place_for_it_everything_works_with_one_line(tmp_path, source,
     assert line.startswith(f"nothing is cached in {root}") and line.endswith("that you can write to")
 
 
-@pytest.mark.unit
 def test_what_killed_processes_have_left_is_removed(path, source):
     path.parent.mkdir(parents=True)
     old, young = (path.parent / f".file.npz.{name}.part" for name in ("old", "young"))
@@ -162,7 +157,6 @@ def test_what_killed_processes_have_left_is_removed(path, source):
     assert young.exists() and not old.exists()
 
 
-@pytest.mark.unit
 def test_a_full_disk_leaves_no_part_of_a_file(path, source, lines, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -172,7 +166,6 @@ def test_a_full_disk_leaves_no_part_of_a_file(path, source, lines, monkeypatch):
     assert list(path.parent.iterdir()) == [] and "No space left" in lines()[0]
 
 
-@pytest.mark.unit
 def test_a_folder_that_is_removed_meanwhile_is_made_again(path, source):
     source.get(path)
     path.unlink()
@@ -181,7 +174,6 @@ def test_a_folder_that_is_removed_meanwhile_is_made_again(path, source):
     assert source.made == 2 and path.exists()
 
 
-@pytest.mark.unit
 def test_nothing_is_writable_by_others_whatever_the_mask(path, source):
     before = os.umask(0)
     try:
@@ -193,7 +185,6 @@ def test_nothing_is_writable_by_others_whatever_the_mask(path, source):
     assert [one.stat().st_mode & 0o777 for one in made] == [0o644, 0o644, 0o755, 0o755]
 
 
-@pytest.mark.unit
 def test_a_stricter_mask_is_kept(path, source):
     before = os.umask(0o077)
     try:
@@ -203,7 +194,6 @@ def test_a_stricter_mask_is_kept(path, source):
     assert [one.stat().st_mode & 0o777 for one in (path, path.parent)] == [0o600, 0o700]
 
 
-@pytest.mark.unit
 def test_a_folder_where_everybody_writes_is_not_read(path, source, lines):
     source.get(path)
     path.parent.chmod(0o777)
@@ -214,7 +204,6 @@ def test_a_folder_where_everybody_writes_is_not_read(path, source, lines):
     assert source.made == 3 and len(lines()) == 1
 
 
-@pytest.mark.unit
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root makes files of others")
 @pytest.mark.parametrize(
     ("mode", "owner", "trusted"), [(0o1777, 12345, False), (0o755, 0, False), (0o755, 12345, True)]
@@ -228,7 +217,6 @@ def test_a_folder_of_another_user_is_read_where_the_cache_is_theirs(path, source
     assert path.exists() == trusted
 
 
-@pytest.mark.unit
 def test_records_have_a_checksum(tmp_path):
     path = tmp_path / "file.json"
     write_record(path, {"b": [1, 2], "a": "é"})
@@ -240,7 +228,6 @@ def test_records_have_a_checksum(tmp_path):
         assert read_record(path) is None
 
 
-@pytest.mark.unit
 def test_a_result_about_models_that_is_damaged_is_found_again(tmp_path, monkeypatch):
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
     (tmp_path / "models").mkdir()
@@ -251,7 +238,6 @@ def test_a_result_about_models_that_is_damaged_is_found_again(tmp_path, monkeypa
     assert published.check_folder(tmp_path / "models") == found
 
 
-@pytest.mark.unit
 def test_paths_of_the_cache(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
@@ -265,7 +251,6 @@ def test_paths_of_the_cache(tmp_path, monkeypatch):
         cache_dir()
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(
     ("text", "message"),
     [("assets: 5", r"config.yaml:1: assets is 5; expected a text"), ("- a", "expected keys with values")]
@@ -283,14 +268,12 @@ def test_a_broken_configuration_file_is_one_line(tmp_path, monkeypatch, text, me
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.unit
 def test_values_that_are_not_used_may_be_anything(tmp_path, monkeypatch):
     monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
     config_file().write_text("mine: [1, 2]\nassets: /x\nobjects:\n")
     assert read_config() == {"assets": "/x"}
 
 
-@pytest.mark.unit
 def test_a_broken_file_of_the_package_is_named(tmp_path, monkeypatch):
     path = tmp_path / "libero_spatial.npz"
     monkeypatch.setattr(store, "shipped_path", lambda suite: path)
@@ -307,7 +290,6 @@ def test_a_broken_file_of_the_package_is_named(tmp_path, monkeypatch):
     store.packaged_states.cache_clear()
 
 
-@pytest.mark.unit
 def test_truncated_caches_of_meshes_stop_no_model(tmp_path, monkeypatch, lines):
     trimesh = pytest.importorskip("trimesh")
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
@@ -362,7 +344,6 @@ def function(tmp_path, monkeypatch):
     return module.twice
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 @pytest.mark.parametrize("size", [0, 10])
 def test_compiled_functions_that_are_damaged_are_compiled_again(tmp_path, function, lines, kind, size):
@@ -376,7 +357,6 @@ def test_compiled_functions_that_are_damaged_are_compiled_again(tmp_path, functi
     assert again(4) == 8 and sum(again.stats.cache_hits.values()) == 1
 
 
-@pytest.mark.unit
 def test_functions_are_compiled_where_nothing_can_be_cached(tmp_path, function, lines, monkeypatch):
     (tmp_path / "__pycache__").write_text("no folder")
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc/1")
@@ -385,7 +365,6 @@ def test_functions_are_compiled_where_nothing_can_be_cached(tmp_path, function, 
     assert "Set NUMBA_CACHE_DIR" in line
 
 
-@pytest.mark.unit
 def test_functions_are_compiled_where_the_disk_is_full(function, lines, monkeypatch):
     made = parallel.compiled(function)
 
@@ -407,7 +386,6 @@ print(cached_arrays(Path(sys.argv[1]), lambda: {"a": np.arange(200_000.0)}, lamb
 """
 
 
-@pytest.mark.unit
 def test_processes_that_start_together_share_an_empty_cache(path):
     command = [sys.executable, "-c", PROGRAM, str(path)]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -441,7 +419,6 @@ cached_folder(folder, make)
 """
 
 
-@pytest.mark.unit
 def test_one_process_makes_a_folder_and_one_that_is_killed_holds_nobody_up(tmp_path):
     folder, log = tmp_path / "cache" / "kind" / "folder", tmp_path / "log"
     command = [sys.executable, "-c", MAKER, str(folder), str(log)]

@@ -29,7 +29,6 @@ def tried(monkeypatch):
     return seen
 
 
-@pytest.mark.unit
 def test_only_what_is_missing_is_tried(tried, tmp_path):
     first = certify(TASKS, 20, out=tmp_path, progress=False)
     assert sorted(tried) == [(task.id, i) for task in TASKS for i in range(20)]
@@ -43,7 +42,6 @@ def test_only_what_is_missing_is_tried(tried, tmp_path):
     assert len(tried) == 60
 
 
-@pytest.mark.unit
 def test_what_was_done_before_a_stop_is_kept(tried, tmp_path, monkeypatch):
     whole, tries = module.attempt, []
 
@@ -61,7 +59,6 @@ def test_what_was_done_before_a_stop_is_kept(tried, tmp_path, monkeypatch):
     assert [len(c.outcomes) for c in found] == [40, 40]
 
 
-@pytest.mark.unit
 def test_another_scene_or_expert_is_run_again(tried, tmp_path, monkeypatch):
     certify(TASKS[:1], 4, out=tmp_path, progress=False)
     monkeypatch.setattr(module, "_digest", lambda *args: "another")
@@ -69,7 +66,6 @@ def test_another_scene_or_expert_is_run_again(tried, tmp_path, monkeypatch):
     assert len(tried) == 8
 
 
-@pytest.mark.unit
 def test_a_broken_certificate_is_named(tried, tmp_path):
     certify(TASKS[:1], 4, out=tmp_path, progress=False)
     (path,) = tmp_path.rglob("*.json")
@@ -78,7 +74,6 @@ def test_a_broken_certificate_is_named(tried, tmp_path):
         certify(TASKS[:1], 4, out=tmp_path, progress=False)
 
 
-@pytest.mark.unit
 def test_figures_by_hand(tried):
     (row,) = results(certify(TASKS[:1], 5, progress=False))["tasks"]
     assert (row["successes"], row["states"], row["retries"]) == (4, 5, 2)
@@ -90,7 +85,6 @@ def test_figures_by_hand(tried):
     assert "| a/0 a | 0/1 |  | 0 | 1x one / two |" in table and "0/1 = 0.0 %" in table
 
 
-@pytest.mark.unit
 def test_the_exit_status_tells_whether_each_task_reaches_the_rate(tried, tmp_path, capsys):
     words = ["tasks", "certify", "libero_object/0", "--jobs", "1", "--out", str(tmp_path)]
     assert cli.main([*words, "--states", "4"]) == 1  # three of four
@@ -103,7 +97,6 @@ def test_the_exit_status_tells_whether_each_task_reaches_the_rate(tried, tmp_pat
     assert (tmp_path / "libero_object.png").stat().st_size > 1000
 
 
-@pytest.mark.unit
 def test_without_matplotlib_there_is_no_figure_and_no_error(tried, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "matplotlib.figure", None)
     argv = ["tasks", "certify", "libero_object/0", "--jobs", "1", "--states", "2", "--out", str(tmp_path)]
@@ -112,7 +105,6 @@ def test_without_matplotlib_there_is_no_figure_and_no_error(tried, tmp_path, cap
     assert not list(tmp_path.glob("*.png"))
 
 
-@pytest.mark.unit
 def test_tasks_are_named_once(tmp_path):
     from libero_env.tasks import find_tasks
 

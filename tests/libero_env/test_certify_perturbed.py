@@ -15,6 +15,7 @@ from libero_env.errors import LiberoError
 from libero_env.perturbations import Perturbation, sampling
 from libero_env.tasks import get_suite, get_task
 
+pytestmark = pytest.mark.sim
 TASK = get_task("libero_goal/3")
 ROBOT = Perturbation("robot", 0.4)
 

@@ -21,8 +21,6 @@ from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, InvalidInputError, LiberoError
 from tests.harness.demos import episode, header, write
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.fixture(scope="module")
 def content(tmp_path_factory):

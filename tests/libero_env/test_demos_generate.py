@@ -153,7 +153,6 @@ def test_a_faithful_drawing_is_recorded(whole, tmp_path):
     assert read_header(file)["drawing"] == "faithful" and "drawing" not in read_header(whole)
 
 
-@pytest.mark.unit
 def test_the_folder_names_every_option_that_is_not_the_default(tmp_path):
     def folder(**options):
         return demo_path(tmp_path, DemoConfig("libero_object/0", (64, 64), **options)).parent.name
@@ -176,7 +175,6 @@ def test_a_recording_killed_before_its_parts_were_joined_is_finished(whole, tmp_
     check_same(generate(TASK, 3, path=path, workers=1, **KINDS), whole)
 
 
-@pytest.mark.unit
 def test_the_digest_of_models_does_not_depend_on_where_they_are_installed(tmp_path):
     def digest(folder, height):
         folder.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,6 @@ from tests.harness.demos import episode, write
 
 av = pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")
-pytestmark = pytest.mark.unit
 STEPS, SIZE = (9, 14, 11), 32
 
 

@@ -117,7 +117,6 @@ def test_it_can_be_undone_and_is_not_mixed(path, other, tmp_path):
         perturbed(path, other, "blur=0.5")
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("text", ["robot=0.3", "delay=0.5", "layout=0.2", "camera=0.1,goal=1"])
 def test_what_changes_what_happens_is_refused(text):
     with pytest.raises(InvalidInputError, match="changes what happens.*valid: .*instruction.*camera"):

@@ -17,8 +17,6 @@ from libero_env.tasks import get_task, write_task
 from libero_env.tasks.problem import same_meaning
 from tests.harness.demos import episode, write
 
-pytestmark = pytest.mark.unit
-
 
 def with_noops(seed):
     """Return an episode with no-ops in steps 3 and 4; in step 7 the gripper begins to close without motion."""

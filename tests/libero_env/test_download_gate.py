@@ -14,8 +14,6 @@ from libero.libero.utils import download_utils
 from libero_env.assets.downloads import DownloadError, checked_listing, download, read_manifest
 from tests.harness.answers import answer, serve
 
-pytestmark = pytest.mark.unit
-
 FILE = ("a/b.hdf5", 3, "a" * 64)  # name, size, digest
 
 

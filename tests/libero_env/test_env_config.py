@@ -13,13 +13,11 @@ FIELDS = [field.name for field in dataclasses.fields(EnvConfig)]
 ENVIRONMENTS = [LiberoEnv, BatchEnv, SubprocEnv]
 
 
-@pytest.mark.unit
 def test_every_field_is_documented():
     for name in FIELDS:
         assert f"\n        {name}: " in EnvConfig.__doc__
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("environment", ENVIRONMENTS, ids=lambda cls: cls.__name__)
 def test_the_signature_shows_the_options_with_their_default_values(environment):
     parameters = inspect.signature(environment).parameters
@@ -28,7 +26,6 @@ def test_the_signature_shows_the_options_with_their_default_values(environment):
         assert parameters[field.name].kind is inspect.Parameter.KEYWORD_ONLY
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("make", [
     lambda **options: LiberoEnv(TASK, **options),
     lambda **options: BatchEnv(TASK, 2, **options),
@@ -40,7 +37,6 @@ def test_an_unknown_option_is_an_error_that_names_the_nearest(make):
         make(camera_siz=(64, 64))
 
 
-@pytest.mark.unit
 def test_values_are_made_plain():
     config = EnvConfig(cameras=["agentview"], observations=["rgb"], camera_size=[64.0, 32])
     assert (config.cameras, config.observations, config.camera_size) == (("agentview",), ("rgb",), (64, 32))

@@ -39,7 +39,6 @@ BAD_VALUES = {
 }
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("name", BAD_VALUES)
 def test_options_outside_of_their_bounds_are_named_with_their_value(name):
     for value in BAD_VALUES[name]:
@@ -47,7 +46,6 @@ def test_options_outside_of_their_bounds_are_named_with_their_value(name):
             EnvConfig(**{name: value})
 
 
-@pytest.mark.unit
 def test_options_of_numpy_and_whole_floats_are_made_plain():
     config = EnvConfig(horizon=np.int64(5), camera_size=np.array([32, 48]), reward_scale=np.float32(0.5))
     assert (config.horizon, config.camera_size, config.reward_scale) == (5, (32, 48), 0.5)
@@ -58,7 +56,6 @@ def test_options_of_numpy_and_whole_floats_are_made_plain():
     assert type(EnvConfig(horizon=7.0).horizon) is int
 
 
-@pytest.mark.unit
 def test_arguments_of_constructors_are_checked():
     with pytest.raises(InvalidInputError, match="^task is"):
         LiberoEnv(None, cameras=())
@@ -387,7 +384,6 @@ def test_only_what_is_drawn_needs_opengl(variables):
     assert told.returncode == 1 and told.stdout.startswith("FAIL  GL:") and not told.stderr
 
 
-@pytest.mark.unit
 def test_rotations_whose_squares_vanish_are_none():
     current, out = np.linspace(-1.0, 1.0, 9), np.empty(9)
     for small in (1e-320, 1e-170, -1e-300, 5e-324):

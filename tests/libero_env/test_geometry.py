@@ -14,8 +14,6 @@ from libero_env.geometry import (
     rotation_between,
 )
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.fixture
 def quats():

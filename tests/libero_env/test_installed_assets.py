@@ -22,8 +22,6 @@ from libero_env.cli.main import main
 from libero_env.errors import MissingPackageError
 from lifelong.results.provenance import installed_versions
 
-pytestmark = pytest.mark.unit
-
 FILES = {
     "scenes/room.xml": b"<mujoco/>\n",
     "articulated_objects/a.xml": b"<mujoco model='a'/>\n",

@@ -9,8 +9,6 @@ from libero_env import limited
 from libero_env.errors import InvalidInputError
 from libero_env.limited import call_limited, limited_process
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.mark.parametrize(("function", "args", "message"), [
     (time.sleep, (60,), "f: reading it takes more than"),

@@ -62,7 +62,6 @@ FAULTS = [
 ]  # fmt: skip
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(("old", "new", "rule", "level", "says"), FAULTS, ids=lambda value: str(value)[:30])
 def test_a_fault_is_reported(old, new, rule, level, says):
     text, line = mutated(old, new)
@@ -73,7 +72,6 @@ def test_a_fault_is_reported(old, new, rule, level, says):
     assert str(finding).startswith(f"mine.bddl:{finding.line}: {level}: ")
 
 
-@pytest.mark.unit
 def test_all_undeclared_names_are_reported_at_once():
     text = SOUND.replace("(On plate_1 main", "(On plat_1 main").replace(GOAL, "(And (In bowl_9 nowhere))")
     findings = [f for f in lint_text(text, "mine.bddl", starts=0) if f.rule == "unknown-name"]
@@ -81,14 +79,12 @@ def test_all_undeclared_names_are_reported_at_once():
     assert text.splitlines()[findings[0].line - 1].strip().startswith("(On plat_1")
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("text", ["", "(define", "hello", "(define (problem p))", SOUND[:300], "\x00"])
 def test_text_that_is_not_a_task_has_one_error_with_a_line(text):
     (finding,) = lint_text(text, "mine.bddl")
     assert finding.level == "error" and finding.rule == "syntax" and finding.line >= 1
 
 
-@pytest.mark.unit
 def test_a_file_that_is_not_text_is_reported(tmp_path):
     path = tmp_path / "mine.bddl"
     path.write_bytes(b"(define\n\xff)")
@@ -96,7 +92,6 @@ def test_a_file_that_is_not_text_is_reported(tmp_path):
     assert (finding.line, finding.rule) == (2, "syntax") and "UTF-8" in finding.remedy
 
 
-@pytest.mark.unit
 def test_a_file_whose_name_is_not_its_instruction_is_reported(tmp_path):
     path = tmp_path / "my_task.bddl"
     path.write_text(SOUND)
@@ -104,19 +99,16 @@ def test_a_file_whose_name_is_not_its_instruction_is_reported(tmp_path):
     assert finding.level == "info" and "'my task'" in finding.what
 
 
-@pytest.mark.unit
 def test_every_predicate_has_its_kinds():
     assert set(PREDICATES) - set(KINDS) == {"True", "False"}
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
 def test_the_texts_of_the_benchmark_have_neither_errors_nor_warnings(task):
     findings = lint_task(task, starts=0)
     assert [str(f) for f in findings if f.level != "info"] == []
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("category", WORKSPACES)
 def test_the_reach_is_a_ring_before_the_robot(category):
     workspace = load_workspace(category)
@@ -200,7 +192,6 @@ def test_no_task_of_the_benchmark_has_an_error():
     assert {f.rule for f in findings if f.level == "warning"} <= {"out-of-reach"}
 
 
-@pytest.mark.unit
 def test_the_command_prints_findings_and_its_status_counts_errors(tmp_path, capsys):
     good, bad = tmp_path / "good.bddl", tmp_path / "bad.bddl"
     good.write_text(SOUND)
@@ -214,7 +205,6 @@ def test_the_command_prints_findings_and_its_status_counts_errors(tmp_path, caps
     assert cli.main(["tasks", "lint", str(tmp_path / "none.bddl")]) == 2
 
 
-@pytest.mark.unit
 def test_linting_texts_needs_no_torch():
     code = (
         "import sys, libero_env.design.lint.checks, libero_env.design.certify\n"

@@ -7,8 +7,6 @@ import pytest
 
 from libero_env import memory
 
-pytestmark = pytest.mark.unit
-
 GIB = 1 << 30
 
 

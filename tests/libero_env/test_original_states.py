@@ -13,8 +13,6 @@ from libero_env.init_states.pickles import StateFileError, read_states, write_st
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_task
 
-pytestmark = pytest.mark.unit
-
 
 def test_reads_every_original_file(shared):
     files = sorted((shared / "official" / "init_files").glob("*/*.pruned_init"))

@@ -15,8 +15,6 @@ from libero_env.parallel import (
 )
 from tests.harness.drawing import draw
 
-pytestmark = pytest.mark.unit
-
 
 def test_a_pool_that_finishes_nothing_is_ended():
     with (

@@ -57,7 +57,6 @@ def plain():
     env.close()
 
 
-@pytest.mark.unit
 def test_a_text_gives_values_in_the_order_of_application():
     found = parse_perturbations(" noise=0.25, camera=0.3@7 ,fov=0", seed=2)
     assert found == (
@@ -70,7 +69,6 @@ def test_a_text_gives_values_in_the_order_of_application():
     assert [k.layer for k in KINDS.values()] == sorted((k.layer for k in KINDS.values()), key=LAYERS.index)
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("text", ["camera", "camera=", "camera=x", "camera=1.1", "camera=-0.1", "camera=nan",
                                   "camera=0.1@x", "camera=0.1@-1", "camera=0.1,camera=0.2"])  # fmt: skip
 def test_what_is_typed_wrongly_is_one_line(text):
@@ -248,7 +246,6 @@ def test_distractors_are_so_many_at_rest_and_leave_the_others_where_they_are():
     env.close()
 
 
-@pytest.mark.unit
 def test_every_instruction_of_the_benchmark_can_be_reworded_at_a_given_distance():
     full = KINDS["instruction"].at_one
     for language in sorted({task.language for suite in SUITES for task in get_suite(suite).tasks})[::16]:
@@ -260,7 +257,6 @@ def test_every_instruction_of_the_benchmark_can_be_reworded_at_a_given_distance(
             assert said.isascii() and "{" not in said
 
 
-@pytest.mark.unit
 def test_the_edit_distance_counts_tokens_and_clauses_are_split_at_and():
     assert edit_distance("a b c", "a b c") == 0 and edit_distance("a b c d", "a x c") == 0.5
     assert split_clauses("open the top drawer and put the bowl inside") == [
@@ -374,7 +370,6 @@ def arriving(name, severity):
     return image
 
 
-@pytest.mark.unit
 def test_pictures_are_blurred_hidden_late_and_lost():
     taken = np.random.default_rng(0).integers(0, 25, (13, 128, 128, 3), np.uint8)
     step = np.zeros((128, 128, 3), np.uint8)
@@ -437,7 +432,6 @@ def test_actions_are_scaled_and_noisy_but_not_the_gripper():
     assert np.array_equal(acted[3], noise.act(action, Episode(episode.key, 3)))
 
 
-@pytest.mark.unit
 def test_a_configuration_with_perturbations_goes_to_other_processes():
     view = CameraView(fovy=50.0)
     config = EnvConfig(

@@ -80,7 +80,6 @@ NAMES = (
 )
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(("old", "new", "line", "message"), FAULTS, ids=lambda value: str(value)[:30])
 def test_the_parser_and_the_linter_name_the_line(old, new, line, message):
     assert old in TEXT
@@ -94,26 +93,22 @@ def test_the_parser_and_the_linter_name_the_line(old, new, line, message):
     assert any(f.line == line and f.level == "error" for f in lint_text(text, "mine.bddl", starts=0))
 
 
-@pytest.mark.unit
 def test_workspaces_are_those_that_have_an_arena():
     assert set(WORKSPACES) == set(arena.WORKSPACES)
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("name", NAMES)
 def test_names_of_the_robot_and_those_that_are_no_names_are_refused(name):
     with pytest.raises(BDDLError, match=r"mine\.bddl:9: .*the name "):
         bddl.parse(TEXT.replace("bowl_1", name), "mine.bddl")
 
 
-@pytest.mark.unit
 def test_a_region_is_not_also_an_object():
     text = TEXT.replace("bowl_2", "kitchen_table_plate_place")
     with pytest.raises(BDDLError, match="is both a region of kitchen_table and an object"):
         bddl.parse(text)
 
 
-@pytest.mark.unit
 def test_a_file_that_is_too_large_is_refused(tmp_path):
     path = tmp_path / "large.bddl"
     path.write_text("; " + "x" * (1 << 22))
@@ -124,7 +119,6 @@ def test_a_file_that_is_too_large_is_refused(tmp_path):
 PROBLEM = bddl.parse(TEXT)
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(("changes", "message"), [
     ({"language": 3}, "Problem: language is 3; expected a text"),
     ({"language": "a\nb"}, "expected one line without ( ) and ;"),
@@ -144,7 +138,6 @@ def test_a_problem_made_in_python_is_checked(changes, message):
     assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)  # noqa: S301
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("make", [
     lambda: Region("a", "kitchen_table", ((0.0, 0.0, 1.0),)),
     lambda: Region("a", "kitchen_table", (("0", 0.0, 1.0, 1.0),)),
@@ -161,7 +154,6 @@ def test_parts_of_a_problem_are_checked_when_they_are_made(make):
         make()
 
 
-@pytest.mark.unit
 def test_a_goal_has_a_largest_depth():
     goal = Atom("Up", ("bowl_1",))
     with pytest.raises(InvalidInputError, match="the goal is too large; expected at most 64 levels"):
@@ -170,7 +162,6 @@ def test_a_goal_has_a_largest_depth():
     assert goal.levels == 64 and Problem("p", "x", goal, PROBLEM.fixtures, PROBLEM.objects)
 
 
-@pytest.mark.unit
 def test_a_users_predicate_takes_as_many_names_as_its_function(monkeypatch):
     for table in (*SEMANTICS.values(), KINDS):
         monkeypatch.setitem(table, "Near", None)

@@ -11,8 +11,6 @@ from libero_env.perturbations.corruptions import CORRUPTIONS, SEVERITIES, corrup
 from libero_env.tasks.published import camera_pose, joint_pose, parse_plus_id
 from libero_env.tasks.published.plus import NOISES, Noise, ViewChange
 
-pytestmark = pytest.mark.unit
-
 BASE = "put_the_bowl_on_the_plate"
 IDS = {
     f"{BASE}_view_285_15_100_0_0_initstate_0": ("camera", BASE, {"view": ViewChange(285, 15)}),

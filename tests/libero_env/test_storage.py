@@ -5,8 +5,6 @@ import pytest
 
 from libero_env.storage import atomic_folder, atomic_path, atomic_write_npz, atomic_write_text, create_text
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.mark.parametrize("fsync", [False, True])
 def test_a_file_is_replaced_when_it_is_complete(tmp_path, fsync):

@@ -99,7 +99,6 @@ def test_workers_give_the_results_of_single_environments(envs):
         env.close()
 
 
-@pytest.mark.unit
 def test_finished_environments_do_not_move_until_reset(envs):
     env = envs([counter(), counter()])
     env.reset()
@@ -117,7 +116,6 @@ def test_finished_environments_do_not_move_until_reset(envs):
         env.reset(options={"reset_mask": [True]})
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(
     ("fault", "says"), [("die", "exit code 3"), ("hang", "no answer within 1 s"), ("raise", "a step too far")]
 )
@@ -142,7 +140,6 @@ def test_the_others_continue_when_a_worker_fails(envs, fault, says):
     assert env.step(np.zeros((3, 2)))[0]["count"].tolist() == [5, 1, 5]
 
 
-@pytest.mark.unit
 def test_a_worker_killed_from_outside_is_replaced(envs):
     env = envs([counter(), counter()])
     env.reset()
@@ -156,7 +153,6 @@ def test_a_worker_killed_from_outside_is_replaced(envs):
     assert env.call("count", indices=[1]) == [0]
 
 
-@pytest.mark.unit
 def test_entries_of_different_shapes_are_in_the_info(envs):
     env = envs([counter(size=2), counter(size=3)])
     seen, info = env.reset()
@@ -164,7 +160,6 @@ def test_entries_of_different_shapes_are_in_the_info(envs):
     assert [own["own"].shape for own in info["own"]] == [(2,), (3,)]
 
 
-@pytest.mark.unit
 def test_environments_that_cannot_be_made_are_errors():
     def broken():
         raise RuntimeError("no such thing")
@@ -177,7 +172,6 @@ def test_environments_that_cannot_be_made_are_errors():
     assert set(mp.active_children()) <= before
 
 
-@pytest.mark.unit
 def test_no_process_and_no_memory_is_left():
     processes, memory = set(mp.active_children()), blocks()
     env = SubprocEnv([counter(), counter("hang", at=1)], timeout=1.0)

@@ -13,8 +13,6 @@ from libero_env.tasks import make_task, read_suite, read_task
 from libero_env.tasks.task import Task
 from libero_env.validation import validate
 
-pytestmark = pytest.mark.unit
-
 TEXT = """\
 scene: kitchen
 furniture: [wooden_cabinet]

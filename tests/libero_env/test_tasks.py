@@ -15,8 +15,6 @@ from libero_env.tasks.problem import Atom, Not, Or
 from tests.libero_env.compare_bddl import all_tasks, compare
 from tests.libero_env.compare_bddl import main as compare_main
 
-pytestmark = pytest.mark.unit
-
 ALL_TASKS = all_tasks()
 SCENE = {
     "problem": "LIBERO_Kitchen_Tabletop_Manipulation",

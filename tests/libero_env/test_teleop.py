@@ -24,7 +24,6 @@ TASK = "libero_90/0"  # KITCHEN_SCENE10_close_the_top_drawer_of_the_cabinet
 WAY = ((0.0, 0.08, 1.17), (0.0, 0.08, 1.11), (0.0, -0.3, 1.11))
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("key", MOTIONS)
 def test_a_key_moves_along_one_axis(key):
     keyboard = Keyboard()
@@ -35,7 +34,6 @@ def test_a_key_moves_along_one_axis(key):
     assert np.allclose(keyboard.action(), expected)
 
 
-@pytest.mark.unit
 def test_keys_are_those_of_robosuite():
     """Its keyboard device: w, a, f towards smaller coordinates; the rotation vector as `input2action` turns it."""
     down = {key for key, (_, direction) in MOTIONS.items() if direction < 0}
@@ -45,7 +43,6 @@ def test_keys_are_those_of_robosuite():
     )
 
 
-@pytest.mark.unit
 def test_taps_and_held_keys():
     keyboard = Keyboard(pos_sensitivity=0.1)
     keyboard.press("d")
@@ -62,7 +59,6 @@ def test_taps_and_held_keys():
     assert keyboard.command is None
 
 
-@pytest.mark.unit
 def test_gripper_and_commands():
     keyboard = Keyboard()
     for expected in (1.0, -1.0, 1.0):
@@ -75,7 +71,6 @@ def test_gripper_and_commands():
         assert keyboard.command == key
 
 
-@pytest.mark.unit
 def test_reports_of_a_mouse():
     mouse = SpaceMouse()
     mouse.report(struct.pack("<B6h", 1, 350, 175, -700, 70, 0, -35))
@@ -92,7 +87,6 @@ def test_reports_of_a_mouse():
     assert mouse.command == RESET
 
 
-@pytest.mark.unit
 def test_keys_of_windows_and_terminals():
     assert [key_name(code) for code in (256, 32, ord("W"), ord("Q"), ord("M"), 300)] == [
         QUIT,
@@ -111,7 +105,6 @@ def test_keys_of_windows_and_terminals():
     assert keyboard.command == QUIT
 
 
-@pytest.mark.unit
 def test_images_as_text():
     picture = np.zeros((4, 2, 3), np.uint8)
     picture[1, 0] = (1, 2, 3)
@@ -121,7 +114,6 @@ def test_images_as_text():
     assert lines[0].count("▀") == 2
 
 
-@pytest.mark.unit
 def test_without_a_screen(monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -237,7 +229,6 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert len(read_demos(out)) == 1
 
 
-@pytest.mark.unit
 def test_a_status_reads_as_a_line():
     status = Status("close it", {"(Close door_1)": False}, 7, 1, 3)
     assert str(status) == "close it | (Close door_1) no | step 7 | 1 of 3 recorded"

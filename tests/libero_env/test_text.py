@@ -23,8 +23,6 @@ from libero_env.text import (
     text_table,
 )
 
-pytestmark = pytest.mark.unit
-
 
 @dataclass(frozen=True)
 class Sample:

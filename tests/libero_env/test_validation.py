@@ -12,8 +12,6 @@ from typing_extensions import TypedDict
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.validation import OneOf, checked, validate, validate_arguments
 
-pytestmark = pytest.mark.unit
-
 Share = Annotated[float, Field(gt=0, le=1)]
 
 

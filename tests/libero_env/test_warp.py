@@ -307,7 +307,6 @@ def test_appearances_need_the_other_back_end(pair):
         observer.render(0, "agentview")
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("text, error, told", [
     ("wrap", UnknownNameError, "warp"),
     ("warp,devise=cpu", UnknownNameError, "device"),
@@ -322,13 +321,11 @@ def test_a_back_end_that_is_not_valid_is_said(text, error, told):
         Backend.read(text)
 
 
-@pytest.mark.unit
 def test_a_back_end_is_written_as_it_is_read():
     for text in ("mujoco", "warp", "warp,device=cuda:1", "warp,device=cpu,contacts=256"):
         assert str(Backend.read(text)) == text
 
 
-@pytest.mark.unit
 def test_a_missing_package_is_said_in_one_line(monkeypatch):
     monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(LiberoError, match=r"pip install 'libero-lifelong\[warp\]'"):
@@ -336,7 +333,6 @@ def test_a_missing_package_is_said_in_one_line(monkeypatch):
     Backend("mujoco").require_installed()
 
 
-@pytest.mark.unit
 def test_demonstrations_name_it(tmp_path):
     plain, warp, other = (DemoConfig(TASK, backend=name) for name in ("mujoco", WARP, "warp,device=cuda:3"))
     assert warp.header() == {**plain.header(), "backend": "warp"}

@@ -14,8 +14,6 @@ from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from tests.harness.sequences import run_context, sequence
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):

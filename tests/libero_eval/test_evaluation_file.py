@@ -8,8 +8,6 @@ import pytest
 from libero_eval.evaluation_file import FORMAT, EvaluationResult, TaskResult
 from lifelong.errors import EvaluationFileError, ResultsError
 
-pytestmark = pytest.mark.unit
-
 
 def task(name: str = "libero_goal/0", **changes) -> TaskResult:
     values = {

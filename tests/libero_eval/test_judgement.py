@@ -15,8 +15,6 @@ from libero_eval.judging.page import render  # noqa: E402
 from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
 from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
 
-pytestmark = pytest.mark.unit
-
 
 def side(label: str, *results) -> Group:
     return Group(label, results, tuple(f"{label}{i}" for i in range(len(results))))

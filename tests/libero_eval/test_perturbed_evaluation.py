@@ -13,6 +13,7 @@ from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from lifelong.errors import ComparisonError, ProtocolError
 
+pytestmark = pytest.mark.sim
 EVAL = ["eval", "told_policy:make", "--suite", "libero_goal/1", "--episodes", "3", "--horizon", "3"]
 EVAL += ["--threads", "1"]
 POLICY = """

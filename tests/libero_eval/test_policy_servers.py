@@ -25,7 +25,6 @@ from lifelong.errors import CodecError, ConnectionLost, ServerError
 from lifelong.evaluation.rollout import run_episodes
 from tests.harness import policy_servers
 
-pytestmark = pytest.mark.unit
 TASK = get_suite("libero_goal").tasks[0]
 SHORT = Limits(connect=5, answer=5)
 

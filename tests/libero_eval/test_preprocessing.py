@@ -19,7 +19,6 @@ from libero_eval.protocols.preprocessing import (
     torch_bilinear,
 )
 
-pytestmark = pytest.mark.unit
 EXPECTED = {
     "pad 256x256": "0dec61788a1ab793", "pad 360x256": "b91e2fb16fa60d34", "jpeg": "52f544cb92c3f887",
     "lanczos": "0e0153f57274daf2", "resized": "aa0b17aa6d4882e1", "crop": "c23e98bc5ba96d25"

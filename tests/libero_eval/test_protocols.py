@@ -15,7 +15,6 @@ from libero_eval.protocols.protocol import SUITES, EvalProtocol
 from libero_eval.user_policy import CallableActor, ProtocolActor
 from lifelong.errors import MissingObservationError, PolicyError, ProtocolError, ProtocolMismatchError
 
-pytestmark = pytest.mark.unit
 TASK = get_task("libero_goal/3")
 RUNNABLE = [name for name in protocol_names() if name not in ("groot", "rlinf")]
 

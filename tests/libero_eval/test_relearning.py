@@ -26,7 +26,6 @@ from lifelong.training.settings import FitSettings
 from lifelong.types import Batch
 from tests.harness.fakes import LinearPolicy, Windows
 
-pytestmark = pytest.mark.unit
 FIT = FitSettings(epochs=1, batch_size=10, lr=0.05, warmup_steps=5, weight_decay=0.0, precision="fp32")
 SETTINGS = RelearnSettings(steps=200, every=5, tolerance=0.05, held_out=1)
 

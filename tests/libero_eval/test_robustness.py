@@ -12,8 +12,6 @@ from libero_eval.robustness.page import curves_figure, render, verdict, write_ro
 from libero_eval.robustness.results import Condition, Outcomes, Robustness, half_severity, name_of
 from lifelong.errors import ResultsError
 
-pytestmark = pytest.mark.unit
-
 TASKS, STARTS = ("libero_goal/0", "libero_goal/1"), tuple(range(10))
 A, B = (("camera", 0.5),), (("camera", 1.0),)
 C, BOTH = (("light", 1.0),), (("camera", 1.0), ("light", 1.0))

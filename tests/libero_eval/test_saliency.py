@@ -12,7 +12,6 @@ from lifelong.policies.base import Policy
 from lifelong.seeding import generator
 from lifelong.types import Batch, PolicySpec
 
-pytestmark = pytest.mark.unit
 SPEC = PolicySpec(image_size=(64, 96), proprio={"x": 2}, language_dim=3, seq_len=2)
 PATCH = (slice(20, 28), slice(60, 70))  # of the second camera
 

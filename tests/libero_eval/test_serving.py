@@ -23,7 +23,6 @@ from lifelong.seeding import generator
 from tests.harness import policy_servers
 from tests.harness.runs import make_run
 
-pytestmark = pytest.mark.unit
 SAMPLING = ("policy/head=gmm_small", "policy.stochastic=true")
 OPENPI_NAMES = ("data.proprio=[ee_pos,gripper_states]",)
 

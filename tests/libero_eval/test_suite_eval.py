@@ -21,7 +21,6 @@ from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolErr
 from lifelong.stats.intervals import wilson_interval
 from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate, evaluation
 
-pytestmark = pytest.mark.unit
 MODULE = """
 import numpy as np
 

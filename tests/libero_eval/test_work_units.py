@@ -29,7 +29,6 @@ from lifelong.errors import ConfigError, EvaluationIncompleteError, LifelongErro
 from tests.harness.drawing import draw
 from tests.harness.evaluations import TASKS, Countdown, Still, evaluate, evaluation
 
-pytestmark = pytest.mark.unit
 STARTS = (3, 4, 9, 20)
 TWO = {"unit_starts": 2}  # four units
 

@@ -15,8 +15,6 @@ from tests.harness.algorithms import assert_resumed_equals_uninterrupted, learn
 from tests.harness.configs import composed
 from tests.harness.fakes import DeepPolicy, Windows
 
-pytestmark = pytest.mark.unit
-
 
 def policy() -> DeepPolicy:
     torch.manual_seed(0)

@@ -15,8 +15,6 @@ from lifelong.report.comparison import compare
 from lifelong.results.provenance import start_record
 from tests.harness.results import PROTOCOL, drawn_result
 
-pytestmark = pytest.mark.unit
-
 
 def result(seed, backend=None):
     found = drawn_result(0.8, seed, suites=("libero_goal",), policy=f"p{seed}:make")

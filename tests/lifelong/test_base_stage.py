@@ -22,7 +22,6 @@ from lifelong.streams import StreamSettings
 from tests.harness import sequences
 from tests.harness.configs import FILES, composed
 
-pytestmark = pytest.mark.unit
 STREAM = StreamSettings(base_tasks=2)
 ALGORITHMS = sorted(f.stem for f in FILES if str(f.parent) == "algo")
 

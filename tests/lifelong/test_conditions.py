@@ -20,8 +20,6 @@ from lifelong.results.provenance import (
 from lifelong.results.records import DemonstrationsRecord, from_line, to_line
 from lifelong.settings import RunSettings
 
-pytestmark = pytest.mark.unit
-
 START = start_record(
     algo="er",
     benchmark="libero_object",

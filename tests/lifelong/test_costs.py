@@ -21,7 +21,6 @@ from lifelong.training.costs import COSTS, action_costs, count_flops, peak_costs
 from lifelong.types import Batch, PolicySpec
 from tests.harness.policies import small_rnn, small_transformer
 
-pytestmark = pytest.mark.unit
 SPEC = PolicySpec(views=("agentview_rgb",), image_size=(16, 16), proprio={"x": 2}, language_dim=4, seq_len=3)
 
 

@@ -13,7 +13,6 @@ from lifelong.data import ReplayMemory, SequenceVLDataset, batches, fake_batch
 from lifelong.errors import DataError
 from lifelong.types import PolicySpec
 
-pytestmark = pytest.mark.unit
 SPEC = PolicySpec(image_size=(6, 8), language_dim=4, seq_len=5)
 LENGTHS = (7, 1, 4, 12)
 

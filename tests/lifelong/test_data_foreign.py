@@ -16,7 +16,6 @@ from lifelong.types import Batch, PolicySpec
 from tests.harness.fuzz import examples
 from tests.harness.robomimic_windows import read_with_robomimic
 
-pytestmark = pytest.mark.unit
 SPEC = PolicySpec(
     views=("agentview_rgb",), image_size=(4, 6), proprio={"ee_pos": 3}, language_dim=2, seq_len=3
 )

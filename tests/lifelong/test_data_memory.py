@@ -23,7 +23,6 @@ from lifelong.streams import StageWindows
 from lifelong.types import Batch, PolicySpec
 from tests.harness.robomimic_windows import read_with_robomimic
 
-pytestmark = pytest.mark.unit
 SPEC = PolicySpec(image_size=(6, 8), language_dim=4, seq_len=5)
 LENGTHS = (7, 2, 4, 12)
 LANGUAGE = torch.arange(4.0)

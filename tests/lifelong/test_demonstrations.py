@@ -14,7 +14,6 @@ from lifelong.data.settings import DataSettings
 from lifelong.errors import DataError
 from tests.harness.demos import episode, write
 
-pytestmark = pytest.mark.unit
 TASKS = get_suite("libero_object").tasks[:3]
 
 

@@ -33,8 +33,6 @@ from lifelong.stats.power import (
     unpaired_episodes,
 )
 
-pytestmark = pytest.mark.unit
-
 
 def pairs(first, second, tasks: int = 1) -> Pairs:
     first, second = np.asarray(first, bool), np.asarray(second, bool)

@@ -7,8 +7,6 @@ import pytest
 from lifelong.algorithms.base import Algorithm
 from lifelong.policies.base import Policy
 
-pytestmark = pytest.mark.unit
-
 
 @pytest.mark.parametrize("documented", [Algorithm, Policy], ids=lambda documented: documented.__name__)
 def test_the_example_runs(documented):

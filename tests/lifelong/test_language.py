@@ -12,7 +12,6 @@ from lifelong.language.encoder import LanguageEncoder, embed, normal_form, shipp
 from lifelong.settings import build
 from tests.harness.configs import composed
 
-pytestmark = pytest.mark.unit
 TEXTS = ["turn on the stove", "close the microwave"]
 
 

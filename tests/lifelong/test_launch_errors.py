@@ -77,7 +77,6 @@ MISTAKES = {
 }
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("words", MISTAKES)
 def test_a_mistake_is_one_line_and_leaves_nothing_behind(words, own, capsys):
     (own / "demos").mkdir()
@@ -89,7 +88,6 @@ def test_a_mistake_is_one_line_and_leaves_nothing_behind(words, own, capsys):
     assert not list(own.rglob("results.jsonl")), "no run has begun"
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("words", [
     "-m algo=l2,er seed=7 --config-dir own",
     "algo=l2,er seed=7 -m -cd own",
@@ -110,7 +108,6 @@ def test_options_of_a_sweep_stand_anywhere(words, own, monkeypatch, capsys):
     assert folder.name == sweep_name(["algo=l2,er", "seed=7"], ["algo"]), "the same, wherever options stand"
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize("chosen", ["choice(er,l2)", "glob([l2*,er],exclude=lwf)"])
 def test_a_sweep_takes_what_hydra_offers_to_name_files(chosen, own, monkeypatch, capsys):
     ran = []
@@ -126,7 +123,6 @@ def test_a_sweep_takes_what_hydra_offers_to_name_files(chosen, own, monkeypatch,
     assert read_sweep(folder).planned == 2
 
 
-@pytest.mark.unit
 def test_a_single_run_takes_options_anywhere(own, capsys):
     for words in ("algo=l2 --config-dir own seed=7 --cfg job", "--cfg job algo=l2 -cd own seed=7"):
         assert main(["train", *words.split(), "algo.strength=3"]) == 0
@@ -134,7 +130,6 @@ def test_a_single_run_takes_options_anywhere(own, capsys):
         assert (shown.algo.strength, shown.seed) == (3, 7)
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(("words", "noted"), [
     ("policy=bc_rnn_small", True), ("policy=bc_vilt_small", True), ("policy=bc_transformer_small", True),
     ("policy=bc_rnn_small data.seq_len=2", False), ("policy=bc_mlp_small", False)
@@ -151,7 +146,6 @@ def test_a_policy_with_a_history_that_is_given_single_frames_says_so(words, note
     assert found.endswith("error: the first task begins\n") and (note in found) == noted
 
 
-@pytest.mark.unit
 def test_values_fit_the_parameters_of_their_target():
     assert build(OmegaConf.create({**FIT, "lr": 1, "steps_per_epoch": None})).lr == 1
     assert build(OmegaConf.create({"_target_": "builtins.dict", "any": "key"})) == {"any": "key"}
@@ -165,14 +159,12 @@ def test_values_fit_the_parameters_of_their_target():
         assert message in str(error.value)
 
 
-@pytest.mark.unit
 def test_missing_commands_print_the_help(capsys):
     for words, shown in (([], "compare"), (["tasks"], "certify"), (["results"], "export")):
         assert main(words) == 2
         assert shown in capsys.readouterr().err
 
 
-@pytest.mark.unit
 def test_a_reader_that_has_seen_enough_is_no_error(monkeypatch, capfd):
     def write(task: str):
         raise BrokenPipeError
@@ -184,7 +176,6 @@ def test_a_reader_that_has_seen_enough_is_no_error(monkeypatch, capfd):
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.unit
 def test_a_suite_is_no_task():
     with pytest.raises(
         LiberoError, match="libero_goal is a suite of 10 tasks, not a task; write libero_goal/0 to"
@@ -208,7 +199,6 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.mark.unit
 def test_progress_is_lines_where_there_is_no_terminal(monkeypatch):
     monkeypatch.setattr(parallel, "LINE_SECONDS", 0.0)
     for stream, progress, expected in [
@@ -224,7 +214,6 @@ def test_progress_is_lines_where_there_is_no_terminal(monkeypatch):
         assert stream.getvalue().endswith(expected) if "%" not in expected else expected in stream.getvalue()
 
 
-@pytest.mark.unit
 def test_short_work_prints_no_lines(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)

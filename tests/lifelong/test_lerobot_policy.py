@@ -18,8 +18,6 @@ from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 from tests.harness.configs import composed
 
-pytestmark = pytest.mark.unit
-
 factory, configs = lerobot_module("policies.factory"), lerobot_module("configs.policies")
 LENGTHS = (9, 14)
 SMALL = {

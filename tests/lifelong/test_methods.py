@@ -17,8 +17,6 @@ from lifelong.stats.methods import (
 )
 from lifelong.stats.metrics import Curve, Scores
 
-pytestmark = pytest.mark.unit
-
 # Student's own example (Biometrika 1908): hours of sleep gained with each of two drugs, by ten patients
 DEXTRO = np.array([0.7, -1.6, -0.2, -1.2, -0.1, 3.4, 3.7, 0.8, 0.0, 2.0])
 LAEVO = np.array([1.9, 0.8, 1.1, 0.1, -0.1, 4.4, 5.5, 1.6, 4.6, 3.4])

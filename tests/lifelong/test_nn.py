@@ -32,7 +32,6 @@ from lifelong.nn.vision import FlatReadout, to_network
 from lifelong.training.precision import bf16_runs_on_cpu
 from lifelong.types import PolicySpec
 
-pytestmark = pytest.mark.unit
 SPEC = PolicySpec(image_size=(16, 20), language_dim=6, seq_len=4)
 
 

@@ -13,7 +13,6 @@ from tests.harness import sequences
 from tests.harness.algorithms import assert_resumed_equals_uninterrupted, learn, outputs
 from tests.harness.fakes import DeepPolicy, Windows
 
-pytestmark = pytest.mark.unit
 SMALL = {"rank": 2, "alpha": 4.0}
 
 

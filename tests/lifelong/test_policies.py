@@ -26,7 +26,6 @@ from lifelong.settings import build
 from lifelong.training.precision import bf16_runs_on_cpu
 from lifelong.types import Batch, Observation, PolicySpec
 
-pytestmark = pytest.mark.unit
 SPEC = PolicySpec(image_size=(32, 32), language_dim=6, seq_len=4)
 HEADS = {
     "gmm": partial(GMMHead, hidden=16, min_std=0.02),

@@ -17,8 +17,6 @@ from lifelong.errors import ConfigError, LifelongError
 from lifelong.evaluation.restore import restore
 from tests.harness.runs import make_run
 
-pytestmark = pytest.mark.unit
-
 
 def test_weights_after_a_given_task_and_after_the_last_by_default(tmp_path):
     tasks, states, *_ = make_run(tmp_path / "run", "algo=sequential")

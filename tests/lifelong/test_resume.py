@@ -15,8 +15,6 @@ from lifelong.sequence import TaskSequence, is_measured
 from tests.harness import sequences
 from tests.harness.sequences import ALGORITHMS, Killed, Killer, assert_same, outcome, run_context, sequence
 
-pytestmark = pytest.mark.unit
-
 # Writes of checkpoints and records after which the second of three tasks is being learned, or evaluated.
 LEARNING, EVALUATING = 25, 30
 

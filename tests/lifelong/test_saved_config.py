@@ -12,7 +12,6 @@ BOMB = "a: &a [1,1,1,1,1,1,1,1,1]\n" + "".join(
 )
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(("content", "said"), [
     (None, "No such file"),
     (b"\x93NUMPY\x00\xff", "not UTF-8"),
@@ -33,7 +32,6 @@ def test_what_is_no_configuration_is_told_in_one_line(content, said, tmp_path):
     assert str(file) in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.unit
 def test_pipes_and_devices_are_not_read(tmp_path):
     (tmp_path / "endless.yaml").symlink_to("/dev/zero")
     os.mkfifo(tmp_path / "pipe.yaml")
@@ -42,7 +40,6 @@ def test_pipes_and_devices_are_not_read(tmp_path):
             read_saved_config(tmp_path / name)
 
 
-@pytest.mark.unit
 def test_texts_are_not_resolved(tmp_path, monkeypatch):
     monkeypatch.setenv("SECRET", "hidden")
     (tmp_path / "config.yaml").write_text("seed: ${oc.env:SECRET}\n")

@@ -70,7 +70,6 @@ def generator_of(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-@pytest.mark.unit
 @every_run
 def test_a_saved_configuration_is_that_of_its_command(name):
     saved = yaml.safe_load((RUNS / name / "config.yaml").read_text())
@@ -78,7 +77,6 @@ def test_a_saved_configuration_is_that_of_its_command(name):
     assert result_relevant(saved) == result_relevant(now)
 
 
-@pytest.mark.unit
 @every_run
 def test_a_restored_policy_acts_as_it_did(name):
     run = restore(RUNS / name, device="cpu")
@@ -94,7 +92,6 @@ def test_a_restored_policy_acts_as_it_did(name):
     np.testing.assert_allclose(np.stack(actions, 1), expected, rtol=0, atol=1e-6)
 
 
-@pytest.mark.unit
 def test_saved_runs_are_reported_together(tmp_path):
     page = write_report([RUNS / name for name in COMMANDS], tmp_path / "report.html")
     text = page.read_text()

@@ -22,7 +22,6 @@ from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 from tests.harness.configs import composed
 
-pytestmark = pytest.mark.unit
 MISSING = object()
 SPEC = PolicySpec(image_size=(64, 64), seq_len=2)
 

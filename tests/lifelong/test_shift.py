@@ -98,7 +98,6 @@ def outcomes(path: Path):
     return kept
 
 
-@pytest.mark.unit
 def test_severity_grows_in_equal_steps():
     stream = StreamSettings(perturb="light=1,camera=0.3", perturb_seed=4)
     found = stream.perturbations((1,) * 4)
@@ -111,7 +110,6 @@ def test_severity_grows_in_equal_steps():
     assert StreamSettings().perturbations((1, 1)) == ((), ()) and stream.perturbations((3,)) == ((),) * 3
 
 
-@pytest.mark.unit
 @pytest.mark.parametrize(
     ("text", "said"),
     [("robot=0.5", "changes what happens"), ("lihgt=1", "light"), ("light=2", "from 0 to 1")],
@@ -124,7 +122,6 @@ def test_what_cannot_be_a_shift_is_refused_in_one_line(text, said):
         build(composed("stream=shift", f"stream.perturb='{text}'").stream)
 
 
-@pytest.mark.unit
 def test_presets_and_mappings():
     kinds = {"shift": "light", "shift_camera": "camera", "shift_instruction": "instruction"}
     for name, kind in kinds.items():
@@ -134,7 +131,6 @@ def test_presets_and_mappings():
     assert same[0].perturbations((1, 1, 1)) == same[1].perturbations((1, 1, 1))
 
 
-@pytest.mark.unit
 def test_a_run_has_perturbations_of_every_task_or_none():
     values = {
         "kind": "run", "algo": "er", "benchmark": "b", "policy": "p", "seed": 1, "preset": "", "tasks": ["t"]
@@ -313,7 +309,6 @@ def record(phase, learned, task, wins, shift=""):
     )  # fmt: skip
 
 
-@pytest.mark.unit
 def test_forgetting_under_shift_is_just_learned_minus_final():
     first = RunRecord(
         algo="er", benchmark="b", policy="p", seed=1, preset="", tasks=("a", "b"), instructions=("a", "b"),
@@ -349,7 +344,6 @@ def test_without_perturbations_nothing_changes(folder, tmp_path, quick):
     assert [r.phase for r in ResultLog(plain / "results.jsonl").read().of(EvalRecord)].count("matrix") == 3
 
 
-@pytest.mark.unit
 def test_a_run_of_before_is_restored(tmp_path):
     tasks, *_ = make_run(tmp_path / "run", "algo=sequential")
     file = tmp_path / "run" / "config.yaml"
@@ -391,7 +385,6 @@ def test_copies_are_further_windows_of_the_same_actions(folder, tmp_path, quick)
     assert said.perturbed == ()
 
 
-@pytest.mark.unit
 def test_settings_of_copies():
     assert build(composed().data).copies == 0 and build(composed("data.perturb={light:1}").data).copies == 1
     assert build(composed("data.perturb={light:1}", "data.perturb_copies=0").data).copies == 0

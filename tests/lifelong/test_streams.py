@@ -30,7 +30,6 @@ from lifelong.streams import StageData, StageWindows, StreamSettings, learning_s
 from tests.harness.fakes import Windows
 from tests.harness.sequences import Killed, Killer, assert_same, dataset, run_context, sequence
 
-pytestmark = pytest.mark.unit
 ROOT = Path(__file__).parents[2]
 
 

@@ -8,7 +8,6 @@ import pytest
 from lifelong.results.records import EvalRecord
 from lifelong.results.subgoals import predicate_of, subgoals
 
-pytestmark = pytest.mark.unit
 POT = ("(Turnon stove_1)", "(On pot_1 stove_1)")
 TWO = ("(In soup_1 basket_1)", "(In milk_1 basket_1)", "(Close drawer_1)")
 

@@ -24,8 +24,6 @@ from lifelong.sweeps import (
     sweep_name,
 )
 
-pytestmark = pytest.mark.unit
-
 
 def job(number: int = 0, key: str = "k", **changes) -> JobRecord:
     return replace(JobRecord(number, key, ("algo=er", f"seed={number}"), "running"), **changes)

@@ -17,8 +17,6 @@ from lifelong.settings import GROUPS, find_target
 from tests.harness.configs import CONFIGS
 from tests.harness.runs import make_run
 
-pytestmark = pytest.mark.unit
-
 HOSTILE = [
     *("os.system", "subprocess.run", "builtins.open", "builtins.exec", "torch.load", "torch.hub.load"),
     *("shutil.copyfile", "importlib.import_module", "pickle.loads", "hydra.utils.instantiate", "a", "", "..", "os."),

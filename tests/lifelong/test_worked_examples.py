@@ -14,8 +14,6 @@ from lifelong.results.records import EvalRecord, TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.results.summary import summarize
 
-pytestmark = pytest.mark.unit
-
 
 def evaluation(phase: str, learned: int, epoch: int, task: int, wins: int) -> EvalRecord:
     return EvalRecord(

@@ -43,7 +43,6 @@ def run(block: Block, text: list[str], scope: dict, folder: Path) -> Ran:
     return Ran(scope, out.getvalue(), source, folder)
 
 
-@pytest.mark.unit
 def test_the_texts_are_those_of_the_manifest(blocks, texts):
     for block in blocks:
         lines = texts[block.text][block.lines[0] - 1 : block.lines[1]]
@@ -52,7 +51,6 @@ def test_the_texts_are_those_of_the_manifest(blocks, texts):
         assert inside <= set(block.numbers), f"{block.id} speaks of lines that are not its own"
 
 
-@pytest.mark.unit
 def test_no_code_is_left_out(blocks, texts):
     for name, text in texts.items():
         listed = [block for block in blocks if block.text == name]
@@ -61,7 +59,6 @@ def test_no_code_is_left_out(blocks, texts):
             assert left_out(text, [other for other in listed if other is not block]), block.id
 
 
-@pytest.mark.unit
 def test_every_block_is_checked_and_every_change_has_its_reason(blocks):
     assert sorted(block.id for block in blocks) == sorted(CHECKS)
     silent = [
@@ -70,7 +67,6 @@ def test_every_block_is_checked_and_every_change_has_its_reason(blocks):
     assert silent == []
 
 
-@pytest.mark.unit
 def test_the_page_counts_what_runs(blocks):
     page = " ".join((ROOT / "docs" / "walkthroughs.md").read_text(encoding="utf-8").split())
     runs = Counter(block.runs for block in blocks)
@@ -83,7 +79,6 @@ def test_the_page_counts_what_runs(blocks):
     )
 
 
-@pytest.mark.unit
 def test_indentation_comes_back():
     code = (
         'class A:\n    """Of b: c."""\n    def f(self):  # why:\n        if x:\n            y = {"a":\n1}\n'
