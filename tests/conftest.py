@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import contextlib
 import os
 from pathlib import Path
 
@@ -13,6 +14,13 @@ def shared() -> Path:
     if not (path / "official").is_dir():
         pytest.skip(f"the original's data are not at {path} (set LIBERO_SHARED)")
     return path
+
+
+@pytest.fixture
+def closing():
+    """Return a function that returns its argument, which is closed at the end of the test."""
+    with contextlib.ExitStack() as stack:
+        yield lambda opened: stack.enter_context(contextlib.closing(opened))
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -41,8 +41,8 @@ def commands(env, steps, num, seed=0):
 
 
 @pytest.mark.parametrize("mode", MODES, ids=str)
-def test_batch_and_states_give_the_same_bits(mode):
-    env, batch = make(mode), make(mode, BatchEnv, 3, num_threads=2)
+def test_batch_and_states_give_the_same_bits(closing, mode):
+    env, batch = closing(make(mode)), closing(make(mode, BatchEnv, 3, num_threads=2))
     env.reset(options={"init_state": 2})
     moves = commands(env, 8, 3)
     batch.reset(options={"init_state": 2})
@@ -58,13 +58,11 @@ def test_batch_and_states_give_the_same_bits(mode):
     for key in single:
         np.testing.assert_array_equal(seen[key][1], single[key])
     np.testing.assert_array_equal(batch.get_state(1), env.get_state())
-    env.close()
-    batch.close()
 
 
 @pytest.mark.parametrize("mode", MODES, ids=str)
-def test_the_action_space_is_that_of_the_controller(mode):
-    env = make(mode)
+def test_the_action_space_is_that_of_the_controller(closing, mode):
+    env = closing(make(mode))
     assert env.action_space.shape == (env.simulations.controller_state.controller.action_dim,)
     env.reset(options={"init_state": 0})
     env.action_space.seed(0)
@@ -72,23 +70,20 @@ def test_the_action_space_is_that_of_the_controller(mode):
     for bad in (np.zeros(env.action_space.shape[0] + 1), np.full(env.action_space.shape, np.nan)):
         with pytest.raises(ActionError):
             env.step(bad)
-    env.close()
 
 
 @pytest.mark.parametrize("mode", MODES, ids=str)
-def test_starts_do_not_depend_on_the_controller(mode):
-    env, usual = make(mode), LiberoEnv(TASK, cameras=())
+def test_starts_do_not_depend_on_the_controller(closing, mode):
+    env, usual = closing(make(mode)), closing(LiberoEnv(TASK, cameras=()))
     np.testing.assert_array_equal(
         env.reset(seed=4)[0]["joint_states"], usual.reset(seed=4)[0]["joint_states"]
     )
     np.testing.assert_array_equal(env.simulations.physics_state(0), usual.simulations.physics_state(0))
-    env.close()
-    usual.close()
 
 
 @pytest.mark.parametrize("name", ["osc_pose", "osc_position"])
-def test_an_absolute_pose_is_reached(name):
-    env = make((name, False))
+def test_an_absolute_pose_is_reached(closing, name):
+    env = closing(make((name, False)))
     env.reset(options={"init_state": 0})
     goal, turn = env.view.eef_pos + [0.05, -0.04, -0.03], [np.pi, 0.0, 0.0]
     action = np.array([*goal, *(turn if name == "osc_pose" else []), -1.0])
@@ -98,7 +93,6 @@ def test_an_absolute_pose_is_reached(name):
     down = [[1, 0, 0], [0, -1, 0], [0, 0, -1]] if name == "osc_pose" else [[0, 1, 0], [1, 0, 0], [0, 0, -1]]
     np.testing.assert_allclose(env.view.eef_mat, down, atol=0.05)
     assert env.view.finger_pos[0] > 0.035
-    env.close()
 
 
 def test_absolute_joints_are_reached_and_deltas_are_relative_to_the_present():
@@ -115,14 +109,13 @@ def test_absolute_joints_are_reached_and_deltas_are_relative_to_the_present():
         env.close()
 
 
-def test_joint_velocities_are_reached():
-    env = make(("joint_velocity", True), observations=["joint_velocities"])
+def test_joint_velocities_are_reached(closing):
+    env = closing(make(("joint_velocity", True), observations=["joint_velocities"]))
     env.reset(options={"init_state": 0})
     command = np.array([0.4, -0.2, 0.2, 0.3, -0.4, 0.3, 0.5, 0.0])
     for _ in range(15):
         seen = env.step(command)[0]
     np.testing.assert_allclose(seen["joint_velocities"], VELOCITY_SCALE * command[:7], atol=0.03)
-    env.close()
 
 
 def test_the_velocity_loop_is_a_pid_with_a_smoothed_derivative_that_stops_summing_when_it_saturates():

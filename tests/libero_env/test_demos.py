@@ -3,11 +3,6 @@
 import json
 import os
 import shutil
-import signal
-import subprocess
-import sys
-import textwrap
-import time
 
 import h5py
 import numpy as np
@@ -193,29 +188,3 @@ def test_a_full_disk_leaves_what_was_recorded(tmp_path, monkeypatch):
     monkeypatch.undo()
     assert len(read_demos(writer.parts)) == 1 and len(list(writer.parts.iterdir())) == 1
     assert len(read_demos(writer.finish())) == 1
-
-
-def test_a_killed_process_leaves_what_was_recorded(tmp_path):
-    script = """
-        import sys
-        sys.path[:0] = sys.argv[2:]
-        from test_demos import DemoWriter, episode, header
-        writer = DemoWriter(sys.argv[1], header())
-        for i in range(10_000):
-            writer.write(i, episode(i, steps=60, size=64))
-            print(i, flush=True)
-    """
-    path = tmp_path / "x.hdf5"
-    command = [sys.executable, "-c", textwrap.dedent(script), str(path), os.path.dirname(__file__)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
-        for _ in range(3):
-            child.stdout.readline()
-        time.sleep(0.05)  # somewhere within the next one
-        child.send_signal(signal.SIGKILL)
-        printed = 3 + len(child.stdout.read().split())
-    writer = DemoWriter(path, header())
-    assert len(writer.recorded()) >= printed
-    demos = read_demos(writer.finish())
-    assert len(demos) >= printed
-    for i, demo in enumerate(demos):
-        np.testing.assert_array_equal(demo.states, episode(i, 60, 64).states)

@@ -301,21 +301,6 @@ def test_a_heap_within_data_is_no_heap(path):
     assert (read_demos(path)[0].obs["agentview_rgb"][:, ::-1] == values).all()
 
 
-def test_bytes_at_random_are_read_or_refused(path, tmp_path):
-    whole, rng = path.read_bytes(), np.random.default_rng(3)
-    for k in range(60):
-        content = np.frombuffer(whole, np.uint8).copy()
-        places = rng.integers(0, min(len(content), 8000), 6)
-        content[places] = rng.integers(0, 256, 6)
-        other = tmp_path / f"{k}.hdf5"
-        other.write_bytes(content.tobytes())
-        for read in (read_demos, demo_lengths, read_episodes, describe):
-            try:
-                list(read(other))
-            except DemoError as error:
-                assert other.name in str(error)
-
-
 def test_more_than_the_free_memory_is_refused(path, monkeypatch):
     monkeypatch.setattr(hdf5, "host_memory", lambda: (3000, 10_000))
     monkeypatch.setattr(hdf5, "FREE_BYTES", 0)

@@ -10,6 +10,7 @@ import pytest
 import libero_env
 from libero_env.objects import catalog
 
+pytestmark = pytest.mark.sim
 ROOT = Path(libero_env.__file__).parent
 MODULES = sorted(
     ".".join(path.relative_to(ROOT.parent).with_suffix("").parts)

@@ -10,10 +10,9 @@ from gymnasium.utils.env_checker import check_env
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import ActionError, LiberoError, UnknownNameError
-from libero_env.init_states import store as init_states
 from libero_env.init_states.store import generate_init_states, load_init_states
 from libero_env.sim.scene import build_scene
-from libero_env.tasks import Task, get_suite
+from libero_env.tasks import get_suite
 
 pytestmark = pytest.mark.sim
 TASK = "libero_object/2"
@@ -33,20 +32,18 @@ def same(a, b):
         np.testing.assert_array_equal(a[key], b[key], err_msg=key)
 
 
-def test_gymnasium_checks_pass():
-    env = LiberoEnv(TASK, **SMALL, render_mode="rgb_array")
+def test_gymnasium_checks_pass(closing):
+    env = closing(LiberoEnv(TASK, **SMALL, render_mode="rgb_array"))
     check_env(env, skip_render_check=True)
-    env.close()
 
 
-def test_observations_are_in_their_space():
-    env = LiberoEnv(TASK, **SMALL)
+def test_observations_are_in_their_space(closing):
+    env = closing(LiberoEnv(TASK, **SMALL))
     observation, info = env.reset(options={"init_state": 0})
     assert env.observation_space.contains(observation)
     assert observation["agentview_rgb"].shape == (32, 48, 3)
     assert not info["success"]
     assert env.observation_space.contains(env.step(np.zeros(7))[0])
-    env.close()
 
 
 def test_the_same_seed_gives_the_same_episode(env):
@@ -91,14 +88,13 @@ def test_states_of_the_original_are_accepted(env, shared):
         env0.set_state(state[:-1])
 
 
-def test_the_horizon_truncates():
-    env = LiberoEnv(TASK, cameras=(), horizon=3)
+def test_the_horizon_truncates(closing):
+    env = closing(LiberoEnv(TASK, cameras=(), horizon=3))
     env.reset(options={"init_state": 0})
     outcomes = [env.step(np.zeros(7))[2:4] for _ in range(3)]
     assert outcomes == [(False, False), (False, False), (False, True)]
     with pytest.raises(LiberoError, match="reset"):
         env.step(np.zeros(7))
-    env.close()
 
 
 def test_reaching_the_goal_terminates(env):
@@ -118,16 +114,12 @@ def test_wrong_names_list_the_valid_ones(env):
         LiberoEnv("libero_subject/0")
     with pytest.raises(UnknownNameError, match="agentview"):
         LiberoEnv(TASK, cameras=("agentveiw",))
-    with pytest.raises(LiberoError, match="init_state"):
-        env.reset(options={"state": 3})
-    with pytest.raises(LiberoError, match="0 to 49"):
-        env.reset(options={"init_state": 50})
 
 
 @pytest.mark.parametrize(("num", "threads"), [(1, 1), (3, 2)])
-def test_a_batch_gives_the_bits_of_single_environments(num, threads):
-    batch = BatchEnv(TASK, num, num_threads=threads, horizon=8, **SMALL)
-    env = LiberoEnv(TASK, horizon=8, **SMALL)
+def test_a_batch_gives_the_bits_of_single_environments(closing, num, threads):
+    batch = closing(BatchEnv(TASK, num, num_threads=threads, horizon=8, **SMALL))
+    env = closing(LiberoEnv(TASK, horizon=8, **SMALL))
     commands = np.random.default_rng(1).uniform(-1, 1, (8, num, 7))
     for how in ({"options": {"init_state": np.arange(num) + 4}}, {"seed": 21}):
         seen = [batch.reset(**how)[0]]
@@ -141,12 +133,10 @@ def test_a_batch_gives_the_bits_of_single_environments(num, threads):
                 same({k: v[i] for k, v in seen[t + 1].items()}, observation)
                 assert (reward, terminated, truncated) == tuple(r[i] for r in results[t][1:4])
             np.testing.assert_array_equal(batch.get_state(i), env.get_state())
-    batch.close()
-    env.close()
 
 
-def test_finished_simulations_do_not_move_until_reset():
-    batch = BatchEnv(TASK, 3, cameras=(), horizon=4)
+def test_finished_simulations_do_not_move_until_reset(closing):
+    batch = closing(BatchEnv(TASK, 3, cameras=(), horizon=4))
     batch.reset(options={"init_state": 0})
     for _ in range(2):
         batch.step(np.zeros((3, 7)))
@@ -158,47 +148,24 @@ def test_finished_simulations_do_not_move_until_reset():
     _, reward, _, truncated, _ = batch.step(np.ones((3, 7)))
     np.testing.assert_array_equal(batch.get_state(0), before)
     assert reward[0] == 0 and not truncated[0]
-    batch.close()
 
 
-def test_a_reset_of_no_simulation_changes_nothing():
-    batch = BatchEnv(TASK, 2, cameras=())
+def test_a_reset_of_no_simulation_changes_nothing(closing):
+    batch = closing(BatchEnv(TASK, 2, cameras=()))
     batch.reset(seed=0)
     before = batch.get_state(0), batch.get_state(1)
     for start in ({}, {"init_state": 0}):
         batch.reset(options={"reset_mask": [False, False], **start})
     np.testing.assert_array_equal((batch.get_state(0), batch.get_state(1)), before)
-    batch.close()
 
 
-def test_a_batch_is_a_gymnasium_vector_environment():
-    batch = BatchEnv(TASK, 2, **SMALL)
+def test_a_batch_is_a_gymnasium_vector_environment(closing):
+    batch = closing(BatchEnv(TASK, 2, **SMALL))
     assert isinstance(batch, gymnasium.vector.VectorEnv)
     observation, _ = batch.reset(options={"init_state": 0})
     assert batch.observation_space.contains(observation)
     with pytest.raises(ActionError):
         batch.step(np.zeros((3, 7)))
-    batch.close()
-
-
-@pytest.mark.parametrize("task", get_suite("libero_object").tasks, ids=lambda task: task.id)
-def test_initial_states_are_at_rest_in_their_regions(task):
-    env = LiberoEnv(task, cameras=())
-    states = env.batch.init_states
-    assert states.shape == (50, env.scene.state_size)
-    assert len(np.unique(states[:, 1:], axis=0)) == 50
-    for i in range(0, 50, 7):
-        env.reset(options={"init_state": i})
-        for atom in task.problem.init:
-            (x0, y0, x1, y1), *_ = task.problem.region(atom.args[1]).ranges
-            x, y, _ = env.view.body_pos(atom.args[0])
-            assert x0 - 2e-3 < x < x1 + 2e-3 and y0 - 2e-3 < y < y1 + 2e-3
-        before = env.simulations.fields["qpos"][0].copy()
-        for _ in range(10):
-            assert not env.step(np.zeros(7))[4]["success"]
-        moved = np.abs(env.simulations.fields["qpos"][0] - before)[env.scene.nq_robot :]
-        assert moved.max() < 5e-3
-    env.close()
 
 
 def test_stored_initial_states_are_reproducible():
@@ -215,18 +182,8 @@ def test_initial_states_of_another_model_are_an_error(monkeypatch):
         load_init_states(task, scene)
 
 
-def test_a_user_defined_task_gets_initial_states(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
-    task = dataclasses.replace(get_suite("libero_object").tasks[0], suite="mine", name="my_task")
-    scene = build_scene(task.problem)
-    monkeypatch.setattr(Task, "num_starts", 2)
-    made = load_init_states(task, scene)
-    monkeypatch.setattr(init_states, "generate_init_states", None)  # found again, not made again
-    np.testing.assert_array_equal(load_init_states(task, scene), made)
-
-
-def test_a_batch_reports_the_progress_of_each_atom():
-    env = BatchEnv("libero_10/3", 2, cameras=())
+def test_a_batch_reports_the_progress_of_each_atom(closing):
+    env = closing(BatchEnv("libero_10/3", 2, cameras=()))
     _, info = env.reset(options={"init_state": [0, 1]})
     drawer = "white_cabinet_1_bottom_region"
     assert env.atoms == (f"(Close {drawer})", f"(In akita_black_bowl_1 {drawer})")
@@ -237,4 +194,3 @@ def test_a_batch_reports_the_progress_of_each_atom():
     env.set_state(0, state)
     info = env.step(np.zeros((2, 7)))[-1]
     np.testing.assert_array_equal(info["progress"], [[True, False], [False, False]])
-    env.close()

@@ -45,19 +45,19 @@ def test_values_are_made_plain():
 
 
 @pytest.mark.sim
-def test_options_replace_fields_of_the_configuration():
+def test_options_replace_fields_of_the_configuration(closing):
     config = EnvConfig(cameras=("agentview",), camera_size=(16, 16), horizon=3, reward="staged")
-    env = LiberoEnv(TASK, config=config, horizon=2)
+    env = closing(LiberoEnv(TASK, config=config, horizon=2))
     assert env.config == dataclasses.replace(config, horizon=2)
     seen, _ = env.reset(options={"init_state": 0})
     assert seen["agentview_rgb"].shape == (16, 16, 3) and "eye_in_hand_rgb" not in seen
     assert [env.step([0.0] * 7)[3] for _ in range(2)] == [False, True]
-    env.close()
-    envs = SubprocEnv(
-        [{"task": TASK}, {"task": TASK, "observations": ["ee_pos"]}],
-        config=config,
-        observations=["rgb", "ee_pos"],
+    envs = closing(
+        SubprocEnv(
+            [{"task": TASK}, {"task": TASK, "observations": ["ee_pos"]}],
+            config=config,
+            observations=["rgb", "ee_pos"],
+        )
     )
     seen, info = envs.reset(options={"init_state": 0})
     assert list(seen) == ["ee_pos"] and list(info["own"][0]) == ["agentview_rgb"]
-    envs.close()

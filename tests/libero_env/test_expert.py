@@ -175,19 +175,15 @@ def test_action_noise_leaves_the_gripper_alone_and_can_be_switched_off():
 
 
 @pytest.fixture
-def view_of():
+def view_of(closing):
     """Return a function that opens a task at its first stored initial state."""
-    opened = []
 
     def open_(task_id):
-        env = LiberoEnv(get_task(task_id), cameras=())
+        env = closing(LiberoEnv(task_id, cameras=()))
         env.reset(options={"init_state": 0})
-        opened.append(env)
         return env.view
 
-    yield open_
-    for env in opened:
-        env.close()
+    return open_
 
 
 @pytest.mark.sim
@@ -277,10 +273,10 @@ def test_a_failed_grasp_is_not_planned_again(view_of):
 
 
 @pytest.mark.sim
-def test_of_a_round_object_the_side_that_is_nearer_to_its_place_is_grasped():
+def test_of_a_round_object_the_side_that_is_nearer_to_its_place_is_grasped(closing):
     """A choice that small differences make is one that a clone averages over."""
     task = get_task("libero_goal/1")
-    env = BatchEnv(task, 6, cameras=())
+    env = closing(BatchEnv(task, 6, cameras=()))
     env.reset(options={"init_state": range(6)})
     shapes = Shapes(env.scene)
     for view in env.views:
@@ -288,7 +284,6 @@ def test_of_a_round_object_the_side_that_is_nearer_to_its_place_is_grasped():
         plan = plan_pick(view, shapes, step.atom)
         bowl = view.body_pos("akita_black_bowl_1")
         assert (plan.grasp.pos_world - bowl)[:2] @ (plan.place.pos - bowl)[:2] > 0
-    env.close()
 
 
 @pytest.mark.sim
@@ -424,19 +419,29 @@ def test_the_elbow_is_not_straightened_further(view_of):
     np.testing.assert_array_equal(limit_elbow_extension(view, -outward), -outward)  # back is free
 
 
+@pytest.fixture
+def attempt_of(closing):
+    """Return a function in which one expert acts from an initial state: its attempt, and the environment."""
+
+    def act(task_id, start, style, noise=None, **options):
+        env = closing(BatchEnv(task_id, 1, cameras=()))
+        env.reset(options={"init_state": start})
+        noises = None if noise is None else [ActionNoise(np.random.default_rng(noise))]
+        (attempt,) = run_experts(env, [Expert(env.task, np.random.default_rng(style))], noises, **options)
+        return attempt, env
+
+    return act
+
+
 @pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.parametrize("task_id, start", [
     ("libero_goal/3", 0), ("libero_spatial/4", 16), ("libero_90/5", 4), ("libero_90/13", 12), ("libero_90/19", 4),
     ("libero_90/42", 7), ("libero_90/62", 6), ("libero_90/83", 3), ("libero_90/86", 2), ("libero_90/89", 3)
 ])  # fmt: skip
-def test_narrow_places_leaning_hands_and_small_knobs(task_id, start):
-    task = get_task(task_id)
-    style_seed, _ = np.random.SeedSequence([task.index, start]).spawn(2)
-    env = BatchEnv(task, 1, cameras=())
-    env.reset(options={"init_state": start})
-    (attempt,) = run_experts(env, [Expert(task, np.random.default_rng(style_seed))])
-    env.close()
+def test_narrow_places_leaning_hands_and_small_knobs(attempt_of, task_id, start):
+    style, _ = np.random.SeedSequence([get_task(task_id).index, start]).spawn(2)
+    attempt, _ = attempt_of(task_id, start, style)
     assert attempt.success and attempt.retries < 4, attempt.reason
 
 
@@ -462,25 +467,16 @@ def test_an_attempt_whose_simulation_diverges_fails_for_that_reason_and_the_othe
 @pytest.mark.parametrize(
     "task_id", ["libero_goal/1", "libero_goal/5", "libero_spatial/0", "libero_90/73", "libero_90/65"]
 )
-def test_walls_plates_mugs_and_books(task_id):
-    task = get_task(task_id)
-    env = BatchEnv(task, 1, cameras=())
-    env.reset(options={"init_state": 0})
-    (attempt,) = run_experts(env, [Expert(task, np.random.default_rng(0))], max_steps=300)
-    env.close()
+def test_walls_plates_mugs_and_books(attempt_of, task_id):
+    attempt, _ = attempt_of(task_id, 0, 0, max_steps=300)
     assert attempt.success, attempt.reason
 
 
 @pytest.mark.sim
 @pytest.mark.parametrize("task_id", ["libero_goal/1", "libero_spatial/0"])
-def test_a_hand_lets_go_in_motion(task_id):
+def test_a_hand_lets_go_in_motion(attempt_of, task_id):
     """A clone of a hand that comes to rest before it lets go comes to rest and stays there."""
-    task = get_task(task_id)
-    env = BatchEnv(task, 1, cameras=())
-    env.reset(options={"init_state": 3})
-    expert, noise = Expert(task, np.random.default_rng(1)), ActionNoise(np.random.default_rng(2))
-    (attempt,) = run_experts(env, [expert], [noise], max_steps=200)
-    env.close()
+    attempt, _ = attempt_of(task_id, 3, 1, noise=2, max_steps=200)
     assert attempt.success and attempt.retries == 0
     opens = int(np.flatnonzero(np.diff(attempt.actions[:, 6]) < 0)[-1]) + 1
     down = attempt.actions[opens - 4 : opens + 2, 2]  # the fingers need two steps to begin to open
@@ -489,30 +485,22 @@ def test_a_hand_lets_go_in_motion(task_id):
 
 @pytest.mark.sim
 @pytest.mark.parametrize("task_id, start, most", [("libero_goal/3", 0, 240), ("libero_goal/5", 2, 110)])
-def test_a_hand_does_not_wait_for_what_cannot_happen(task_id, start, most):
+def test_a_hand_does_not_wait_for_what_cannot_happen(attempt_of, task_id, start, most):
     """A tilted hand leaves its line faster than it descends; a fixture keeps a hand from going lower."""
-    task = get_task(task_id)
-    env = BatchEnv(task, 1, cameras=())
-    env.reset(options={"init_state": start})
-    (attempt,) = run_experts(env, [Expert(task, np.random.default_rng(start))], max_steps=400)
-    env.close()
+    attempt, _ = attempt_of(task_id, start, start, max_steps=400)
     assert attempt.success and len(attempt) < most
 
 
 @pytest.mark.sim
 @pytest.mark.parametrize("task", get_suite("libero_object").tasks, ids=lambda task: task.name)
-def test_every_task_is_reached_and_stays_reached(task):
-    env = BatchEnv(task, 1, cameras=())
-    env.reset(options={"init_state": 31})
-    expert, noise = Expert(task, np.random.default_rng(0)), ActionNoise(np.random.default_rng(5))
-    (attempt,) = run_experts(env, [expert], [noise], max_steps=200)
+def test_every_task_is_reached_and_stays_reached(attempt_of, task):
+    attempt, env = attempt_of(task, 31, 0, noise=5, max_steps=200)
     assert attempt.reason == "" and attempt.success
     assert np.abs(attempt.actions).max() <= 1.0 and len(attempt) < 160
     hold = np.array([[0.0] * 6 + [-1.0]])
     for _ in range(12):  # let go of, it comes to rest in the basket
         env.simulations.step([0], hold)
     assert env.check_goal(0)[0]
-    env.close()
 
 
 @pytest.mark.sim
@@ -535,9 +523,9 @@ def test_what_one_simulation_does_depends_on_no_other():
 
 
 @pytest.mark.sim
-def test_an_object_that_slipped_is_picked_again():
+def test_an_object_that_slipped_is_picked_again(closing):
     task = get_task("libero_object/7")
-    env = LiberoEnv(task, cameras=())
+    env = closing(LiberoEnv(task, cameras=()))
     env.reset(options={"init_state": 3})
     expert = Expert(task, np.random.default_rng(0), style=MotionStyle())
     dropped, success = 0, False
@@ -548,21 +536,12 @@ def test_an_object_that_slipped_is_picked_again():
         _, _, success, _, _ = env.step(action)
         if success:
             break
-    env.close()
     assert dropped == 8 and expert.retries >= 1 and success
 
 
 @pytest.mark.sim
-def test_a_finger_on_the_rim_goes_up_again():
+def test_a_finger_on_the_rim_goes_up_again(attempt_of):
     """A push leaves a finger standing on a wide can; pressing on would last for seventy steps."""
-    task = get_task("libero_object/0")
-    style_seed, noise_seed = np.random.SeedSequence([0, 8]).spawn(2)
-    env = BatchEnv(task, 1, cameras=())
-    env.reset(options={"init_state": 8})
-    expert, noise = (
-        Expert(task, np.random.default_rng(style_seed)),
-        ActionNoise(np.random.default_rng(noise_seed)),
-    )
-    (attempt,) = run_experts(env, [expert], [noise])
-    env.close()
+    style, noise = np.random.SeedSequence([0, 8]).spawn(2)
+    attempt, _ = attempt_of("libero_object/0", 8, style, noise)
     assert attempt.success and len(attempt) < 160

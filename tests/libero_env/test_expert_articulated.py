@@ -17,7 +17,7 @@ from libero_env.expert.skills.move_joint import MoveJoint
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose
 from libero_env.sim.predicates import evaluate
-from libero_env.tasks import get_task, read_task
+from libero_env.tasks import get_task, make_task
 from libero_env.tasks.problem import Atom
 
 pytestmark = pytest.mark.sim
@@ -44,42 +44,13 @@ CASES = [
     ("flat_stove", "", "turnoff", "Turnon", (-0.2, -0.2), FRONT),
 ]
 
-PROBLEM = """
-(define (problem LIBERO_Kitchen_Tabletop_Manipulation)
-  (:domain robosuite)
-  (:language {state} it)
-  (:regions
-    (place (:target kitchen_table) (:ranges (({x0} {y0} {x1} {y1}))) (:yaw_rotation (({yaw} {yaw}))))
-    {part}
-  )
-  (:fixtures kitchen_table - kitchen_table fixture_1 - {category})
-  (:objects)
-  (:obj_of_interest)
-  (:init (On fixture_1 kitchen_table_place) {begin})
-  (:goal (And ({goal} {address})))
-)
-"""
 
-
-def make_task(tmp_path, category, region, state, begin, place, yaw):
-    x, y = place
-    address = f"fixture_1_{region}" if region else "fixture_1"
-    text = PROBLEM.format(
-        category=category,
-        state=state,
-        goal=state.capitalize(),
-        address=address,
-        yaw=yaw,
-        part=f"({region} (:target fixture_1))" if region else "",
-        begin=f"({begin} {address})" if begin else "",
-        x0=x - 0.01,
-        y0=y - 0.01,
-        x1=x + 0.01,
-        y1=y + 0.01,
-    )
-    file = tmp_path / f"{category}_{region}_{state}.bddl"
-    file.write_text(text)
-    return read_task(file), address
+def task_of(category, region, state, begin, place, yaw):
+    """Return the task of one fixture of the kitchen, and the address of its part."""
+    address = f"{category}_1_{region}" if region else f"{category}_1"
+    facts = {"scene": "kitchen", "furniture": [category], "goal": f"{state.capitalize()} {address}"}
+    facts["place"] = {f"{category}_1": {"at": place, "half": 0.01, "yaw": yaw}}
+    return make_task(**facts, init=[f"{begin} {address}"] if begin else [], language=f"{state} it"), address
 
 
 def run(env, skills, steps=STEPS):
@@ -98,9 +69,9 @@ def run(env, skills, steps=STEPS):
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(filter(None, case[:3])))
-def test_a_joint_is_moved_and_stays(tmp_path, case):
-    task, address = make_task(tmp_path, *case)
-    env = BatchEnv(task, SEEDS, num_threads=1, cameras=())
+def test_a_joint_is_moved_and_stays(closing, case):
+    task, address = task_of(*case)
+    env = closing(BatchEnv(task, SEEDS, num_threads=1, cameras=()))
     env.reset(seed=0)
     atom = Atom(case[2].capitalize(), (address,))
     assert not any(evaluate(atom, view) for view in env.views)
@@ -113,7 +84,6 @@ def test_a_joint_is_moved_and_stays(tmp_path, case):
     for _ in range(10):
         env.simulations.step(np.arange(SEEDS), rest)
     held = sum(evaluate(atom, view) for view in env.views)
-    env.close()
     # its bars are 2 cm long and taper, and its door is closed only while it is pressed against its stop
     least = 0.8 if case[0].startswith("short") else 0.9
     assert reached.sum() >= least * SEEDS
@@ -122,8 +92,8 @@ def test_a_joint_is_moved_and_stays(tmp_path, case):
     assert held >= least * SEEDS, [(skill.phase, skill.failure_reason) for skill in skills]
 
 
-def test_the_same_motion_style_gives_the_same_actions(tmp_path):
-    task, address = make_task(tmp_path, *CASES[0])
+def test_the_same_motion_style_gives_the_same_actions():
+    task, address = task_of(*CASES[0])
     taken = []
     for _ in range(2):
         env = BatchEnv(task, 1, num_threads=1, cameras=())
@@ -133,29 +103,27 @@ def test_the_same_motion_style_gives_the_same_actions(tmp_path):
     np.testing.assert_array_equal(*taken)
 
 
-def test_a_reached_state_needs_no_motion(tmp_path):
-    task, address = make_task(tmp_path, *CASES[3])
-    env = BatchEnv(task, 1, num_threads=1, cameras=())
+def test_a_reached_state_needs_no_motion(closing):
+    task, address = task_of(*CASES[3])
+    env = closing(BatchEnv(task, 1, num_threads=1, cameras=()))
     env.reset(seed=0)
     skill = MoveJoint(address, "open")
     assert skill.done(env.views[0]) and skill.retries == 0
-    env.close()
 
 
-def test_a_fixture_without_the_joint_is_reported(tmp_path):
-    task, _ = make_task(tmp_path, *CASES[0])
-    env = BatchEnv(task, 1, num_threads=1, cameras=())
+def test_a_fixture_without_the_joint_is_reported(closing):
+    task, _ = task_of(*CASES[0])
+    env = closing(BatchEnv(task, 1, num_threads=1, cameras=()))
     env.reset(seed=0)
-    skill = MoveJoint("fixture_1_top_side", "open")
+    skill = MoveJoint("wooden_cabinet_1_top_side", "open")
     np.testing.assert_array_equal(skill.act(env.views[0])[:6], 0.0)
-    assert "fixture_1_top_side" in skill.failure_reason
-    env.close()
+    assert "wooden_cabinet_1_top_side" in skill.failure_reason
 
 
 @pytest.mark.parametrize("case", [CASES[0], CASES[6]], ids=["bar that lies", "bar that stands"])
-def test_the_handle_is_found_in_front(tmp_path, case):
-    task, address = make_task(tmp_path, *case)
-    env = BatchEnv(task, 1, num_threads=1, cameras=())
+def test_the_handle_is_found_in_front(closing, case):
+    task, address = task_of(*case)
+    env = closing(BatchEnv(task, 1, num_threads=1, cameras=()))
     env.reset(seed=0)
     view = env.views[0]
     part = Part.from_joint(view.scene.model, view.scene.joints[address][0])
@@ -167,7 +135,6 @@ def test_the_handle_is_found_in_front(tmp_path, case):
     assert (handle.part_points @ handle.out).max() == pytest.approx(
         handle.pos @ handle.out + 0.5 * handle.depth, abs=1e-3
     )
-    env.close()
 
 
 def poses(number, seed=0):
@@ -181,10 +148,9 @@ def poses(number, seed=0):
     return pos, np.array(mats)
 
 
-def test_the_wrist_bends_as_inverse_kinematics_says():
-    env = BatchEnv("libero_goal/7", 1, num_threads=1, cameras=())
+def test_the_wrist_bends_as_inverse_kinematics_says(closing):
+    env = closing(BatchEnv("libero_goal/7", 1, num_threads=1, cameras=()))
     arm, base = ArmKinematics(env.scene.model), np.array(env.scene.workspace.robot_base_pos)
-    env.close()
     pos, mat = poses(60)
     expected = wrist_bend(pos, mat, base)
     found = [arm.solve(np.array(REST_QPOS), Pose(p, m)) for p, m in zip(pos, mat, strict=True)]
@@ -223,8 +189,8 @@ def test_the_collision_depth_of_the_hand():
     assert table_penetration(0.2, pose, True) == 0.0 and table_penetration(0.3, pose, True) > 0.01
 
 
-def test_the_hand_leans_over_a_knob_close_to_the_base():
-    env = BatchEnv(get_task("libero_goal/7"), 1, num_threads=1, cameras=())
+def test_the_hand_leans_over_a_knob_close_to_the_base(closing):
+    env = closing(BatchEnv(get_task("libero_goal/7"), 1, num_threads=1, cameras=()))
     env.reset(options={"init_state": 8})
     view = env.views[0]
     part = Part.from_joint(view.scene.model, view.scene.joints["flat_stove_1"][0])
@@ -234,12 +200,11 @@ def test_the_hand_leans_over_a_knob_close_to_the_base():
     assert wrist_bend(hold.contact.pos[None], upright[None], base)[0] > 2.9
     assert all(wrist_bend(pose.pos[None], pose.mat[None], base)[0] < 2.9 for pose in ends)
     assert hold.contact.mat[2, 2] < -0.8 and abs(hold.contact.mat[2, 0]) < 1e-6  # the fingers stay level
-    env.close()
 
 
-def test_a_door_may_rotate_under_the_hand(tmp_path):
-    task, address = make_task(tmp_path, *next(c for c in CASES if c[0] == "short_fridge" and c[2] == "close"))
-    env = BatchEnv(task, 1, num_threads=1, cameras=())
+def test_a_door_may_rotate_under_the_hand(closing):
+    task, address = task_of(*next(c for c in CASES if c[0] == "short_fridge" and c[2] == "close"))
+    env = closing(BatchEnv(task, 1, num_threads=1, cameras=()))
     env.reset(seed=0)
     view = env.views[0]
     part = Part.from_joint(view.scene.model, view.scene.joints[address][0])
@@ -255,4 +220,3 @@ def test_a_door_may_rotate_under_the_hand(tmp_path):
     anchor, axis = part.axis(view)
     radius = [np.linalg.norm(np.cross(p - anchor, axis)) for p in (hold.contact.pos, rigid.pos)]
     assert radius[0] == pytest.approx(radius[1])
-    env.close()

@@ -4,6 +4,7 @@ two-step task with an object of the user's own."""
 import mujoco
 import numpy as np
 import pytest
+import yaml
 
 from libero_env.design.certify import certify
 from libero_env.objects import ObjectModel, register_object
@@ -14,144 +15,60 @@ pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 STARTS, SOLVED = 10, 8
 
-DRAWER = """
-(define (problem LIBERO_Living_Room_Tabletop_Manipulation)
-  (:domain robosuite)
-  (:language open the bottom drawer of the white cabinet)
-  (:regions
-    (cabinet_place (:target living_room_table) (:ranges ((0.0 -0.31 0.04 -0.27))) (:yaw_rotation ((3.0 3.3))))
-    (mug_place (:target living_room_table) (:ranges ((-0.2 0.1 -0.1 0.2))) (:yaw_rotation ((0.0 0.0))))
-    (popcorn_place (:target living_room_table) (:ranges ((0.1 0.1 0.2 0.2))) (:yaw_rotation ((0.0 0.0))))
-    (bottom_region (:target white_cabinet_1))
-  )
-  (:fixtures
-    living_room_table - living_room_table
-    white_cabinet_1 - white_cabinet
-  )
-  (:objects
-    red_coffee_mug_1 - red_coffee_mug
-    popcorn_1 - popcorn
-  )
-  (:obj_of_interest white_cabinet_1)
-  (:init
-    (On white_cabinet_1 living_room_table_cabinet_place)
-    (On red_coffee_mug_1 living_room_table_mug_place)
-    (On popcorn_1 living_room_table_popcorn_place)
-  )
-  (:goal (And (Open white_cabinet_1_bottom_region)))
-)
-"""
-
-STACK = """
-(define (problem LIBERO_Study_Tabletop_Manipulation)
-  (:domain robosuite)
-  (:language stack the butter on the chocolate pudding on the cream cheese)
-  (:regions
-    (cheese_place (:target study_table) (:ranges ((-0.05 -0.05 0.05 0.05))) (:yaw_rotation ((0.0 1.5))))
-    (pudding_place (:target study_table) (:ranges ((-0.15 0.13 -0.05 0.23))) (:yaw_rotation ((0.0 1.5))))
-    (butter_place (:target study_table) (:ranges ((-0.15 -0.23 -0.05 -0.13))) (:yaw_rotation ((0.0 1.5))))
-  )
-  (:fixtures study_table - study_table)
-  (:objects
-    cream_cheese_1 - cream_cheese
-    chocolate_pudding_1 - chocolate_pudding
-    butter_1 - butter
-  )
-  (:obj_of_interest butter_1 chocolate_pudding_1 cream_cheese_1)
-  (:init
-    (On cream_cheese_1 study_table_cheese_place)
-    (On chocolate_pudding_1 study_table_pudding_place)
-    (On butter_1 study_table_butter_place)
-  )
-  (:goal (And (Stack butter_1 chocolate_pudding_1) (Stack chocolate_pudding_1 cream_cheese_1)))
-)
-"""
-
-DOOR = """
-(define (problem LIBERO_Kitchen_Tabletop_Manipulation)
-  (:domain robosuite)
-  (:language open the microwave behind the ketchup)
-  (:regions
-    (microwave_place (:target kitchen_table) (:ranges ((0.03 0.3 0.07 0.34))) (:yaw_rotation ((-0.15 0.15))))
-    (ketchup_place (:target kitchen_table) (:ranges ((0.05 -0.15 0.15 -0.05))) (:yaw_rotation ((0.0 0.0))))
-    (plate_place (:target kitchen_table) (:ranges ((-0.15 -0.25 -0.05 -0.15))) (:yaw_rotation ((0.0 0.0))))
-  )
-  (:fixtures
-    kitchen_table - kitchen_table
-    microwave_1 - microwave
-  )
-  (:objects
-    ketchup_1 - ketchup
-    plate_1 - plate
-  )
-  (:obj_of_interest microwave_1)
-  (:init
-    (On microwave_1 kitchen_table_microwave_place)
-    (On ketchup_1 kitchen_table_ketchup_place)
-    (On plate_1 kitchen_table_plate_place)
-    (Close microwave_1)
-  )
-  (:goal (And (Open microwave_1)))
-)
-"""
-
-KNOB = """
-(define (problem LIBERO_Tabletop_Manipulation)
-  (:domain robosuite)
-  (:language turn on the stove next to the mugs)
-  (:regions
-    (stove_place (:target main_table) (:ranges ((-0.12 -0.27 -0.08 -0.23))) (:yaw_rotation ((0.2 0.5))))
-    (mug_place (:target main_table) (:ranges ((-0.2 -0.1 -0.12 -0.02))) (:yaw_rotation ((0.0 0.0))))
-    (other_mug_place (:target main_table) (:ranges ((0.05 0.05 0.15 0.15))) (:yaw_rotation ((0.0 0.0))))
-    (cook_region (:target flat_stove_1))
-  )
-  (:fixtures
-    main_table - table
-    flat_stove_1 - flat_stove
-  )
-  (:objects
-    porcelain_mug_1 - porcelain_mug
-    white_yellow_mug_1 - white_yellow_mug
-  )
-  (:obj_of_interest flat_stove_1)
-  (:init
-    (On flat_stove_1 main_table_stove_place)
-    (On porcelain_mug_1 main_table_mug_place)
-    (On white_yellow_mug_1 main_table_other_mug_place)
-    (Turnoff flat_stove_1)
-  )
-  (:goal (And (Turnon flat_stove_1)))
-)
-"""
-
-MIX = """
-(define (problem LIBERO_Kitchen_Tabletop_Manipulation)
-  (:domain robosuite)
-  (:language put the bobbin in the top drawer of the cabinet and close it)
-  (:regions
-    (cabinet_place (:target kitchen_table) (:ranges ((0.03 -0.32 0.05 -0.3))) (:yaw_rotation ((3.14159 3.14159))))
-    (bobbin_place (:target kitchen_table) (:ranges ((-0.15 0.05 -0.02 0.2))) (:yaw_rotation ((0.0 0.0))))
-    (soup_place (:target kitchen_table) (:ranges ((0.1 0.12 0.2 0.22))) (:yaw_rotation ((0.0 0.0))))
-    (top_region (:target wooden_cabinet_1))
-  )
-  (:fixtures
-    kitchen_table - kitchen_table
-    wooden_cabinet_1 - wooden_cabinet
-  )
-  (:objects
-    test_bobbin_1 - test_bobbin
-    alphabet_soup_1 - alphabet_soup
-  )
-  (:obj_of_interest test_bobbin_1 wooden_cabinet_1)
-  (:init
-    (On wooden_cabinet_1 kitchen_table_cabinet_place)
-    (On test_bobbin_1 kitchen_table_bobbin_place)
-    (On alphabet_soup_1 kitchen_table_soup_place)
-    (Open wooden_cabinet_1_top_region)
-  )
-  (:goal (And (In test_bobbin_1 wooden_cabinet_1_top_region) (Close wooden_cabinet_1_top_region)))
-)
-"""
+TASKS = yaml.safe_load("""
+drawer:
+  scene: living_room
+  furniture: [white_cabinet]
+  objects: [red_coffee_mug, popcorn]
+  place:
+    white_cabinet_1: {at: [0.02, -0.29], half: 0.02, yaw: [3.0, 3.3]}
+    red_coffee_mug_1: {at: [-0.15, 0.15], half: 0.05, yaw: 0}
+    popcorn_1: {at: [0.15, 0.15], half: 0.05, yaw: 0}
+  goal: Open white_cabinet_1_bottom_region
+  language: open the bottom drawer of the white cabinet
+stack:
+  scene: study
+  objects: [cream_cheese, chocolate_pudding, butter]
+  place:
+    cream_cheese_1: {at: [0, 0], half: 0.05, yaw: [0, 1.5]}
+    chocolate_pudding_1: {at: [-0.1, 0.18], half: 0.05, yaw: [0, 1.5]}
+    butter_1: {at: [-0.1, -0.18], half: 0.05, yaw: [0, 1.5]}
+  goal: [Stack butter_1 chocolate_pudding_1, Stack chocolate_pudding_1 cream_cheese_1]
+  language: stack the butter on the chocolate pudding on the cream cheese
+door:
+  scene: kitchen
+  furniture: [microwave]
+  objects: [ketchup, plate]
+  place:
+    microwave_1: {at: [0.05, 0.32], half: 0.02, yaw: [-0.15, 0.15]}
+    ketchup_1: {at: [0.1, -0.1], half: 0.05, yaw: 0}
+    plate_1: {at: [-0.1, -0.2], half: 0.05, yaw: 0}
+  init: [Close microwave_1]
+  goal: Open microwave_1
+  language: open the microwave behind the ketchup
+knob:
+  scene: table
+  furniture: [flat_stove]
+  objects: [porcelain_mug, white_yellow_mug]
+  place:
+    flat_stove_1: {at: [-0.1, -0.25], half: 0.02, yaw: [0.2, 0.5]}
+    porcelain_mug_1: {at: [-0.16, -0.06], half: 0.04, yaw: 0}
+    white_yellow_mug_1: {at: [0.1, 0.1], half: 0.05, yaw: 0}
+  init: [Turnoff flat_stove_1]
+  goal: Turnon flat_stove_1
+  language: turn on the stove next to the mugs
+mix:
+  scene: kitchen
+  furniture: [wooden_cabinet]
+  objects: [test_bobbin, alphabet_soup]
+  place:
+    wooden_cabinet_1: {at: [0.04, -0.31], half: 0.01, yaw: 3.14159}
+    test_bobbin_1: {at: [-0.085, 0.125], half: [0.065, 0.075], yaw: 0}
+    alphabet_soup_1: {at: [0.15, 0.17], half: 0.05, yaw: 0}
+  init: [Open wooden_cabinet_1_top_region]
+  goal: [In test_bobbin_1 wooden_cabinet_1_top_region, Close wooden_cabinet_1_top_region]
+  language: put the bobbin in the top drawer of the cabinet and close it
+""")
 
 BOBBIN = """
 <mujoco>
@@ -164,8 +81,6 @@ BOBBIN = """
   </worldbody>
 </mujoco>
 """
-
-TASKS = {"drawer": DRAWER, "stack": STACK, "door": DOOR, "knob": KNOB, "mix": MIX}
 
 
 @pytest.fixture
@@ -195,8 +110,8 @@ def bobbin(tmp_path):
 
 @pytest.mark.parametrize("name", TASKS)
 def test_a_new_task_is_solved(tmp_path, bobbin, name):
-    file = tmp_path / f"{name}.bddl"
-    file.write_text(TASKS[name])
+    file = tmp_path / f"{name}.yaml"
+    file.write_text(yaml.safe_dump(TASKS[name]))
     task = read_task(file)
     known = [old.problem for suite in suite_names() for old in get_suite(suite).tasks]
     assert task.problem not in known

@@ -308,6 +308,8 @@ def test_other_formats_likewise(home, name, data, message):
     ({"size": float("inf")}, "size is inf"),
     ({"size": 1e-300}, "size is 1e-300; expected at least 0.001"),
     ({"size": "big"}, "size is 'big'; expected a number"),
+    ({"mass": 1.0, "density": 2.0}, "give only one of them"),
+    ({"up": "x"}, "expected one of .y. or .z."),
     ({"mass": 1e300}, "mass is 1e[+]300; expected at most 10000"),
     ({"density": -1.0}, "density is -1.0; expected above 0"),
     ({"faces": 0}, "faces is 0; expected at least 1"),

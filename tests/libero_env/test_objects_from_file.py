@@ -14,7 +14,7 @@ from libero_env.cli.main import main
 from libero_env.design.objects import add_object, register_object_file
 from libero_env.design.objects.collision import boxes_of, collision_pieces, is_closed, volume_filled
 from libero_env.design.objects.mesh_file import bounds, read_mesh
-from libero_env.design.objects.mesh_object import DENSITY, Options, merge_vertices
+from libero_env.design.objects.mesh_object import DENSITY, merge_vertices
 from libero_env.errors import LiberoError
 from libero_env.limited import limited_process
 from libero_env.objects import catalog, folder, get_object, object_names
@@ -376,15 +376,6 @@ def test_what_cannot_be_used_is_named_with_its_remedy(tmp_path, kind, options, m
         add_object(broken(tmp_path, kind), **options)
     root = tmp_path / "objects"
     assert not root.exists() or not list(root.iterdir())  # nothing half made stays
-
-
-def test_options_that_contradict_each_other():
-    with pytest.raises(LiberoError, match="give only one of them"):
-        Options(mass=1.0, density=2.0)
-    with pytest.raises(LiberoError, match="size is 0.0; expected at least 0.001"):
-        Options(size=0.0)
-    with pytest.raises(LiberoError, match="expected one of .y. or .z."):
-        Options(up="x")
 
 
 def test_a_stored_object_that_is_broken_is_named(tmp_path):

@@ -47,22 +47,20 @@ def turned_on(env):
     return state
 
 
-def test_each_name_gives_the_documented_entries(kitchen):
+def test_each_name_gives_the_documented_entries(closing, kitchen):
     seen = kitchen.set_state(kitchen.get_state())
     assert kitchen.observation_space.contains(seen)
     assert seen["agentview_depth"].dtype == np.float32 and seen["agentview_segmentation"].dtype == np.int32
     assert seen["agentview_rgb"].shape == (96, 128, 3) and seen["eye_in_hand_depth"].shape == (96, 128)
     np.testing.assert_array_equal(seen["akita_black_bowl_1_pos"], kitchen.view.body_pos("akita_black_bowl_1"))
     assert seen["wooden_cabinet_1_joints"].shape == (3,) and seen["flat_stove_1_joints"].shape == (1,)
-    few = LiberoEnv(TASK, cameras=(), observations=["ee_quat", "objects"])
+    few = closing(LiberoEnv(TASK, cameras=(), observations=["ee_quat", "objects"]))
     assert "joint_states" not in few.reset(seed=0)[0]
-    few.close()
 
 
-def test_default_observations_are_images_and_proprioception():
-    env = LiberoEnv(TASK, camera_size=(8, 8))
+def test_default_observations_are_images_and_proprioception(closing):
+    env = closing(LiberoEnv(TASK, camera_size=(8, 8)))
     assert list(env.reset(seed=0)[0]) == ["agentview_rgb", "eye_in_hand_rgb", *PROPRIOCEPTION]
-    env.close()
 
 
 def test_depth_and_segmentation_agree_with_object_positions(kitchen):
@@ -142,9 +140,9 @@ def test_a_glowing_site_is_visible_only_while_turned_on(kitchen):
     np.testing.assert_array_equal(again["agentview_rgb"], off["agentview_rgb"])
 
 
-def test_one_simulation_and_many_have_the_same_observations():
+def test_one_simulation_and_many_have_the_same_observations(closing):
     kwargs = {"camera_size": (24, 32), "observations": EVERYTHING, "reward": "staged"}
-    batch, env = BatchEnv(STOVE, 2, num_threads=2, **kwargs), LiberoEnv(STOVE, **kwargs)
+    batch, env = closing(BatchEnv(STOVE, 2, num_threads=2, **kwargs)), closing(LiberoEnv(STOVE, **kwargs))
     moves = np.random.default_rng(1).uniform(-1, 1, (3, 2, 7))
     rows = [batch.reset(seed=3)[0]]
     steps = [batch.step(move) for move in moves]
@@ -158,8 +156,6 @@ def test_one_simulation_and_many_have_the_same_observations():
         for many, one in zip([*rows, *(step[0] for step in steps)], singles, strict=True):
             for key in one:
                 np.testing.assert_array_equal(many[key][i], one[key], err_msg=key)
-    batch.close()
-    env.close()
 
 
 @pytest.mark.parametrize("make", [LiberoEnv, lambda *args, **kwargs: BatchEnv(*args, 2, **kwargs)])
@@ -185,18 +181,17 @@ def test_images_are_rendered_only_on_request(make, monkeypatch):
     env.close()
 
 
-def test_observations_are_copies():
-    env = LiberoEnv(TASK, camera_size=(8, 8))
+def test_observations_are_copies(closing):
+    env = closing(LiberoEnv(TASK, camera_size=(8, 8)))
     first, _ = env.reset(seed=0)
     copy = {key: value.copy() for key, value in first.items()}
     env.step(np.ones(7))
     for key in first:
         np.testing.assert_array_equal(first[key], copy[key])
-    env.close()
 
 
-def test_staged_rewards_increase_towards_the_goal_and_only_success_gives_one(kitchen):
-    env = LiberoEnv(STOVE, cameras=(), reward="staged", reward_scale=2.0)
+def test_staged_rewards_increase_towards_the_goal_and_only_success_gives_one(closing, kitchen):
+    env = closing(LiberoEnv(STOVE, cameras=(), reward="staged", reward_scale=2.0))
     env.reset(seed=0)
     _, reward, *_ = env.step(np.zeros(7))
     assert 0 < reward < 2
@@ -213,7 +208,6 @@ def test_staged_rewards_increase_towards_the_goal_and_only_success_gives_one(kit
     assert staged_reward(env.view, [atom], [True]) == 0.99  # atoms hold, the goal does not
     with pytest.raises(UnknownNameError, match="staged"):
         Reward("dense")
-    env.close()
 
 
 @pytest.mark.parametrize("suite", suite_names())

@@ -63,11 +63,11 @@ def test_an_environment_that_was_loaded_more_often_draws_more_joints():
 
 
 @pytest.mark.parametrize("num_envs", [1, 2])
-def test_the_first_steps_are_those_of_the_original(num_envs):
+def test_the_first_steps_are_those_of_the_original(closing, num_envs):
     with np.load(DATA / "original_start.npz") as recorded:
         actions, qpos, start = recorded["actions"], recorded["qpos"], recorded["start"]
     task = "libero_goal/3"
-    env = BatchEnv(task, num_envs, cameras=())
+    env = closing(BatchEnv(task, num_envs, cameras=()))
     (fixtures,) = drawn_fixtures(env.scene, 7, 1)
     rows = np.tile(np.concatenate([start, fixtures.ravel()]), (num_envs, 1))
     env.reset(options={"start": rows, "outdated_controller": True})
@@ -80,13 +80,11 @@ def test_the_first_steps_are_those_of_the_original(num_envs):
     env.step(np.tile(actions[0], (num_envs, 1)))
     other = np.abs(env.simulations.fields["qpos"][-1, :9] - qpos[1]).max()
     assert other > 1e-3, "a controller that knows the arm's pose starts otherwise"
-    env.close()
 
 
-def test_starts_of_another_task_are_refused():
-    env = BatchEnv("libero_goal/3", 2, cameras=())
+def test_starts_of_another_task_are_refused(closing):
+    env = closing(BatchEnv("libero_goal/3", 2, cameras=()))
     with pytest.raises(LiberoError, match=r"libero_goal/3: a start has \d+ numbers.*3 fixtures; got 5"):
         env.reset(options={"start": np.zeros((2, 5))})
     with pytest.raises(LiberoError, match="start: expected 2 rows"):
         env.reset(options={"start": np.zeros((1, 5))})
-    env.close()

@@ -30,10 +30,15 @@ SMALL = {"camera_size": (32, 32), "cameras": ("agentview",)}
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 
 
-def world_of(perturb, start=0, task=TASK, **options):
-    env = LiberoEnv(task, perturb=perturb, **{**SMALL, **options})
-    observation, info = env.reset(options={"init_state": start})
-    return env, observation, info
+@pytest.fixture
+def world_of(closing):
+    """Return a function that resets an environment under perturbations: the environment, observation and info."""
+
+    def make(perturb, start=0, task=TASK, **options):
+        env = closing(LiberoEnv(task, perturb=perturb, **{**SMALL, **options}))
+        return env, *env.reset(options={"init_state": start})
+
+    return make
 
 
 def episode(env, start=0, steps=4):
@@ -82,16 +87,15 @@ def test_what_is_typed_wrongly_is_one_line(text):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_does_something(kind, plain):
+def test_every_kind_does_something(closing, kind, plain):
     base, seen = plain
     pictures = KINDS[kind].layer in ("appearance", "observation")
-    env = LiberoEnv(TASK, perturb=f"{kind}=1", **SMALL | ({} if pictures else {"cameras": ()}))
+    env = closing(LiberoEnv(TASK, perturb=f"{kind}=1", **SMALL | ({} if pictures else {"cameras": ()})))
     changed = episode(env, steps=4)
     known = [{name: obs[name] for name in changed[0]} for obs in seen]
     assert (
         env.task.language != base.task.language or not same(known, changed) or in_sight(env) != in_sight(base)
     )
-    env.close()
 
 
 def in_sight(env):
@@ -99,32 +103,28 @@ def in_sight(env):
     return {name: env.view.body_pos(name).tolist() for name in env.scene.objects}
 
 
-def test_severity_0_changes_no_bit(plain):
+def test_severity_0_changes_no_bit(closing, plain):
     _, seen = plain
     nothing = ",".join(f"{kind}=0" for kind, definition in KINDS.items() if not definition.exclusive)
-    env = LiberoEnv(TASK, perturb=nothing, **SMALL)
+    env = closing(LiberoEnv(TASK, perturb=nothing, **SMALL))
     assert same(episode(env), seen) and env.config.perturb == () and env.batch.perturbed is None
-    env.close()
-    empty = LiberoEnv(TASK, perturb=[Appearance()], **SMALL)
+    empty = closing(LiberoEnv(TASK, perturb=[Appearance()], **SMALL))
     assert same(episode(empty), seen)
-    empty.close()
 
 
-def test_draws_do_not_depend_on_the_batch_or_its_order():
+def test_draws_do_not_depend_on_the_batch_or_its_order(closing):
     perturb = ",".join(f"{name}=0.5" for name, kind in KINDS.items() if not kind.exclusive)
     actions = np.random.default_rng(0).uniform(-1, 1, (3, 3, 7))
-    batch = BatchEnv(TASK, 3, perturb=perturb, **SMALL)
-    alone = LiberoEnv(TASK, perturb=perturb, **SMALL)
+    batch = closing(BatchEnv(TASK, 3, perturb=perturb, **SMALL))
+    alone = closing(LiberoEnv(TASK, perturb=perturb, **SMALL))
     for starts in ([2, 0, 1], [1, 2, 0]):
         seen = [batch.reset(options={"init_state": starts})[0]]
         seen += [batch.step(a[starts])[0] for a in actions]
         own = [alone.reset(options={"init_state": 2})[0], *(alone.step(a[2])[0] for a in actions)]
         assert same(own, [{name: rows[starts.index(2)] for name, rows in obs.items()} for obs in seen])
-    batch.close()
-    alone.close()
 
 
-def test_kinds_do_not_disturb_each_other_and_another_seed_is_another_draw():
+def test_kinds_do_not_disturb_each_other_and_another_seed_is_another_draw(world_of):
     def joints(perturb):
         env, observation, _ = world_of(perturb, cameras=())
         env.close()
@@ -138,7 +138,7 @@ def test_kinds_do_not_disturb_each_other_and_another_seed_is_another_draw():
     assert np.allclose(joints("robot=0.8") - rest, 2 * step)  # further in the same direction
 
 
-def test_absolute_changes_can_be_given_as_they_are():
+def test_absolute_changes_can_be_given_as_they_are(world_of):
     qpos = (0.1, -0.2, 0.0, -2.3, 0.0, 2.2, 0.7)
     view = CameraView(pos=(1.0, 0.1, 1.5), quat=(0.6, 0.35, 0.35, 0.63), fovy=50.0)
     env, observation, _ = world_of([RobotJoints(qpos), Appearance(cameras={CAMERA: view})])
@@ -146,16 +146,14 @@ def test_absolute_changes_can_be_given_as_they_are():
     pose = env.observer.camera_to_world(0, CAMERA)
     assert np.array_equal(pose[:3, 3], view.pos)
     assert env.observer.intrinsics(CAMERA)[0, 0] == pytest.approx(16 / np.tan(np.deg2rad(25)))
-    env.close()
     env, moved, _ = world_of([RobotJoints(qpos), Perturbation("robot", 0.4)], cameras=())  # starts from there
     assert np.linalg.norm(moved["joint_states"] - qpos) == pytest.approx(KINDS["robot"].amount(0.4))
-    env.close()
     with pytest.raises(UnknownNameError, match="lamp"):
         world_of([Appearance(lights={"lamp": Light()})])
 
 
 @pytest.mark.parametrize("severity", [0.2, 1.0])
-def test_the_camera_orbits_by_degrees(severity, plain):
+def test_the_camera_orbits_by_degrees(severity, plain, world_of):
     base, _ = plain
     env, _, _ = world_of(f"camera={severity}", start=3)
     before, after = (e.observer.camera_to_world(0, CAMERA) for e in (base, env))
@@ -165,10 +163,9 @@ def test_the_camera_orbits_by_degrees(severity, plain):
     assert np.rad2deg(np.arccos(cosine)) == pytest.approx(KINDS["camera"].at_one * severity, abs=1e-6)
     assert np.cross(after[:3, 2], rays[1] / np.linalg.norm(rays[1])) == pytest.approx(np.zeros(3), abs=1e-6)
     assert after[2, 0] == pytest.approx(0, abs=1e-9)  # upright
-    env.close()
 
 
-def test_light_is_a_ratio_of_all_lights_and_the_field_of_view_is_in_degrees(plain):
+def test_light_is_a_ratio_of_all_lights_and_the_field_of_view_is_in_degrees(plain, world_of):
     base, _ = plain
     env, _, _ = world_of("light=0.5,fov=0.5")
     drawn = [e.observer.renderer._scene for e in (base, env)]
@@ -183,11 +180,10 @@ def test_light_is_a_ratio_of_all_lights_and_the_field_of_view_is_in_degrees(plai
     assert abs(fovy[1] - fovy[0]) == pytest.approx(KINDS["fov"].amount(0.5))
     eye = drawn[1].camera[0]
     assert np.rad2deg(2 * np.arctan(eye.frustum_top / eye.frustum_near)) == pytest.approx(fovy[1], rel=1e-5)
-    env.close()
 
 
 @pytest.mark.parametrize("severity", [0.2, 0.6, 1.0])
-def test_the_robot_is_at_an_exact_distance_within_limits_and_touches_nothing(severity):
+def test_the_robot_is_at_an_exact_distance_within_limits_and_touches_nothing(severity, world_of):
     base, observation, _ = world_of("", start=1, cameras=())
     env, moved, info = world_of(f"robot={severity}", start=1, cameras=())
     offset = moved["joint_states"] - observation["joint_states"]
@@ -199,11 +195,9 @@ def test_the_robot_is_at_an_exact_distance_within_limits_and_touches_nothing(sev
     nq = env.scene.nq_robot
     rest = [e.simulations.fields["qpos"][0, nq:] for e in (base, env)]
     assert np.array_equal(*rest)
-    base.close()
-    env.close()
 
 
-def test_noise_is_in_grey_levels():
+def test_noise_is_in_grey_levels(world_of):
     pictures = []
     for perturb in ("", "noise=0.2"):
         env, observation, _ = world_of(perturb, camera_size=(96, 96))
@@ -214,7 +208,7 @@ def test_noise_is_in_grey_levels():
     assert np.std(difference) == pytest.approx(KINDS["noise"].amount(0.2), rel=0.03)
 
 
-def test_actions_are_delayed_by_steps():
+def test_actions_are_delayed_by_steps(world_of):
     delay, action = int(KINDS["delay"].amount(0.5)), np.array([0.5, 0, 0, 0, 0, 0, -1.0])
     late, _, _ = world_of("delay=0.5", cameras=())
     plain, _, _ = world_of("", cameras=())
@@ -224,11 +218,9 @@ def test_actions_are_delayed_by_steps():
     for _ in range(3):
         now, then = plain.step(action)[0], late.step(action)[0]
     assert delay == 2 and same([now], [then])
-    late.close()
-    plain.close()
 
 
-def test_distractors_are_so_many_at_rest_and_leave_the_others_where_they_are():
+def test_distractors_are_so_many_at_rest_and_leave_the_others_where_they_are(world_of):
     base, _, _ = world_of("", start=4, cameras=())
     env, _, info = world_of("distractors=0.5", start=4, cameras=())
     scene, old = env.scene, env.batch.base_scene
@@ -242,8 +234,6 @@ def test_distractors_are_so_many_at_rest_and_leave_the_others_where_they_are():
     for _ in range(10):
         env.step(np.zeros(7))
     assert np.allclose(before, [env.view.body_pos(name) for name in added], atol=1e-3)
-    base.close()
-    env.close()
 
 
 def test_every_instruction_of_the_benchmark_can_be_reworded_at_a_given_distance():
@@ -271,37 +261,33 @@ def test_the_edit_distance_counts_tokens_and_clauses_are_split_at_and():
         assert split_clauses(whole) == [whole]
 
 
-def test_an_episode_from_a_seed_is_paired_with_the_same_placement():
+def test_an_episode_from_a_seed_is_paired_with_the_same_placement(closing):
     plain, perturbed = (
-        LiberoEnv(TASK, cameras=()),
-        LiberoEnv(TASK, cameras=(), perturb="robot=0.3,distractors=0.2"),
+        closing(LiberoEnv(TASK, cameras=())),
+        closing(LiberoEnv(TASK, cameras=(), perturb="robot=0.3,distractors=0.2")),
     )
     plain.reset(seed=5)
     first = perturbed.reset(seed=5)[0]
     for name in plain.scene.entities:
         assert np.array_equal(plain.view.body_pos(name), perturbed.view.body_pos(name))
     assert same([first], [perturbed.reset(seed=5)[0]])
-    plain.close()
-    perturbed.close()
 
 
-def test_another_goal_of_the_scene_comes_with_its_instruction():
+def test_another_goal_of_the_scene_comes_with_its_instruction(world_of):
     goals = {task.language: task.problem.goal for task in get_suite("libero_goal").tasks}
     env, _, info = world_of("goal=1", cameras=())
     assert env.task.language != env.batch.base_task.language
     assert env.task.problem.goal == goals[env.task.language] and not info["success"]
     assert env.task.id == TASK and env.scene.problem.objects == env.batch.base_scene.problem.objects
-    env.close()
     env, _, _ = world_of("goal=1", task="libero_object/0", cameras=())  # where no task begins in the same way
     carried = env.task.problem.goal.parts[0].args[0]
     assert env.task.problem.objects[carried].replace("_", " ").removeprefix("new ") in env.task.language
-    env.close()
     with pytest.raises(InvalidInputError, match="goal cannot be combined with"):
         EnvConfig(perturb="goal=1,instruction=0.5")
 
 
 @pytest.mark.parametrize("severity", [0.3, 1.0])
-def test_a_layout_moves_objects_by_metres_and_keeps_what_the_goal_puts_them_on(severity):
+def test_a_layout_moves_objects_by_metres_and_keeps_what_the_goal_puts_them_on(severity, world_of):
     base, _, _ = world_of("", task="libero_object/3", start=9, cameras=())
     env, _, info = world_of(f"layout={severity}", task="libero_object/3", start=9, cameras=())
     before, after = ({n: e.view.body_pos(n) for n in e.scene.objects} for e in (base, env))
@@ -314,20 +300,16 @@ def test_a_layout_moves_objects_by_metres_and_keeps_what_the_goal_puts_them_on(s
         x0, y0, x1, y1 = region.ranges[0]
         x, y, _ = after[name] - env.scene.workspace.offset
         assert x0 - 0.02 < x < x1 + 0.02 and y0 - 0.02 < y < y1 + 0.02  # the task says where they are
-    base.close()
-    env.close()
 
 
-def test_objects_that_places_tell_apart_move_together():
+def test_objects_that_places_tell_apart_move_together(world_of):
     base, _, _ = world_of("", task="libero_spatial/1", cameras=())
     env, _, _ = world_of("layout=0.5", task="libero_spatial/1", cameras=())
     steps = [env.view.body_pos(n) - base.view.body_pos(n) for n in env.scene.objects]
     assert np.allclose(steps, steps[0], atol=1e-9) and np.linalg.norm(steps[0]) == pytest.approx(0.05)
-    base.close()
-    env.close()
 
 
-def test_other_objects_stand_where_those_were_that_the_task_is_not_about():
+def test_other_objects_stand_where_those_were_that_the_task_is_not_about(world_of):
     base, _, _ = world_of("", task="libero_object/3", cameras=())
     env, _, _ = world_of("objects=1", task="libero_object/3", cameras=())
     old, new = base.task.problem.objects, env.task.problem.objects
@@ -336,13 +318,11 @@ def test_other_objects_stand_where_those_were_that_the_task_is_not_about():
     for name in exchanged:
         assert np.allclose(env.view.body_pos(name)[:2], base.view.body_pos(name)[:2], atol=0.01)
     assert np.array_equal(env.view.body_pos("bbq_sauce_1"), base.view.body_pos("bbq_sauce_1"))
-    base.close()
-    env.close()
     with pytest.raises(InvalidInputError, match="no object that could be another"):
         world_of("objects=1", task="libero_90/12")
 
 
-def test_objects_start_at_a_distance_from_their_places_and_carry_what_stands_on_them():
+def test_objects_start_at_a_distance_from_their_places_and_carry_what_stands_on_them(world_of):
     task, start = "libero_spatial/3", 2  # the bowl stands on the cookie box
     base, _, _ = world_of("", task=task, start=start, cameras=())
     env, _, _ = world_of("object_pose=0.6", task=task, start=start, cameras=())
@@ -353,8 +333,6 @@ def test_objects_start_at_a_distance_from_their_places_and_carry_what_stands_on_
     for a, b in (("akita_black_bowl_1", "cookies_1"),):
         apart = [np.linalg.norm(e.view.body_pos(a) - e.view.body_pos(b)) for e in (base, env)]
         assert apart[0] == pytest.approx(apart[1])
-    base.close()
-    env.close()
 
 
 def arriving(name, severity):
@@ -407,7 +385,7 @@ def test_late_pictures_do_not_depend_on_which_are_looked_at():
     env.close()
 
 
-def test_sensors_are_off_by_metres_and_radians():
+def test_sensors_are_off_by_metres_and_radians(world_of):
     entries = ("proprioception", "ee_quat")
     base, right, _ = world_of("", observations=entries)
     env, wrong, _ = world_of("proprio_bias=0.5", observations=entries)
@@ -418,8 +396,6 @@ def test_sensors_are_off_by_metres_and_radians():
     assert 2 * np.arccos(cosine) == pytest.approx(amount, rel=1e-6)
     assert quat_to_axis_angle(wrong["ee_quat"][None])[0] == pytest.approx(wrong["ee_ori"], abs=1e-9)
     assert np.array_equal(env.view.eef_pos, base.view.eef_pos)
-    base.close()
-    env.close()
 
 
 def test_actions_are_scaled_and_noisy_but_not_the_gripper():

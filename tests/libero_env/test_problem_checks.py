@@ -201,12 +201,10 @@ def test_what_the_models_lack_is_one_error_everywhere(old, new, message, tmp_pat
 
 
 @pytest.mark.sim
-def test_the_task_runs_as_long_as_nothing_is_wrong_and_placement_ends_in_seconds():
-    env = LiberoEnv(task(TEXT), cameras=())
+def test_the_task_runs_as_long_as_nothing_is_wrong_and_placement_ends_in_seconds(closing):
+    env = closing(LiberoEnv(task(TEXT), cameras=()))
     env.reset(seed=0)
     assert env.step(np.zeros(7))[4]["progress"]
-    env.close()
-    env = LiberoEnv(task(TEXT.replace("(-0.03 -0.02 0.03 0.02)", "(0.05 0.2 0.05 0.2)")), cameras=())
+    env = closing(LiberoEnv(task(TEXT.replace("(-0.03 -0.02 0.03 0.02)", "(0.05 0.2 0.05 0.2)")), cameras=()))
     with pytest.raises(PlacementError, match="still collide after 500 tries"):
         env.reset(seed=0)
-    env.close()

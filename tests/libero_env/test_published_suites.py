@@ -112,7 +112,7 @@ def test_variants_start_where_their_base_task_does_unless_objects_were_moved(plu
     np.testing.assert_array_equal(load_init_states(robot, build_scene(robot.problem)), base)
     scene = build_scene(moved.problem)
     assert load_init_states(moved, scene).shape == (1, base.shape[1])
-    with LiberoEnvClosing(moved, cameras=()) as env, pytest.raises(InvalidInputError, match="0 to 0"):
+    with LiberoEnv(moved, cameras=()) as env, pytest.raises(InvalidInputError, match="0 to 0"):
         env.reset(options={"init_state": 1})
 
 
@@ -152,13 +152,10 @@ def test_noise_is_on_one_camera_and_depends_on_no_batch(plus):
     before, after = observe(base_task()), observe(task)
     assert (before["agentview_rgb"] != after["agentview_rgb"]).mean() > 0.3
     np.testing.assert_array_equal(before["eye_in_hand_rgb"], after["eye_in_hand_rgb"])
-    env = BatchEnv(task, 2, camera_size=(64, 64), num_threads=1, drawing="faithful")
-    try:
+    with BatchEnv(task, 2, camera_size=(64, 64), num_threads=1, drawing="faithful") as env:
         both, _ = env.reset(options={"init_state": np.array([1, 0])})
-        np.testing.assert_array_equal(both["agentview_rgb"][1], after["agentview_rgb"])
-        assert (both["agentview_rgb"][0] != both["agentview_rgb"][1]).any()
-    finally:
-        env.close()
+    np.testing.assert_array_equal(both["agentview_rgb"][1], after["agentview_rgb"])
+    assert (both["agentview_rgb"][0] != both["agentview_rgb"][1]).any()
 
 
 @pytest.mark.sim
@@ -169,7 +166,7 @@ def test_both_readings_of_the_arms_pose(plus):
     assert overwritten.id != skipped.id
     rows = {}
     for task in (base_task(), overwritten, skipped):
-        with LiberoEnvClosing(task, cameras=()) as env:
+        with LiberoEnv(task, cameras=()) as env:
             env.reset(options={"init_state": 3})
             rows[task.id] = env.simulations.physics_state(0)
             at_rest = joint_pose(0 if task is base_task() else 451)
@@ -287,19 +284,9 @@ def test_all_suites_of_libero_pro_are_read():
         assert all(own) if name.endswith(("_language", "_task")) else not any(own)
 
 
-class LiberoEnvClosing(LiberoEnv):
-    """A `LiberoEnv` that a `with` statement closes."""
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.close()
-
-
 def observe(task) -> dict[str, np.ndarray]:
     """Return the first observation from initial state 0."""
-    with LiberoEnvClosing(task, camera_size=(64, 64), drawing="faithful") as env:
+    with LiberoEnv(task, camera_size=(64, 64), drawing="faithful") as env:
         return env.reset(options={"init_state": 0})[0]
 
 

@@ -1,9 +1,8 @@
 """Files and folders that are replaced in one step."""
 
-import numpy as np
 import pytest
 
-from libero_env.storage import atomic_folder, atomic_path, atomic_write_npz, atomic_write_text, create_text
+from libero_env.storage import atomic_folder, atomic_path, atomic_write_text, create_text
 
 
 @pytest.mark.parametrize("fsync", [False, True])
@@ -25,15 +24,6 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path):
         raise OSError("disk full")
     assert target.read_text() == "old"
     assert list(tmp_path.iterdir()) == [target]
-
-
-def test_arrays_keep_their_names_and_values(tmp_path):
-    arrays = {"a": np.arange(3), "b.digest": np.array("0123")}
-    atomic_write_npz(tmp_path / "arrays.npz", arrays)
-    with np.load(tmp_path / "arrays.npz", allow_pickle=False) as stored:
-        assert list(stored.files) == ["a", "b.digest"]
-        assert stored["a"].tolist() == [0, 1, 2] and str(stored["b.digest"]) == "0123"
-    assert [path.name for path in tmp_path.iterdir()] == ["arrays.npz"]
 
 
 def test_two_writers_of_one_file_do_not_disturb_each_other(tmp_path):

@@ -33,7 +33,7 @@ TASK = {
 
 @pytest.mark.parametrize("task", ALL_TASKS, ids=lambda task: task.id)
 def test_generated_bddl_reads_back(task):
-    assert bddl.parse(task.bddl_text) == task.problem
+    assert bddl.parse(task.bddl_text) == task.problem and bddl.write(task.problem) == task.bddl_text
     assert get_task(task.id) is get_task(f"{task.suite}-{task.index}") is get_task(task.name) is task
     assert task.language == task.language.strip() and "_" not in task.language
     assert pickle.loads(pickle.dumps(task)) == task  # noqa: S301
