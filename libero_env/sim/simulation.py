@@ -334,7 +334,14 @@ class Simulations(ABC):
 
 
 class LoopSimulations(Simulations):
-    """Simulations that are stepped one after the other in the calling thread."""
+    """Simulations that are stepped one after the other in the calling thread.
+
+    Attributes:
+        ends_current: Whether kinematics and contacts are those of the state when `step` ends; otherwise of one substep
+            earlier, as `mj_step` leaves them, and `mj_step1` is to be called before the next `step`.
+    """
+
+    ends_current = True
 
     def __init__(self, model: mujoco.MjModel, num: int = 1, fixture_bodies: Indices = ()):
         super().__init__(model, num, fixture_bodies)
@@ -381,6 +388,8 @@ class LoopSimulations(Simulations):
                 mujoco.mj_step2(model, data)
                 if watch is not None and substep == WATCHED[0]:
                     watch(INTEGRATED, np.array([i]))
+                if substep + 1 == SUBSTEPS and not self.ends_current:
+                    break
                 mujoco.mj_step1(model, data)
                 if watch is not None and substep + 1 in WATCHED:
                     self._gather(np.array([i]))

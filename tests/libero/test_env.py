@@ -98,10 +98,25 @@ def test_horizon(make_env):
     env.reset()
     assert not env.step(REST)[2]
     assert not env.step(REST)[2]
+    env.set_init_state(env.get_sim_state())  # not a reset, as in the original
     with pytest.raises(EpisodeOverError, match="2 steps"):
         env.step(REST)
     env.reset()
     env.step(REST)
+
+
+def test_after_a_step_poses_are_of_the_substep_before_as_mj_step_leaves_them(make_env):
+    env = make_env(**BLIND)
+    env.reset()
+    env.step([1.0] * 7)
+    model, data = env.sim.model._model, env.sim.data
+    left, end = data.xpos.copy(), data.qpos.copy()
+    mujoco.mj_integratePos(model, data.qpos, data.qvel, -model.opt.timestep)
+    env.sim.forward()
+    assert np.allclose(data.xpos, left, rtol=0, atol=1e-12)
+    data.qpos[:] = end
+    env.sim.forward()
+    assert np.abs(data.xpos - left).max() > 1e-5
 
 
 def test_only_the_seed_determines_the_placement(make_env):

@@ -243,6 +243,7 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def _simulate(self, model: mujoco.MjModel) -> None:
         self.simulations = ClientSimulations(model, 1, self.scene.fixture_bodies.tolist())
+        self.simulations.ends_current = False
         self.sim = MjSim(self.simulations, self.get_xml, faithful=self.drawing == FAITHFUL)
         self.view = StateView(self.scene, self.simulations, 0)
         self.simulations.domain = weakref.ref(self)
@@ -316,11 +317,12 @@ class BDDLBaseDomain(RobosuiteMethods):
     def _sample(self) -> Start:
         """Return a settled initial state; the arm holds its pose, whatever the controller."""
         controller, self.simulations.controller_state = self.simulations.controller_state, ControllerState(1)
+        self.simulations.ends_current = True
         try:
             fixtures = None if self._resets is None else self._resets.reset()
             return sample_settled(self.scene, self.simulations, 0, self.rng, fixtures)
         finally:
-            self.simulations.controller_state = controller
+            self.simulations.controller_state, self.simulations.ends_current = controller, False
 
     def restart(self, state: np.ndarray) -> None:
         """Start from [time, qpos, qvel], with or without the poses of the fixtures after it; the arm holds its pose.
@@ -346,7 +348,8 @@ class BDDLBaseDomain(RobosuiteMethods):
     def step(self, action: Any) -> "tuple[OrderedDict[str, np.ndarray], float, bool, dict[str, Any]]":
         """Act for 50 ms; return observation, reward, success, and a dictionary with `success`.
 
-        The observation is of 2 ms before the end, as in the original.
+        The observation is of 2 ms before the end, as in the original. So are poses and contacts in `sim.data`, which
+        success is judged by, until `sim.forward`.
 
         Raises:
             EpisodeOverError: The horizon is reached.

@@ -110,8 +110,7 @@ class ControlEnv:
             self.env.simulations.outdate_controller([0])
 
     def set_init_state(self, init_state: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Set the state, see `BDDLBaseDomain.restart`, and observe it; the horizon counts from here."""
-        self.env.timestep, self.env.done = 0, False
+        """Set the state, see `BDDLBaseDomain.restart`, and observe it; the horizon counts from the reset."""
         return self.regenerate_obs_from_state(init_state)
 
     def regenerate_obs_from_state(self, mujoco_state: np.ndarray) -> Mapping[str, np.ndarray]:
