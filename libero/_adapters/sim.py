@@ -26,6 +26,7 @@ KINDS = {kind: getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}") for kind in _NAME
 _COUNTS = {"body": "nbody", "joint": "njnt", "camera": "ncam", "actuator": "nu"}  # the others are `n<kind>`
 _FREE = mujoco.mjtJoint.mjJNT_FREE
 _SHOWN_SITE_GROUPS = 3  # groups 0 to 2
+_LARGE = 100_000  # [bytes] of arrays of meshes and textures
 
 
 class MjSimState(NamedTuple):
@@ -58,9 +59,11 @@ class MjModel:
     """
 
     def __init__(self, model: mujoco.MjModel, xml: Any = None):
-        self.__dict__.update(_model=model, _xml=xml)
+        self.__dict__.update(_model=model, _xml=xml, _is_drawn_otherwise=False)
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith(("tex", "mesh")):  # what clients asked for, they may have changed
+            self.__dict__["_is_drawn_otherwise"] = True
         for kind in KINDS:
             if name == f"{kind}_name2id":
                 return partial(self._id, kind)
@@ -176,6 +179,49 @@ class ClientSimulations(LoopSimulations):
         bodies = self.fixture_bodies
         return np.concatenate([self.model.body_pos[bodies], self.model.body_quat[bodies]], axis=1)
 
+    def set_rest(self, joints: np.ndarray) -> None:
+        """Let the controller take these joints, (7,) rad, for the arm's rest pose."""
+        if not np.array_equal(joints, self.rest):
+            self.rest = joints
+            vars(self).pop("_rest_fields", None)  # computed from it
+
+
+class BuiltModel:
+    """What a model was when it was built.
+
+    Args:
+        model: The model that is simulated, which clients change.
+        built: Another one, which nobody changes.
+    """
+
+    def __init__(self, model: mujoco.MjModel, built: mujoco.MjModel):
+        self._small: list[tuple[np.ndarray, np.ndarray]] = []
+        self._large: list[tuple[np.ndarray, np.ndarray]] = []
+        self._numbers: list[tuple[Any, str, Any]] = []
+        parts = [(getattr(model, key), getattr(built, key)) for key in ("opt", "stat")]
+        parts += [(getattr(model.vis, key), getattr(built.vis, key)) for key in _public(model.vis)]
+        for part, origin in [(model, built), *parts]:
+            for name in _public(part):
+                value = getattr(origin, name)
+                if isinstance(value, np.ndarray):
+                    few = value.nbytes < _LARGE
+                    (self._small if few else self._large).append((getattr(part, name), value))
+                elif part is not model:
+                    self._numbers.append((part, name, value))
+
+    def restore(self, large: bool) -> None:
+        """Undo all changes of the model; those of meshes and textures if `large`."""
+        for array, origin in self._small + self._large * large:
+            np.copyto(array, origin)
+        for part, name, value in self._numbers:
+            setattr(part, name, value)
+
+
+def _public(part: Any) -> list[str]:
+    """Return the names of the values of one of MuJoCo's structures."""
+    names = (name for name in dir(part) if not name.startswith("_"))
+    return [name for name in names if not callable(getattr(part, name))]
+
 
 class MjSim:
     """The simulation of an environment.
@@ -185,14 +231,21 @@ class MjSim:
 
     Args:
         simulations: One simulation.
+        built: Its model as it was built, which nobody changes.
         xml: Function that returns the scene as MJCF.
         faithful: Whether images are drawn as `libero_env.sim.render.Renderer` describes.
     """
 
     def __init__(
-        self, simulations: LoopSimulations, xml: Callable[[], str] | None = None, *, faithful: bool = True
+        self,
+        simulations: LoopSimulations,
+        built: mujoco.MjModel,
+        xml: Callable[[], str] | None = None,
+        *,
+        faithful: bool = True,
     ):
-        self._simulations = simulations
+        self._simulations, self._origin = simulations, built
+        self._built: BuiltModel | None = None
         self.model = MjModel(simulations.model, xml)
         self.data = MjData(self.model, simulations.data(0))
         self._renderers: dict[tuple[int, int], Renderer] = {}
@@ -201,6 +254,16 @@ class MjSim:
     def reset(self) -> None:
         """Set the state to the initial state of the model."""
         mujoco.mj_resetData(self.model._model, self.data._data)
+
+    def restore_model(self) -> None:
+        """Undo all changes of the model."""
+        if self._built is None:
+            self._built = BuiltModel(self.model._model, self._origin)
+        large = self.model._is_drawn_otherwise
+        self._built.restore(large)
+        if large:  # renderers hold the textures
+            self._free_renderers()
+            self.model.__dict__["_is_drawn_otherwise"] = False
 
     def forward(self) -> None:
         """Compute everything that follows from positions and velocities."""
@@ -295,11 +358,14 @@ class MjSim:
             )
         return self._renderers[height, width]
 
-    def free(self) -> None:
-        """Free GL contexts and the simulation. Idempotent."""
+    def _free_renderers(self) -> None:
         for renderer in self._renderers.values():
             renderer.close()
         self._renderers.clear()
+
+    def free(self) -> None:
+        """Free GL contexts and the simulation. Idempotent."""
+        self._free_renderers()
         self._simulations.close()
 
 

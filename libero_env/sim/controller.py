@@ -20,11 +20,18 @@ import numpy as np
 
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.parallel import compiled
-from libero_env.sim.osc import POSITION_SCALE, goals_from_deltas, goals_from_poses, move_gripper, osc_torques
+from libero_env.sim.osc import (
+    GAINS,
+    POSITION_SCALE,
+    goals_from_deltas,
+    goals_from_poses,
+    move_gripper,
+    osc_torques,
+)
 
 JOINT_SCALE = 0.05  # [rad] at full action
 VELOCITY_SCALE = 0.5  # [rad/s] at full action
-_POINTING_DOWN = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0])  # rotation matrix
+POINTING_DOWN = np.array([0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, -1.0])  # rotation matrix
 _WORKSPACE_LIMIT = 3.0  # [m] bound of absolute positions along each axis
 _JOINT_LOW = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # [rad] limits of the Panda
 _JOINT_HIGH = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)  # [rad]
@@ -33,9 +40,10 @@ VELOCITY_WINDOW = 5  # substeps over which the derivative is averaged
 VELOCITY_MEMORY = (
     7 * VELOCITY_WINDOW + 7 + 2
 )  # errors of the window, their sum, saturated, number of substeps
-_KP = 50.0
-_KD = 2.0 * np.sqrt(50.0)
-_VELOCITY_KP = 3.0  # of the width of the torque range, per rad/s
+_JOINT_GAINS = np.array([[50.0] * 7, [2.0 * np.sqrt(50.0)] * 7])
+_VELOCITY_GAINS = np.full(
+    (2, 7), 3.0
+)  # of the width of the torque range, per rad/s; the second row is not used
 _INTEGRAL, _DERIVATIVE = 0.005, 0.001  # of the proportional gain
 
 SetGoals = Callable[..., None]
@@ -54,6 +62,7 @@ class Controller:
         kernel: Compiled control law, called in each substep; see `libero_env.sim.osc.osc_torques`.
         set_goals: Function that writes new goals at the first substep; called with (ids, actions, qpos, site_pos,
             site_mat, goal, memory).
+        gains: Gains of the kernel on errors and on velocities, (2, 6) or (2, 7).
     """
 
     name: str
@@ -63,6 +72,7 @@ class Controller:
     goal_sizes: tuple[int, int] = field(repr=False)
     kernel: Callable[..., None] = field(repr=False)
     set_goals: SetGoals = field(repr=False)
+    gains: np.ndarray = field(repr=False, compare=False)
 
     @property
     def action_dim(self) -> int:
@@ -147,7 +157,7 @@ def _osc_pose(delta: bool) -> Controller:
         goals_from_poses(ids, np.clip(actions[:, :6], -high[:6], high[:6]), goal, memory)
 
     set_goals = goals_from_deltas if delta else absolute_goals
-    return Controller("osc_pose", delta, -high, high, (3, 9), osc_torques, set_goals)
+    return Controller("osc_pose", delta, -high, high, (3, 9), osc_torques, set_goals, GAINS)
 
 
 def _osc_position(delta: bool) -> Controller:
@@ -156,9 +166,9 @@ def _osc_position(delta: bool) -> Controller:
     def set_goals(ids, actions, qpos, site_pos, site_mat, goal, memory):
         move = np.clip(actions[ids, :3], -high[:3], high[:3])
         goal[ids] = site_pos[ids] + POSITION_SCALE * move if delta else move
-        memory[ids] = _POINTING_DOWN
+        memory[ids] = POINTING_DOWN
 
-    return Controller("osc_position", delta, -high, high, (3, 9), osc_torques, set_goals)
+    return Controller("osc_position", delta, -high, high, (3, 9), osc_torques, set_goals, GAINS)
 
 
 def _joint_position(delta: bool) -> Controller:
@@ -169,17 +179,16 @@ def _joint_position(delta: bool) -> Controller:
         move = np.clip(actions[ids, :7], low[:7], high[:7])
         goal[ids] = qpos[ids, :7] + JOINT_SCALE * move if delta else move
 
-    return Controller("joint_position", delta, low, high, (7, 0), joint_position_torques, set_goals)
+    law = joint_position_torques
+    return Controller("joint_position", delta, low, high, (7, 0), law, set_goals, _JOINT_GAINS)
 
 
 def _joint_velocity(delta: bool) -> Controller:
     def set_goals(ids, actions, qpos, site_pos, site_mat, goal, memory):
         goal[ids] = VELOCITY_SCALE * np.clip(actions[ids, :7], -1.0, 1.0)
 
-    sizes = (7, VELOCITY_MEMORY)
-    return Controller(
-        "joint_velocity", delta, -np.ones(8), np.ones(8), sizes, joint_velocity_torques, set_goals
-    )
+    sizes, law, high = (7, VELOCITY_MEMORY), joint_velocity_torques, np.ones(8)
+    return Controller("joint_velocity", delta, -high, high, sizes, law, set_goals, _VELOCITY_GAINS)
 
 
 CONTROLLERS: dict[str, Callable[[bool], Controller]] = {
@@ -193,7 +202,7 @@ CONTROLLERS: dict[str, Callable[[bool], Controller]] = {
 @compiled
 def joint_position_torques(
     ids, actions, qpos, qvel, xanchor, xaxis, site_pos, site_mat, mass, bias, goal, memory, gripper, ctrl,
-    mass_address, torque_limit, finger_range, rest,
+    mass_address, torque_limit, finger_range, rest, gains,
 ):  # fmt: skip
     """Compute one substep of control of joint positions: tau = M (kp (goal - q) - kd qd) + bias.
 
@@ -203,7 +212,7 @@ def joint_position_torques(
     for k in range(ids.shape[0]):
         i = ids[k]
         for j in range(7):
-            pull[j] = _KP * (goal[i, j] - qpos[i, j]) - _KD * qvel[i, j]
+            pull[j] = gains[0, j] * (goal[i, j] - qpos[i, j]) - gains[1, j] * qvel[i, j]
         for j in range(7):
             tau = bias[i, j]
             for c in range(7):
@@ -215,7 +224,7 @@ def joint_position_torques(
 @compiled
 def joint_velocity_torques(
     ids, actions, qpos, qvel, xanchor, xaxis, site_pos, site_mat, mass, bias, goal, memory, gripper, ctrl,
-    mass_address, torque_limit, finger_range, rest,
+    mass_address, torque_limit, finger_range, rest, gains,
 ):  # fmt: skip
     """Compute one substep of a PID loop on joint velocities, plus bias.
 
@@ -238,7 +247,7 @@ def joint_velocity_torques(
             memory[i, 7 * (VELOCITY_WINDOW - 1) + j] = error
             if memory[i, flag] == 0.0:
                 memory[i, total + j] += error
-            gain = _VELOCITY_KP * 2.0 * torque_limit[j]
+            gain = gains[0, j] * 2.0 * torque_limit[j]
             tau = bias[i, j] + gain * (error + _INTEGRAL * memory[i, total + j] + _DERIVATIVE * change)
             ctrl[i, j] = min(max(tau, -torque_limit[j]), torque_limit[j])
             saturated = saturated or ctrl[i, j] != tau

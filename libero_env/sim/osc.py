@@ -23,6 +23,7 @@ ROTATION_SCALE = 0.5  # [rad] at full action
 GRIPPER_SPEED = 0.01  # change of the command, in [-1, 1], in each substep
 KP = 150.0
 KD = 2.0 * np.sqrt(150.0)
+GAINS = np.array([[KP] * 6, [KD] * 6])
 NULL_KP = 10.0
 NULL_KD = 2.0 * np.sqrt(10.0)
 REST = np.array(REST_QPOS)  # [rad]
@@ -165,14 +166,14 @@ def _substitute(a, b, n):
 @compiled
 def osc_torques(
     ids, actions, qpos, qvel, xanchor, xaxis, site_pos, site_mat, mass, bias, goal_pos, goal_mat, gripper, ctrl,
-    mass_address, torque_limit, finger_range, rest,
+    mass_address, torque_limit, finger_range, rest, gains,
 ):  # fmt: skip
     """Compute one substep of control for the simulations `ids`; torques and finger commands are written to ctrl.
 
     The leading axis of all state arrays is the simulation: actions (n, action_dim), qpos (n, nq), qvel (n, nv), xanchor
     and xaxis (n, njnt, 3), site_pos (n, 3), site_mat (n, 9), mass (n, nM), bias (n, nv), goal_pos (n, 3), goal_mat
-    (n, 9), gripper (n, 2), ctrl (n, nu). The constants of the arm: mass_address (7, 7), torque_limit (7,), finger_range
-    (2, 2), rest (7,).
+    (n, 9), gripper (n, 2), ctrl (n, nu). The constants: mass_address (7, 7), torque_limit (7,), finger_range (2, 2),
+    rest (7,), gains (2, 6) on errors of the pose and on velocities.
     """
     jac = np.empty((6, 7))
     m = np.empty((7, 7))
@@ -219,7 +220,7 @@ def osc_torques(
             for j in range(7):
                 v += jac[r, j] * qvel[i, j]
                 w += jac[3 + r, j] * qvel[i, j]
-            force[r] = KP * (goal_pos[i, r] - site_pos[i, r]) - KD * v
+            force[r] = gains[0, r] * (goal_pos[i, r] - site_pos[i, r]) - gains[1, r] * v
             a, b = (r + 1) % 3, (r + 2) % 3
             error = 0.0
             for c in range(3):
@@ -227,7 +228,7 @@ def osc_torques(
                     site_mat[i, 3 * a + c] * goal_mat[i, 3 * b + c]
                     - site_mat[i, 3 * b + c] * goal_mat[i, 3 * a + c]
                 )
-            torque[r] = KP * 0.5 * error - KD * w
+            torque[r] = gains[0, 3 + r] * 0.5 * error - gains[1, 3 + r] * w
         _solve(linear, force, 3)
         _solve(angular, torque, 3)
         _solve(full, task_pull, 6)

@@ -45,7 +45,7 @@ _CONTROLLED = (
 
 # Substeps after which the original observes: kinematics of the first, positions of the second.
 WATCHED = (SUBSTEPS - 2, SUBSTEPS - 1)
-INTEGRATED = -1  # between integration and kinematics of the second, where it does; of `LoopSimulations` only
+INTEGRATED = -1  # between integration and kinematics of each substep; of `LoopSimulations` only
 
 # The original calls mj_forward twice in each substep. Where that moves the solver's warm start we do it, too.
 _SOLVES_BEFORE_STEP = 2 if FORWARD_WARM_STARTS else 0
@@ -93,10 +93,12 @@ class Simulations(ABC):
         arm: Indices of the arm in the model.
         fields: Field of MjData by name, (num, ...), for reading. Kinematics are those of the current state.
         backend: Backend that steps them.
+        substeps: Number of substeps of a control step; may be set for `LoopSimulations`.
         controller_state: Controller that runs, its goals and gripper commands; may be replaced by another.
     """
 
     backend = Backend()
+    substeps = SUBSTEPS
 
     def __init__(self, model: mujoco.MjModel, num: int, fixture_bodies: Indices = ()):
         log_warnings()
@@ -252,7 +254,8 @@ class Simulations(ABC):
             ids: Indices of the simulations.
             actions: Action of each simulation, (num, action_dim), finite; rows of other simulations are not used.
             watch: Function that is called after each substep of `WATCHED`, with the number of substeps done and the
-                indices of the simulations whose fields are of that moment; by `LoopSimulations` at `INTEGRATED`, too.
+                indices of the simulations whose fields are of that moment; by `LoopSimulations` with `INTEGRATED`
+                in each substep, too.
 
         Raises:
             SimulationError: Some have failed; the others have moved.
@@ -279,7 +282,7 @@ class Simulations(ABC):
         failed, step = {}, self.model.opt.timestep
         for i, time in before.items():
             is_first = abs(time) < 0.5 * step  # a reset in the first substep does not show in the time
-            if abs(self.time(i) - time - SUBSTEPS * step) > 0.5 * step or (
+            if abs(self.time(i) - time - self.substeps * step) > 0.5 * step or (
                 is_first and any(self.data(i).warning[kind].number for kind in _UNSTABLE)
             ):
                 failed[i] = DIVERGED
@@ -330,7 +333,10 @@ class Simulations(ABC):
     @property
     def _constants(self) -> Inputs:
         """Constants that the kernel of a controller takes."""
-        return self.arm.mass_address, self.arm.torque_limit, self.arm.finger_range, self.rest
+        arm = self.arm
+        return (
+            arm.mass_address, arm.torque_limit, arm.finger_range, self.rest, self.controller_state.controller.gains,
+        )  # fmt: skip
 
 
 class LoopSimulations(Simulations):
@@ -380,15 +386,15 @@ class LoopSimulations(Simulations):
             if self.num > 1:
                 self.pose_fixtures(i)
             goals = [array[row] for array in state]
-            for substep in range(SUBSTEPS):
+            for substep in range(self.substeps):
                 for _ in range(_SOLVES_BEFORE_STEP):
                     mujoco.mj_forwardSkip(model, data, mujoco.mjtStage.mjSTAGE_VEL, True)
                 seen = self._inputs_of[i] if first is None or substep else [field[row] for field in first]
                 kernel(only, actions[row], *seen, *goals, ctrl, *constants)
                 mujoco.mj_step2(model, data)
-                if watch is not None and substep == WATCHED[0]:
+                if watch is not None:
                     watch(INTEGRATED, np.array([i]))
-                if substep + 1 == SUBSTEPS and not self.ends_current:
+                if substep + 1 == self.substeps and not self.ends_current:
                     break
                 mujoco.mj_step1(model, data)
                 if watch is not None and substep + 1 in WATCHED:

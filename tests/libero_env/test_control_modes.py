@@ -143,6 +143,7 @@ def test_the_velocity_loop_is_a_pid_with_a_smoothed_derivative_that_stops_summin
             limit,
             np.array([[0.0, 0.04], [-0.04, 0.0]]),
             np.zeros(7),
+            state.controller.gains,
         )
         error = state.goal[0] - velocity
         changes, last = [*changes, error - last][-5:], error

@@ -11,6 +11,14 @@ from typing import Any
 
 import numpy as np
 
+from libero._adapters.arguments import (
+    DEFAULT_NOISE,
+    check_arguments,
+    check_horizon,
+    noise_of,
+    substeps_of,
+    with_room,
+)
 from libero._adapters.lookup import answers, lookup
 from libero._adapters.models import facade_pack
 from libero._adapters.observations import Observer, RobosuiteMethods, cameras, quat_xyzw
@@ -20,7 +28,7 @@ from libero.libero.envs import bddl_utils as BDDLUtils
 from libero.libero.envs.bddl_utils import task_file
 from libero.libero.envs.object_states import BaseObjectState, ObjectState, SiteObjectState
 from libero.libero.envs.predicates import eval_predicate_fn
-from libero.libero.envs.robots import SingleArm, controller_of
+from libero.libero.envs.robots import SingleArm
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
 from libero.libero.utils.utils import postprocess_model_xml
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, ROBOTS
@@ -44,23 +52,15 @@ from libero_env.sim.scene import DRAWINGS, FAITHFUL, build_scene, scene_spec
 from libero_env.sim.simulation import INTEGRATED
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import BUILTIN_PREDICATES
-from libero_env.text import shown
+from libero_env.timing import SUBSTEPS, TIMESTEP
 
 TASK_MAPPING: dict[str, type["BDDLBaseDomain"]] = {}
 CONTROL_FREQ = 20  # Hz
-# Arguments of robosuite or the original that have no effect: the task file decides, or they are about a window.
-WITHOUT_EFFECT = """
-    arena_type custom_material env_configuration env_name gripper_types hard_reset has_offscreen_renderer mount_types
-    object_property_initializers render_collision_mesh render_gpu_device_id render_visual_mesh renderer renderer_config
-    robot_configs scene_properties scene_xml table_friction table_full_size table_offset use_latch
-    visualization_sites_list workspace_name workspace_offset z_offset
-""".split()  # noqa: SIM905
-
-# Those of them that are attributes of robosuite's environments, and their defaults.
+# Arguments in `kwargs` that are attributes of robosuite's environments, and their defaults.
 _KEPT: dict[str, Any] = {
     **{"env_configuration": "default", "has_offscreen_renderer": True, "render_collision_mesh": False},
     **{"render_visual_mesh": True, "render_gpu_device_id": -1, "renderer": "mujoco", "renderer_config": None},
-    **{"object_property_initializers": None, "hard_reset": True},
+    "object_property_initializers": None,
 }
 _FLOOR_OFFSET = (0.0, 0.0, -0.035)  # the original's origin of regions on the floor, m
 
@@ -108,13 +108,6 @@ def register_problem(target_class: type["BDDLBaseDomain"]) -> type["BDDLBaseDoma
     return target_class
 
 
-def _check_horizon(horizon: Any) -> None:
-    """Raise unless a horizon is above 0; robosuite takes infinity, too."""
-    number = isinstance(horizon, int | float | np.integer | np.floating) and not isinstance(horizon, bool)
-    if not number or not horizon > 0:
-        raise InvalidInputError(f"horizon is {shown(horizon)}; expected at least 1")
-
-
 @answers(_NAMES)
 class BDDLBaseDomain(RobosuiteMethods):
     """One simulation of a task file.
@@ -130,8 +123,10 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     Args:
         bddl_file_name: Task file.
-        controller_configs: Controller, `{"type": "OSC_POSE"}`; `control_delta` or `use_delta` for absolute actions.
-        initialization_noise: None for none; otherwise the arm starts near its rest pose.
+        controller_configs: Controller, `{"type": "OSC_POSE"}`, with gains, scales and limits of robosuite;
+            `control_delta` or `use_delta` for absolute actions.
+        initialization_noise: Noise of the arm's joints at a reset: `default`, None for none, or
+            `{"magnitude": 0.02, "type": "gaussian"}`, rad, also of type `uniform`.
         reward_scale: Reward of success.
         has_renderer, render_camera: Whether `render` shows a window, and the camera it shows.
         horizon: Control steps after which `step` raises, unless `ignore_done`.
@@ -141,11 +136,15 @@ class BDDLBaseDomain(RobosuiteMethods):
             `fast`; an addition.
         robot: Model of the arm, `libero` (that of robosuite 1.4.0) or `robosuite-1.4.1`; by default the key `robot` of
             the configuration file, or else `libero`; an addition.
-        kwargs: Arguments of the original's classes in `WITHOUT_EFFECT` are accepted and have no effect.
+        hard_reset: Whether a reset undoes all changes of model, controller and robot, as robosuite's does.
+        scene_xml, scene_properties: Room, see `libero._adapters.arguments.with_room`.
+        kwargs: Other arguments of the original's classes, see `libero._adapters.arguments`; values that would change
+            something there are refused.
 
     Raises:
         BDDLError: The file is not a task file.
-        UnknownNameError: An argument, controller, camera or robot does not exist.
+        UnknownNameError: An argument, controller, camera, style or robot does not exist.
+        InvalidInputError: A value is not valid, or not supported.
     """
 
     def __init__(
@@ -169,16 +168,16 @@ class BDDLBaseDomain(RobosuiteMethods):
         camera_widths: int | Sequence[int] = 256,
         camera_depths: bool | Sequence[bool] = False,
         camera_segmentations: Any = None,
+        hard_reset: bool = True,
+        scene_xml: str | None = None,
+        scene_properties: Mapping[str, str] | None = None,
         drawing: str = FAITHFUL,
         robot: str | None = None,
         **kwargs: Any,
     ):
-        if unknown := [key for key in kwargs if key not in WITHOUT_EFFECT]:
-            valid = [*signature(BDDLBaseDomain).parameters, *WITHOUT_EFFECT]
-            raise UnknownNameError("argument", unknown[0], valid)
-        if control_freq != CONTROL_FREQ:
-            raise LiberoError(f"control_freq={control_freq}: the benchmark runs at {CONTROL_FREQ} Hz")
-        _check_horizon(horizon)
+        check_arguments(kwargs, signature(BDDLBaseDomain).parameters)
+        check_horizon(horizon)
+        self._substeps = substeps_of(control_freq)
         if drawing not in DRAWINGS:
             raise UnknownNameError("drawing", drawing, DRAWINGS)
         self.robot = robot or str(read_config().get("robot") or DEFAULT_ROBOT)
@@ -186,7 +185,7 @@ class BDDLBaseDomain(RobosuiteMethods):
             raise UnknownNameError("robot", self.robot, ROBOTS)
         self.drawing = drawing
         self.bddl_file_name, self.control_freq = task_file(bddl_file_name), control_freq
-        self.problem = BDDLUtils.read_problem(bddl_file_name)
+        self.problem = with_room(BDDLUtils.read_problem(bddl_file_name), scene_xml, scene_properties)
         self.parsed_problem = BDDLUtils.robosuite_parse_problem(bddl_file_name)
         self.obj_of_interest = self.parsed_problem["obj_of_interest"]
         self.conditioned_initial_place_dict: dict[str, Any] = {}
@@ -196,15 +195,15 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.window, self.has_renderer = Window(render_camera) if has_renderer else None, has_renderer
         vars(self).update({key: kwargs.get(key, value) for key, value in _KEPT.items()})
         self._xml_processor: Callable[[str], str] | None = None
-        self.initialization_noise = initialization_noise
+        self.initialization_noise, self.hard_reset = noise_of(initialization_noise), hard_reset
         self.placement_initializer = placement_initializer
         sizes = camera_heights, camera_widths
         self.camera_list = cameras(camera_names, *sizes, camera_depths, camera_segmentations)
         self.camera_names = [camera.name for camera in self.camera_list]
         self.rng = np.random.default_rng()
         self._resets: OriginalResets | None = None
-        self.timestep, self.cur_time, self.done = 0, 0.0, False
-        self._closed = False
+        self._restart_clock()
+        self._is_sampled = self._closed = False
         self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
         self._controller_configs, self._robots, self._xml = controller_configs, robots, ""
         self._load_model()
@@ -244,7 +243,8 @@ class BDDLBaseDomain(RobosuiteMethods):
     def _simulate(self, model: mujoco.MjModel) -> None:
         self.simulations = ClientSimulations(model, 1, self.scene.fixture_bodies.tolist())
         self.simulations.ends_current = False
-        self.sim = MjSim(self.simulations, self.get_xml, faithful=self.drawing == FAITHFUL)
+        self.simulations.substeps = self._substeps
+        self.sim = MjSim(self.simulations, model, self.get_xml, faithful=self.drawing == FAITHFUL)
         self.view = StateView(self.scene, self.simulations, 0)
         self.simulations.domain = weakref.ref(self)
 
@@ -262,7 +262,7 @@ class BDDLBaseDomain(RobosuiteMethods):
             self.object_states_dict[name] = SiteObjectState(self, name, site.parent_name)
         states = self.object_states_dict.values()
         self.tracking_object_states_change = [s for s in states if getattr(s, "has_turnon_affordance", 0)]
-        self.robots = [SingleArm(self, controller_of(controller_configs), robots)]
+        self.robots = [SingleArm(self, controller_configs, robots)]
         parts = [*self.objects, *self.fixtures]
         self.model = TaskModel(scene, self.sim.model._model, self.get_xml, parts, self.robots[0].robot_model)
         self.visualize(dict.fromkeys(self._visualizations, False))
@@ -295,34 +295,62 @@ class BDDLBaseDomain(RobosuiteMethods):
     def reset(self) -> "OrderedDict[str, np.ndarray]":
         """Sample an initial state and observe it; raise a PlacementError if the objects do not fit."""
         self._check_open()
-        if self._xml_processor is not None:
-            self._rebuild(self._xml_processor(self.get_xml()))
+        if self.hard_reset:
+            self._restore()
         self._reset_internal()
-        self.timestep, self.cur_time, self.done = 0, 0.0, False
+        self._restart_clock()
         self.visualize(dict.fromkeys(self._visualizations, False))
         return self._get_observations(force_update=True)
+
+    def _restore(self) -> None:
+        """Undo all changes of model, controller and robot."""
+        if self._xml:
+            self.sim.free()
+            self._xml = ""
+            self._load_model()
+            self._setup_references(self._controller_configs, self._robots)
+        else:
+            self.sim.restore_model()
+            self.robots[0] = SingleArm(self, self._controller_configs, self._robots)
+        if self._xml_processor is not None:
+            self._rebuild(self._xml_processor(self.get_xml()))
+
+    def _restart_clock(self) -> None:
+        self.timestep, self.cur_time, self.done, self._clock = 0, 0.0, False, 0.0
 
     def _reset_internal(self) -> None:
         """Set the state to a sampled initial state; a subclass may change it afterwards."""
         start = self._sample()
         qpos = start.qpos.copy()
-        if self.initialization_noise is None:
-            qpos[: self.scene.nq_robot] = REST_QPOS + OPEN_FINGERS
+        qpos[:7], qpos[7:9] = self._arm_start(start.qpos[:7]), OPEN_FINGERS
+        self.simulations.set_rest(qpos[:7].copy())
+        self.robots[0].reset()
         if self.placement_initializer is not None:
             for name, (pos, quat, *_) in self.placement_initializer.sample().items():
                 joint = self.scene.pose_address(name)
                 qpos[joint : joint + 7] = [*pos, *quat]
         self.restart(np.concatenate([[0.0], qpos, np.zeros(self.scene.model.nv), start.fixtures.ravel()]))
 
+    def _arm_start(self, sampled: np.ndarray) -> np.ndarray:
+        """Return the joints of the arm at a reset, (7,) rad; those of a placement have robosuite's default noise."""
+        robot = self.robots[0]
+        noise, joints = noise_of(robot.initialization_noise), np.array(robot.init_qpos, np.float64)
+        if noise == DEFAULT_NOISE:
+            return sampled + (joints - REST_QPOS)
+        if noise["type"] == "gaussian":
+            return joints + noise["magnitude"] * self.rng.standard_normal(7)
+        return joints + noise["magnitude"] * self.rng.uniform(-1.0, 1.0, 7)
+
     def _sample(self) -> Start:
         """Return a settled initial state; the arm holds its pose, whatever the controller."""
         controller, self.simulations.controller_state = self.simulations.controller_state, ControllerState(1)
-        self.simulations.ends_current = True
+        self.simulations.ends_current, self.simulations.substeps = True, SUBSTEPS
         try:
             fixtures = None if self._resets is None else self._resets.reset()
             return sample_settled(self.scene, self.simulations, 0, self.rng, fixtures)
         finally:
             self.simulations.controller_state, self.simulations.ends_current = controller, False
+            self.simulations.substeps = self._substeps
 
     def restart(self, state: np.ndarray) -> None:
         """Start from [time, qpos, qvel], with or without the poses of the fixtures after it; the arm holds its pose.
@@ -346,10 +374,10 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.simulations.reset([0], qpos, qvel, float(state[0]), fixtures)
 
     def step(self, action: Any) -> "tuple[OrderedDict[str, np.ndarray], float, bool, dict[str, Any]]":
-        """Act for 50 ms; return observation, reward, success, and a dictionary with `success`.
+        """Act for a control period; return observation, reward, success, and a dictionary with `success`.
 
-        The observation is of 2 ms before the end, as in the original. So are poses and contacts in `sim.data`, which
-        success is judged by, until `sim.forward`.
+        Of when the observation is, see `_update_observables`. Poses and contacts in `sim.data`, which success is judged
+        by, are of 2 ms before the end until `sim.forward`, as in the original.
 
         Raises:
             EpisodeOverError: The horizon is reached.
@@ -410,8 +438,17 @@ class BDDLBaseDomain(RobosuiteMethods):
     # Observations -------------------------------------------------------------------------------------------
 
     def _update_observables(self, force: bool = False) -> None:
-        """Observe the present state."""
-        self._observations = self._observe()
+        """Advance robosuite's sampling clock by a physics step, and observe at the first step of each control period.
+
+        Observing by force advances the clock, too (robosuite 1.4.0, `utils/observables.py`): observations of `step`
+        are of as many physics steps before its end as there were calls with `force` after that of `reset`.
+        """
+        self._clock += TIMESTEP
+        if force or not self._is_sampled:
+            self._observations, self._is_sampled = self._observe(), True
+        period = 1.0 / self.control_freq
+        if self._clock >= period:
+            self._clock, self._is_sampled = self._clock % period, False
 
     def _get_observations(self, force_update: bool = False) -> "OrderedDict[str, np.ndarray]":
         """Return the last observation."""
@@ -483,7 +520,8 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.sim.forward()
         present = self.view.eef_pos[None], self.view.eef_mat.reshape(1, 9)
         self.simulations.controller_state.restart(np.zeros(1, np.int64), *present)
-        self.timestep, self.cur_time, self.done = 0, 0.0, False
+        self._restart_clock()
+        self._update_observables(force=True)
 
     def _rebuild(self, xml_string: str) -> None:
         spec = scene_spec(self.problem, self.scene.pack, drawing=self.drawing, robot=self.robot)

@@ -75,7 +75,7 @@ class ControlEnv:
     _visualizations = property(attrgetter("env._visualizations"))
 
     def step(self, action: Any) -> tuple[Mapping[str, np.ndarray], float, bool, dict[str, Any]]:
-        """Act for 50 ms, see `BDDLBaseDomain.step`."""
+        """Act for a control period, see `BDDLBaseDomain.step`."""
         return self.env.step(action)
 
     def reset(self) -> Mapping[str, np.ndarray]:

@@ -1,27 +1,21 @@
 """The arm on its two mounts, and as robosuite offers it: `env.robots[0].controller`, `.gripper`, ..."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from operator import attrgetter
 from typing import Any, ClassVar
 
 import numpy as np
 
+from libero._adapters.controllers import Controller, controller_of
 from libero._adapters.lookup import alias_modules, answers
 from libero._adapters.observations import quat_xyzw
 from libero._adapters.sim import Domain, MjModel, MjSim
 from libero_env.assets.robot import ARM_JOINTS, GRIP_SITE, OPEN_FINGERS, REST_QPOS, add_panda
 from libero_env.envs.checks import checked_actions
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import mujoco
-from libero_env.sim.controller import CONTROLLERS as KINDS
-from libero_env.sim.controller import ControllerState, get_controller
-from libero_env.sim.osc import GRIPPER_SPEED, POSITION_SCALE, ROTATION_SCALE
-
-_GAIN = 150.0  # [1/s^2] of operational space control; robosuite's controllers/config/osc_pose.json
-_SCALES = np.array([POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3)
-CONTROLLERS = tuple(name.upper() for name in KINDS)
-
+from libero_env.sim.osc import GRIPPER_SPEED
 
 _ELEMENTS = ("body", "joint", "actuator", "site", "sensor", "camera")
 _PART: dict[str, Callable[[Any], Any]] = {
@@ -155,79 +149,6 @@ class OnTheGroundPanda(Panda):
     }
 
 
-def controller_of(configs: Any) -> dict[str, Any]:
-    """Return the configuration of the controller; raise an UnknownNameError if it does not exist.
-
-    Args:
-        configs: Configuration, list of one configuration, name of the controller, or None for the default.
-    """
-    if isinstance(configs, Sequence) and not isinstance(configs, str):
-        configs = configs[0] if configs else None
-    config = {"type": configs} if isinstance(configs, str) else dict(configs or {})
-    config.setdefault("type", "OSC_POSE")
-    if config["type"] not in CONTROLLERS:
-        raise UnknownNameError("controller", config["type"], CONTROLLERS)
-    return config
-
-
-class Controller:
-    """Goals of the arm.
-
-    Attributes:
-        name: Name of the controller, such as `OSC_POSE`.
-        goal_pos, goal_ori: Goal of the grip site under operational space control, (3,) m and (3, 3).
-    """
-
-    def __init__(self, env: Domain, config: Mapping[str, Any]):
-        self._env, self.name = env, config["type"]
-        delta = bool(config.get("control_delta", config.get("use_delta", True)))
-        env.simulations.controller_state = ControllerState(1, get_controller(self.name.lower(), delta))
-
-    _state = property(attrgetter("_env.simulations.controller_state"))
-    goal_pos = property(lambda self: self._state.goal[0])
-    goal_ori = property(lambda self: self._state.memory[0].reshape(3, 3))
-    ee_pos = property(attrgetter("_env.view.eef_pos"), doc="Position of the grip site, (3,) m.")
-    ee_ori_mat = property(attrgetter("_env.view.eef_mat"), doc="Orientation of the grip site, (3, 3).")
-    joint_pos = property(lambda self: self._env.sim.data.qpos[:7].copy(), doc="Joint positions, (7,) rad.")
-
-    @property
-    def use_delta(self) -> bool:
-        """Whether actions are relative to the present pose; may be set at any time."""
-        return self._state.controller.control_delta
-
-    @use_delta.setter
-    def use_delta(self, value: bool) -> None:
-        self._state.controller = get_controller(self.name.lower(), bool(value))
-
-    kp = property(lambda self: np.full(6, _GAIN), doc="Gains on pose errors, (6,) 1/s^2.")
-    kd = property(lambda self: np.full(6, 2 * np.sqrt(_GAIN)), doc="Gains on velocities, (6,).")
-    input_max = property(lambda self: np.ones(self.control_dim), doc="Largest action, without the gripper.")
-    input_min = property(lambda self: -np.ones(self.control_dim), doc="Smallest action, without the gripper.")
-    output_max = property(
-        lambda self: _SCALES[: self.control_dim], doc="Motion of the largest action, m and rad."
-    )
-    output_min = property(lambda self: -_SCALES[: self.control_dim], doc="Motion of the smallest action.")
-
-    @property
-    def control_dim(self) -> int:
-        """Length of an action without the gripper."""
-        return self._state.controller.action_dim - 1
-
-    def update(self, force: bool = False) -> None:
-        """Measure the arm, if forced; otherwise do nothing: kinematics are read when they are needed."""
-        if force:
-            self._env.simulations.update_controller([0])
-
-    def update_base_pose(self, base_pos: Any = None, base_ori: Any = None) -> None:
-        """Do nothing: goals are in the world frame."""
-
-    def reset_goal(self) -> None:
-        """Set the goal to the present pose; the command of the gripper stays."""
-        gripper = self._state.gripper[0].copy()
-        self._state.restart(np.zeros(1, np.int64), self.ee_pos[None], self.ee_ori_mat.reshape(1, 9))
-        self._state.gripper[0] = gripper
-
-
 class PandaGripper(ModelPart):
     """The two fingers.
 
@@ -312,7 +233,7 @@ class SingleArm:
     idn, dof, has_gripper, gripper_type, mount_type = 0, 8, True, "default", "default"
     eef_rot_offset = np.array([0.0, 0.0, -0.9241889, 0.3825449], np.float32)
 
-    def __init__(self, env: Domain, config: Mapping[str, Any], robots: Any = ("Panda",)):
+    def __init__(self, env: Domain, config: Any, robots: Any = ("Panda",)):
         names = [robots] if isinstance(robots, str) else list(robots)
         if len(names) != 1 or not str(names[0]).endswith("Panda"):
             raise LiberoError(f"robots={names}: the benchmark has one arm; pass ['Panda']")
@@ -321,10 +242,9 @@ class SingleArm:
         self.robot_model, self.name = kind(sim=env.sim), kind.__name__
         (self.gripper,) = self.robot_model.grippers.values()
         self.gripper._env = env
-        self.controller = Controller(env, config)
-        self.controller_config = dict(config)
+        self.controller_config = controller_of(config)
         self.init_qpos = self.robot_model.init_qpos
-        self.initialization_noise = noise_of(env.initialization_noise)
+        self.initialization_noise = dict(env.initialization_noise)
         self._ref_joint_indexes = self.joint_indexes = self._ref_joint_actuator_indexes = list(range(7))
         self._ref_joint_gripper_actuator_indexes = [7, 8]
         self._ref_joint_pos_indexes = self._ref_joint_vel_indexes = list(np.arange(7, dtype=np.int32))
@@ -334,7 +254,7 @@ class SingleArm:
         self.eef_site_id, self.eef_cylinder_id = (
             env.sim.model.site_name2id(sites[name]) for name in ("grip_site", "grip_cylinder")
         )
-        self.recent_qpos, self.recent_actions = Recent(7), Recent(self.action_dim)
+        self.reset()
 
     _hand_pos = property(lambda self: self.sim.data.get_body_xpos(self.robot_model.eef_name).copy())
     _hand_orn = property(lambda self: self.sim.data.get_body_xmat(self.robot_model.eef_name).copy())
@@ -343,8 +263,13 @@ class SingleArm:
     @property
     def action_limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest action."""
-        controller = self._env.simulations.controller_state.controller
-        return controller.low.copy(), controller.high.copy()
+        low, high = self.controller.control_limits
+        return np.append(low, -1.0), np.append(high, 1.0)
+
+    def reset(self) -> None:
+        """Make the controller anew, from `controller_config`; it takes the present rest pose for its own."""
+        self.controller = Controller(self._env, controller_of(self.controller_config))
+        self.recent_qpos, self.recent_actions = Recent(7), Recent(self.action_dim)
 
     def set_robot_joint_positions(self, jpos: Any) -> None:
         """Set the joint positions, (7,) rad."""
@@ -393,12 +318,6 @@ class SingleArm:
         self.recent_qpos.push(self._joint_positions)
         self.recent_actions.push(action)
         return action
-
-
-def noise_of(noise: Any) -> dict[str, Any]:
-    """Return robosuite's noise of the first joint positions: `magnitude` and `type`."""
-    named = {"magnitude": {None: 0.0, "default": 0.02}.get(noise), "type": "gaussian"}
-    return dict(noise) if isinstance(noise, Mapping) else named
 
 
 ROBOT_CLASS_MAPPING = dict.fromkeys(("Panda", "MountedPanda", "OnTheGroundPanda"), SingleArm)

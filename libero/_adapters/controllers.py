@@ -1,0 +1,262 @@
+"""Controllers of the arm with the configurations and attributes of robosuite 1.4.0 (`controllers/*.py` there)."""
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import replace
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+
+from libero._adapters.sim import Domain
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.sim.controller import POINTING_DOWN, ControllerState, get_controller
+from libero_env.sim.osc import goals_from_poses, move_gripper, rotate
+from libero_env.text import shown
+
+# robosuite's controllers/config/*.json
+_MOVES, _TURNS = [0.05] * 3, [0.5] * 3  # m and rad
+_INPUT = {"input_max": 1, "input_min": -1}
+_GAINS = {
+    "damping_ratio": 1,
+    "impedance_mode": "fixed",
+    "kp_limits": [0, 300],
+    "damping_ratio_limits": [0, 10],
+}
+_RAMP = {"interpolation": None, "ramp_ratio": 0.2}
+_POSE = {"output_max": _MOVES + _TURNS, "output_min": [-x for x in _MOVES + _TURNS], "kp": 150}
+_POSITION = {"output_max": _MOVES, "output_min": [-x for x in _MOVES], "kp": 150}
+_JOINTS = {"output_max": 0.05, "output_min": -0.05, "kp": 50}
+_SPEEDS = {"output_max": 0.5, "output_min": -0.5, "kp": 3.0, "velocity_limits": [-1, 1]}
+_TORQUES = {"output_max": 0.1, "output_min": -0.1, "torque_limits": None}
+_POSES = {"orientation_limits": None, "uncouple_pos_ori": True}
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "OSC_POSE": {
+        **_INPUT,
+        **_POSE,
+        **_GAINS,
+        "position_limits": None,
+        **_POSES,
+        "control_delta": True,
+        **_RAMP,
+    },
+    "OSC_POSITION": {
+        **_INPUT,
+        **_POSITION,
+        **_GAINS,
+        "position_limits": None,
+        "control_delta": True,
+        **_RAMP,
+    },
+    "JOINT_POSITION": {**_INPUT, **_JOINTS, **_GAINS, "qpos_limits": None, **_RAMP},
+    "JOINT_VELOCITY": {**_INPUT, **_SPEEDS, **_RAMP},
+    "JOINT_TORQUE": {**_INPUT, **_TORQUES, **_RAMP},
+}
+_PANDA = {"type": "JOINT_VELOCITY", "kp": 0.03}  # default_panda.json
+# Keys that have one value here; the others of robosuite are obeyed, or have no effect with these values.
+_FIXED: dict[str, Any] = {"impedance_mode": "fixed", "interpolation": None, **_POSES}
+_SET_BY_ROBOT = "robot_name sim eef_name eef_rot_offset joint_indexes actuator_range policy_freq ndim".split()  # noqa: SIM905
+_LIMITS = ("position_limits", "qpos_limits", "velocity_limits", "torque_limits")
+
+
+def controller_of(configs: Any) -> dict[str, Any]:
+    """Return the whole configuration of a controller, with robosuite's values for keys that are left out.
+
+    Args:
+        configs: Configuration, list of one configuration, name of the controller, or None for robosuite's default.
+
+    Raises:
+        UnknownNameError: There is no such controller, or a key is not one of its configuration.
+        LiberoError: A value is not supported.
+    """
+    if isinstance(configs, Sequence) and not isinstance(configs, str):
+        configs = configs[0] if configs else None
+    configs = _PANDA if configs is None else configs
+    given = configs if isinstance(configs, Mapping) else {"type": configs}
+    config = {key: value for key, value in given.items() if key not in _SET_BY_ROBOT}
+    kind = config.setdefault("type", "OSC_POSE")
+    if kind not in DEFAULTS:
+        raise UnknownNameError("controller", kind, DEFAULTS)
+    if "use_delta" in config:  # as the attribute is called
+        config["control_delta"] = config.pop("use_delta")
+    valid = ["type", "control_delta", *DEFAULTS[kind]]
+    for key, value in config.items():
+        if key not in valid:
+            raise UnknownNameError(f"key of the controller {kind}", key, valid)
+        if key in _FIXED and value != _FIXED[key]:
+            raise LiberoError(
+                f"controller {kind}, {key}={shown(value)}: not supported; leave {_FIXED[key]!r}"
+            )
+    return deepcopy({"type": kind, **DEFAULTS[kind], **config})
+
+
+class Controller:
+    """Goals, gains and limits of the arm. They may be set, and count from the next step to the next reset.
+
+    Attributes:
+        name: Name of the controller, such as `OSC_POSE`.
+        control_dim: Length of an action without the gripper.
+        input_min, input_max, output_min, output_max: Ranges of an action, and what they mean, (control_dim,).
+        position_limits, velocity_limits, torque_limits: Bounds of goals, (2, n): m, rad, rad/s or N m; None for none.
+        initial_joint: Joints towards which operational space control pulls, (7,) rad.
+    """
+
+    def __init__(self, env: Domain, config: Mapping[str, Any]):
+        self._env, self.name = env, config["type"]
+        self.use_delta = bool(config.get("control_delta", True))
+        self.control_dim = self._law.action_dim - 1
+        for key in ("input_max", "input_min", "output_max", "output_min"):
+            setattr(self, key, self._numbers(config, key, self.control_dim))
+        self.position_limits = self.velocity_limits = self.torque_limits = None
+        for key in _LIMITS:
+            if config.get(key) is not None:
+                setattr(self, key.replace("qpos", "position"), self._bounds(config, key))
+        law = replace(self._law, set_goals=self._set_goals, gains=self._gains(config))
+        if self.name == "JOINT_TORQUE":
+            law = replace(law, kernel=_given_torques)
+        env.simulations.controller_state = ControllerState(1, law)
+        self.initial_joint = env.simulations.rest
+
+    def _gains(self, config: Mapping[str, Any]) -> np.ndarray:
+        gains = self._law.gains.copy()
+        if "kp" in config:
+            gains[0] = self._numbers(config, "kp", gains.shape[1])
+        if "damping_ratio" in config:
+            gains[1] = 2 * np.sqrt(gains[0]) * self._numbers(config, "damping_ratio", gains.shape[1])
+        if self.name == "JOINT_VELOCITY" and np.ndim(config["kp"]):  # a list is not of the torque range
+            gains[0] /= 2 * self._env.simulations.arm.torque_limit
+        return gains
+
+    def _numbers(self, config: Mapping[str, Any], key: str, count: int) -> np.ndarray:
+        try:
+            values = np.asarray(config[key], np.float64)
+            if values.ndim <= 1 and np.isfinite(values).all() and (key != "kp" or (values >= 0).all()):
+                return np.array(np.broadcast_to(values, (count,)))
+        except (TypeError, ValueError):
+            pass
+        raise self._invalid(config, key, f"a number, or {count} numbers")
+
+    def _bounds(self, config: Mapping[str, Any], key: str) -> np.ndarray:
+        n = 3 if self.name.startswith("OSC") else 7
+        try:
+            low, high = config[key]
+            bounds = np.stack([np.broadcast_to(np.asarray(end, np.float64), (n,)) for end in (low, high)])
+            if not np.isnan(bounds).any():
+                return bounds
+        except (TypeError, ValueError):
+            pass
+        raise self._invalid(config, key, f"two rows of {n} numbers, lowest and highest")
+
+    def _invalid(self, config: Mapping[str, Any], key: str, expected: str) -> InvalidInputError:
+        return InvalidInputError(f"controller {self.name}: {key}={shown(config[key])}; expected {expected}")
+
+    # The meaning of an action -------------------------------------------------------------------------------
+
+    def scale_action(self, action: Any) -> np.ndarray:
+        """Return what an action without the gripper means, from the ranges of input and output."""
+        scale = abs(self.output_max - self.output_min) / abs(self.input_max - self.input_min)
+        middle, centre = (self.input_max + self.input_min) / 2.0, (self.output_max + self.output_min) / 2.0
+        return (np.clip(action, self.input_min, self.input_max) - middle) * scale + centre
+
+    def _set_goals(self, ids, actions, qpos, site_pos, site_mat, goal, memory):
+        """See `libero_env.sim.controller.Controller`."""
+        move, limits = actions[0, : self.control_dim], self.position_limits
+        wanted = (
+            self.scale_action(move)
+            if self.use_delta
+            else np.clip(move, self._law.low[:-1], self._law.high[:-1])
+        )
+        if self.name == "OSC_POSE" and not self.use_delta:
+            goals_from_poses(ids, wanted[None], goal, memory)
+        elif self.name == "OSC_POSE" and wanted[3:].any():
+            rotate(wanted[3:], site_mat[0], memory[0])
+        elif self.name == "OSC_POSITION":
+            memory[0] = POINTING_DOWN
+        start = 0.0
+        if self.name == "JOINT_VELOCITY":
+            limits = self.velocity_limits
+        elif self.name == "JOINT_TORQUE":
+            most = self._env.simulations.arm.torque_limit
+            limits = (-most, most) if self.torque_limits is None else self.torque_limits
+        elif self.use_delta:
+            start = site_pos[0] if self.name.startswith("OSC") else qpos[0, :7]
+        goal[0] = start + wanted[: goal.shape[1]]
+        if limits is not None:
+            goal[0] = np.clip(goal[0], *limits)
+
+    @property
+    def use_delta(self) -> bool:
+        """Whether actions are relative to the present pose; may be set at any time."""
+        return self._law.control_delta
+
+    @use_delta.setter
+    def use_delta(self, value: bool) -> None:
+        is_torque = self.name == "JOINT_TORQUE"  # absolute neither, as joint velocities
+        name = "joint_position" if is_torque and value else self.name.lower()
+        self._law = get_controller(name, bool(value))
+
+    @property
+    def control_limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest action without the gripper; a range of input is that of relative actions."""
+        if self.use_delta:
+            return self.input_min, self.input_max
+        return self._law.low[:-1], self._law.high[:-1]
+
+    # State --------------------------------------------------------------------------------------------------
+
+    _state = property(attrgetter("_env.simulations.controller_state"))
+    goal_pos = property(lambda self: self._state.goal[0], doc="Goal of the grip site, (3,) m.")
+    goal_ori = property(
+        lambda self: self._state.memory[0].reshape(3, 3), doc="Goal of its orientation, (3, 3)."
+    )
+    ee_pos = property(attrgetter("_env.view.eef_pos"), doc="Position of the grip site, (3,) m.")
+    ee_ori_mat = property(attrgetter("_env.view.eef_mat"), doc="Orientation of the grip site, (3, 3).")
+    joint_pos = property(lambda self: self._env.sim.data.qpos[:7].copy(), doc="Joint positions, (7,) rad.")
+
+    @property
+    def kp(self) -> np.ndarray:
+        """Gains on errors, (6,) of poses or (7,) of joints."""
+        kp = self._state.controller.gains[0]
+        return kp * 2 * self._env.simulations.arm.torque_limit if self.name == "JOINT_VELOCITY" else kp
+
+    @kp.setter
+    def kp(self, value: Any) -> None:
+        self._set_gains(0, value)
+
+    @property
+    def kd(self) -> np.ndarray:
+        """Gains on velocities, (6,) or (7,)."""
+        return 0.001 * self.kp if self.name == "JOINT_VELOCITY" else self._state.controller.gains[1]
+
+    @kd.setter
+    def kd(self, value: Any) -> None:
+        self._set_gains(1, value)
+
+    def _set_gains(self, row: int, value: Any) -> None:
+        if self.name in ("JOINT_VELOCITY", "JOINT_TORQUE"):
+            raise InvalidInputError(f"controller {self.name}: its gains are those of the configuration")
+        gains = self._state.controller.gains
+        gains[row] = self._numbers({"value": value}, "value", gains.shape[1])
+
+    def update(self, force: bool = False) -> None:
+        """Measure the arm, if forced; otherwise do nothing: kinematics are read when they are needed."""
+        if force:
+            self._env.simulations.update_controller([0])
+
+    def update_base_pose(self, base_pos: Any = None, base_ori: Any = None) -> None:
+        """Do nothing: goals are in the world frame."""
+
+    def reset_goal(self) -> None:
+        """Set the goal to the present pose; the command of the gripper stays."""
+        gripper = self._state.gripper[0].copy()
+        self._state.restart(np.zeros(1, np.int64), self.ee_pos[None], self.ee_ori_mat.reshape(1, 9))
+        self._state.gripper[0] = gripper
+
+
+def _given_torques(
+    ids, actions, qpos, qvel, xanchor, xaxis, site_pos, site_mat, mass, bias, goal, memory, gripper, ctrl,
+    mass_address, torque_limit, finger_range, rest, gains,
+):  # fmt: skip
+    """Write the torques of the goal plus bias; arguments as in `libero_env.sim.osc.osc_torques`, of one simulation."""
+    ctrl[0, :7] = np.clip(goal[0] + bias[0, :7], -torque_limit, torque_limit)
+    move_gripper(actions[0, 7], gripper[0], ctrl[0], finger_range)
