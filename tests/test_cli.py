@@ -20,6 +20,7 @@ from libero_env.cli import main as cli
 from libero_env.cli.doctor import Finding
 from libero_env.errors import MAX_LISTED, UnknownNameError
 from libero_env.tasks import bddl, get_suite, get_task
+from lifelong.cli import gpu
 from lifelong.cli.runs import check_torch
 
 ROOT = Path(__file__).parents[1]
@@ -213,6 +214,56 @@ importlib.import_module = without_egl
     monkeypatch.setattr(doctor, "_PROBE", no_egl + doctor._PROBE)
     finding = doctor.check_gl()
     assert finding.ok and finding.detail.startswith("osmesa on"), finding.detail
+
+
+def test_doctor_says_in_one_line_that_there_is_no_gpu(monkeypatch, capsys):
+    monkeypatch.setenv("PATH", "")
+    assert cli.main(["doctor", "--gpu"]) == 1
+    found, remedy = capsys.readouterr().out.splitlines()
+    assert found.startswith("FAIL  GPU:") and "nvidia-smi finds none" in found and "without a GPU" in remedy
+
+
+@pytest.mark.parametrize(
+    ("cuda", "ok"), [("12.8", True), ("12.4", True), ("12.3", False), ("13.0", True), ("", False)]
+)
+def test_doctor_reads_the_driver(tmp_path, monkeypatch, cuda, ok):
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text(f"#!/bin/sh\n[ $# = 0 ] && echo '| CUDA Version: {cuda} |' || echo 'H100, 580.126'\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/bin")
+    monkeypatch.setattr(doctor, "check_renderers", lambda n: Finding(f"{n} renderers", ""))
+    monkeypatch.setattr(doctor, "check_warp", lambda device: Finding(device, ""))
+    monkeypatch.setattr("lifelong.cli.gpu.examine", lambda: [Finding("torch", "")])
+    driver, *others = doctor.examine_gpu()
+    titles = [finding.title for finding in others]
+    assert driver.ok is ok and driver.detail.startswith("H100, 580.126") and cuda in driver.detail
+    assert {"1 renderers", "4 renderers"} < set(titles) and titles[-2:] == ["cuda:0", "torch"]
+
+
+def test_a_probe_that_fails_or_hangs_is_told_by_its_last_line():
+    assert doctor.run_probe(["-c", "print('found'); print('it')"]) == (True, "it")
+    assert doctor.run_probe(["-c", "import sys; print('it'); sys.exit('it differs')"]) == (
+        False,
+        "it differs",
+    )
+    assert doctor.run_probe(["-c", "import time; time.sleep(60)"], 0.1) == (False, "no answer within 0.1 s")
+
+
+@pytest.mark.parametrize("name", [n for n in gpu.PROBES if n != "compiled kernel"])
+def test_what_a_gpu_is_asked_for_works_on_the_processor(name, monkeypatch):
+    assert gpu.PROBES[name][0]("cpu")
+    if name == "training step":
+        monkeypatch.setattr(gpu, "TOLERANCE", -1.0)
+        with pytest.raises(SystemExit, match="after three training steps the loss is"):
+            gpu.train_three_steps("cpu")
+
+
+@pytest.mark.slow
+@pytest.mark.sim
+def test_what_compiles_on_a_gpu_compiles_on_the_processor():
+    pytest.importorskip("mujoco_warp")
+    assert doctor.check_warp("cpu").detail.endswith("differs from the processor's by 0e+00")
+    assert gpu.check("compiled kernel", "cpu").ok
 
 
 def test_doctor_finds_what_is_not_installed():

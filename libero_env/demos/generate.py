@@ -7,6 +7,7 @@ recorded before, or on how often the recording was interrupted.
 import json
 import sys
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -31,23 +32,23 @@ from libero_env.tasks import Task, get_suite
 _WAIT_SECONDS = 600.0  # between two lines about the process that is waited for
 
 
-class DemoJob:
+class DemoJob(ABC):
     """A demonstration file to make, of which some demonstrations may be there."""
 
     path: Path
 
-    @cached_property
+    @property
+    @abstractmethod
     def writer(self) -> DemoWriter:
         """Writer of the file."""
-        raise NotImplementedError
 
+    @abstractmethod
     def missing(self, n: int) -> set[int]:
         """Return which of the first `n` demonstrations are not there.
 
         Raises:
             DemoError: What is there is broken, or of another configuration.
         """
-        raise NotImplementedError
 
     def is_complete(self, n: int) -> bool:
         """Return whether the file is finished and has the first `n` demonstrations."""

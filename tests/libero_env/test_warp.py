@@ -12,6 +12,7 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, LiberoError, SimulationError, UnknownNameError
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.expert import MAX_STEPS
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim import backend as backends
 from libero_env.sim.appearance import Appearance
 from libero_env.sim.backend import Backend
@@ -20,7 +21,7 @@ from libero_env.sim.predicates import register_predicate
 from libero_env.tasks.problem import And, Atom, ForAll, Not, Or
 
 wp = pytest.importorskip("warp")
-pytest.importorskip("mujoco_warp")
+mjw = pytest.importorskip("mujoco_warp")
 warp_simulations = pytest.importorskip("libero_env.sim.mjwarp.simulations")
 wp.config.optimization_level = 0  # kernels compile in a third of the time
 
@@ -434,3 +435,68 @@ def test_the_expert_succeeds_as_often():
     }
     assert won["mujoco"].mean() > 0.9
     assert abs(won[WARP].mean() - won["mujoco"].mean()) <= 0.02
+
+
+MESH = np.random.default_rng(0).normal(size=(12, 3))  # twelve corners of a convex body of a few centimetres
+MESH = 0.05 * MESH / np.linalg.norm(MESH, axis=1, keepdims=True)
+
+
+def contact_scene(*bodies):
+    """A model of free bodies, each a position and a geom, and of fixed geoms, each with a position of its own."""
+    placed = [
+        geom if where is None else f'<body pos="{where}"><freejoint/>{geom}</body>' for where, geom in bodies
+    ]
+    corners = " ".join(f"{x:.9f}" for x in MESH.ravel())
+    mesh = f'<asset><mesh name="m" vertex="{corners}"/></asset>'
+    return mujoco.MjModel.from_xml_string(f"<mujoco>{mesh}<worldbody>{''.join(placed)}</worldbody></mujoco>")
+
+
+def beside(geom, gap=0.03):
+    mesh = f'<geom type="mesh" mesh="m" margin="{gap}"/>'
+    return contact_scene(("0 0 0", mesh), ("0.12 0.01 0", f'<geom {geom} margin="{gap}"/>'))
+
+
+def overlapping(away):
+    mesh = '<geom type="mesh" mesh="m" gap="0.01"/>'
+    return contact_scene((f"0 {away} 0", mesh), (f"0.08 {away} 0.01", mesh))
+
+
+TABLE, BOX = '<geom type="box" size="0.3 0.3 0.02"/>', '<geom type="box" size="0.1 0.1 0.1"/>'
+CYLINDER = '<geom type="cylinder" size="0.014 0.03" euler="0 90 0"/>'
+CONTACT_SCENES = {  # with errors of MuJoCo Warp before 4.0.0, by its issues: seconds to simulate, largest error [m]
+    "overlapping meshes (1527)": (lambda: overlapping(0.0), 0.0, 1e-6),
+    "far from the origin (1546)": (lambda: overlapping(1.0), 0.0, 1e-6),
+    "sphere near a mesh (1649)": (lambda: beside('type="sphere" size="0.05"'), 0.0, 1e-6),
+    "box near a mesh (1649)": (lambda: beside('type="box" size="0.05 0.05 0.05"'), 0.0, 1e-6),
+    "capsule near a mesh (1649)": (lambda: beside('type="capsule" size="0.05 0.05"'), 0.0, 1e-6),
+    "lying cylinder (1555)": (lambda: contact_scene((None, TABLE), ("0 0 0.034", CYLINDER)), 0.5, 1e-4),
+    "stacked boxes (1526)": (
+        lambda: contact_scene((None, TABLE), ("0 0 0.12", BOX), ("0.01 0 0.32", BOX)),
+        0.5,
+        1e-4,
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CONTACT_SCENES)
+def test_contacts_that_were_wrong_once_are_those_of_mujoco(name):
+    make, seconds, error = CONTACT_SCENES[name]
+    model = make()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    with wp.ScopedDevice("cpu"):
+        on_device = mjw.put_model(model)
+        worlds = mjw.put_data(model, data, nworld=1, nconmax=32, njmax=128)
+        mjw.forward(on_device, worlds)
+        for _ in range(round(seconds / model.opt.timestep)):
+            mujoco.mj_step(model, data)
+            mjw.step(on_device, worlds)
+        if seconds:
+            assert max(abs(data.qvel[:3]).max(), abs(worlds.qvel.numpy()[0, :3]).max()) < 2e-3, "it rests"
+            np.testing.assert_allclose(worlds.qpos.numpy()[0], data.qpos, atol=error)
+        count = int(worlds.nacon.numpy()[0])
+        assert count == data.ncon > 0 and int(worlds.nefc.numpy()[0]) == data.nefc
+        np.testing.assert_allclose(
+            np.sort(worlds.contact.dist.numpy()[:count]), np.sort(data.contact.dist), atol=error
+        )
