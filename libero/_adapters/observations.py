@@ -6,12 +6,12 @@ Quaternions are xyzw, pictures have the lowest row first.
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import partial, partialmethod
 from typing import Any
 
 import numpy as np
 
-from libero._adapters.lookup import lookup
+from libero._adapters.lookup import answers, lookup
 from libero._adapters.sim import MjSim
 from libero_env.assets.robot import GRIP_SITE
 from libero_env.errors import LiberoError, UnknownNameError
@@ -229,7 +229,26 @@ class Observable:
             value = function(value)
         self.obs = obs_cache[self.name] = value
 
+    def reset(self) -> None:
+        """Do nothing: no value of the last episode is kept."""
 
+
+for _setting in _SETTERS:
+    setattr(Observable, f"set_{_setting}", partialmethod(Observable.set, _setting))
+
+
+def _those(env: Any, is_so: Callable[[Any], bool]) -> set[str]:
+    return {name for name, observable in env._observables.items() if is_so(observable)}
+
+
+@answers(
+    {
+        "observation_names": lambda env: set(env._observables),
+        "enabled_observables": lambda env: _those(env, lambda observable: observable.is_enabled()),
+        "active_observables": lambda env: _those(env, lambda observable: observable.is_active()),
+        "observation_modalities": lambda env: {o.modality for o in env._observables.values()},
+    }
+)
 class RobosuiteMethods:
     """Contacts and observables of an environment with `sim`, `observer` and `control_freq`."""
 
@@ -295,35 +314,14 @@ class RobosuiteMethods:
         """Set `sensor`, `corrupter`, `filter`, `enabled` or `active` of an observable."""
         observable = lookup(self._observables, "observable", observable_name)
         lookup(dict.fromkeys(_SETTERS), "attribute of an observable", attribute)
-        if isinstance(observable, Observable):
-            observable.set(attribute, modifier)
-        else:  # of robosuite's class
-            getattr(observable, f"set_{attribute}")(modifier)
-
-    @property
-    def observation_names(self) -> set[str]:
-        """Names of all observables."""
-        return set(self._observables)
-
-    @property
-    def enabled_observables(self) -> set[str]:
-        """Names of the observables that are measured."""
-        return {name for name, observable in self._observables.items() if observable.is_enabled()}
-
-    @property
-    def active_observables(self) -> set[str]:
-        """Names of the observables that are among the observations."""
-        return {name for name, observable in self._observables.items() if observable.is_active()}
-
-    @property
-    def observation_modalities(self) -> set[str]:
-        """Groups of the observables."""
-        return {observable.modality for observable in self._observables.values()}
+        getattr(observable, f"set_{attribute}")(modifier)
 
     def _observe(self) -> "OrderedDict[str, np.ndarray]":
         """Return the observations of the present state, as the observables have them."""
         values = self.observer.observe()
         if all(isinstance(o, Observable) and o.is_plain for o in self._observables.values()):
+            for name, observable in self._observables.items():
+                observable.obs = values[name]
             return values
         cache: dict[str, Any] = {name: value for name, value in values.items() if name in self._observables}
         active: OrderedDict[str, np.ndarray] = OrderedDict()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from libero._adapters.observations import Observable
-from libero.libero.envs import ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv
+from libero.libero.envs import TASK_MAPPING, ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv
 from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, EpisodeOverError
 from libero_env.assets.robot import REST_QPOS
 from libero_env.errors import (
@@ -273,7 +273,7 @@ def test_absolute_actions_and_other_controllers(make_env):
 
 
 def test_a_problem_class_can_move_a_camera(suite):
-    from libero.libero.envs.bddl_base_domain import TASK_MAPPING, register_problem
+    from libero.libero.envs.bddl_base_domain import register_problem
 
     original = TASK_MAPPING["libero_floor_manipulation"]
     try:
@@ -365,6 +365,42 @@ def test_contacts_and_grasps_have_robosuites_methods(make_env):
     assert controller.kp.tolist() == [150.0] * 6
     assert controller.output_max.tolist() == [0.05] * 3 + [0.5] * 3 == (-controller.output_min).tolist()
     assert env.env.model.get_xml().startswith("<mujoco")
+
+
+def test_sites_are_shown_as_robosuite_shows_them(make_env):
+    env = make_env(OffScreenRenderEnv, camera_heights=64, camera_widths=64)
+    plain = env.reset()["robot0_eye_in_hand_image"]
+    alpha = env.sim.model.site_rgba[:, 3]
+    assert alpha.min() < 0 and alpha.max() == 0  # hidden
+
+    def picture(**shown):
+        env.env.visualize({"env": False, "robots": False, "grippers": False, **shown})
+        return env.regenerate_obs_from_state(env.get_sim_state())["robot0_eye_in_hand_image"]
+
+    assert (picture() == plain).all() and (picture(robots=True) == plain).all()
+    assert (picture(grippers=True) != plain).mean() > 0.01
+    assert (picture() == plain).all()
+
+
+def test_robosuites_wrappers(suite, tmp_path):
+    wrappers = pytest.importorskip("robosuite.wrappers")
+    path = suite.get_task_bddl_file_path(0)
+    env = TASK_MAPPING["libero_floor_manipulation"](
+        path, controller_configs={"type": "OSC_POSE"}, camera_heights=64, camera_widths=64
+    )
+    env.reset()
+    shown = wrappers.VisualizationWrapper(env, indicator_configs="default")
+    shown.set_indicator_pos("indicator0", [0.3, 0.0, 0.3])
+    picture = shown.step(np.zeros(7))[0]["agentview_image"].astype(int)
+    assert (picture[..., 0] - picture[..., 1] > 80).sum() > 10, "a red ball"
+    recorded = wrappers.DataCollectionWrapper(shown, str(tmp_path))
+    recorded.reset()
+    for _ in range(3):
+        recorded.step(np.zeros(7))
+    recorded.close()
+    (file,) = tmp_path.glob("*/*.npz")
+    with np.load(file, allow_pickle=True) as stored:
+        assert stored["states"].shape == (4, env.sim.get_state().flatten().size)
 
 
 def test_observables_can_be_changed(make_env):

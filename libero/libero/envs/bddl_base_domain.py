@@ -5,6 +5,7 @@ import warnings
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import replace
 from inspect import signature
 from typing import Any
@@ -60,7 +61,7 @@ CONTROL_FREQ = 20  # Hz
 _KEPT: dict[str, Any] = {
     **{"env_configuration": "default", "has_offscreen_renderer": True, "render_collision_mesh": False},
     **{"render_visual_mesh": True, "render_gpu_device_id": -1, "renderer": "mujoco", "renderer_config": None},
-    "object_property_initializers": None,
+    "object_property_initializers": [],
 }
 _FLOOR_OFFSET = (0.0, 0.0, -0.035)  # the original's origin of regions on the floor, m
 
@@ -193,7 +194,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.reward_scale, self.reward_shaping = reward_scale, reward_shaping
         self.horizon, self.ignore_done, self.render_camera = horizon, ignore_done, render_camera
         self.window, self.has_renderer = Window(render_camera) if has_renderer else None, has_renderer
-        vars(self).update({key: kwargs.get(key, value) for key, value in _KEPT.items()})
+        vars(self).update(deepcopy(_KEPT) | {key: value for key, value in kwargs.items() if key in _KEPT})
         self._xml_processor: Callable[[str], str] | None = None
         self.initialization_noise, self.hard_reset = noise_of(initialization_noise), hard_reset
         self.placement_initializer = placement_initializer
@@ -313,7 +314,7 @@ class BDDLBaseDomain(RobosuiteMethods):
             self.sim.restore_model()
             self.robots[0] = SingleArm(self, self._controller_configs, self._robots)
         if self._xml_processor is not None:
-            self._rebuild(self._xml_processor(self.get_xml()))
+            self._build(self._xml_processor(self.get_xml()))
 
     def _restart_clock(self) -> None:
         self.timestep, self.cur_time, self.done, self._clock = 0, 0.0, False, 0.0
@@ -509,7 +510,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         """
         poses = read_fixture_poses(xml_string, self.scene)
         try:
-            self._rebuild(xml_string)
+            self._build(xml_string)
         except DemoError as error:
             warnings.warn(f"{error}; only the poses of the fixtures are taken from it", stacklevel=2)
             for name, pose in poses.items():
@@ -523,7 +524,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         self._restart_clock()
         self._update_observables(force=True)
 
-    def _rebuild(self, xml_string: str) -> None:
+    def _build(self, xml_string: str) -> None:
         spec = scene_spec(self.problem, self.scene.pack, drawing=self.drawing, robot=self.robot)
         model = compile_stored(xml_string, spec)
         self._check_names(model)

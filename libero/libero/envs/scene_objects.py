@@ -48,7 +48,9 @@ def scene_sites(scene: Scene) -> dict[str, SiteObject]:
             joints = [model.joint(j).name for j in scene.joints.get(region.address, ())]
             sites[region.address] = SiteObject(
                 region.address,
-                region.target,
+                region.target
+                if region.target in scene.entities
+                else None,  # a zone of the workspace has none
                 joints=joints,
                 size=model.site_size[site].copy(),
                 rgba=model.site_rgba[site].copy(),

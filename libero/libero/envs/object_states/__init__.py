@@ -17,7 +17,7 @@ class BaseObjectState:
     Attributes:
         env: The environment.
         object_name: Name of the object or fixture, or address of the region.
-        parent_name: For a region the object or fixture that it belongs to, otherwise `object_name`.
+        parent_name: For a region the object or fixture that it belongs to, or None; otherwise `object_name`.
         is_fixture: Whether it, or its parent, is a fixture.
         query_dict: All objects or all fixtures, by name.
         object_state_type: `object` or `site`.
@@ -102,6 +102,7 @@ class SiteObjectState(BaseObjectState):
 
     def __init__(self, env: Domain, object_name: str, parent_name: str | None, is_fixture: bool = False):
         super().__init__(env, object_name, parent_name, parent_name in env.fixtures_dict)
+        self.parent_name = parent_name
 
     def get_geom_state(self) -> dict[str, np.ndarray]:
         """Return `pos` (3,), m, and `quat` (4,), xyzw as in the original, in the world frame."""

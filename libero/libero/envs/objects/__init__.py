@@ -95,7 +95,8 @@ class SiteObject:
     ):
         self.name, self.parent_name, self.joints = name, parent_name, joints
         self.size, self.rgba, self.site_type = np.asarray(size, np.float64), rgba, site_type
-        self.site_pos, self.site_quat = site_pos, site_quat
+        self.pos = self.site_pos = site_pos
+        self.quat = self.site_quat = site_quat
         self.object_properties = object_properties or {"vis_site_names": {}}
 
     def in_box(self, this_position: Any, this_mat: Any, other_position: Any) -> bool:
@@ -107,6 +108,11 @@ class SiteObject:
     ) -> bool:
         """Return whether a point is above the box, by less than `other_height`, m."""
         return bool(is_over(self._box(this_position, this_mat), np.asarray(other_position), other_height))
+
+    def on_top(self, this_position: Any, this_mat: Any, other_position: Any) -> bool:
+        """Return whether a point is beyond the upper corner of the box of half size |R size|, as in the original."""
+        reach = np.abs(np.asarray(this_mat).reshape(3, 3) @ self.size)
+        return bool((np.asarray(other_position) > np.asarray(this_position) + reach).all())
 
     def _box(self, position: Any, mat: Any) -> Box:
         return Box(np.asarray(position), np.asarray(mat).reshape(3, 3), self.size)
@@ -136,12 +142,8 @@ class TargetZone(BuiltinObject):
         self.size = np.array([*zone_size[:2], zone_height], np.float64)
         self.pos = np.array([*zone_centroid_xy[:2], z_offset], np.float64)
 
-    _box, in_box, under = SiteObject._box, SiteObject.in_box, SiteObject.under
-
-    def on_top(self, this_position: Any, this_mat: Any, other_position: Any) -> bool:
-        """Return whether a point is beyond the upper corner of the box of half size |R size|, as in the original."""
-        reach = np.abs(np.asarray(this_mat) @ self.size)
-        return bool((np.asarray(other_position) > np.asarray(this_position) + reach).all())
+    _box, in_box = SiteObject._box, SiteObject.in_box
+    under, on_top = SiteObject.under, SiteObject.on_top
 
 
 send_to_workers(__name__, "OBJECTS_DICT", "VISUAL_CHANGE_OBJECTS_DICT")
