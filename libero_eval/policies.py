@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from libero_env.init_states.store import NUM_INIT_STATES
+from libero_env.storage import require_own_folders
 from libero_env.tasks import Task
 from libero_eval.protocols.adapter import ACTION_DIM, view_of
 from libero_eval.protocols.environment import OBSERVATIONS, ProtocolEnv, run_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
 from lifelong.data.settings import CAMERAS
+from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, PolicyActor
 from lifelong.evaluation.environments import Obs
 from lifelong.evaluation.restore import restore
@@ -99,6 +101,8 @@ class RunPolicy(PolicyUnderTest):
         self.run = run
         self.identity = {"run": str(run.path), "after": run.learned, "weights": run.weights_digest}
         self.out = run.path / "eval" / f"after_{run.learned:02d}"
+        if request.out is None:
+            require_own_folders(run.path, "eval", f"eval/{self.out.name}", error=ConfigError)
         self.tasks = run.tasks
         self.selection = tuple(run.eval.init_states("curve"))
         self.on_cpu = run.device.type == "cpu"

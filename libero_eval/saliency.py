@@ -25,7 +25,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from libero_env.errors import SimulationError
-from libero_env.storage import atomic_path, atomic_write_text
+from libero_env.storage import atomic_path, atomic_write_text, require_own_folders
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import PolicyActor, observe
 from lifelong.evaluation.environments import Obs
@@ -272,7 +272,7 @@ def draw_saliency(
         beside it.
 
     Raises:
-        ConfigError: The task does not exist, or there are no moments.
+        ConfigError: The task does not exist, there are no moments, or the folder is a link that leads out of the run.
         LiberoError: The run cannot be read, or its policy has no `predict`.
     """
     run = restore(source, after=after, device=device, allow=allow)
@@ -280,6 +280,7 @@ def draw_saliency(
         raise ConfigError(
             f"task {task} and {moments} moments; valid: tasks 0 to {len(run.tasks) - 1}, and 1 moment or more"
         )
+    require_own_folders(run.path, "saliency", error=ConfigError)
     frames, success = _run_episode(run, task, start, horizon)
     steps = sorted({round(i) for i in np.linspace(0, len(frames) - 1, moments)})
     language = run.embed(run.learned_task(task)).to(run.device)

@@ -28,7 +28,7 @@ from libero_env.demos.contents import (
 from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
 from libero_env.demos.read import Episode, demo_files
 from libero_env.errors import DemoError
-from libero_env.storage import atomic_path
+from libero_env.storage import atomic_path, require_own_folders
 
 TAG = "libero-v1"
 FRAMES_PER_CHUNK = 8
@@ -78,7 +78,8 @@ class DemoWriter:
 
     def discard_parts(self) -> None:
         """Remove the parts that an interrupted recording left."""
-        if self.parts.is_dir() and not self.parts.is_symlink():
+        require_own_folders(self.path.parent, self.parts.name, error=DemoError)
+        if self.parts.is_dir():
             shutil.rmtree(self.parts)
 
     def write(self, index: int, episode: Episode) -> Path:
@@ -89,6 +90,7 @@ class DemoWriter:
                 earlier demonstrations are intact.
         """
         _check_values(episode, f"{self.path}: demo_{index}")
+        require_own_folders(self.path.parent, self.parts.name, error=DemoError)
         target = self.parts / f"demo_{index:05d}.hdf5"
         try:
             with atomic_path(target, fsync=True) as temporary, h5py.File(temporary, "w") as handle:
@@ -134,6 +136,7 @@ class DemoWriter:
 
         A broken part is removed, to be recorded again; a broken file or one of another configuration is refused.
         """
+        require_own_folders(self.path.parent, self.parts.name, error=DemoError)
         seen: set[str] = set()
         if self.path.is_file():
             yield from self._demos_in(self.path, seen)

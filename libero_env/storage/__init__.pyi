@@ -18,6 +18,7 @@ from .files import (
     read_bounded,
     read_json,
     regular_file,
+    require_own_folders,
     sync_folder,
     write_json,
 )
@@ -50,6 +51,7 @@ __all__ = [
     "read_yaml",
     "read_yaml_file",
     "regular_file",
+    "require_own_folders",
     "sync_folder",
     "write_cache",
     "write_json",

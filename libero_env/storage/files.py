@@ -93,10 +93,33 @@ def read_bounded(path: Path, most: int, *, within: Path | None = None) -> bytes:
     Raises:
         OSError: It cannot be read, is a folder, a pipe or a device, is too large, or lies outside of the folder.
     """
-    if within is not None and not path.resolve().is_relative_to(within.resolve()):
+    if within is not None and _leads_out(path, within):
         raise OSError(f"it is a link that leads out of {within}")
     with open(path, "rb", opener=regular_file(most)) as file:
         return file.read(min(most, os.fstat(file.fileno()).st_size))  # a buffer of that size is made before
+
+
+def require_own_folders(folder: Path, *names: str, error: type[LiberoError] = InvalidInputError) -> None:
+    """Check that parts of a folder that may be somebody else's are no links to folders elsewhere, before writing there.
+
+    Args:
+        folder: The folder; it may be a link itself.
+        names: Relative paths of folders in it, which need not exist.
+        error: Type of the error.
+
+    Raises:
+        LiberoError: One leads out of the folder, or is not a folder; of the type `error`.
+    """
+    for path in (folder / name for name in names):
+        if os.path.lexists(path) and (_leads_out(path, folder) or not path.is_dir()):
+            raise error(f"{path} is not a folder, or is a link that leads out of {folder}; remove it")
+
+
+def _leads_out(path: Path, folder: Path) -> bool:
+    try:
+        return not path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError):  # links in a circle
+        return True
 
 
 def regular_file(most: int, *, links: bool = True) -> Callable[[str, int], int]:

@@ -27,7 +27,7 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from libero_env.errors import InvalidInputError
-from libero_env.storage import create_text, write_json
+from libero_env.storage import create_text, require_own_folders, write_json
 from libero_env.tasks import Task
 from libero_env.text import flatten, json_safe, shorten, to_json
 from libero_env.validation import validate
@@ -42,6 +42,7 @@ PLAN_FORMAT = "libero-evaluation-plan/1"
 UNIT_FORMAT = "libero-evaluation-unit/1"
 AGAIN = "name another folder with --out, or repeat the evaluation with --again"
 PARTS = (PLAN_NAME, FILE_NAME, "units", "claims", "errors")
+FOLDERS = ("units", "claims", "errors", "videos")
 MAX_ERROR = 20_000  # characters of a traceback that is kept
 Seconds = Annotated[float, Field(ge=0, le=1e11)]  # since the epoch
 
@@ -165,7 +166,8 @@ class WorkStore:
         """Start the evaluation, or join it; starts and tasks that are not in it yet are added.
 
         Raises:
-            ConfigError: The folder holds another evaluation; the message names every difference.
+            ConfigError: The folder holds another evaluation (the message names every difference), or a folder that is a
+                link out of it.
             LifelongError: The folder cannot be written, or holds a broken file.
         """
         growing = {
@@ -173,6 +175,7 @@ class WorkStore:
             "tasks": list(dict.fromkeys(unit.task.id for unit in units)),
             "units": {unit.name: len(unit.init_states) for unit in units},
         }
+        require_own_folders(self.path, *FOLDERS, error=ConfigError)
         with _named_errors(self.path, "the folder of the evaluation cannot be written"):
             self.path.mkdir(parents=True, exist_ok=True)
             file = self.path / PLAN_NAME
@@ -192,8 +195,9 @@ class WorkStore:
         """Remove the evaluation; videos and files of others stay.
 
         Raises:
-            ConfigError: Another process works on it.
+            ConfigError: Another process works on it, or a folder in it is a link that leads out of it.
         """
+        require_own_folders(self.path, *FOLDERS, error=ConfigError)
         for held in self.claims.held().values():
             raise ConfigError(
                 f"{self.path}: {held.holder} works on {held.unit}; end it before you repeat the evaluation"

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.storage import atomic_write_text, read_bounded
+from libero_env.errors import InvalidInputError
+from libero_env.storage import atomic_write_text, read_bounded, require_own_folders
 from libero_env.text import duration
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import MUJOCO, Plan, compare, findings, write_comparison
@@ -370,6 +371,10 @@ def _media(folder: Path) -> dict[str, Any]:
     items: list[dict[str, Any]] = []
     left_out: list[str] = []
     used = 0
+    try:
+        require_own_folders(folder.parent, folder.name)
+    except InvalidInputError as error:
+        return {"items": items, "left_out": [str(error)]}
     for path in sorted(folder.iterdir()) if folder.is_dir() else []:
         kind = MEDIA_TYPES.get(path.suffix.lower())
         if kind is None:

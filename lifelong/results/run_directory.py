@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from libero_env.errors import InvalidInputError
-from libero_env.storage import PART_SUFFIX, atomic_write_text, read_yaml_file
+from libero_env.storage import PART_SUFFIX, atomic_write_text, read_yaml_file, require_own_folders
 from lifelong import checkpoints
 from lifelong.errors import CheckpointError, ConfigError, RunLockedError
 from lifelong.results.log import ResultLog
@@ -147,7 +147,7 @@ class RunDirectory:
             resume: Whether to resume an existing run; otherwise it is moved aside.
 
         Raises:
-            ConfigError: The existing run has another configuration.
+            ConfigError: The existing run has another configuration, or a folder in it is a link that leads out of it.
             RunLockedError: Another process is writing there.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -155,6 +155,7 @@ class RunDirectory:
             if not resume and self.path.exists():
                 os.rename(self.path, _free_name(self.path))
             self.path.mkdir(exist_ok=True)
+            require_own_folders(self.path, self.videos.name, self.checkpoints.path.name, error=ConfigError)
             self._digest = None
             for part in self.path.rglob(f".*{PART_SUFFIX}"):  # left by a process that was killed
                 part.unlink(missing_ok=True)

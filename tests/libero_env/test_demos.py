@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env.demos.generate import _recording_lock
 from libero_env.demos.read import demo_origin, read_demos
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
@@ -188,3 +189,23 @@ def test_a_full_disk_leaves_what_was_recorded(tmp_path, monkeypatch):
     monkeypatch.undo()
     assert len(read_demos(writer.parts)) == 1 and len(list(writer.parts.iterdir())) == 1
     assert len(read_demos(writer.finish())) == 1
+
+
+def test_a_recording_follows_no_link_out_of_its_folder(tmp_path):
+    victim, path = tmp_path / "victim.hdf5", tmp_path / "own" / "x.hdf5"
+    victim.write_text("precious, and no demonstration")
+    path.parent.mkdir()
+    writer = DemoWriter(path, {})
+    writer.parts.symlink_to(tmp_path)
+    for use in (writer.recorded, writer.finish, writer.discard_parts, lambda: writer.write(0, episode(0))):
+        with pytest.raises(
+            DemoError, match=r"x\.hdf5\.parts is not a folder, or is a link that leads out of"
+        ):
+            use()
+    (path.parent / ".recording.lock").symlink_to(victim)
+    with (
+        pytest.raises(DemoError, match="demonstrations cannot be recorded there"),
+        _recording_lock(path.parent),
+    ):
+        pass
+    assert victim.read_text() == "precious, and no demonstration"

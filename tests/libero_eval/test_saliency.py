@@ -1,11 +1,15 @@
 """Saliency maps against a policy whose input is known."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from libero_eval.saliency import SaliencySettings, contact_sheet, overlay, saliency, window_at
+from libero_eval.policies import RunPolicy
+from libero_eval.requests import EvalRequest
+from libero_eval.saliency import SaliencySettings, contact_sheet, draw_saliency, overlay, saliency, window_at
 from lifelong.data import fake_batch
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
@@ -109,3 +113,16 @@ def test_windows_end_at_the_step():
     frames = [{"x": torch.full((1, 1, 1), float(step))} for step in range(5)]
     assert window_at(frames, 3, 2)["x"].flatten().tolist() == [2, 3]
     assert window_at(frames, 1, 4)["x"].flatten().tolist() == [0, 1]
+
+
+def test_what_is_written_into_a_run_follows_no_link_out_of_it(tmp_path, monkeypatch):
+    run = SimpleNamespace(path=tmp_path / "run", tasks=["task"], learned=0, weights_digest="")
+    run.path.mkdir()
+    for name in ("saliency", "eval"):
+        (run.path / name).symlink_to(tmp_path)
+    monkeypatch.setattr("libero_eval.saliency.restore", lambda *_, **__: run)
+    monkeypatch.setattr("libero_eval.policies.restore", lambda *_, **__: run)
+    with pytest.raises(ConfigError, match="saliency is not a folder, or is a link that leads out of"):
+        draw_saliency(run.path, task=0)
+    with pytest.raises(ConfigError, match="eval is not a folder, or is a link that leads out of"):
+        RunPolicy(EvalRequest(policy=str(run.path)))

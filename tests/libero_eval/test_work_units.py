@@ -421,6 +421,19 @@ def test_hostile_files_in_the_folder_end_in_one_line_or_count_for_nothing(tmp_pa
             assert "\n" not in str(caught.value) and len(str(caught.value)) < 1000
 
 
+@pytest.mark.parametrize("name", ["units", "claims", "errors", "videos"])
+def test_a_folder_that_is_a_link_out_of_the_evaluation_is_refused(tmp_path, name):
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    evaluate(out, **TWO)
+    (out / name).rename(elsewhere) if (out / name).exists() else elsewhere.mkdir()
+    (out / name).symlink_to(elsewhere)
+    before = sorted(elsewhere.iterdir())
+    for ask in (lambda: evaluate(out, **TWO), evaluation(out, **TWO).store.clear):
+        with pytest.raises(ConfigError, match=f"{name} is not a folder, or is a link that leads out of"):
+            ask()
+    assert sorted(elsewhere.iterdir()) == before
+
+
 def test_a_folder_of_another_version_or_of_something_else_is_refused(tmp_path):
     (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/7"}')
     with pytest.raises(ConfigError, match="libero-evaluation-plan/7"):

@@ -594,12 +594,21 @@ def test_a_report_follows_no_link_out_of_a_run_and_waits_for_no_pipe(tmp_path: P
     (run / "videos").mkdir(exist_ok=True)
     (run / "videos" / "a.webp").symlink_to(secret)
     os.mkfifo(run / "videos" / "b.webp")
+    (run / "videos" / "c.webp").symlink_to("c.webp")
+    (tmp_path / "albums").mkdir()
+    (tmp_path / "albums" / "holiday.png").write_bytes(b"private")
+    (run / "saliency").symlink_to(tmp_path / "albums")
     (run / "config.yaml").unlink(missing_ok=True)
     (run / "config.yaml").symlink_to(secret)
     html = write_report([run]).read_text()
     assert victim.read_text() == "precious" and not (run / "heatmap.png").is_symlink()
     assert "private" not in html and base64.b64encode(secret.read_bytes()).decode() not in html
     assert "a.webp (it is a link that leads out of" in html and "b.webp (it is a folder, a pipe" in html
+    assert (
+        "c.webp (it is a link" in html
+        and "saliency is not a folder, or is a link" in html
+        and "holiday" not in html
+    )
     (run / "config.yaml").unlink()
     os.mkfifo(run / "config.yaml")
     assert "config.yaml is not read" in write_report([run]).read_text()

@@ -54,6 +54,29 @@ def test_a_broken_configuration_is_one_line_with_its_file(tmp_path, content):
         assert (directory.path / "config.yaml").read_bytes() != content
 
 
+@pytest.mark.parametrize("name", ["videos", "checkpoints"])
+@pytest.mark.parametrize("target", ["elsewhere", "nowhere", "run/videos/a"])
+def test_a_folder_that_is_a_link_out_of_the_run_is_refused_and_nothing_there_changes(tmp_path, name, target):
+    directory, elsewhere = RunDirectory(tmp_path / "run"), tmp_path / "elsewhere"
+    with directory.opened(CONFIG, resume=True):
+        pass
+    elsewhere.mkdir()
+    (elsewhere / ".a.part").touch()
+    (directory.path / name).symlink_to(tmp_path / target)
+    if target.startswith("run"):
+        (directory.path / name).unlink()
+        (directory.path / name).symlink_to(directory.path / name)  # in a circle
+    message = f"{name} is not a folder, or is a link that leads out of"
+    with pytest.raises(ConfigError, match=message), directory.opened(CONFIG, resume=True):
+        pass
+    assert (elsewhere / ".a.part").exists()
+    (directory.path / name).unlink()
+    (directory.path / "kept").mkdir()
+    (directory.path / name).symlink_to("kept")
+    with directory.opened(CONFIG, resume=True):
+        pass  # it stays inside
+
+
 def test_starting_again_keeps_the_old_run(tmp_path):
     directory = RunDirectory(tmp_path / "run")
     for lr in (0.1, 0.2, 0.3):
