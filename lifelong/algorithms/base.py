@@ -141,6 +141,10 @@ class Algorithm:
         """
         return [p for p in policy.parameters() if p.requires_grad]
 
+    def count_trained(self, policy: Policy) -> int:
+        """Count the numbers that steps move: all of `trained`, unless the algorithm holds some of them."""
+        return sum(p.numel() for p in self.trained(policy))
+
     def mode_train(self, policy: Policy) -> None:
         """Put the policy in training mode; an algorithm may keep some layers in evaluation mode."""
         policy.train()

@@ -91,6 +91,15 @@ class PackNet(Algorithm):
         """Store which weights may change, and the values of the others."""
         self._freeze(policy)
 
+    def count_trained(self, policy: Policy) -> int:
+        """Count the weights that the task may change."""
+        self._freeze_once(policy)
+        return sum(
+            int(self._movable[name].sum()) if name in self._movable else p.numel() * (name not in self._fixed)
+            for name, p in policy.named_parameters()
+            if p.requires_grad
+        )
+
     def mode_train(self, policy: Policy) -> None:
         """Set training mode, with running statistics frozen after the first task (`masks_only`: from the start)."""
         policy.train()

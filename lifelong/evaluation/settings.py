@@ -14,6 +14,8 @@ from lifelong.results.records import MatrixCells, measured_tasks
 from lifelong.stats.metrics import Transfer
 from lifelong.types import Count, Natural
 
+Selection = Literal["best", "first_best", "last"]
+
 
 @checked
 class EvalSettings:
@@ -34,8 +36,9 @@ class EvalSettings:
         selection: Initial states of the learning curve, by which the best epoch is chosen. `apart`: the last
             ones of the 50, which no reported number uses. `reporting`: those of the reported numbers, as LIBERO
             does.
-        select: Weights that are kept of a task: those of the `best` epoch, the earliest of equally good ones, or of
-            the `last`.
+        select: Weights that are kept of a task: those of the `best` epoch, the latest of equally good ones; of the
+            `first_best`, the earliest of them, as in LIBERO's code: those from before the task where nothing succeeds;
+            or of the `last`.
         transfer: Estimate of forward transfer. `unbiased`: where the best epoch is kept, it is chosen without the start
             that measures it, and where the last one is, none is held. `published`: eq. 3 as written, which holds the
             largest of the measured points.
@@ -58,7 +61,7 @@ class EvalSettings:
     horizon: Count = 600
     settle_steps: Natural = 5
     selection: Literal["apart", "reporting"] = "apart"
-    select: Literal["best", "last"] = "best"
+    select: Selection = "best"
     transfer: Literal["unbiased", "published"] = "unbiased"
     precision: Literal["auto", "bf16", "fp32"] = "auto"
     record_every: Natural = 4
@@ -80,9 +83,9 @@ class EvalSettings:
                 f"initial states, a task has {NUM_INIT_STATES}: lower one of them, or set "
                 "eval.selection=reporting"
             )
-        if self.curve == "none" and self.select == "best":
+        if self.curve == "none" and self.select != "last":
             raise ConfigError(
-                "eval.select=best needs a learning curve, and eval.curve=none has none: set eval.select=last"
+                f"eval.select={self.select} needs a learning curve, and eval.curve=none has none: set eval.select=last"
             )
 
     @property

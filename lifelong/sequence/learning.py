@@ -141,6 +141,14 @@ class TaskSequence:
         )
         if phase.selects_best:
             self.recovery.load_best(phase)
+            if context.ranks.first and not any((rates := phase.points(self.log.read())).values()):
+                kept = phase.best_epoch(self.log.read(), phase.epochs)
+                whose = (
+                    f"of epoch {kept}, the last of {len(rates)} equal ones,"
+                    if kept
+                    else "from before the task"
+                )
+                say(context, f"warning: no rollout has succeeded at any epoch: the weights {whose} are kept")
         context.algorithm.end_phase(phase.kind, context.policy)
 
     def _after_epoch(self, phase: TrainingPhase, end: EpochEnd) -> None:
@@ -188,7 +196,9 @@ class TaskSequence:
         first = training_phases(self.context, stage)[0]
         best = first.best_epoch(results, first.epochs)
         columns = self.context.eval.row(stage, len(self.context.tasks))
-        row = [self.evaluator.evaluate("matrix", task, seen, best) for seen in columns]
+        # there and back, so that a row begins with the environments that the one before ended with
+        turn = 1 if self.stages.index(stage) % 2 else -1
+        row = [self.evaluator.evaluate("matrix", task, seen, best) for seen in columns[::turn]]
         shifted = self.context.eval.shifted_row(stage, len(self.context.tasks)) if self.context.shift else ()
         under = [self.evaluator.evaluate("shift", task, seen, best) for seen in shifted]
         if results.task_end(task) is None:

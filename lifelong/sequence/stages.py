@@ -7,6 +7,7 @@ from itertools import accumulate
 
 from lifelong.algorithms.base import Phase
 from lifelong.context import RunContext
+from lifelong.evaluation.settings import Selection
 from lifelong.results.records import EvalRecord
 from lifelong.results.results import Results
 from lifelong.streams import learning_stages
@@ -24,7 +25,7 @@ class TrainingPhase:
         steps_per_epoch: Number of steps per epoch; None: every window once.
         offset: Number of epochs of the stage's earlier phases.
         curve: Epochs of the phase at which its learning curve has points; empty where success is not its measure.
-        selects_best: Whether the weights of the best point are kept, rather than the last ones.
+        select: Weights that are kept, see `EvalSettings`.
     """
 
     stage: Sequence[int]
@@ -34,7 +35,12 @@ class TrainingPhase:
     steps_per_epoch: int | None
     offset: int
     curve: tuple[int, ...]
-    selects_best: bool
+    select: Selection
+
+    @property
+    def selects_best(self) -> bool:
+        """Whether the weights of the best point are kept, rather than the last ones."""
+        return self.select != "last"
 
     @property
     def task(self) -> int:
@@ -52,7 +58,7 @@ class TrainingPhase:
         return found
 
     def best_epoch(self, results: Results, until: int) -> int:
-        """Return the earliest epoch with the highest recorded success; a phase without a curve ends with its last one.
+        """Return the epoch with the highest recorded success; where the last weights are kept, the last epoch.
 
         Args:
             results: Records of the run, with at least one point of the curve.
@@ -61,7 +67,7 @@ class TrainingPhase:
         if not self.selects_best:
             return self.epochs
         rates = {epoch: rate for epoch, rate in self.points(results).items() if epoch <= until}
-        return max(rates, key=lambda epoch: (rates[epoch], -epoch))
+        return max(rates, key=lambda epoch: (rates[epoch], -epoch if self.select == "first_best" else epoch))
 
     def missing_points(self, results: Results, before: int | None = None) -> list[int]:
         """Return the epochs whose points of the curve are not recorded, of those before an epoch or of all."""
@@ -83,7 +89,7 @@ def training_phases(context: RunContext, stage: Sequence[int]) -> list[TrainingP
             steps_per_epoch=steps,
             offset=offset,
             curve=context.eval.curve_epochs(count) if phase.measures_transfer else (),
-            selects_best=context.eval.select == "best" and phase.measures_transfer,
+            select=context.eval.select if phase.measures_transfer else "last",
         )
         for number, (phase, count, offset) in enumerate(
             zip(phases, epochs, accumulate(epochs, initial=0), strict=False)

@@ -25,7 +25,7 @@ from lifelong.seeding import generator, seeded
 
 COSTS: Mapping[str, str] = {
     "parameters": "parameters of the policy, and those the algorithm adds and trains",
-    "parameters_trained": "parameters that the optimiser updates",
+    "parameters_trained": "parameters that training may change, without those that PackNet has given to earlier tasks",
     "flops_per_step": "floating-point operations of a training step, replay and penalties included",
     "flops_per_action": "floating-point operations of one action, with a full history",
     "stored_bytes": "storage the algorithm keeps from task to task: its state, and the frames it may replay",
@@ -57,7 +57,7 @@ def step_costs(
     few, many = (_step_flops(policy, algorithm, windows, size) for size in (_SMALL_BATCH, 2 * _SMALL_BATCH))
     return {
         "parameters": sum(sizes.values()),
-        "parameters_trained": sum(p.numel() for p in trained),
+        "parameters_trained": algorithm.count_trained(policy),
         "flops_per_step": few + (many - few) * (batch_size - _SMALL_BATCH) / _SMALL_BATCH,
     }
 

@@ -242,7 +242,8 @@ def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
 @pytest.mark.parametrize("preset", ["paper", "laptop"])
 def test_compat_libero_sets_every_choice(name, preset):
     config = composed(f"algo={name}", f"preset={preset}", "compat=libero")
-    assert config.eval.selection == "reporting" and config.eval.select == "best" and config.policy.stochastic
+    chosen = (config.eval.selection, config.eval.select, config.policy.stochastic)
+    assert chosen == ("reporting", "first_best", True)
     assert (config.algo != composed(f"algo={name}", f"preset={preset}").algo) == (name in WITH_COMPAT)
     build(config.algo)
 
@@ -251,7 +252,7 @@ PAPER = {  # what `preset=paper compat=libero` sets beside algorithms
     "language": {"model": "bert", "pad_to": 25, "numbered": False},
     "data": {"pairing": "stored"},
     "train": {"lr_every": "epoch", "last_batch": "short", "statistics_first": True, "precision": "fp32"},
-    "eval": {"precision": "fp32", "selection": "reporting", "select": "best"},
+    "eval": {"precision": "fp32", "selection": "reporting", "select": "first_best"},
     "policy": {"stochastic": True, "normalise_proprio": False, "standardise_language": False},
 }
 ENCODERS = {

@@ -17,6 +17,7 @@ from lifelong.report import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record
 from lifelong.results.records import EvalRecord
+from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import summarize
 from lifelong.seeding import seeded
 from lifelong.sequence import is_measured
@@ -81,7 +82,7 @@ def test_what_is_frozen_is_run_once_and_recorded_as_without_reuse(tmp_path, name
     assert sorted(episodes) == [0] * 3 + [1] * 3 + [2] * 3
     results = reusing.directory.log.read()
     copies = [r for r in results.of(EvalRecord) if r.same_as]
-    assert [(r.learned, r.task, r.same_as[:2], r.seconds) for r in copies] == [
+    assert sorted((r.learned, r.task, r.same_as[:2], r.seconds) for r in copies) == [
         (row, task, ("matrix", task), 0.0) for row in range(TASKS) for task in range(row)
     ]
     assert results.episodes() == (9, 9) and summarize(results)["episodes"] == {"run": 9, "copied": 9}
@@ -293,6 +294,23 @@ def test_a_curve_without_its_start_and_no_curve():
     assert EvalSettings(every=5, curve="none", select="last").curve_epochs(12) == ()
     with pytest.raises(ConfigError, match=r"eval\.select=best needs a learning curve"):
         EvalSettings(curve="none")
+
+
+def test_rows_go_there_and_back_so_that_open_environments_are_used_again(tmp_path):
+    context, _ = learn(tmp_path / "half", Sequential(), curve="none", select="last")
+    built = []
+    context = replace(context, directory=RunDirectory(tmp_path / "run"), algorithm=Sequential())
+    sequence(replace(context, envs=EnvPool(lambda key: built.append(key) or FakeEnv(*key), TASKS - 1))).run()
+    assert len(built) == TASKS + 1  # one task too many for the pool, in the last row alone
+
+
+@pytest.mark.parametrize(("select", "kept"), [("best", 2), ("first_best", 0)])
+def test_where_nothing_succeeds_the_kept_weights_are_named(tmp_path, monkeypatch, capsys, select, kept):
+    monkeypatch.setattr(EvalRecord, "rate", 0.0)
+    context, _ = learn(tmp_path, Sequential(), tasks=1, select=select)
+    assert context.directory.log.read().task_end(0).best_epoch == kept
+    whose = "from before the task" if kept == 0 else "of epoch 2, the last of 3 equal ones,"
+    assert f"no rollout has succeeded at any epoch: the weights {whose} are kept" in capsys.readouterr().out
 
 
 def test_forward_transfer_without_epoch_0_is_the_mean_of_the_others(tmp_path):
