@@ -287,6 +287,7 @@ def report(runs: Sequence[Planned]) -> None:
                 [run.unpack(Path()) for run in found],
                 HERE / study.name / "report.html",
                 references=[name for name in REFERENCES if name in study.algorithms],
+                other_worlds=True,  # README.md says which runs are of which models
             )
         print(f"{len(found)} runs: {page}")
 

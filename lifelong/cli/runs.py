@@ -75,6 +75,7 @@ def report(
     reference: tuple[str, ...] = (),
     all_pairs: bool = False,
     margin: Annotated[float, Field(gt=0, lt=1)] = 0.05,
+    other_worlds: bool = False,
 ) -> None:
     """Write a page about one run, or about several side by side; print which of several differ significantly.
 
@@ -84,12 +85,20 @@ def report(
         reference: Methods that each other one is compared with, such as er; two methods are compared in any case.
         all_pairs: Compare every method with every other.
         margin: Difference in success from which on two methods are not equivalent.
+        other_worlds: Compare runs in other models or with another MuJoCo, too.
     """
     from lifelong.report.page import comparison_text, shift_text, write_report
 
     for folder in run_dirs:
         _check_run(folder)
-    page = write_report(list(run_dirs), out, references=reference, all_pairs=all_pairs, margin=margin)
+    page = write_report(
+        list(run_dirs),
+        out,
+        references=reference,
+        all_pairs=all_pairs,
+        margin=margin,
+        other_worlds=other_worlds,
+    )
     print(page)
     for line in comparison_text(page) if len(run_dirs) > 1 else shift_text(run_dirs[0]):
         print(line)

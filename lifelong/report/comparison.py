@@ -1,6 +1,6 @@
 """Comparison of groups of runs: means over seeds, intervals, differences, forgetting by task, costs.
 
-The number after ± is the standard error over seeds; intervals and tests are those of `lifelong.stats.methods`.
+Intervals and tests are those of `lifelong.stats.methods`.
 """
 
 import json
@@ -14,7 +14,8 @@ import numpy as np
 from libero_env.storage import atomic_write_text
 from libero_env.text import json_safe
 from lifelong.errors import ComparisonError
-from lifelong.report.runs import Group, Run, other_demonstrations
+from lifelong.report.runs import Group, Run, check_same_world, unlike
+from lifelong.results.provenance import few_of
 from lifelong.stats.intervals import mean_and_standard_error
 from lifelong.stats.methods import MARGIN, MethodRun, statistics
 from lifelong.stats.metrics import METRIC_NAMES, metric_values
@@ -30,11 +31,13 @@ class Plan:
         references: Labels of the methods that each other one is compared with.
         all_pairs: Whether every method is compared with every other instead.
         margin: Difference in success from which on two methods are not equivalent.
+        other_worlds: Whether runs in other models or other physics may be compared.
     """
 
     references: tuple[str, ...] = ()
     all_pairs: bool = False
     margin: float = MARGIN
+    other_worlds: bool = False
 
 
 def compare(groups: Sequence[Group], plan: Plan | None = None) -> dict[str, Any]:
@@ -50,17 +53,19 @@ def compare(groups: Sequence[Group], plan: Plan | None = None) -> dict[str, Any]
         `subgoals` and `costs`. `differences` and `statistics`: see `lifelong.stats.methods.statistics`.
         `after_base_stage`: `metrics` by label and `differences` over the later tasks alone, as if the sequence began
         with them, of the methods whose runs all learned a task after a base stage; None if there are none. `backend`:
-        what simulated all rollouts. `other_demonstrations`: sentences about runs that learned from other demonstrations
-        than the rest.
+        what simulated all rollouts. `conditions`: sentences about all else in which runs differ, see
+        `lifelong.report.runs.unlike`.
 
     Raises:
-        ComparisonError: The runs are of different back ends, or a reference is not a method.
+        ComparisonError: The runs are of different back ends or worlds, or a reference is not a method.
     """
     plan = plan or Plan()
     measured = {g.label: [r for r in g.runs if r.metrics is not None] for g in groups}
     check_same_back_end(
         {f"{g.label} ({r.path})": r.record.backend for g in groups for r in measured[g.label]}
     )
+    if not plan.other_worlds:
+        check_same_world(groups)
     found = _statistics({label: runs_of(runs) for label, runs in measured.items() if runs}, plan)
     later = {
         label: [replace(m, scores=m.scores.without_first()) for m in runs_of(runs)]
@@ -74,7 +79,7 @@ def compare(groups: Sequence[Group], plan: Plan | None = None) -> dict[str, Any]
         "differences": found["differences"],
         "statistics": found["statistics"],
         "after_base_stage": _statistics(later, plan_later) if later else None,
-        "other_demonstrations": other_demonstrations(groups),
+        "conditions": unlike(groups),
     }
 
 
@@ -118,13 +123,9 @@ def findings(found: Mapping[str, Any], names: Mapping[str, str], most: int = 12)
                 _named(p, m) for p, m in rows if not _known(m["p_value"])
             ],
         }
-        texts = [f"{kind}: {_list(of_kind, most)}." for kind, of_kind in kinds.items() if of_kind]
+        texts = [f"{kind}: {few_of(of_kind, most)}." for kind, of_kind in kinds.items() if of_kind]
         lines += [f"{name}. {' '.join(texts)}"] if texts else []
     return lines
-
-
-def _list(names: Sequence[str], most: int) -> str:
-    return ", ".join(names[:most]) + (f", and {len(names) - most} more" if len(names) > most else "")
 
 
 def _named(pair: str, m: Mapping[str, Any], seeds: int | None = None) -> str:

@@ -37,10 +37,11 @@ from lifelong.report.tables import (
 )
 from lifelong.results.records import RunRecord
 from lifelong.results.relearning import by_measure, read_relearning, savings_heads, savings_rows
+from lifelong.results.results import Results
 from lifelong.results.shifts import shift_scores
 from lifelong.results.summary import write_episodes
 from lifelong.stats.methods import MARGIN
-from lifelong.stats.metrics import METRIC_NAMES, Curve, Metrics, average_success, metric_values
+from lifelong.stats.metrics import METRIC_NAMES, Metrics, average_success, metric_values
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -71,6 +72,7 @@ def write_report(
     references: Sequence[str] = (),
     all_pairs: bool = False,
     margin: float = MARGIN,
+    other_worlds: bool = False,
 ) -> Path:
     """Write report.html and heatmap.png, .pdf; of several runs also forgetting.png, comparison.json, episodes.csv.gz.
 
@@ -81,6 +83,7 @@ def write_report(
         references: Labels of the methods that each other one is compared with; two methods are compared in any case.
         all_pairs: Whether every method is compared with every other instead.
         margin: Difference in success from which on two methods are not equivalent.
+        other_worlds: Whether runs in other models or with another MuJoCo may be compared.
 
     Returns:
         Path of the page. It needs no other file and no network.
@@ -88,7 +91,7 @@ def write_report(
     Raises:
         LifelongError: No run is given, a run directory has no results, or `out` cannot be written.
     """
-    plan = Plan(tuple(references), all_pairs, margin)
+    plan = Plan(tuple(references), all_pairs, margin, other_worlds)
     if not run_dirs:
         raise LifelongError("no run directory given; name one or more, such as runs/libero_object/er/seed1")
     runs = [load_run(Path(d)) for d in run_dirs]
@@ -98,7 +101,7 @@ def write_report(
             out = out / "report.html"
         out.parent.mkdir(parents=True, exist_ok=True)
         context = _single_run(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent, plan)
-        page = page_template("page.html").render(**context, metric_texts=METRIC_TEXTS)
+        page = page_template("page.html").render(context)
         atomic_write_text(out, page)
     except OSError as error:
         raise LifelongError(f"{out or Path.cwd()}: the report cannot be written ({error})") from error
@@ -109,7 +112,7 @@ def comparison_text(page: Path) -> list[str]:
     """Return what a comparison shows, in sentences, from the numbers beside its page."""
     found = json.loads((page.parent / "comparison.json").read_text(encoding="utf-8"))
     later = [f"Later tasks alone: {line}" for line in _findings(found["after_base_stage"])]
-    return found["other_demonstrations"] + _findings(found) + later
+    return found["conditions"] + _findings(found) + later
 
 
 def _findings(found: dict[str, Any] | None) -> list[str]:
@@ -151,9 +154,10 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "facts": _facts(run),
         "notes": run.notes,
         "metrics": _metric_rows(run.metrics),
+        "metric_texts": _metric_texts([run]),
         "later_metrics": _metric_rows(run.results.after_base_stage()),
         "base_tasks": _base_tasks(record),
-        "transfer": " ".join([TRANSFER_TEXTS[run.results.transfer], *_points(curves)]),
+        "transfer": TRANSFER_TEXTS[run.results.transfer],
         "published": _published(run),
         "bar_low": min(0.0, run.metrics.nbt.value) if run.metrics else 0.0,
         "heatmaps": [run_heatmap(run.results, labels)],
@@ -181,7 +185,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
 
 def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]:
     """Return the template's variables for several runs, and write figures and numbers beside the page."""
-    groups = group_runs(runs)
+    groups = sorted(group_runs(runs), key=_rank)
     found = compare(groups, plan)
     later = found["after_base_stage"]
     for group in found["groups"].values():  # a page that is sent says nothing of this machine
@@ -209,9 +213,10 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
             for g in groups
             for r in g.repeats
         ]
-        + found["other_demonstrations"],
+        + found["conditions"],
         "groups": _group_rows({label: group["metrics"] for label, group in found["groups"].items()}, found),
         "later_groups": _group_rows(later["metrics"], found) if later else [],
+        "metric_texts": _metric_texts(runs),
         "differences": found["differences"],
         "later_differences": later["differences"] if later else [],
         "findings": _findings(found),
@@ -242,15 +247,38 @@ def _success_of(group: Group) -> tuple[Panel, dict[str, Any], Line]:
     return Panel(group.label, mean, labels), titled, Line(group.label, values)
 
 
-def _points(curves: Mapping[int, Curve]) -> list[str]:
-    """Return a sentence about the points of the learning curves, of which FWT is the mean; none without any."""
-    counts = {int(n) for curve in curves.values() for n in curve.episodes}
-    epochs = sorted({int(e) for curve in curves.values() for e in curve.epochs})
-    if not epochs:
-        return []
+def _rank(group: Group) -> tuple[float, float]:
+    """Return by what methods are sorted, best first: mean AUC, of those without one mean final success."""
+    found = [r.metrics for r in group.runs if r.metrics is not None]
+    means = [
+        np.mean([getattr(m, name).value for m in found]) if found else np.nan
+        for name in ("auc", "final_success")
+    ]
+    return tuple(np.nan_to_num(means, nan=-np.inf) * -1)
+
+
+def _metric_texts(runs: Sequence[Run]) -> dict[str, tuple[str, str, str]]:
+    """Return name, meaning and direction of each metric; FWT's meaning names the points that it is the mean of."""
+    name, meaning, better = METRIC_TEXTS["fwt"]
+    points = dict.fromkeys(text for run in runs if (text := _points(run.results)))
+    return METRIC_TEXTS | {"fwt": (name, "; or ".join([meaning, *points]).replace("; or ", ": ", 1), better)}
+
+
+def _points(results: Results) -> str:
+    """Return the epochs and starts of the learning curves; empty without any."""
+    curves = [r for r in results.evaluations() if r.phase == "curve"]
+    if not curves:
+        return ""
+    epochs, counts = sorted({r.epoch for r in curves}), {len(r.successes) for r in curves}
     shown = ", ".join(map(str, epochs if len(epochs) < 8 else [*epochs[:3], "…", epochs[-1]]))
-    starts = f"{min(counts)} to {max(counts)}" if len(counts) > 1 else f"{min(counts)}"
-    return [f"The points of a learning curve are epochs {shown}, of {starts} starts each."]
+    starts = {state for r in curves for state in r.init_states}
+    apart = starts.isdisjoint(
+        state for r in results.evaluations() if r.phase == "matrix" for state in r.init_states
+    )
+    which = (
+        f"{'–'.join(map(str, sorted({min(counts), max(counts)})))} starts{' of their own' if apart else ''}"
+    )
+    return f"epochs {shown}, from {which}"
 
 
 def _kept(run: Run) -> dict[int, int]:
@@ -297,19 +325,11 @@ def _published_of(found: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
 
 
 def _group_rows(metrics: Mapping[str, dict[str, Any]], found: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row of metrics for each group, with the best of each column marked."""
-    rows: list[dict[str, Any]] = [
-        {"label": label, "count": found["groups"][label]["measured"], "cells": cells, "best": set()}
+    """Return a row of metrics for each group."""
+    return [
+        {"label": label, "count": found["groups"][label]["measured"], "cells": cells}
         for label, cells in metrics.items()
     ]
-    for name in METRIC_NAMES:
-        means = np.array([row["cells"][name]["mean"] for row in rows])
-        if len(rows) > 1 and not np.isnan(means).all():
-            best = np.nanmax(means) if METRIC_TEXTS[name][2] == "up" else np.nanmin(means)
-            for row, mean in zip(rows, means, strict=True):
-                if np.isclose(mean, best):
-                    row["best"].add(name)
-    return rows
 
 
 def _forgotten_tasks(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:

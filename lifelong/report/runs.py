@@ -11,7 +11,7 @@ import yaml
 
 from libero_env.storage import MAX_YAML_BYTES, read_bounded
 from libero_env.text import flatten
-from lifelong.errors import LifelongError, ResultsError
+from lifelong.errors import ComparisonError, LifelongError, ResultsError
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import few_of, resume_notes
 from lifelong.results.records import RunRecord
@@ -19,9 +19,10 @@ from lifelong.results.results import Results
 from lifelong.stats.metrics import Metrics, lifelong_metrics
 
 _BASICS = ("algo", "benchmark", "policy", "preset")
-# of keys that change no result
+# of keys that change no result by themselves
 _IGNORED = (
     "benchmark.order",
+    "benchmark.horizon",
     "language.cache_dir",
     "data.memory",
     "eval.reuse",
@@ -105,8 +106,23 @@ def load_run(path: Path) -> Run:
     if not results.finished:
         so_far = f"{learned} of {len(record.tasks)} tasks are learned"
         notes.insert(0, f"This run is not finished: {so_far}, and the metrics are over these.")
-    remarks = (*notes, *resume_notes(results), *results.error_notes, *results.problems)
+    remarks = (*notes, *_untrained(results), *resume_notes(results), *results.error_notes, *results.problems)
     return Run(path, results, record, config, text, remarks, learned, metrics)
+
+
+def _untrained(results: Results) -> list[str]:
+    """Return a sentence about the tasks that nothing was learned on, though they count as learned."""
+    tasks = range(len(results.run.tasks))
+    kept = [
+        f"task {t + 1}" for t in tasks if (end := results.task_end(t)) is not None and end.best_epoch == 0
+    ]
+    full = [f"task {t + 1}" for t in tasks if results.costs(t).get("parameters_trained") == 0]
+    notes = (
+        [f"No epoch was better than none, so the weights from before are kept of {few_of(kept)}."]
+        if kept
+        else []
+    )
+    return notes + ([f"No weight was free, so nothing was trained on {few_of(full)}."] if full else [])
 
 
 def short_labels(instructions: Sequence[str]) -> list[str]:
@@ -154,34 +170,101 @@ def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
     return f"{identity['algo']} ({', '.join(words)})" if words else str(identity["algo"])
 
 
-def other_demonstrations(groups: Sequence[Group]) -> list[str]:
+def unlike(groups: Sequence[Group]) -> list[str]:
+    """Return a sentence for all in which runs differ besides their methods' names, or that a record does not tell."""
+    return [
+        *(
+            f"Runs differ in {text}."
+            for text in _unlike_facts(groups, (*_WORLD, "source", "estimate of FWT"))
+        ),
+        *_unlike_demonstrations(groups),
+        *_unlike_settings(groups),
+    ]
+
+
+def check_same_world(groups: Sequence[Group]) -> None:
+    """Check that runs are of one world: of the same models, simulated by the same MuJoCo.
+
+    Raises:
+        ComparisonError: They are not; the message names runs of each. What no record tells is not refused.
+    """
+    if found := _unlike_facts(groups, _WORLD, unknown=False):
+        raise ComparisonError(
+            f"runs of different worlds are only compared with --other-worlds: they differ in {'; in '.join(found)}"
+        )
+
+
+_WORLD = ("models digest", "mujoco")
+
+
+def _unlike_facts(groups: Sequence[Group], names: Sequence[str], *, unknown: bool = True) -> list[str]:
+    """Return the facts of the records in which runs differ, each with its values and the runs of each value."""
+    lines = []
+    for name in names:
+        found: dict[str, list[str]] = {}
+        for label, run in ((group.label, run) for group in groups for run in group.runs):
+            facts = {**run.record.versions, **run.record.conditions, "estimate of FWT": run.results.transfer}
+            value = facts.get(name.replace(" ", "_"), facts.get(name))
+            if value is not None or unknown:
+                found.setdefault(value or "unknown", []).append(f"{label} seed {run.record.seed}")
+        if len(found) > 1:
+            lines.append(f"{name} ({'; '.join(f'{value}: {few_of(runs)}' for value, runs in found.items())})")
+    return lines
+
+
+def _unlike_demonstrations(groups: Sequence[Group]) -> list[str]:
     """Return a sentence for each set of runs whose demonstrations differ although their settings of them are equal.
 
     That happens when the expert was improved, or files of `data.folder` were replaced, between two runs.
     """
     sets: dict[Any, dict[tuple[tuple[str, str], ...], list[str]]] = {}
+    unknown = []
     for group in groups:
         for run in group.runs:
+            name = f"{group.label} seed {run.record.seed}"
             if (found := run.results.demonstrations) is None:
+                unknown.append(name)
                 continue
             counts = tuple(sorted(zip(run.record.tasks, found.counts, strict=True)))
             digests = tuple(sorted(zip(run.record.tasks, found.digests, strict=True)))
             data = tuple(item for item in _identity(run) if item[0].startswith("data."))
             alike = sets.setdefault((run.record.benchmark, counts, data), {})
-            alike.setdefault(digests, []).append(f"{group.label} seed {run.record.seed}")
-    lines = []
+            alike.setdefault(digests, []).append(name)
+    lines = (
+        [f"No record tells which demonstrations these learned from: {few_of(unknown)}."] if unknown else []
+    )
     for (first, names), *others in (list(alike.items()) for alike in sets.values()):
         for digests, others_names in others:
             differ = [task for (task, was), (_, now) in zip(first, digests, strict=True) if was != now]
             lines.append(
-                f"{_few(others_names)} learned from other demonstrations of {few_of(differ)} than {_few(names)}: a "
-                "difference between them may be due to that."
+                f"{few_of(others_names)} learned from other demonstrations of {few_of(differ)} than {few_of(names)}: "
+                "a difference between them may be due to that."
             )
     return lines
 
 
-def _few(names: Sequence[str], most: int = 4) -> str:
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more runs" if len(names) > most else "")
+def _unlike_settings(groups: Sequence[Group]) -> list[str]:
+    """Return a sentence with the settings that differ between methods, and that their names do not tell."""
+    known = [(group.label, dict(_identity(group.runs[0]))) for group in groups]
+    shared = set[str].intersection(*(set(settings) for _, settings in known)) - set(_BASICS)
+    one_policy = (
+        len({settings["policy"] for _, settings in known}) == 1
+    )  # keys of another one mean something else
+    untold = []
+    for key in sorted(shared):
+        found: dict[Any, list[str]] = {}
+        for label, settings in known:
+            found.setdefault(settings[key], []).append(label)
+        told = all(f"{key.rpartition('.')[2]} {settings[key]}" in label for label, settings in known)
+        if (
+            len(found) > 1
+            and not told
+            and not key.startswith("algo.")
+            and (one_policy or key[:7] != "policy.")
+        ):
+            values = ", ".join(f"{value} of {few_of(labels)}" for value, labels in found.items())
+            untold.append(f"{key.rstrip('.')} ({values})")
+    return [f"Settings differ that no method's name tells: {few_of(untold, 6)}."] if untold else []
 
 
 def _identity(run: Run) -> tuple[tuple[str, Any], ...]:

@@ -25,7 +25,7 @@ COST_COLUMNS: dict[str, tuple[str, str, Callable[[float], str]]] = {
     "flops_per_step": ("A step", "operations of a training step, replay and penalties included", _flop),
     "flops_per_action": ("An action", "operations of one action with a full history", _flop),
     "parameters": ("Parameters", "of the policy and of what the algorithm trains beside it", quantity),
-    "parameters_trained": ("Trained", "parameters that the optimiser moves", quantity),
+    "parameters_trained": ("Trained", "parameters that training may change", quantity),
     "stored_bytes": ("Stored", "kept from task to task: state, and frames to replay", _bytes),
     "peak_gpu_bytes": ("GPU memory", "largest while learning a task", _bytes),
     "peak_memory_bytes": ("Memory", "largest of the process so far", _bytes),

@@ -231,10 +231,9 @@ def changed_demonstrations(
     )
 
 
-def few_of(names: Sequence[str], most: int = 3) -> str:
-    """Return names as a list, and of more than `most` how many there are and the first ones."""
-    listed = ", ".join(names[:most])
-    return listed if len(names) <= most else f"{len(names)} tasks ({listed}, …)"
+def few_of(names: Sequence[str], most: int = 4) -> str:
+    """Return names as a list, and of more than `most` the first ones and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 @cache

@@ -271,7 +271,9 @@ def test_several_runs_side_by_side(tmp_path: Path):
     page = Page(out.read_text())
     assert page.open == [] and out.name == "report.html"
     assert "4 methods on libero_object" in page.text
-    assert len(re.findall(r"± \d", page.text)) >= 4 * 5
+    assert len(re.findall(r"\[[−\d]+, \d+\]", page.text)) >= 4 * 5
+    found = json.loads((out.parent / "comparison.json").read_text())["groups"]
+    assert list(found) == sorted(found, key=lambda name: -found[name]["metrics"]["auc"]["mean"])
     assert {p.name for p in out.parent.iterdir()} == {
         "report.html",
         "comparison.json",
@@ -379,11 +381,11 @@ def test_means_and_intervals_of_the_comparison(compared: tuple[Path, dict]):
             assert metric["standard_error"] == pytest.approx(values.std(ddof=1) / np.sqrt(len(values)))
             assert metric["low"] < metric["mean"] < metric["high"]
     (difference,) = found["differences"]
-    assert (difference["of"], difference["less"]) == ("ewc", "er")
+    assert (difference["of"], difference["less"]) == ("er", "ewc")  # best AUC first
     final = difference["metrics"]["final_success"]
-    means = [found["groups"][n]["metrics"]["final_success"]["mean"] for n in ("ewc", "er")]
+    means = [found["groups"][n]["metrics"]["final_success"]["mean"] for n in ("er", "ewc")]
     assert final["value"] == pytest.approx(means[0] - means[1])
-    assert final["low"] < final["value"] < final["high"] < 0  # made so: er keeps more
+    assert 0 < final["low"] < final["value"] < final["high"]  # made so: er keeps more
 
 
 def test_the_table_of_episodes_gives_the_same_numbers(compared: tuple[Path, dict]):
@@ -476,7 +478,7 @@ def test_runs_that_learned_from_other_demonstrations_are_told(tmp_path: Path):
     told = [line for line in comparison_text(page) if "other demonstrations" in line]
     second = load_run(runs[0]).record.tasks[1]
     assert told == [
-        f"ewc seed 2 learned from other demonstrations of {second} than ewc seed 0, er seed 1: a difference between "
+        f"ewc seed 2 learned from other demonstrations of {second} than er seed 1, ewc seed 0: a difference between "
         "them may be due to that."
     ]
     assert told[0] in page.read_text(), (
@@ -662,3 +664,51 @@ def test_the_ring_is_the_kept_epoch_and_a_sent_page_names_no_folder_of_the_machi
     page = write_report(runs, tmp_path / "page")
     for file in ("report.html", "comparison.json"):
         assert str(tmp_path) not in (page.parent / file).read_text()
+
+
+def test_what_differs_besides_the_method_is_said_and_other_worlds_are_refused(tmp_path: Path):
+    runs = [
+        make_run(tmp_path / f"{algo}{seed}", algo, seed, tasks=2) for algo in ("ewc", "er") for seed in (1, 2)
+    ]
+
+    def change(run: Path, horizon: int, **facts: str) -> None:
+        first, *others = (run / "results.jsonl").read_bytes().splitlines(keepends=True)
+        values = json.loads(first)
+        del values["crc32"]
+        values["versions"] |= facts
+        (run / "results.jsonl").write_bytes(signed_line(values) + b"".join(others))
+        (run / "config.yaml").write_text(yaml.safe_dump({"eval": {"horizon": horizon}}))
+
+    for run in runs[:2]:
+        change(run, 130, mujoco="3.3.2")
+    for run in runs[2:]:
+        change(run, 600, mujoco="3.3.2")
+    demonstrations = DemonstrationsRecord(counts=(9, 9), generators=("", ""), digests=("a", "b"))
+    ResultLog(runs[0] / "results.jsonl").append(demonstrations)
+    told = comparison_text(write_report(runs, tmp_path / "alike"))
+    assert told[:2] == [
+        "No record tells which demonstrations these learned from: er seed 1, er seed 2, ewc seed 2.",
+        "Settings differ that no method's name tells: eval.horizon (600 of er, 130 of ewc).",
+    ]
+    for name, value in {"mujoco": "4.0.0", "models_digest": "another"}.items():
+        change(runs[1], 130, **{name: value})
+        with pytest.raises(
+            LifelongError, match=f"other-worlds: .*{name.replace('_', ' ')} .*{value}: ewc seed 2"
+        ):
+            write_report(runs, tmp_path / "page")
+    text = write_report(runs, tmp_path / "page", other_worlds=True).read_text()
+    assert "Runs differ in mujoco (3.3.2: er seed 1, er seed 2, ewc seed 1; 4.0.0: ewc seed 2)." in text
+
+
+def test_a_page_says_what_forward_transfer_is_the_mean_of_and_which_weights_were_never_trained(
+    tmp_path: Path,
+):
+    run = make_run(tmp_path / "run", tasks=2)
+    text = Page(write_report([run]).read_text()).text
+    assert "the epochs of learning a task: epochs 0, 2, 4, 6, 8, 10, from 20 starts" in text
+    assert "are kept" not in "".join(load_run(run).notes)
+    ResultLog(run / "results.jsonl").append(TaskEndRecord(task=1, best_epoch=0, seconds=1.0))
+    ResultLog(run / "results.jsonl").append(CostRecord(task=1, costs={"parameters_trained": 0}))
+    notes = load_run(run).notes
+    assert any("weights from before" in note and "task 2" in note for note in notes)
+    assert any("nothing was trained" in note and "task 2" in note for note in notes)
