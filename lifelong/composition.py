@@ -35,6 +35,8 @@ REFUSALS = (
     TypeError,
     ValueError,
 )
+# of LeRobot, which users name as policies
+LEROBOT_TYPES = ("act", "diffusion", "vqbet", "tdmpc", "smolvla", "pi0", "pi0_fast", "pi05", "groot")
 # keys at the top of the original's configuration -> those of this package
 ORIGINAL_KEYS = {
     "lifelong": "algo",
@@ -107,7 +109,10 @@ def explained(error: Exception, words: Sequence[str], folders: Sequence[Path]) -
     if file := re.search(r"Could not find '([^']+)/([^/']+)'", said):
         if file[1] == "hydra/launcher" and file[2] in LAUNCHERS:
             require_package(*LAUNCHERS[file[2]])
-        return UnknownNameError(file[1], file[2], _names(file[1], folders))
+        unknown = UnknownNameError(file[1], file[2], _names(file[1], folders))
+        if file[1] == "policy" and file[2] in LEROBOT_TYPES:
+            unknown = ConfigError(f"{unknown} A policy of LeRobot: policy=lerobot policy.type={file[2]}")
+        return unknown
     key = re.search(r"Could not override '([^']+)'", said)
     try:
         if key:
@@ -136,7 +141,8 @@ def _unknown_key(name: str, config: DictConfig) -> ConfigError:
         )
     if top not in plain and top not in choices:
         tops = sorted({*filter(str.isidentifier, choices), *plain})
-        near = ORIGINAL_KEYS.get(top) or closest(top, tops)
+        leaves = [key for key in flatten(plain) if key.endswith(f".{name}")]
+        near = ORIGINAL_KEYS.get(top) or " or ".join(leaves) or closest(top, tops)
         hint = f" Did you mean {near}?" if near else ""
         return ConfigError(f"unknown key {name} of the configuration.{hint} Valid: {', '.join(tops)}")
     node = plain.get(top)

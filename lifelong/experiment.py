@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,14 @@ import torch
 from omegaconf import DictConfig
 
 from libero_env.assets.pack import select_pack
+from libero_env.assets.robot import robosuite_assets
 from libero_env.demos.read import demo_origin
 from libero_env.envs.batch import BatchEnv
 from libero_env.memory import memory_limit
 from libero_env.perturbations import Perturbation, format_perturbations
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
+from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
 from lifelong.data.demonstrations import DemoDatasets, check_folder, demo_copies, find_demos, perturb_demos
@@ -49,7 +52,8 @@ from lifelong.results.run_directory import RunDirectory, config_digest
 from lifelong.results.summary import write_summary
 from lifelong.sequence import TaskSequence, is_measured
 from lifelong.settings import Configuration, RunSettings, plain_data
-from lifelong.streams import plan_tasks
+from lifelong.streams import TaskPlan, plan_tasks
+from lifelong.tracking import Tracker
 from lifelong.training.distributed import Ranks
 from lifelong.training.memory import check_memory, policy_bytes, training_needs
 from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory
@@ -102,6 +106,21 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
                 context.tracker.finish()
                 _write_results(directory, plain)
     return directory.path
+
+
+def check(config: DictConfig) -> None:
+    """Check a configuration as `run` does before it writes anything, without drawing or training.
+
+    Raises:
+        LiberoError: A run would refuse the configuration, or this machine lacks what it needs.
+    """
+    configuration = Configuration(_with_drawing(plain_data(config)))
+    settings = configuration.settings()
+    parts = _checked_parts(configuration, Ranks().device(settings.device))
+    for group in ("language", "augmentation"):
+        configuration.build(group)
+    if not configuration.is_own("policy"):  # others are checked with the memory that they need
+        configuration.build("policy", spec=parts.data.spec(EXAMPLE_DIM))
 
 
 def _with_drawing(config: dict[str, Any]) -> dict[str, Any]:
@@ -160,25 +179,11 @@ def _build_contexts(
     config: Configuration, settings: RunSettings, directory: RunDirectory, ranks: Ranks
 ) -> tuple[RunContext, RunContext | None]:
     """Return the context of the run, and that of the pretraining before it if there is any."""
-    plan, device = plan_tasks(config), ranks.device(settings.device)
-    data: DataSettings = config.build("data")
-    check_folder(data)
-    fit: FitSettings = config.build("train")
-    evaluation: EvalSettings = config.build("eval")
-    algorithm, augment, tracker = config.build("algo"), config.build("augmentation"), config.build("wandb")
-    demos = plan.stream.demos(data.demos, len(plan.tasks), plan.group_sizes[0])
-
-    # what cannot fit into memory is refused, and sizes of a policy that do not work together
-    weights = policy_bytes(config, data.spec(EXAMPLE_DIM))
-    episodes = max(evaluation.episodes, evaluation.curve_episodes)
-    replayed = algorithm.ratio if isinstance(algorithm, Rehearsal) else 0.0
-    needs = training_needs(data, fit, weights, max(demos) * (1 + data.copies), episodes, replayed)
-    on_gpu = torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else 0
-    check_memory(needs, memory_limit() + on_gpu)
-    if fit.compile != "off":
-        check_compiler(device)
+    device = ranks.device(settings.device)
+    parts = _checked_parts(config, device)
+    plan, data, evaluation = parts.plan, parts.data, parts.eval
     if ranks.first and settings.device == "auto" and device.type == "cpu":
-        _warn_of_cpu(data, fit)
+        _warn_of_cpu(data, parts.fit)
 
     first, said = len(plan.before), list(plan.instructions)
     languages = ranks.broadcast(lambda: config.build("language").embed(said))
@@ -198,18 +203,18 @@ def _build_contexts(
     context = RunContext(
         tasks=plan.tasks,
         languages=languages[first:],
-        demos=demos,
+        demos=parts.demos,
         data=data,
         policy=policy_at_start(config, spec, settings.seed, settings.init_from).to(device),
-        algorithm=algorithm,
-        fit=fit,
+        algorithm=parts.algorithm,
+        fit=parts.fit,
         eval=evaluation,
-        augment=augment,
+        augment=config.build("augmentation"),
         stream=plan.stream,
         group_sizes=plan.group_sizes,
         envs=EnvPool(make, evaluation.open_environments),
         directory=directory,
-        tracker=tracker,
+        tracker=parts.tracker,
         seed=settings.seed,
         device=device,
         progress=progress if ranks.first else False,
@@ -227,6 +232,37 @@ def _build_contexts(
     return context, pretraining_context(
         context, plan.before, languages[:first], pretrain, RunDirectory(folder)
     )
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """What a run is made of, as far as its configuration alone decides it."""
+
+    plan: TaskPlan
+    data: DataSettings
+    fit: FitSettings
+    eval: EvalSettings
+    algorithm: Algorithm
+    tracker: Tracker
+    demos: tuple[int, ...]
+
+
+def _checked_parts(config: Configuration, device: torch.device) -> _Parts:
+    """Build what a run is made of; refuse what cannot fit into memory, or needs a package that is not there."""
+    robosuite_assets()
+    plan, data = plan_tasks(config), config.build("data")
+    check_folder(data)
+    fit, evaluation, algorithm = config.build("train"), config.build("eval"), config.build("algo")
+    demos = plan.stream.demos(data.demos, len(plan.tasks), plan.group_sizes[0])
+    weights = policy_bytes(config, data.spec(EXAMPLE_DIM))
+    episodes = max(evaluation.episodes, evaluation.curve_episodes)
+    replayed = algorithm.ratio if isinstance(algorithm, Rehearsal) else 0.0
+    needs = training_needs(data, fit, weights, max(demos) * (1 + data.copies), episodes, replayed)
+    on_gpu = torch.cuda.get_device_properties(device).total_memory if device.type == "cuda" else 0
+    check_memory(needs, memory_limit() + on_gpu)
+    if fit.compile != "off":
+        check_compiler(device)
+    return _Parts(plan, data, fit, evaluation, algorithm, config.build("wandb"), demos)
 
 
 def _make_env(

@@ -1,20 +1,22 @@
 """From the command line to a run: jobs are run by Hydra, errors take one line, sweeps get a report."""
 
 import argparse
+import io
 import math
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from copy import copy
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.cli import ending
@@ -24,7 +26,7 @@ from libero_env.text import printable, suggest
 from lifelong import experiment
 from lifelong.composition import REFUSALS, compose_first, config_folders, explained, swept
 from lifelong.errors import ConfigError
-from lifelong.report.page import write_report
+from lifelong.report.page import comparison_text, write_report
 from lifelong.results.provenance import config_digest
 from lifelong.settings import plain_data
 from lifelong.sweeps import (
@@ -132,6 +134,10 @@ def _launch(options: argparse.Namespace, ranks: Ranks) -> int:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach the caller, which prints a line
     try:
         hydra.main(version_base="1.3", config_path=str(folders[0]), config_name="config")(job)()
+        if options.cfg == "job":  # what is shown may be what a run refuses
+            with open_dict(config):
+                del config["hydra"]
+            experiment.check(config)
     except LiberoError:
         raise
     except REFUSALS as error:  # of Hydra: jobs keep theirs
@@ -171,9 +177,21 @@ class Job:
         hydra_config = HydraConfig.get()
         is_sweep = hydra_config.mode == RunMode.MULTIRUN
         if is_sweep:
-            config = self._named(config, hydra_config.overrides.task)
+            words = hydra_config.overrides.task
+            config = self._named(config, words)
+            own = [word for word in words if word.partition("=")[0] in swept(self.words)]
+            planned = read_sweep(Path(hydra_config.sweep.dir)).planned
+            name = " ".join([f"{hydra_config.job.num + 1}/{planned or '…'}", *own])
+            with (
+                redirect_stdout(_Named(sys.stdout, f"[{name}] ")),
+                redirect_stderr(_Named(sys.stderr, f"[{name}] ")),
+            ):
+                return self._learn(config, hydra_config, ranks)
+        return self._learn(config, hydra_config, ranks)
+
+    def _learn(self, config: DictConfig, hydra_config: Any, ranks: Ranks) -> Path | None:
         learn = partial(experiment.run, config, hydra_config.runtime.choices, ranks)
-        if not is_sweep or not ranks.first:
+        if hydra_config.mode != RunMode.MULTIRUN or not ranks.first:
             try:
                 return learn()
             except Exception as error:  # noqa: BLE001 - told by kind
@@ -201,14 +219,38 @@ class Job:
         return config
 
 
+class _Named(io.TextIOBase):
+    """A stream whose lines begin with a name, as those of jobs that run side by side.
+
+    Args:
+        stream: Stream that is written to. It counts as no terminal, so that progress is told in lines.
+        name: What each line begins with.
+    """
+
+    def __init__(self, stream: TextIO, name: str):
+        self._stream, self._name, self._fresh = stream, name, True
+
+    def write(self, text: str) -> int:
+        """Write text, of which each line gets the name once."""
+        if text:
+            body = text[:-1].replace("\n", f"\n{self._name}") + text[-1]
+            self._stream.write(self._name * self._fresh + body)
+            self._fresh = text.endswith("\n")
+        return len(text)
+
+    def flush(self) -> None:
+        """Write out what the stream has kept."""
+        self._stream.flush()
+
+
 def _end_sweep(folder: Path, ranks: Ranks) -> int:
     """Say what became of the jobs, compare the runs that are finished, and return the exit status."""
     if not ranks.first or not folder.is_dir():
         return 0
     sweep = read_sweep(folder)
     if len(sweep.runs) > 1:
-        page = write_report(sweep.runs, sweep.folder / "report.html")
-        print(f"{len(sweep.runs)} runs compared: {page}")
+        page = write_report(sweep.runs, sweep.folder / "report.html", other_worlds=True)
+        print("\n".join([f"{len(sweep.runs)} runs compared: {page}", *comparison_text(page)]))
     if sweep.exit_status:
         print("\n".join(status_lines(sweep)), file=sys.stderr)
     return sweep.exit_status

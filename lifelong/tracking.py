@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from lifelong.errors import LifelongError
+from lifelong.errors import LifelongError, require_package
 
 
 class Tracker:
@@ -14,6 +14,9 @@ class Tracker:
             it later. `online` uploads at once.
         project: Name of the W&B project.
         entity: W&B user or team; None for the default of the login.
+
+    Raises:
+        MissingPackageError: The package wandb is not installed.
     """
 
     def __init__(
@@ -23,6 +26,8 @@ class Tracker:
         project: str = "libero-lifelong",
         entity: str | None = None,
     ):
+        if mode != "disabled":
+            require_package("wandb", "wandb")
         self.mode, self.project, self.entity = mode, project, entity
         self._run: Any = None
 
@@ -35,16 +40,12 @@ class Tracker:
             config: Configuration of the run.
 
         Raises:
-            LifelongError: The package wandb is not installed, or W&B does not start.
+            LifelongError: W&B does not start.
         """
         if self.mode == "disabled":
             return
-        try:
-            import wandb
-        except ImportError as error:
-            raise LifelongError(
-                f"wandb.mode={self.mode} needs the package wandb: pip install wandb, or wandb.mode=disabled"
-            ) from error
+        import wandb
+
         try:
             self._run = wandb.init(
                 mode=self.mode,

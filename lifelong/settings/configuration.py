@@ -9,11 +9,14 @@ configuration may be somebody else's: there, a name must be one of this package'
 lie in a package that the user has allowed.
 """
 
+import os
 import pkgutil
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
+from importlib.util import find_spec
 from inspect import isclass
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
@@ -286,10 +289,15 @@ def _is_within(name: str, packages: Sequence[str]) -> bool:
 
 
 def _resolve(name: str) -> Target:
+    """Return the class or function of a name; modules are looked for in the current folder, too, after all others."""
     try:
+        if os.getcwd() not in sys.path and find_spec(name.partition(".")[0]) is None:
+            sys.path.append(os.getcwd())  # for good: processes that this one starts need it as well
         target = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"names {name}, which cannot be found: {error}") from error
+        raise ConfigError(
+            f"names {name}, which cannot be found, neither installed nor in {os.getcwd()}: {error}"
+        ) from error
     if not callable(target):
         raise ConfigError(f"names {name}, which is not a class or function")
     return target

@@ -1,5 +1,6 @@
 """What is wrong on the command line of a training is told in one line, with what would be right."""
 
+import importlib.util
 import io
 import os
 import sys
@@ -34,6 +35,8 @@ def own(here) -> Path:
     """The folder of a user, with a configuration file in `own`."""
     (here / "own" / "algo").mkdir(parents=True)
     (here / "own" / "algo" / "l2.yaml").write_text("_target_: my_package.L2\nstrength: 10.0\n")
+    (here / "own" / "policy").mkdir()
+    (here / "own" / "policy" / "mine.yaml").write_text("_target_: my_policy.Mine\n")
     return here
 
 
@@ -41,6 +44,18 @@ def own(here) -> Path:
 MISTAKES = {
     "train.epochs=abc": ("train.epochs", "'abc'", "a whole number"),
     "train.epoch=3": ("train.epoch", "Did you mean 'train.epochs'?"),
+    "lr=3e-4": ("unknown key lr", "Did you mean train.lr?"),
+    "temporal.layers=2 policy=bc_rnn_small": ("Did you mean policy.temporal.layers?",),
+    "policy=act": ("'act'", "policy=lerobot policy.type=act"),
+    "policy=mine --config-dir own": (
+        "my_policy.Mine",
+        "neither installed nor in",
+        "No module named 'my_policy'",
+    ),
+    "policy=mine policy/head=gmm --config-dir own": ("policy/head", "policy has no group head"),
+    "--cfg job train.epochs=abc": ("train.epochs", "'abc'"),
+    "--cfg job benchmark.tasks=[3,99]": ("libero_goal 99",),
+    "--cfg job policy.encoder.width=17": ("17 channels",),
     "trian.epochs=3": ("trian", "Did you mean train?"),
     "+train.foo=3": ("train.foo", "unknown key", "Valid: epochs"),
     "+foo=3": ("foo", "unknown key", "Valid: seed"),
@@ -125,9 +140,47 @@ def test_a_sweep_takes_what_hydra_offers_to_name_files(chosen, own, monkeypatch,
 
 def test_a_single_run_takes_options_anywhere(own, capsys):
     for words in ("algo=l2 --config-dir own seed=7 --cfg job", "--cfg job algo=l2 -cd own seed=7"):
-        assert main(["train", *words.split(), "algo.strength=3"]) == 0
+        assert main(["train", *words.split(), "algo.strength=3"]) == 2, "there is no my_package"
         shown = OmegaConf.create(capsys.readouterr().out)
         assert (shown.algo.strength, shown.seed) == (3, 7)
+
+
+def test_classes_of_a_module_in_the_current_folder_are_found(own, monkeypatch, capsys):
+    """Beside the command, as `libero eval my_policy:make` finds it; with policies that name no head."""
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if Path(entry).resolve() != own])
+    (own / "my_package.py").write_text(
+        "from lifelong import Algorithm\n\n\nclass L2(Algorithm):\n"
+        "    def __init__(self, *, strength: float):\n        self.strength = strength\n"
+    )
+    (own / "my_policy.py").write_text(
+        "from lifelong.policies import BCMLP\n\n\nclass Mine(BCMLP):\n    pass\n"
+    )
+    for words in ("algo=l2", "policy=mine"):
+        status = main(["train", *words.split(), "--config-dir", "own", "--cfg", "job"])
+        assert (status, capsys.readouterr().err) == (0, "")
+
+
+@pytest.mark.parametrize("package", ["wandb", "robosuite"])
+def test_a_package_that_is_not_installed_leaves_no_directory(package, here, monkeypatch, capsys):
+    find = importlib.util.find_spec
+    for place in ("importlib.util.find_spec", "lifelong.errors.find_spec"):
+        monkeypatch.setattr(place, lambda name, *more: None if name == package else find(name, *more))
+    assert main(["train", "preset=smoke", "wandb=offline"]) == 2
+    assert f"{package} is not installed" in capsys.readouterr().err and not (here / "runs").exists()
+
+
+def test_lines_of_the_jobs_of_a_sweep_have_their_names(here, monkeypatch, capsys):
+    def run(config, names, ranks):
+        print("Task 1/2: a\n  epoch 0", end="")
+        print(": success 0%", flush=True)
+        raise ConfigError("a run begins")
+
+    monkeypatch.setattr(experiment, "run", run)
+    assert main(["train", "-m", "algo=er", "seed=3,4"]) == 2
+    out, err = capsys.readouterr()
+    for name in ("[1/2 seed=3] ", "[2/2 seed=4] "):
+        assert f"{name}Task 1/2: a\n{name}  epoch 0: success 0%\n" in out
+        assert f"{name}error: a run begins\n" in err
 
 
 @pytest.mark.parametrize(("words", "noted"), [
