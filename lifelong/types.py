@@ -3,7 +3,7 @@
 Shape legend: B batch, T time, V views, H W C image, A action, D size of a reading, L language embedding.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated
@@ -59,12 +59,12 @@ class PolicySpec:
     seq_len: int = 10
 
 
-def _mover(device: torch.device | str) -> Callable[[Tensor], Tensor]:
-    """Return a function that copies a tensor to a device, asynchronously to a GPU only.
+def to_device(x: Tensor, device: torch.device | str) -> Tensor:
+    """Return a tensor on a device, copied asynchronously to a GPU only.
 
     An asynchronous copy to the host returns before its values are there, and whoever reads them at once gets others.
     """
-    return partial(Tensor.to, device=device, non_blocking=torch.device(device).type == "cuda")
+    return x.to(device=device, non_blocking=torch.device(device).type == "cuda")
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Observation:
 
     def to(self, device: torch.device | str) -> "Observation":
         """Return the observation on another device."""
-        move = _mover(device)
+        move = partial(to_device, device=device)
         proprio = {name: move(reading) for name, reading in self.proprio.items()}
         return Observation(move(self.images), proprio, move(self.language))
 
@@ -112,7 +112,7 @@ class Batch:
 
     def to(self, device: torch.device | str) -> "Batch":
         """Return the batch on another device."""
-        move = _mover(device)
+        move = partial(to_device, device=device)
         moved = self.observation.to(device)
         is_pad = None if self.is_pad is None else move(self.is_pad)
         return Batch(moved, move(self.actions), move(self.task_ids), move(self.window_ids), is_pad)

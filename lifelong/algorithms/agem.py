@@ -66,12 +66,13 @@ def project(params: list[Tensor], reference: tuple[Tensor | None, ...]) -> None:
     """
     used = [(p, r) for p, r in zip(params, reference, strict=True) if r is not None]
     products = [(p.grad * r).sum() for p, r in used if p.grad is not None]
-    product = torch.stack(products).sum() if products else torch.zeros(())
-    if product >= 0:
+    if not products:
         return
+    product = torch.stack(products).sum()
     share = product / torch.stack([r.square().sum() for _, r in used]).sum()
+    share = torch.where(product >= 0, 0.0, share)  # on the device: the host need not know it
     for p, r in used:
-        if p.grad is None:
-            p.grad = -share * r
-        else:
+        if p.grad is not None:
             p.grad.sub_(share * r)
+        elif share != 0:
+            p.grad = -share * r

@@ -120,10 +120,10 @@ class CLARE(RoutedExperts):
         return self.task_index if unfinished else None
 
     def route(self, name: str, samples: Tensor) -> Tensor:
-        """Return the task whose adapter acts on each sample (n, tokens, D) of a layer's input, (n,) int64."""
+        """Return the task whose adapter acts on each sample (n, tokens, D) of an input, (n,) int64 on the CPU."""
         known = [(t, of[name]) for t, of in self._discriminators.items()]
-        uses = torch.tensor([self._chosen[t][name] for t, _ in known], device=samples.device)
-        return uses[torch.stack([d.errors(samples) for _, d in known]).argmin(0)]
+        uses = torch.tensor([self._chosen[t][name] for t, _ in known])
+        return uses[torch.stack([d.errors(samples) for _, d in known]).argmin(0).cpu()]
 
     def compare(self, samples: Samples) -> dict[str, int]:
         """Return for each layer the task whose adapter the present task uses: its own where the samples are new."""

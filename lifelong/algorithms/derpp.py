@@ -10,7 +10,7 @@ from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy, device_of, in_mode
-from lifelong.types import Batch, Count, NonNegative
+from lifelong.types import Batch, Count, NonNegative, to_device
 
 _CHUNK = 32  # windows per forward pass at the end of a task
 
@@ -68,11 +68,12 @@ class DERpp(Rehearsal):
         """Return the policy's answers on windows of the memory at the end of their tasks, each (B, T, ...)."""
         outputs: dict[str, Tensor] = {}
         for task, kept in self._kept.items():
-            mine = batch.task_ids == task
-            rows = (batch.window_ids[mine, None].to(kept.device) == kept).int().argmax(1)
+            self._kept[task] = kept = to_device(kept, batch.window_ids.device)
+            rows = (batch.window_ids[:, None] == kept).int().argmax(1)
             for name, values in self._outputs[task].items():
-                part = outputs.setdefault(name, batch.actions.new_empty(len(batch), *values.shape[1:]))
-                part[mine] = values[rows].to(part)
+                found = values[rows].to(batch.actions)
+                mine = (batch.task_ids == task).view(-1, *(1,) * (found.dim() - 1))
+                outputs[name] = torch.where(mine, found, outputs.get(name, found))
         return outputs
 
     def end_task(

@@ -96,14 +96,15 @@ class DMPEL(RoutedExperts):
         self._memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
         self.episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
         self._held: Tensor | None = None  # (B, G, N), coefficients of the present episodes
-        # of each group, the tasks (counted in the library) whose experts count in some row of the present pass
-        self._counting: list[list[int]] = []
+        # of each group, the tasks (counted in the library) whose experts count in some row of the present pass, and
+        # their coefficients (B, experts of these tasks)
+        self._counting: list[tuple[list[int], Tensor]] = []
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Store the episodes' contexts; after the base, add experts and build a new router."""
         layers = adapted_layers(policy, self.adapted)
         queries, of_window = of_episodes(dataset, lambda batch: self.query(batch.observation))
-        queries = queries.to(device_of(policy))
+        queries, of_window = (x.to(device_of(policy)) for x in (queries, of_window))
         self.episodes = {"queries": queries, "of_window": of_window}
         draws = self._begin(task_index, policy)
         if draws is None:
@@ -198,20 +199,25 @@ class DMPEL(RoutedExperts):
         groups = {name: _groups(layers).index(name.partition(".")[0]) for name in layers}
 
         def add(name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
-            if self._now is None or not (counting := self._counting[groups[name]]):
+            if self._now is None:
+                return None
+            counting, coefficients = self._counting[groups[name]]
+            if not counting:
                 return None
             pairs = [of_task[name] for of_task in self.library.values()]
             rank = pairs[0]["a"].shape[0] // self.experts
-            of_tasks = self._now[:, groups[name]].unflatten(1, (-1, self.experts))  # (B, tasks, experts)
-            weights = self.scale * of_tasks[:, counting].flatten(1).repeat_interleave(rank, dim=1)
+            weights = self.scale * coefficients.repeat_interleave(rank, dim=1)
             return expert_output(layer, x, [pairs[i] for i in counting], weights)
 
         def encode(policy: Any, own: Any, observation: Observation) -> Tensor:
-            self._now = self.coefficients(observation) if self._held is None else self._held
-            of_tasks = self._now.detach().unflatten(2, (-1, self.experts))  # (B, G, tasks, experts)
-            self._counting = [
-                [i for i, some in enumerate(of_group) if some] for of_group in of_tasks.any(3).any(0).tolist()
-            ]
+            now = self.coefficients(observation) if self._held is None else self._held
+            if now is not self._now:  # the same during an episode
+                self._now = now
+                of_tasks = now.unflatten(2, (-1, self.experts))  # (B, G, tasks, experts)
+                self._counting = [
+                    _counting(of_tasks[:, group], counts)
+                    for group, counts in enumerate(of_tasks.detach().any(3).any(0).tolist())
+                ]
             return own(observation)
 
         return layers, add, encode
@@ -276,6 +282,13 @@ class _Routed(Policy):
             self._coefficients = self._algorithm.coefficients(observation)
         with self._algorithm.holding(self._coefficients):
             return self.inner._act(observation, generators)
+
+
+def _counting(of_tasks: Tensor, counts: Sequence[bool]) -> tuple[list[int], Tensor]:
+    """Return the tasks that count, and their experts' coefficients of (B, tasks, experts) side by side."""
+    tasks = [task for task, some in enumerate(counts) if some]
+    chosen = torch.cat([of_tasks[:, task] for task in tasks], 1) if tasks else of_tasks[:, 0]
+    return tasks, chosen
 
 
 def _groups(layers: Mapping[str, nn.Module]) -> list[str]:

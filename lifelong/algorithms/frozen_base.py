@@ -12,6 +12,7 @@ from lifelong.data.windows import TaskWindows
 from lifelong.errors import PolicyError
 from lifelong.nn.experts import Attachment, ExpertLibrary, expert_output, freeze_statistics
 from lifelong.policies.base import Policy
+from lifelong.types import to_device
 
 
 class FrozenBase(Algorithm):
@@ -148,6 +149,7 @@ class RoutedExperts(FrozenBase):
         for task, rows in groups:
             if task not in self.library:
                 continue
+            rows = None if rows is None else to_device(rows, x.device)
             pairs, own = [self.library[task][name]], x if rows is None else x[rows]
             part = self.scale * expert_output(layer, own, pairs, relu=self.relu)
             if rows is None:

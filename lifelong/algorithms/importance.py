@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lifelong.data.windows import WindowDataset
 from lifelong.policies.base import Policy, in_mode
-from lifelong.types import Batch, Count, Natural
+from lifelong.types import Batch, Count, Natural, to_device
 
 
 class ImportanceEstimator:
@@ -136,7 +136,7 @@ class ActionSensitivity(ImportanceEstimator):
         actions = policy.predict(batch)
         if self.of == "squared":
             return actions.square().sum(-1).mean()
-        directions = torch.randn(actions.shape, generator=draws).to(actions)
+        directions = to_device(torch.randn(actions.shape, generator=draws), actions.device)
         steps = actions.shape[:-1].numel()
         return (directions * actions).sum() / steps**0.5  # of variance |h|^2
 

@@ -88,7 +88,7 @@ class IsCiL(RoutedExperts):
         self._draw_seed(generator)
 
     def retrieve(self, states: Tensor) -> Tensor:
-        """Return the task whose adapter acts on each embedding (B, F), (B,) int64."""
+        """Return the task whose adapter acts on each embedding (B, F), (B,) int64 on the CPU."""
         return nearest_key(states, self._prototypes)
 
     def _hooks(self, policy: Policy) -> tuple[Any, Any, Any]:

@@ -12,7 +12,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy, copy_weights, device_of
-from lifelong.types import Batch, NonNegative
+from lifelong.types import Batch, NonNegative, to_device
 
 P = TypeVar("P", bound=Policy)
 
@@ -75,7 +75,7 @@ class LwF(Algorithm):
         if self._languages:
             drawn = torch.randint(len(self._languages), (len(batch),), generator=generator)
             languages = torch.stack(list(self._languages.values()))
-            language = languages[drawn.to(languages.device)].to(batch.observation.language)
+            language = languages[to_device(drawn, languages.device)].to(batch.observation.language)
             self.distilled = replace(batch, observation=replace(batch.observation, language=language))
         return batch
 

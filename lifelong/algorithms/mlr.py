@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from functools import cache
 from itertools import combinations
 from typing import Any
 
@@ -14,7 +15,7 @@ from lifelong.data.latents import LATENTS_FORM, LatentMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.policies.history import HistoryPolicy, with_features
-from lifelong.types import Batch, Count, Natural, NonNegative, Observation, Share
+from lifelong.types import Batch, Count, Natural, NonNegative, Observation, Share, to_device
 
 _SAMPLE = 512  # windows whose features describe a task
 _CHUNK = 64  # windows of a forward pass
@@ -131,7 +132,9 @@ class MLR(Algorithm):
         if self._replayed is None:
             return None
         policy, device = with_features(policy), device_of(policy)
-        latents, actions = (x.to(device) for x in self._replayed)
+        latents, actions = (
+            to_device(x.pin_memory() if device.type == "cuda" else x, device) for x in self._replayed
+        )
         losses = policy.head.losses(policy.head(policy.over_time(latents)), actions)
         total = self.ratio * losses.mean()
         if self._present is not None:
@@ -145,7 +148,7 @@ class MLR(Algorithm):
             features = policy.encode(observation)
         z = policy.over_time(features)[:, -1]
         own = _direction(policy.modalities(features)["language"][:, 0].float().flatten(1))
-        return adjust(z, own, self.near.to(own), self.margin)
+        return adjust(z, own, to_device(self.near, own.device), self.margin)
 
     def _similar(self, instructions: Tensor, images: Tensor) -> Tensor:
         """Return the directions (J, F) of earlier instructions that are similar to a task's, see `similar_pairs`."""
@@ -273,8 +276,13 @@ def _fitted(directions: Tensor, size: int) -> Tensor:
     """Return directions (K, F) in a space of `size` numbers: as they are, or projected by a fixed random matrix."""
     if directions.shape[-1] == size:
         return directions
-    matrix = torch.randn(directions.shape[-1], size, generator=torch.Generator().manual_seed(0))
-    return _direction(directions @ matrix.to(directions))
+    return _direction(directions @ _projection(directions.shape[-1], size, directions.device))
+
+
+@cache
+def _projection(inputs: int, outputs: int, device: torch.device) -> Tensor:
+    """Return the fixed random matrix (inputs, outputs)."""
+    return torch.randn(inputs, outputs, generator=torch.Generator().manual_seed(0)).to(device)
 
 
 def _angle(cosine: Tensor) -> Tensor:

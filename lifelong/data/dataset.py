@@ -16,7 +16,7 @@ from libero_env.demos.read import Episode
 from lifelong.data.frame_cache import FrameFile
 from lifelong.data.source import DemoSource, check_fits, check_language, demo_tensors, last_frames
 from lifelong.errors import DataError
-from lifelong.types import Batch, Observation, PolicySpec
+from lifelong.types import Batch, Observation, PolicySpec, to_device
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +155,7 @@ class SequenceVLDataset:
             raise DataError(
                 f"window indices must lie in [0, {len(self)}), got {indices.min()} .. {indices.max()}"
             )
-        indices = indices.to(self.last.device)
+        indices = to_device(indices, self.last.device)
         frames = self.frames(indices)
         gather = lambda x: self._gather(x, frames)  # noqa: E731
         language = self.language.expand(len(indices), -1)

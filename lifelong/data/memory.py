@@ -138,10 +138,12 @@ class ReplayMemory(TaskMemory[Tensor]):
         Raises:
             DataError: A dataset is missing or has fewer windows than the state refers to; the memory is unchanged.
         """
-        for task, kept in state["indices"].items():
+        # on the host, as those that `add` draws: batches are divided there
+        saved = {task: kept.to("cpu", copy=True) for task, kept in state["indices"].items()}
+        for task, kept in saved.items():
             if not task.isdecimal() or kept.dtype != torch.int64 or kept.dim() != 1 or (kept < 0).any():
                 raise DataError(f"the memory's windows of task {task!r} are not indices")
-        indices = {int(task): i.clone() for task, i in state["indices"].items()}
+        indices = {int(task): kept for task, kept in saved.items()}
         absent = sorted(set(indices) - set(datasets))
         if absent:
             raise DataError(

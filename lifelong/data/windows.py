@@ -9,7 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from lifelong.types import Batch
+from lifelong.types import Batch, to_device
 
 _CHUNK = 8  # windows that are read at a time
 
@@ -97,9 +97,9 @@ class StageWindows(JoinedWindows):
         indices = torch.as_tensor(indices, dtype=torch.int64, device="cpu")
         batch = super().batch(indices)  # ordered by dataset
         places = torch.bucketize(indices, self._ends, right=True).argsort(stable=True).argsort()
-        batch = batch.rows(places.to(batch.window_ids.device))
-        task_ids = torch.full_like(batch.task_ids, self.task_id)
-        return replace(batch, task_ids=task_ids, window_ids=indices.to(batch.window_ids))
+        places, window_ids = (to_device(x, batch.window_ids.device) for x in (places, indices))
+        batch = batch.rows(places)
+        return replace(batch, task_ids=torch.full_like(batch.task_ids, self.task_id), window_ids=window_ids)
 
 
 @dataclass(frozen=True, eq=False)

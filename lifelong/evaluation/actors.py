@@ -100,8 +100,6 @@ def observe(obs: Obs, spec: PolicySpec, language: Tensor, device: torch.device) 
         device: Device of the policy.
     """
     images = np.stack([obs[view] for view in spec.views], axis=1)[:, None]  # (B, 1, V, H, W, C)
-    proprio = {
-        name: torch.from_numpy(np.asarray(obs[name], np.float32))[:, None].to(device) for name in spec.proprio
-    }
-    languages = language.to(device).expand(len(images), -1)
-    return Observation(torch.from_numpy(images).to(device), proprio, languages)
+    proprio = {name: torch.from_numpy(np.asarray(obs[name], np.float32))[:, None] for name in spec.proprio}
+    languages = language.expand(len(images), -1)
+    return Observation(torch.from_numpy(images), proprio, languages).to(device)

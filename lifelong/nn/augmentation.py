@@ -9,13 +9,14 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Annotated
 
 import torch
 from pydantic import Field
 from torch import Tensor
 
-from lifelong.types import Batch, NonNegative, Share
+from lifelong.types import Batch, NonNegative, Share, to_device
 
 
 class Augmentation(ABC):
@@ -122,8 +123,8 @@ class ColorJitter(Augmentation):
         b, t, v, h, w, c = images.shape
         matrix, contrast, brightness = self._draw(b * v, generator)
         x = images.to(torch.float32).transpose(1, 2).reshape(b * v, t * h * w, c)
-        matrix, contrast, brightness = (a.to(x.device) for a in (matrix, contrast, brightness))
-        gray = (x.mean(1) @ x.new_tensor(_GRAY))[:, None, None]  # one level per window
+        matrix, contrast, brightness = (to_device(a, x.device) for a in (matrix, contrast, brightness))
+        gray = (x.mean(1) @ _constant(_GRAY, x.device))[:, None, None]  # one level per window
         changed = torch.baddbmm(gray * (1 - contrast) * brightness, x, matrix * (contrast * brightness))
         changed = changed.round_().clamp_(0, 255).to(images.dtype)
         return changed.view(b, v, t, h, w, c).transpose(1, 2).contiguous()
@@ -140,6 +141,12 @@ class ColorJitter(Augmentation):
         to_gray = torch.tensor(_GRAY).expand(3, 3)
         colour = (to_gray * -saturation + torch.eye(3) * (1 + saturation)) @ hue
         return colour.transpose(1, 2), 1 + contrast, 1 + brightness
+
+
+@cache
+def _constant(values: tuple[float, ...], device: torch.device) -> Tensor:
+    """Return values on a device, float32; they are copied there once."""
+    return torch.tensor(values, device=device)
 
 
 _GRAY = (0.299, 0.587, 0.114)
@@ -190,50 +197,67 @@ class SharedJitter(Augmentation):
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return changed images; see `Augmentation`."""
-        windows = []
-        for window in images:
-            changed = window
+        windows, orders, drawn = [], [], []
+        for window in range(len(images)):
             if torch.rand((), generator=generator) >= self.keep:
-                order = torch.randperm(4, generator=generator).tolist()
-                drawn = (2 * torch.rand(4, generator=generator) - 1).tolist()
-                amounts = [limit * share for limit, share in zip(self.limits, drawn, strict=True)]
-                x = jitter(window.to(torch.float32).div_(255.0), amounts, order)
-                changed = x.mul_(255.0).round_().to(images.dtype)
-            windows.append(changed)
-        return torch.stack(windows)
+                windows.append(window)
+                orders.append(torch.randperm(4, generator=generator))
+                drawn.append(2 * torch.rand(4, generator=generator) - 1)
+        if not windows:
+            return images
+        amounts = torch.stack(drawn).double() * torch.tensor(self.limits, dtype=torch.float64)
+        order, changed = torch.stack(orders), images.clone()
+        # a CPU is faster while pictures fit into its cache, a GPU with few launches
+        for part in torch.arange(len(windows)).split(len(windows) if images.is_cuda else 1):
+            rows = to_device(torch.tensor(windows)[part], images.device)
+            x = jitter(images[rows].to(torch.float32).div_(255.0), amounts[part], order[part])
+            changed[rows] = x.mul_(255.0).round_().to(images.dtype)
+        return changed
 
 
-def jitter(x: Tensor, amounts: list[float], order: list[int]) -> Tensor:
-    """Change the colours of pictures.
+def jitter(x: Tensor, amounts: Tensor, orders: Tensor) -> Tensor:
+    """Change the colours of windows: at each place in their orders, all that have the same change together.
 
     Args:
-        x: Pictures (..., H, W, 3) float32 in [0, 1].
-        amounts: Relative change of brightness, of contrast and of saturation, and the turn of hue.
-        order: Order of the four changes, by their positions in `amounts`.
+        x: Pictures (N, T, V, H, W, 3) float32 in [0, 1].
+        amounts: Relative change of brightness, contrast and saturation, and the turn of hue, (N, 4) float64 on the CPU.
+        orders: Order of the four changes of each window, by their positions in `amounts`, (N, 4) int64 on the CPU.
 
     Returns:
-        Pictures of the same shape, in [0, 1].
+        The pictures, in [0, 1].
     """
-    for change in order:
-        amount, factor = amounts[change], 1 + amounts[change]
-        if change == 0:
-            x = (x * factor).clamp(0, 1)
-        elif change == 1:
-            x = (x * factor + (1 - factor) * _gray(x).mean((-3, -2, -1), keepdim=True)).clamp(0, 1)
-        elif change == 2:
-            x = (x * factor + (1 - factor) * _gray(x)).clamp(0, 1)
-        else:
-            x = _turn_hue(x, amount)
+    factors = 1 + amounts
+    terms = to_device(torch.stack([factors, 1 - factors, 6 * amounts]).float(), x.device)
+    by_change = to_device(orders.T.argsort(dim=1, stable=True), x.device)
+    for rows, changes in zip(by_change, orders.T, strict=True):
+        counts = changes.bincount(minlength=4).tolist()
+        for change, chosen in enumerate(rows.split(counts)):
+            own = terms[:, chosen, change, None, None, None, None, None]
+            if len(chosen) == len(x):
+                x = _change(x, change, *own)
+            elif len(chosen):
+                x[chosen] = _change(x[chosen], change, *own)
     return x
+
+
+def _change(x: Tensor, change: int, factor: Tensor, rest: Tensor, sixths: Tensor) -> Tensor:
+    """Make one of the changes of `jitter` to pictures (n, T, V, H, W, 3); the terms are (n, 1, 1, 1, 1, 1)."""
+    if change == 0:
+        return (x * factor).clamp(0, 1)
+    if change == 1:
+        return (x * factor + rest * _gray(x).mean((-3, -2, -1), keepdim=True)).clamp(0, 1)
+    if change == 2:
+        return (x * factor + rest * _gray(x)).clamp(0, 1)
+    return _turn_hue(x, sixths)
 
 
 def _gray(x: Tensor) -> Tensor:
     """Return the grey level of pixels, (..., 3) -> (..., 1)."""
-    return (x * x.new_tensor(_GRAY_HSV)).sum(-1, keepdim=True)
+    return (x * _constant(_GRAY_HSV, x.device)).sum(-1, keepdim=True)
 
 
-def _turn_hue(x: Tensor, turn: float) -> Tensor:
-    """Turn the hue of HSV of pixels (..., 3) by a fraction of the circle; value and saturation stay.
+def _turn_hue(x: Tensor, sixths: Tensor) -> Tensor:
+    """Turn the hue of HSV of pixels (..., 3) by sixths of the circle (..., 1); value and saturation stay.
 
     The channel with offset n (red 5, green 3, blue 1) is V - C max(0, min(k, 4 - k, 1)) with k = n + 6 H mod 6, where
     C is the chroma: Alvy Ray Smith's HSV (1978), written without cases.
@@ -243,7 +267,6 @@ def _turn_hue(x: Tensor, turn: float) -> Tensor:
     r, g, b = ((value[..., None] - x) / torch.where(chroma > 0, chroma, 1.0)[..., None]).unbind(-1)
     red, green = x[..., 0] == value, x[..., 1] == value
     sixth = torch.where(red, b - g, torch.where(green, 2 + r - b, 4 + g - r))  # 6 H
-    offsets = x.new_tensor([5.0, 3.0, 1.0])
-    k = (offsets + (sixth + 6 * turn)[..., None]) % 6
+    k = (_constant((5.0, 3.0, 1.0), x.device) + (sixth[..., None] + sixths)) % 6
     ramp = torch.minimum(k, 4 - k).clamp(0, 1)
     return (value[..., None] - chroma[..., None] * ramp).clamp(0, 1)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import ActionHead, full_precision
-from lifelong.types import Depth, Width
+from lifelong.types import Depth, Width, to_device
 
 _EVAL_SEED = 0
 _OCTAVES = 6  # frequencies that encode the time
@@ -100,8 +100,10 @@ class FlowHead(ActionHead):
         if self.training:
             return torch.randn_like(chunks), torch.rand(chunks.shape[:2], device=chunks.device)
         draws = torch.Generator().manual_seed(_EVAL_SEED)
-        noise = torch.randn(chunks.shape[1:], generator=draws).to(chunks.device).expand_as(chunks)
-        return noise, torch.rand(chunks.shape[1], generator=draws).to(chunks.device).expand(chunks.shape[:2])
+        noise = torch.randn(chunks.shape[1:], generator=draws)
+        time = torch.rand(chunks.shape[1], generator=draws)
+        noise, time = (to_device(x, chunks.device) for x in (noise, time))
+        return noise.expand_as(chunks), time.expand(chunks.shape[:2])
 
     def integrate(self, params: dict[str, Tensor], noise: Tensor) -> Tensor:
         """Carry `noise` (..., H, A) along the flow to a chunk of the same shape, float32, with gradients."""
@@ -122,7 +124,7 @@ class FlowHead(ActionHead):
     def sample(self, params: dict[str, Tensor], generator: torch.Generator | None) -> Tensor:
         """Draw a chunk and return its first action, (..., A)."""
         shape, device = self._empty(params).shape, params["latent"].device
-        noise = torch.randn(shape, generator=generator).to(device)
+        noise = to_device(torch.randn(shape, generator=generator), device)
         return self.integrate(params, noise)[..., 0, :]
 
     def plan(self, params: dict[str, Tensor], generators: Sequence[torch.Generator] | None) -> Tensor:
@@ -130,7 +132,7 @@ class FlowHead(ActionHead):
         noise = torch.zeros_like(self._empty(params))
         if generators is not None:
             draws = [torch.randn(noise.shape[1:], generator=generator) for generator in generators]
-            noise = torch.stack(draws).to(noise.device)
+            noise = to_device(torch.stack(draws), noise.device)
         return self.integrate(params, noise)[:, : self.execute]
 
     def _empty(self, params: dict[str, Tensor]) -> Tensor:

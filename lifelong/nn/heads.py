@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lifelong.types import Depth, NonNegative, Width
+from lifelong.types import Depth, NonNegative, Width, to_device
 
 
 class ActionHead(nn.Module, ABC):
@@ -77,12 +77,12 @@ class ActionHead(nn.Module, ABC):
         """
         if generators is None:
             return self.mode(params)[:, None]
+        device, on_host = next(iter(params.values())).device, {k: v.cpu() for k, v in params.items()}
         draws = [
-            self.sample({k: v[i : i + 1].cpu() for k, v in params.items()}, generator)
+            self.sample({k: v[i : i + 1] for k, v in on_host.items()}, generator)
             for i, generator in enumerate(generators)
         ]
-        device = next(iter(params.values())).device
-        return torch.stack(draws).to(device)
+        return to_device(torch.stack(draws), device)
 
 
 def full_precision(x: Tensor) -> torch.autocast:

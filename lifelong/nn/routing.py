@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lifelong.errors import CheckpointError
+from lifelong.types import to_device
 
 _SAMPLES = 64  # of a step of an autoencoder
 
@@ -101,15 +102,17 @@ def cluster_centres(x: Tensor, count: int, draws: torch.Generator, iterations: i
 
 
 def nearest_key(x: Tensor, prototypes: Mapping[int, Tensor]) -> Tensor:
-    """Return for each point (B, F) the key whose centres (K, F) have the most similar one by cosine, (B,) int64."""
+    """Return for each point (B, F) the key whose centres (K, F) have the most similar one by cosine.
+
+    Keys are (B,) int64 on the CPU, where the rows of each are told apart.
+    """
     x = functional.normalize(x.float(), dim=-1)
     similar = [(x @ functional.normalize(c.float(), dim=-1).T).amax(1) for c in prototypes.values()]
-    keys = torch.tensor(list(prototypes), device=x.device)
-    return keys[torch.stack(similar).argmax(0)]
+    return torch.tensor(list(prototypes))[torch.stack(similar).argmax(0).cpu()]
 
 
 def groups_of_rows(keys: Tensor) -> list[tuple[int, Tensor | None]]:
-    """Return the keys that occur among (B,) int64, each with its rows (n,) int64; None for all rows."""
+    """Return the keys that occur among (B,) int64 on the CPU, each with its rows (n,) int64; None for all rows."""
     distinct = keys.unique().tolist()
     return [(key, None if len(distinct) == 1 else (keys == key).nonzero()[:, 0]) for key in distinct]
 
@@ -151,7 +154,7 @@ class Discriminator:
         with torch.enable_grad():
             optimizer = torch.optim.AdamW(weights.values(), lr=lr)
             for _ in range(steps):
-                rows = torch.randint(len(samples), (_SAMPLES,), generator=draws).to(samples.device)
+                rows = to_device(torch.randint(len(samples), (_SAMPLES,), generator=draws), samples.device)
                 optimizer.zero_grad()
                 _errors(samples[rows], weights).mean().backward()
                 optimizer.step()

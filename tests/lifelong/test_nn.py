@@ -26,6 +26,7 @@ from lifelong.nn import (
     SpatialSoftmax,
     TemporalTransformer,
 )
+from lifelong.nn.augmentation import jitter
 from lifelong.nn.tokens import standardise
 from lifelong.nn.transformer import TransformerLayer, attend, block_causal_mask
 from lifelong.nn.vision import FlatReadout, to_network
@@ -373,6 +374,14 @@ def test_brightness_scales() -> None:
     changed = ColorJitter(0.3, 0, 0, 0, keep=0.0).images(images, generator()).float()
     assert ((changed >= 70) & (changed <= 130)).all()
     assert len(changed.unique()) > 3  # each window its own
+
+
+def test_windows_are_jittered_together_as_one_by_one() -> None:
+    pictures = torch.rand(9, 2, 1, 5, 4, 3, generator=generator())
+    amounts = torch.rand(9, 4, generator=generator(1), dtype=torch.float64) - 0.5
+    orders = torch.stack([torch.randperm(4, generator=generator(k)) for k in range(9)])
+    alone = [jitter(pictures[k : k + 1], amounts[k : k + 1], orders[k : k + 1]) for k in range(9)]
+    assert torch.equal(jitter(pictures.clone(), amounts, orders), torch.cat(alone))
 
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read from /proc")
