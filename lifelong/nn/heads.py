@@ -119,6 +119,7 @@ class GMMHead(ActionHead):
         min_std: Smallest standard deviation. The original's 1e-4 lets likelihoods of saturated dimensions
             grow without bound; 0.02 or so balances dimensions when data and time are short.
         low_eval_noise: Whether to sample with `min_std` instead of the learned deviation in eval mode.
+        absolute: Weight of the absolute error of the mixture's mean beside the likelihood; the original has none.
     """
 
     def __init__(
@@ -132,8 +133,10 @@ class GMMHead(ActionHead):
         norm: bool = False,
         min_std: NonNegative = 1e-4,
         low_eval_noise: bool = False,
+        absolute: NonNegative = 0.0,
     ) -> None:
         super().__init__()
+        self.absolute = absolute
         self.modes, self.action_dim = modes, action_dim
         self.min_std, self.low_eval_noise = min_std, low_eval_noise
         self.trunk = _trunk(in_dim, hidden, layers, norm)
@@ -161,8 +164,11 @@ class GMMHead(ActionHead):
             return torch.logsumexp(params["logits"].log_softmax(-1) + per_mode, dim=-1)
 
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
-        """Return the negative log-likelihood of each action, (..., A) -> (...)."""
-        return -self.log_prob(params, actions)
+        """Return the negative log-likelihood of each action, (..., A) -> (...), and the absolute error where chosen."""
+        losses = -self.log_prob(params, actions)
+        if self.absolute:
+            losses = losses + self.absolute * (actions.float() - self.mean(params)).abs().mean(-1)
+        return losses
 
     def mode(self, params: dict[str, Tensor]) -> Tensor:
         """Return the mean of the heaviest component, (..., A)."""

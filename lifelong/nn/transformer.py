@@ -120,6 +120,7 @@ class TemporalTransformer(nn.Module):
         dropout: Dropout of attention weights, after attention and in the feed-forward networks.
         attention_dropout: Dropout of attention weights alone, see `TransformerLayer`.
         drop_path: Chance that a window skips a feed-forward network, see `TransformerLayer`.
+        final_norm: Whether a LayerNorm follows the last layer, as is usual with pre-norm layers. The original has none.
         max_length: Longest window, T.
     """
 
@@ -134,6 +135,7 @@ class TemporalTransformer(nn.Module):
         dropout: Share = 0.1,
         attention_dropout: Share | None = None,
         drop_path: Share = 0.0,
+        final_norm: bool = False,
         max_length: int = 10,
     ) -> None:
         super().__init__()
@@ -141,6 +143,7 @@ class TemporalTransformer(nn.Module):
             TransformerLayer(dim, heads, head_dim, mlp_dim, dropout, attention_dropout, drop_path)
             for _ in range(layers)
         )
+        self.norm = nn.LayerNorm(dim) if final_norm else nn.Identity()
         self.register_buffer("positions", sinusoidal_positions(max_length, dim), persistent=False)
 
     def forward(self, tokens: Tensor) -> Tensor:
@@ -150,7 +153,7 @@ class TemporalTransformer(nn.Module):
         x = (tokens + self.positions[:t, None]).reshape(b, t * m, e)
         for layer in self.layers:
             x = layer(x, mask)
-        return x.view(b, t, m, e)
+        return self.norm(x).view(b, t, m, e)
 
 
 class SpatialTransformer(nn.Module):

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from lifelong.nn.heads import GMMHead
 from lifelong.nn.transformer import TemporalTransformer
 from lifelong.nn.vision import ResNetFiLMEncoder, encode_views
-from lifelong.policies.history import Head, ImageEncoder, OverTime, TokenPolicy
+from lifelong.policies.history import Head, ImageEncoder, OverTime, Readout, TokenPolicy
 from lifelong.types import Observation, PolicySpec, Share, Width
 
 
@@ -28,6 +28,7 @@ class BCTransformer(TokenPolicy):
             `language_dim` and `latent_dim`.
         temporal: Network over time, see `TemporalTransformer`; completed with `dim` and `max_length`.
         head: Action head: `GMMHead`, `DeterministicHead` or `FlowHead`; completed with `in_dim` and `action_dim`.
+        readout: What the head reads: the instruction's token alone, or all of the frame's beside it, see `TokenPolicy`.
         stochastic: See `HistoryPolicy`.
         normalise_proprio: Whether to bring readings to order one, see `ProprioScaling`.
         proprio_dropout: Chance that a modality is hidden in training, see `ProprioScaling`.
@@ -45,6 +46,7 @@ class BCTransformer(TokenPolicy):
         encoder: ImageEncoder = ResNetFiLMEncoder,
         temporal: OverTime = TemporalTransformer,
         head: Head = GMMHead,
+        readout: Readout = "instruction",
         stochastic: bool = False,
         normalise_proprio: bool = True,
         proprio_dropout: Share = 0.0,
@@ -54,7 +56,7 @@ class BCTransformer(TokenPolicy):
         sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": embed_dim}
         self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
         readings = {"normalise": normalise_proprio, "dropout": proprio_dropout}
-        self.build_rest(spec.views, embed_dim, temporal, head, **readings)
+        self.build_rest(spec.views, embed_dim, temporal, head, readout, **readings)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""

@@ -13,7 +13,7 @@ from lifelong.nn.heads import GMMHead
 from lifelong.nn.tokens import LanguageToken
 from lifelong.nn.transformer import SpatialTransformer, TemporalTransformer
 from lifelong.nn.vision import PatchEncoder
-from lifelong.policies.history import Component, Head, OverTime, TokenPolicy
+from lifelong.policies.history import Component, Head, OverTime, Readout, TokenPolicy
 from lifelong.types import CompletedWith, Observation, PolicySpec, Share, Width
 
 Patches = Annotated[Component, CompletedWith(("image_size", "dim"))]
@@ -38,6 +38,7 @@ class BCViLT(TokenPolicy):
             `dim` and `out_dim`.
         temporal: Network over time, see `TemporalTransformer`; completed with `dim` and `max_length`.
         head: Action head: `GMMHead`, `DeterministicHead` or `FlowHead`; completed with `in_dim` and `action_dim`.
+        readout: What the head reads: the instruction's token alone, or all of the frame's beside it, see `TokenPolicy`.
         stochastic: See `HistoryPolicy`.
         normalise_proprio: Whether to bring readings to order one, see `ProprioScaling`.
         proprio_dropout: Chance that a modality is hidden in training, see `ProprioScaling`.
@@ -57,6 +58,7 @@ class BCViLT(TokenPolicy):
         spatial: OverPatches = SpatialTransformer,
         temporal: OverTime = TemporalTransformer,
         head: Head = GMMHead,
+        readout: Readout = "instruction",
         stochastic: bool = False,
         normalise_proprio: bool = True,
         proprio_dropout: Share = 0.0,
@@ -71,7 +73,7 @@ class BCViLT(TokenPolicy):
         patches = encoders[spec.views[0]].patches
         self.spatial = spatial(views=len(encoders), patches=patches, dim=patch_embed, out_dim=embed_dim)
         readings = {"normalise": normalise_proprio, "dropout": proprio_dropout}
-        self.build_rest(("images",), embed_dim, temporal, head, **readings)
+        self.build_rest(("images",), embed_dim, temporal, head, readout, **readings)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""

@@ -5,7 +5,7 @@ Shape legend: B batch, T time, E latent, A action.
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -22,6 +22,7 @@ Component = Callable[..., Any]
 Head = Annotated[Component, CompletedWith(("in_dim", "action_dim"))]
 ImageEncoder = Annotated[Component, CompletedWith(("image_size", "language_dim", "latent_dim"))]
 OverTime = Annotated[Component, CompletedWith(("dim", "max_length"))]
+Readout = Literal["instruction", "all"]
 
 
 class HistoryPolicy(Policy):
@@ -185,21 +186,29 @@ class VectorPolicy(HistoryPolicy):
 class TokenPolicy(HistoryPolicy):
     """Policy whose features are tokens of each frame: the instruction, one per reading, and what the cameras see.
 
-    A transformer over time mixes them; the action is read from the instruction's token.
+    A transformer over time mixes them. The head reads the instruction's token after it, as the original's does, and
+    with `readout="all"` the frame's own tokens beside it.
     """
 
     uses_history = True
 
     def build_rest(
-        self, cameras: Sequence[str], dim: int, temporal: Component, head: Component, **proprio: Any
+        self,
+        cameras: Sequence[str],
+        dim: int,
+        temporal: Component,
+        head: Component,
+        readout: Readout,
+        **proprio: Any,
     ) -> None:
         """Build all but what reads the images, whose tokens of `dim` numbers have the names `cameras`."""
-        spec = self.spec
+        spec, self.readout = self.spec, readout
         self.language = LanguageToken(language_dim=spec.language_dim, dim=dim)
         self.proprio = ProprioTokens(proprio=spec.proprio, dim=dim, **proprio)
         self.transformer = temporal(dim=dim, max_length=spec.seq_len)
-        self.head = self.build_head(head, in_dim=dim)
         self._sizes = {"language": 1, "proprio": len(spec.proprio)} | dict.fromkeys(cameras, 1)
+        tokens = 1 + (sum(self._sizes.values()) if readout == "all" else 0)
+        self.head = self.build_head(head, in_dim=dim * tokens)
 
     def tokens_beside(self, observation: Observation, language: Tensor) -> list[Tensor]:
         """Return the tokens of the instruction (B, L) and of each reading, each (B, T, E)."""
@@ -211,8 +220,9 @@ class TokenPolicy(HistoryPolicy):
         return named_parts(features, self._sizes, dim=2)
 
     def over_time(self, features: Tensor) -> Tensor:
-        """Map tokens (B, T, M, E) to the instruction's latent at every step, (B, T, E)."""
-        return self.transformer(features)[:, :, 0]
+        """Map tokens (B, T, M, E) to what the head reads, (B, T, E), or (B, T, E + M E) where it reads all."""
+        answer = self.transformer(features)[:, :, 0]
+        return answer if self.readout == "instruction" else torch.cat([answer, features.flatten(2)], dim=-1)
 
 
 def with_features(policy: Policy) -> HistoryPolicy:

@@ -28,7 +28,7 @@ from lifelong.results.records import DemonstrationsRecord, EvalRecord, Record, R
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_summary
 from lifelong.stats.intervals import wilson_interval
-from lifelong.stats.metrics import METRIC_NAMES, Metrics, lifelong_metrics
+from lifelong.stats.metrics import METRIC_NAMES, Metrics, lifelong_metrics, other_conventions
 
 COLUMNS = (
     *("method", "seed", "order", "transfer", "together", "phase", "row", "epoch", "position", "task"),
@@ -92,6 +92,7 @@ def summarize(results: Results) -> dict[str, Any]:
         "metrics_diagonal_from_curve": (
             _as_data(lifelong_metrics(results.scores("curve", "published"))) if size else None
         ),
+        "metrics_of_other_conventions": other_conventions(results.scores().matrix) if size else None,
         "success_matrix": {
             "rates": rates.tolist(),
             "episodes": episodes.tolist(),

@@ -198,6 +198,40 @@ def average_success(matrix: ArrayLike) -> Floats:
     return np.array([c[i, : i + 1].mean() for i in range(len(c))], dtype=float)
 
 
+def other_conventions(matrix: ArrayLike) -> dict[str, float]:
+    """Return what other papers print of forgetting, from the same matrix (K, K); NaN with one task or a missing cell.
+
+    The K - 1 tasks that others follow are averaged:
+
+    - `bwt`: c[K,k] - c[k,k] (Lopez-Paz and Ranzato, NeurIPS 2017, eq. 3); above 0 later tasks helped.
+    - `forgetting`: the best of c[k,k] ... c[K-1,k] less c[K,k] (Chaudhry et al., ECCV 2018, eq. 3).
+    - `nbt_of_followed`: NBT_k of eq. 3 without the empty term of the last task.
+    - `relative_nbt`: NBT_k / c[k,k], over the tasks that were learned at all (c[k,k] > 0).
+    """
+    c = np.asarray(matrix, dtype=float)
+    if len(c) < 2:
+        return dict.fromkeys(("bwt", "forgetting", "nbt_of_followed", "relative_nbt"), float("nan"))
+    learned, nbt = np.diag(c)[:-1], negative_backward_transfer(c)[:-1]
+    best = np.array([c[k:-1, k].max() for k in range(len(c) - 1)])
+    some = learned > 0
+    return {
+        "bwt": float((c[-1, :-1] - learned).mean()),
+        "forgetting": float((best - c[-1, :-1]).mean()),
+        "nbt_of_followed": float(nbt.mean()),
+        "relative_nbt": float((nbt[some] / learned[some]).mean()) if some.any() else float("nan"),
+    }
+
+
+def intransigence(matrix: ArrayLike, reference: ArrayLike) -> float:
+    """Return the mean of a[k] - c[k,k]: how much worse tasks are learned than by a reference (Chaudhry et al., eq. 4).
+
+    Args:
+        matrix: c, (K, K).
+        reference: a, (K,), success on each task of a policy that learned it alone, or all tasks together.
+    """
+    return float((np.asarray(reference, dtype=float) - np.diag(np.asarray(matrix, dtype=float))).mean())
+
+
 def mean_curve(curves: Sequence[Curve]) -> Curve:
     """Return the mean of the curves of tasks that are learned together, at their common epochs."""
     if len(curves) == 1:

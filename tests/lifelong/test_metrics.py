@@ -12,8 +12,10 @@ from lifelong.stats.metrics import (
     area_under_curve,
     average_success,
     forward_transfer,
+    intransigence,
     lifelong_metrics,
     negative_backward_transfer,
+    other_conventions,
 )
 
 NAN = float("nan")
@@ -48,6 +50,34 @@ def test_worked_example():
     assert found.final_success.value == pytest.approx((0.1 + 0.3 + 0.6) / 3)
     assert found.just_learned.value == pytest.approx((0.8 + 0.4 + 0.6) / 3)
     assert average_success(scores.matrix) == pytest.approx([0.8, 0.45, 1 / 3])
+
+
+def test_other_conventions_of_a_published_matrix():
+    """RoboCasa365 (ICLR 2026), success after each of four phases [%], worked out by hand."""
+    c = np.full((4, 4), NAN)
+    c[np.tril_indices(4)] = [41.5, 13.9, 24.5, 13.9, 4.8, 11.3, 10.6, 1.7, 2.7, 4.3]
+    found = other_conventions(c)
+    first = (27.6 + 27.6 + 30.9) / 3, (19.7 + 22.8) / 2, 8.6  # what phases 1 to 3 lose
+    assert found["bwt"] == pytest.approx(-(30.9 + 22.8 + 8.6) / 3)
+    assert found["forgetting"] == pytest.approx((30.9 + 22.8 + 8.6) / 3)
+    assert found["nbt_of_followed"] == pytest.approx(sum(first) / 3)
+    assert found["nbt_of_followed"] == pytest.approx(negative_backward_transfer(c).mean() * 4 / 3)
+    shares = [drop / learned for drop, learned in zip(first, (41.5, 24.5, 11.3), strict=True)]
+    assert found["relative_nbt"] == pytest.approx(sum(shares) / 3)
+    assert intransigence(c, [51.5, 24.5, 11.3, 4.3]) == pytest.approx(2.5)
+
+
+def test_forgetting_counts_from_the_best_and_tasks_never_learned_have_no_share():
+    c = np.array([[0.2, NAN, NAN], [0.6, 0.0, NAN], [0.1, 0.0, 0.5]])
+    found = other_conventions(c)
+    assert found["forgetting"] == pytest.approx((0.5 + 0.0) / 2)  # of task 1 from 0.6, its best
+    assert found["bwt"] == pytest.approx(-0.05)
+    assert found["relative_nbt"] == pytest.approx((0.2 - 0.35) / 0.2)  # of task 1 alone
+    assert all(np.isnan(v) for v in other_conventions([[0.5]]).values())
+    thinned = np.array([[0.2, NAN, NAN], [NAN, 0.4, NAN], [0.1, 0.3, 0.5]])
+    assert np.isnan(other_conventions(thinned)["forgetting"]) and np.isfinite(
+        other_conventions(thinned)["bwt"]
+    )
 
 
 def test_best_epoch_is_the_earliest_of_equals_and_holding_changes_nothing_else():
