@@ -327,6 +327,7 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             config=plain,
             group_sizes=context.group_sizes,
             cells=context.eval.cells,
+            cells_share=context.eval.cells_share if context.eval.cells == "sampled" else 1.0,
             conditions=present_conditions(
                 context.device, processes=context.ranks.size, renderer=renderer_name_or_none()
             ),

@@ -58,6 +58,7 @@ def find_demos(
             missing,
             count,
             camera_size=(data.image_size, data.image_size),
+            seed=data.seed or 0,
             drawing=data.drawing,
             root=folder,
             robot=data.robot,
@@ -108,7 +109,9 @@ def _files_in(
     stated = [(path, one) for path in _demo_files_below(folder) if (one := _stated_task(path)) is not None]
     for task in left:
         size = (data.image_size, data.image_size)
-        own = demo_path(folder, DemoConfig(task, size, drawing=data.drawing, robot=data.robot))
+        own = demo_path(
+            folder, DemoConfig(task, size, data.seed or 0, drawing=data.drawing, robot=data.robot)
+        )
         paths = [path for path, other in stated if same_meaning(task.problem, other.problem)]
         if own in paths:  # which the recording completes
             continue
@@ -155,6 +158,8 @@ def _misfit(file: Path, required: int, data: DataSettings) -> str:
         return f"was rendered under {header['perturb']}; use data.perturb or stream.perturb"
     if "generator" in header and recorded_robot(file) != data.robot:
         return f"has the robot {recorded_robot(file)}; data.robot is {data.robot}"
+    if data.seed is not None and header.get("seed", data.seed) != data.seed:
+        return f"was recorded with seed {header['seed']}; data.seed is {data.seed}"
     if data.drawing and "generator" in header and header.get("drawing", FAST) != data.drawing:
         return f"is drawn {header.get('drawing', FAST)}; data.drawing is {data.drawing}"
     available = len(demo_lengths(file, required))

@@ -47,6 +47,8 @@ class DataSettings:
             too: the recorded states, rendered again. None: no copies.
         perturb_copies: Number of copies, each with draws of its own.
         perturb_seed: Seed of the first copy's draws; those of the others follow.
+        seed: Seed of the expert's demonstrations: of their starts, motions and noise. None: 0 for those that are
+            recorded, and any for those of `files` and `folder`.
     """
 
     demos: Annotated[int, Field(ge=1, le=100_000)]
@@ -64,6 +66,7 @@ class DataSettings:
     perturb: PerturbSetting | None = None
     perturb_copies: Annotated[int, Field(ge=0, le=1000)] = 1
     perturb_seed: Natural = 0
+    seed: Natural | None = None
 
     def __post_init__(self) -> None:
         for key in ("views", "proprio"):

@@ -1,7 +1,9 @@
 """Settings of the measurement of success."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import Field
 
 from libero_env.errors import LiberoError
 from libero_env.init_states.store import NUM_INIT_STATES
@@ -28,7 +30,10 @@ class EvalSettings:
         curve: Points of a learning curve: `all`; `trained`, without epoch 0, so that forward transfer is the mean over
             the other points; `none`, so that it is not defined.
         cells: Cells of the success matrix: `all`; `diagonal`, each task just after learning it; `last_row`, all
-            tasks at the end; or both of these. Metrics that need other cells are not defined.
+            tasks at the end; or both of these, `diagonal_and_last_row`. Metrics that need other cells are not defined.
+            `sampled` adds a random share of the others to both, from which NBT and AUC are estimated without bias, see
+            `lifelong.stats.metrics.estimate_cells`.
+        cells_share: Share of the earlier tasks that `sampled` measures after each task.
         reuse: Whether rollouts that would repeat earlier ones to the bit are copied instead of run: same weights and
             whatever else acts, same starts, nothing random.
         horizon: Maximum number of control steps per episode.
@@ -57,6 +62,7 @@ class EvalSettings:
     every: Count = 5
     curve: Literal["all", "trained", "none"] = "all"
     cells: MatrixCells = "all"
+    cells_share: Annotated[float, Field(gt=0, le=1)] = 0.1
     reuse: bool = True
     horizon: Count = 600
     settle_steps: Natural = 5
@@ -123,11 +129,11 @@ class EvalSettings:
         first = 0 if self.curve == "all" else self.every
         return tuple(sorted({*range(first, epochs + 1, self.every), epochs}))
 
-    def row(self, stage: Sequence[int], tasks: int) -> range:
+    def row(self, stage: Sequence[int], tasks: int) -> Sequence[int]:
         """Return the tasks that are measured after a stage of a run of so many tasks."""
-        return measured_tasks(self.cells, stage, tasks)
+        return measured_tasks(self.cells, stage, tasks, self.cells_share)
 
-    def shifted_row(self, stage: Sequence[int], tasks: int) -> range:
+    def shifted_row(self, stage: Sequence[int], tasks: int) -> Sequence[int]:
         """Return the tasks that are evaluated under the held-out shift after a stage of a run of so many tasks."""
         if not self.shift_perturbations():
             return range(0)

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from itertools import accumulate
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
+import numpy as np
 from pydantic import Field, WrapValidator
 
 from libero_env.errors import InvalidInputError
@@ -18,23 +19,33 @@ from lifelong.stats.metrics import Transfer
 _CHECKSUM = "crc32"
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
-MatrixCells = Literal["all", "diagonal", "last_row", "diagonal_and_last_row"]
+MatrixCells = Literal["all", "diagonal", "last_row", "diagonal_and_last_row", "sampled"]
 Phase = Literal["curve", "matrix", "shift"]
 Number = Annotated[float, WrapValidator(lambda value, parse: math.nan if value is None else parse(value))]
 
 
-def measured_tasks(cells: MatrixCells, stage: Sequence[int], tasks: int) -> range:
-    """Return the tasks that are measured after a stage: its row of the success matrix.
+def measured_tasks(cells: MatrixCells, stage: Sequence[int], tasks: int, share: float = 1.0) -> Sequence[int]:
+    """Return the tasks that are measured after a stage, ascending: its row of the success matrix.
 
     Args:
         cells: Cells that the run measures.
         stage: Positions of the tasks that were learned together last, ascending and without gaps.
         tasks: Number of tasks of the run.
+        share: Share of the earlier tasks that `sampled` measures in each row but the last: the same ones in all runs.
     """
     final = stage[-1] == tasks - 1
     if cells == "all" or (final and cells != "diagonal"):
         return range(stage[-1] + 1)
-    return range(0) if cells == "last_row" else range(stage[0], stage[-1] + 1)
+    if cells == "last_row":
+        return range(0)
+    earlier = sampled_tasks(stage[0], share) if cells == "sampled" else []
+    return [*earlier, *range(stage[0], stage[-1] + 1)]
+
+
+def sampled_tasks(earlier: int, share: float) -> list[int]:
+    """Return a share, rounded up, of the tasks before position `earlier`, drawn uniformly without replacement."""
+    chosen = np.random.default_rng(earlier).choice(earlier, math.ceil(share * earlier), replace=False)
+    return sorted(chosen.tolist())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +67,7 @@ class RunRecord:
     started: str  # ISO 8601, UTC
     conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.provenance`
     cells: MatrixCells = "all"  # of the success matrix, which are measured
+    cells_share: Annotated[float, Field(gt=0, le=1)] = 1.0  # of each row, where they are sampled
     # number of tasks in each group that is one step of the sequence; () for one task at a time
     group_sizes: tuple[Annotated[int, Field(ge=1)], ...] = ()
     transfer: Transfer = "cross_fitted"  # estimate of forward transfer, see `lifelong.stats.metrics`

@@ -25,7 +25,15 @@ from lifelong.results.records import (
     measured_tasks,
 )
 from lifelong.results.subgoals import Subgoals, subgoals
-from lifelong.stats.metrics import Curve, Metrics, Scores, Transfer, lifelong_metrics, mean_curve
+from lifelong.stats.metrics import (
+    Curve,
+    Metrics,
+    Scores,
+    Transfer,
+    estimate_cells,
+    lifelong_metrics,
+    mean_curve,
+)
 
 Diagonal = Literal["matrix", "curve"]
 
@@ -120,7 +128,7 @@ class Results:
         rates, _ = self.success_matrix()
 
         def is_complete(group: range) -> bool:  # without cells to be measured: whether it has ended
-            columns = measured_tasks(self.run.cells, group, len(rates))
+            columns = measured_tasks(self.run.cells, group, len(rates), self.run.cells_share)
             row = rates[group[-1], columns]
             return bool(np.isfinite(row).all()) if columns else self.task_end(group[-1]) is not None
 
@@ -206,12 +214,15 @@ class Results:
         groups = [g for g in self.run.groups if g.stop <= size]
         rates, episodes = self.success_matrix(diagonal)
         rows = [g[-1] for g in groups]
+        if self.run.cells == "sampled":
+            rates = estimate_cells(rates, [(g[-1], g.start) for g in groups])
         return Scores(
             tuple(self._group_curves.get(row, _curve(())) for row in rows),
             np.stack([rates[rows, g.start : g.stop].mean(1) for g in groups], axis=1),
             np.stack([episodes[rows, g.start : g.stop].sum(1) for g in groups], axis=1),
             tuple(map(len, groups)),
             transfer or self.transfer,
+            sampled=self.run.cells == "sampled",
         )
 
     def costs(self, task: int) -> dict[str, float]:

@@ -11,6 +11,7 @@ episodes.csv.gz  one row an episode: the method's label, seed and order of the r
 import csv
 import gzip
 import io
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
@@ -70,6 +71,12 @@ def write_summary(path: Path | str, results: Results, config: Mapping[str, Any])
     return summary
 
 
+def _other_conventions(results: Results) -> dict[str, float]:
+    """Return forgetting by other conventions; the one that is not linear is unknown from a sample of the cells."""
+    scores = results.scores()
+    return other_conventions(scores.matrix) | ({"forgetting": math.nan} if scores.sampled else {})
+
+
 def summarize(results: Results) -> dict[str, Any]:
     """Return the summary as plain data: the run, its success, metrics, costs and times."""
     run, size = results.run, results.learned_tasks()
@@ -92,7 +99,7 @@ def summarize(results: Results) -> dict[str, Any]:
         "metrics_diagonal_from_curve": (
             _as_data(lifelong_metrics(results.scores("curve", "published"))) if size else None
         ),
-        "metrics_of_other_conventions": other_conventions(results.scores().matrix) if size else None,
+        "metrics_of_other_conventions": _other_conventions(results) if size else None,
         "success_matrix": {
             "rates": rates.tolist(),
             "episodes": episodes.tolist(),

@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from typing import Annotated
 
+import numpy as np
 from pydantic import AfterValidator, Field
 
 from libero_env.errors import UnknownNameError
@@ -49,6 +50,7 @@ class BenchmarkSettings:
         order: Index of one of the suite's published sequences.
         tasks: Number of tasks from the start of the sequence, or a list of names or indices in learning order.
             None: all.
+        order_seed: Seed of a random order of these tasks, in place of the published one; None: no random order.
         horizon: Number of control steps in which a fast policy solves any of the tasks; `eval.horizon` may refer
             to it.
         group_size: Number of neighbouring tasks of the sequence that are learned together as one step of it. They
@@ -59,6 +61,7 @@ class BenchmarkSettings:
     suite: str
     order: Natural = 0
     tasks: Count | Annotated[Sequence[Natural | str], Field(min_length=1)] | None = None
+    order_seed: Natural | None = None
     horizon: Count = 600
     group_size: Count = 1
     files: Annotated[Sequence[PathText], Field(min_length=1)] | None = None
@@ -68,8 +71,19 @@ class BenchmarkSettings:
 
         Raises:
             UnknownNameError: The suite, the order or a task does not exist.
-            ConfigError: The files do not make a suite, or it has fewer tasks than are asked for.
+            ConfigError: The files do not make a suite, it has fewer tasks than are asked for, or two orders are given.
         """
+        tasks = self._chosen()
+        if self.order_seed is None:
+            return tasks
+        if self.order:
+            raise ConfigError(
+                f"benchmark.order is {self.order} and benchmark.order_seed {self.order_seed}; give one of them"
+            )
+        order = np.random.default_rng(self.order_seed).permutation(len(tasks))
+        return tuple(tasks[i] for i in order)
+
+    def _chosen(self) -> tuple[Task, ...]:
         suite = self._suite()
         tasks = suite.order(self.order)
         if self.tasks is None:

@@ -84,6 +84,7 @@ class Scores:
         group_sizes: Number of tasks of each group that was learned together; () for one task at a time. K is then
             the number of groups, and each group counts as one task whose success is the mean over its tasks.
         transfer: Estimate of forward transfer, see the module.
+        sampled: Whether the matrix is `estimate_cells` of a sample, so that only what is linear in it means something.
     """
 
     curves: tuple[Curve, ...]
@@ -91,6 +92,7 @@ class Scores:
     episodes: NDArray[np.int64]
     group_sizes: tuple[int, ...] = ()
     transfer: Transfer = "published"
+    sampled: bool = False
 
     def __post_init__(self) -> None:
         k = len(self.curves)
@@ -196,6 +198,27 @@ def average_success(matrix: ArrayLike) -> Floats:
     """Return (K,) the mean over j <= i of c[i,j]: success over the tasks learned so far, after each task."""
     c = np.asarray(matrix, dtype=float)
     return np.array([c[i, : i + 1].mean() for i in range(len(c))], dtype=float)
+
+
+def estimate_cells(matrix: ArrayLike, rows: Sequence[tuple[int, int]]) -> Floats:
+    """Return a matrix (K, K) whose every cell, and so NBT and AUC, is unbiased over the samples that may be drawn.
+
+    Of each row, a uniform sample of the earlier tasks is measured, of the last row all. The last row predicts the rows
+    above it, and what is measured there corrects the prediction, weighted by its chance to be drawn: the difference
+    estimator (Särndal, Swensson and Wretman, Model Assisted Survey Sampling, 1992, section 6.3). Single cells may lie
+    outside of [0, 1]. Before the last row is measured, the others are NaN.
+
+    Args:
+        matrix: Success rates c[i,j], NaN where they were not measured.
+        rows: Row and number of earlier tasks of each step of the sequence, in order.
+    """
+    c = np.array(matrix, dtype=float)
+    for row, earlier in rows[:-1]:
+        seen, predicted = np.isfinite(c[row, :earlier]), c[-1, :earlier]
+        if not seen.all():
+            weight = earlier / max(1, seen.sum())
+            c[row, :earlier] = predicted + np.where(seen, weight * (c[row, :earlier] - predicted), 0.0)
+    return c
 
 
 def other_conventions(matrix: ArrayLike) -> dict[str, float]:

@@ -86,7 +86,7 @@ def test_a_user_defined_task(tmp_path):
 
 def test_suites_and_orders_are_the_originals(shared):
     facts = json.loads((shared / "official" / "suites.json").read_text())
-    assert {*suite_names()} == {*facts["suites"], "libero_100"}
+    assert {*suite_names()} == {*facts["suites"], "libero_100", "libero_130"}
     for name, tasks in facts["suites"].items():
         suite = get_suite(name)
         assert [task.name for task in suite.tasks] == tasks
@@ -98,11 +98,13 @@ def test_libero_100_is_90_then_10():
     tasks = get_suite("libero_100").tasks
     assert tasks == get_suite("libero_90").tasks + get_suite("libero_10").tasks
     assert get_task("libero_100/95") is get_task("libero_10/5")
+    assert len({task.id for task in get_suite("libero_130").tasks}) == 130
+    assert get_task("libero_130/30") is get_task("libero_90/0")
 
 
 def test_every_scene_is_used_and_has_a_description():
     folder = Path(builder.__file__).parent / "data" / "scenes"
-    facts = [load_data(f"{name}.yaml") for name in suite_names() if name != "libero_100"]
+    facts = [load_data(f"{name}.yaml") for name in suite_names() if name not in ("libero_100", "libero_130")]
     used = {task.get("scene", suite.get("scene")) for suite in facts for task in suite["tasks"]}
     assert {file.stem for file in folder.iterdir()} == used
     assert all(file.read_text().startswith("# ") for file in folder.iterdir())
@@ -117,7 +119,7 @@ def test_orders_are_permutations(name):
 
 
 @pytest.mark.parametrize(("ask", "hint"), [
-    (lambda: get_suite("libero_objects"), "Did you mean 'libero_object'? Valid: libero_10, libero_100, "),
+    (lambda: get_suite("libero_objects"), "Did you mean 'libero_object'? Valid: libero_10, libero_100, libero_130, "),
     (lambda: get_suite("libero_90").order(1), "task order of libero_90 1. Valid: 0"),
     (lambda: get_suite("libero_object").order(21), "task order of libero_object 21"),
     (lambda: get_suite("libero_object").order(-1), "Valid: 0 to 20"),
@@ -125,7 +127,7 @@ def test_orders_are_permutations(name):
     (lambda: get_task("LIBERO_OBJECT"), "unknown suite 'LIBERO_OBJECT'. Did you mean 'libero_object'?"),
     (lambda: get_task("libero-object"), "unknown suite 'libero-object'. Did you mean 'libero_object'?"),
     (lambda: get_task("libero_object-12"), "index of libero_object '12'. Valid: 0 to 9"),
-    (lambda: get_task("nope"), "Valid: libero_10/0 to libero_10/9, libero_100/0 to libero_100/99, "),
+    (lambda: get_task("nope"), "Valid: libero_10/0 to libero_10/9, libero_100/0 to libero_100/99, libero_130/0 to libero_130/129, "),
     (lambda: get_task("libero_object/-1"), "index of libero_object '-1'"),
     (lambda: get_task("pick_up_the_milk_and_put_it_in_the_basket"),
      "Did you mean 'pick_up_the_milk_and_place_it_in_the_basket'"),

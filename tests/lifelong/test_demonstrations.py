@@ -22,9 +22,9 @@ def recorded(monkeypatch):
     """Return the names of the tasks that would be recorded."""
     names: list[str] = []
 
-    def ensure(tasks, n, *, root, **kwargs):
+    def ensure(tasks, n, *, root, seed, **kwargs):
         names.extend(task.name for task in tasks)
-        return [Path(root or "cache") / "ours" / f"{task.name}_{n}.hdf5" for task in tasks]
+        return [Path(root or "cache") / f"seed{seed}" / f"{task.name}_{n}.hdf5" for task in tasks]
 
     monkeypatch.setattr(demonstrations, "ensure_demos", ensure)
     return names
@@ -63,17 +63,23 @@ def test_named_files_and_files_of_a_folder_are_found_by_the_task_that_they_state
         assert demonstrations.find_demos(TASKS, [2, 2, 2], data, False)[1] == path
         assert recorded == [TASKS[0].name, TASKS[2].name]
         recorded.clear()
+    seeded = replace(settings(str(tmp_path)), seed=5)
+    assert demonstrations.find_demos(TASKS[:1], [2], seeded, False)[0].parent.name == "seed5"
 
 
 @pytest.mark.parametrize(("kwargs", "words"), [
     ({"size": 16}, "16x16 pixels and data.image_size is 8; use data.image_size=16"),
     ({"demos": 1}, "has 1 demonstrations and 2 are required; use data.demos=1"),
     ({"perturb": "light=0.5"}, "was rendered under light=0.5"),
+    ({"seed": 2}, "was recorded with seed 2; data.seed is 1"),
     ({"generator": "teleoperation", "robot": "robosuite-1.4.1"}, "data.robot is libero"),
 ])  # fmt: skip
 def test_demonstrations_that_do_not_fit_are_refused_by_name(kwargs, words, tmp_path, recorded):
     path = own(tmp_path / "mine.hdf5", **kwargs)
-    for data in (replace(settings(None), files=[str(path)]), settings(str(tmp_path))):
+    for data in (
+        replace(settings(None), files=[str(path)], seed=1),
+        replace(settings(str(tmp_path)), seed=1),
+    ):
         with pytest.raises(DataError, match=rf"mine.hdf5 .*{re.escape(words)}"):
             demonstrations.find_demos(TASKS, [2, 2, 2], data, False)
     assert not recorded

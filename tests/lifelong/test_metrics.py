@@ -11,6 +11,7 @@ from lifelong.stats.metrics import (
     Scores,
     area_under_curve,
     average_success,
+    estimate_cells,
     forward_transfer,
     intransigence,
     lifelong_metrics,
@@ -78,6 +79,24 @@ def test_forgetting_counts_from_the_best_and_tasks_never_learned_have_no_share()
     assert np.isnan(other_conventions(thinned)["forgetting"]) and np.isfinite(
         other_conventions(thinned)["bwt"]
     )
+
+
+def test_sampled_cells_give_unbiased_forgetting():
+    """The mean over all samples that may be drawn, one cell of each row, is the metric of the whole matrix."""
+    rng = np.random.default_rng(0)
+    c = np.where(np.tri(5, dtype=bool), rng.random((5, 5)), NAN)
+    fwt, rows, found = rng.random(5), [(k, k) for k in range(5)], []
+    for kept in np.ndindex(1, 2, 3):
+        sampled = c.copy()
+        for row, one in zip((1, 2, 3), kept, strict=True):
+            sampled[row, :row] = np.where(np.arange(row) == one, c[row, :row], NAN)
+        cells = estimate_cells(sampled, rows)
+        found.append([*negative_backward_transfer(cells), *area_under_curve(fwt, cells)])
+    whole = [*negative_backward_transfer(c), *area_under_curve(fwt, c)]
+    assert np.mean(found, axis=0) == pytest.approx(whole)
+    assert np.array(found).std(0).max() > 0.05
+    unfinished = estimate_cells(np.where(np.arange(5)[:, None] < 4, sampled, NAN), rows)
+    assert np.isnan(negative_backward_transfer(unfinished)).any()
 
 
 def test_best_epoch_is_the_earliest_of_equals_and_holding_changes_nothing_else():

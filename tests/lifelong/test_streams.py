@@ -395,3 +395,12 @@ def test_the_commands_of_the_guide_are_valid(overrides) -> None:
     groups = stream.group_sizes(len(tasks), benchmark.group_size)
     assert len(stream.demos(config.data.demos, len(tasks), groups[0])) == len(tasks)
     assert bool(before.sequence()) == any(o.startswith("pretrain") for o in overrides)
+
+
+def test_orders_by_seed_hold_the_same_tasks():
+    published = BenchmarkSettings("libero_10", tasks=6).sequence()
+    orders = [BenchmarkSettings("libero_10", tasks=6, order_seed=seed).sequence() for seed in (0, 1, 0)]
+    assert orders[0] == orders[2] != orders[1] and {*orders[0]} == {*orders[1]} == {*published}
+    assert len({*BenchmarkSettings("libero_130", order_seed=7).sequence()}) == 130
+    with pytest.raises(ConfigError, match="benchmark.order is 3 and benchmark.order_seed 1; give one of them"):
+        BenchmarkSettings("libero_10", order=3, order_seed=1).sequence()
