@@ -402,5 +402,7 @@ def test_orders_by_seed_hold_the_same_tasks():
     orders = [BenchmarkSettings("libero_10", tasks=6, order_seed=seed).sequence() for seed in (0, 1, 0)]
     assert orders[0] == orders[2] != orders[1] and {*orders[0]} == {*orders[1]} == {*published}
     assert len({*BenchmarkSettings("libero_130", order_seed=7).sequence()}) == 130
-    with pytest.raises(ConfigError, match="benchmark.order is 3 and benchmark.order_seed 1; give one of them"):
+    with pytest.raises(
+        ConfigError, match="benchmark.order is 3 and benchmark.order_seed 1; give one of them"
+    ):
         BenchmarkSettings("libero_10", order=3, order_seed=1).sequence()
