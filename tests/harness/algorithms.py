@@ -1,26 +1,60 @@
-"""Learning with an algorithm on small random tasks."""
+"""Learning with an algorithm on small random tasks, of pairs and of frames."""
 
 import torch
 
 from lifelong.algorithms import Algorithm
-from lifelong.seeding import generator
+from lifelong.seeding import generator, seeded
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
-from tests.harness import sequences
+from lifelong.types import Batch, Observation
+from tests.harness import policies, sequences
 from tests.harness.fakes import LinearPolicy, Windows
 
 SETTINGS = FitSettings(epochs=2, batch_size=8, lr=1e-2, weight_decay=0.1, precision="fp32")
+SMALL = FitSettings(epochs=2, batch_size=8, lr=1e-2, precision="fp32")
+POLICIES = {
+    f"bc_{kind}": getattr(policies, f"small_{kind}") for kind in ("transformer", "rnn", "vilt", "mlp")
+}
+MIXING = ("bc_transformer", "bc_rnn", "bc_vilt")  # over time
 
 
-def learn(algorithm: Algorithm, policy, task: int) -> None:
-    """Learn a task from beginning to end, as `TaskSequence` does."""
-    dataset = Windows(task)
+def make_policy(kind: str = "bc_transformer", head: str = "gmm", spec=sequences.SPEC):
+    with seeded(3):
+        return POLICIES[kind](spec, head)
+
+
+def learn(algorithm: Algorithm, policy, task: int, dataset=None, settings: FitSettings = SETTINGS) -> None:
+    """Learn a task from beginning to end, as `TaskSequence` does; by default one of pairs."""
+    dataset = Windows(task) if dataset is None else dataset
     algorithm.begin_task(task, dataset, policy)
     for number, phase in enumerate(algorithm.phases()):
         algorithm.begin_phase(phase, policy)
-        fit(policy, dataset, algorithm, settings=SETTINGS, seed=(task, number))
+        fit(policy, dataset, algorithm, settings=settings, seed=(task, number), augment=algorithm.augment)
         algorithm.end_phase(phase, policy)
     algorithm.end_task(task, dataset, policy, generator(task))
+
+
+def learn_frames(algorithm: Algorithm, policy, *tasks: int, settings: FitSettings = SMALL) -> None:
+    """Learn tasks of frames from beginning to end."""
+    for task in tasks:
+        learn(algorithm, policy, task, sequences.dataset(task), settings)
+
+
+def everything(task: int) -> Batch:
+    """All windows of a task of frames."""
+    return sequences.dataset(task).batch(torch.arange(20))
+
+
+def predict(algorithm: Algorithm, policy, batch: Batch, task: int = 0) -> torch.Tensor:
+    with torch.no_grad(), algorithm.policy_for(task, policy) as acting:
+        return acting.eval().predict(batch)
+
+
+def frame(observation: Observation, step: int) -> Observation:
+    """One step of windows."""
+    at = slice(step, step + 1)
+    proprio = {k: v[:, at] for k, v in observation.proprio.items()}
+    return Observation(observation.images[:, at], proprio, observation.language)
 
 
 def outputs(algorithm: Algorithm, policy, task: int) -> torch.Tensor:

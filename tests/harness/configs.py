@@ -1,5 +1,7 @@
 """The configuration files, and configurations composed from them."""
 
+import copy
+from functools import cache
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
@@ -16,5 +18,10 @@ FILES = sorted(f for f in FOUND if f.parts[0] != "hydra")  # launchers are of ot
 
 
 def composed(*overrides: str) -> DictConfig:
+    return copy.deepcopy(_composed(*overrides))
+
+
+@cache
+def _composed(*overrides: str) -> DictConfig:
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
         return compose("config", [*overrides])

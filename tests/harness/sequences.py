@@ -1,5 +1,6 @@
 """A sequence of three tasks with a tiny policy and a fake environment; simulated kills of runs."""
 
+from collections.abc import Callable
 from dataclasses import asdict
 
 import numpy as np
@@ -7,7 +8,7 @@ import torch
 
 from libero_env.tasks import get_suite
 from lifelong import checkpoints
-from lifelong.algorithms import ER, EWC, PackNet, Sequential
+from lifelong.algorithms import ER, EWC, Algorithm, PackNet, Sequential
 from lifelong.context import RunContext
 from lifelong.data import SequenceVLDataset
 from lifelong.data.memory import ReplayMemory
@@ -80,7 +81,7 @@ def dataset(task: int) -> SequenceVLDataset:
     )
 
 
-def run_context(path, algo: str, tasks: int = TASKS) -> RunContext:
+def run_context(path, algo: str | Callable[[], Algorithm], tasks: int = TASKS) -> RunContext:
     with seeded(7):
         policy = small_transformer(SPEC)
     return RunContext(
@@ -89,7 +90,7 @@ def run_context(path, algo: str, tasks: int = TASKS) -> RunContext:
         demos=(2,) * tasks,
         data=DataSettings(demos=2, image_size=16, seq_len=SPEC.seq_len, views=SPEC.views, proprio=()),
         policy=policy,
-        algorithm=ALGORITHMS[algo](),
+        algorithm=(ALGORITHMS[algo] if isinstance(algo, str) else algo)(),
         envs=EnvPool(lambda key: FakeEnv(*key), 2),
         fit=FitSettings(epochs=2, batch_size=8, lr=1e-2, precision="fp32"),
         eval=EvalSettings(episodes=3, curve_episodes=2, every=1, horizon=6, settle_steps=1, precision="fp32"),

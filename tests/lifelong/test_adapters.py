@@ -15,17 +15,24 @@ from lifelong.data.windows import WindowSubset, of_episodes
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn.experts import expert_output
 from lifelong.nn.routing import SigmoidRouter
-from lifelong.seeding import generator, seeded
+from lifelong.seeding import generator
 from lifelong.sequence.stages import TrainingPhase
 from lifelong.streams import StageWindows
 from lifelong.training.costs import count_flops
 from lifelong.training.fit import fit
-from lifelong.training.settings import FitSettings
-from lifelong.types import Observation
 from tests.harness import sequences
-from tests.harness.algorithms import assert_resumed_equals_uninterrupted, learn, outputs
+from tests.harness.algorithms import (
+    MIXING,
+    SMALL,
+    everything,
+    frame,
+    learn,
+    learn_frames,
+    make_policy,
+    outputs,
+    predict,
+)
 from tests.harness.fakes import DeepPolicy, Windows
-from tests.harness.policies import small_rnn, small_transformer, small_vilt
 
 ALL = {
     "lora": lambda: LoRA(rank=2, alpha=4.0),
@@ -33,30 +40,11 @@ ALL = {
     "iscil": lambda: IsCiL(rank=2, alpha=4.0, bases=3, states=10),
     "clare": lambda: CLARE(rank=2, hidden=2, discriminator_steps=3, threshold=1.5, windows=5),
 }
-POLICIES = {"bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt}
-SMALL = FitSettings(epochs=2, batch_size=8, lr=1e-2, precision="fp32")
-
-
-def make_policy(kind: str = "bc_transformer", head: str = "gmm"):
-    with seeded(3):
-        return POLICIES[kind](sequences.SPEC, head)
-
-
-def learn_small(algorithm, policy, task: int, settings=SMALL) -> None:
-    """A task of the fake demonstrations from its beginning to its end."""
-    dataset = sequences.dataset(task)
-    algorithm.begin_task(task, dataset, policy)
-    for number, phase in enumerate(algorithm.phases()):
-        algorithm.begin_phase(phase, policy)
-        fit(policy, dataset, algorithm, settings=settings, seed=(task, number))
-        algorithm.end_phase(phase, policy)
-    algorithm.end_task(task, dataset, policy, generator(task))
 
 
 def answers(algorithm, policy, task: int) -> torch.Tensor:
     """What the policy of a task would do on its windows."""
-    with torch.no_grad(), algorithm.policy_for(task, policy) as acting:
-        return acting.eval().predict(sequences.dataset(task).batch(torch.arange(20)))
+    return predict(algorithm, policy, everything(task), task)
 
 
 def loss_on(algorithm, policy, task: int) -> float:
@@ -67,50 +55,13 @@ def loss_on(algorithm, policy, task: int) -> float:
 # --- all
 
 
-@pytest.fixture
-def harness(monkeypatch):
-    monkeypatch.setattr(sequences, "ALGORITHMS", ALL)
-    return sequences
-
-
-@pytest.mark.parametrize("algo", ALL)
-def test_killed_and_resumed_equals_uninterrupted(harness, tmp_path, algo, monkeypatch):
-    assert_resumed_equals_uninterrupted(tmp_path, algo, monkeypatch)
-
-
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_a_state_restored_between_tasks_changes_nothing(make, tmp_path):
-    policy, algorithm = make_policy(), make()
-    for task in (0, 1):
-        learn_small(algorithm, policy, task)
-    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
-    learn_small(algorithm, policy, 2)
-
-    state = checkpoints.load(tmp_path / "s")
-    other_policy, other = make_policy(), make()
-    other_policy.load_state_dict(state["policy"])
-    other.load_state_dict(state["algorithm"], {t: sequences.dataset(t) for t in (0, 1)})
-    learn_small(other, other_policy, 2)
-    sequences.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
-    sequences.assert_same(other.state_dict(), algorithm.state_dict())
-
-
-@pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_the_base_is_learned_as_by_fine_tuning(make):
-    plain, policy, algorithm = make_policy(), make_policy(), make()
-    fit(plain, sequences.dataset(0), sequences.Sequential(), settings=SMALL, seed=(0, 0))
-    learn_small(algorithm, policy, 0)
-    sequences.assert_same(dict(policy.state_dict()), dict(plain.state_dict()))
-
-
-@pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_the_weights_kept_are_those_of_the_best_epoch(harness, tmp_path, make, monkeypatch):
+def test_the_weights_kept_are_those_of_the_best_epoch(tmp_path, make, monkeypatch):
     """Success falls to nothing after the second task's first epoch: its adapter must be the first epoch's."""
     kept = {}
-    monkeypatch.setitem(sequences.ALGORITHMS, "this", make)
-    p = harness.run_context(tmp_path, "this")
+    p = sequences.run_context(tmp_path, make)
     p.algorithm.recall_steps = 0  # recall changes the router after the task
-    sequence = harness.sequence(p)
+    sequence = sequences.sequence(p)
     evaluate = sequence.evaluator.evaluate
 
     def present() -> torch.Tensor:
@@ -133,13 +84,13 @@ def test_the_weights_kept_are_those_of_the_best_epoch(harness, tmp_path, make, m
 
 
 @pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-@pytest.mark.parametrize("kind", POLICIES)
+@pytest.mark.parametrize("kind", MIXING)
 def test_later_tasks_are_learned_on_a_frozen_base(make, kind):
     policy, algorithm = make_policy(kind), make()
-    learn_small(algorithm, policy, 0)
+    learn_frames(algorithm, policy, 0)
     base = copy.deepcopy(policy.state_dict())
     before = loss_on(algorithm, policy, 1)
-    learn_small(algorithm, policy, 1, dataclasses.replace(SMALL, epochs=10))
+    learn_frames(algorithm, policy, 1, settings=dataclasses.replace(SMALL, epochs=10))
     assert loss_on(algorithm, policy, 1) < before - 0.02
     with algorithm.policy_for(0, policy):
         sequences.assert_same(dict(policy.state_dict()), dict(base))
@@ -149,7 +100,7 @@ def test_later_tasks_are_learned_on_a_frozen_base(make, kind):
 def test_adapters_grow_by_the_same_number_with_each_task(make):
     policy, algorithm, sizes = make_policy(), make(), []
     for task in range(4):
-        learn_small(algorithm, policy, task)
+        learn_frames(algorithm, policy, task)
         assert list(algorithm.library) == list(range(1, task + 1))
         sizes += [sum(p.numel() for p in algorithm.library.parameters(task))] if task else []
     assert len(set(sizes)) == 1 or isinstance(algorithm, CLARE)
@@ -167,13 +118,13 @@ def test_patterns_without_a_match_are_named(make):
 # --- LoRA
 
 
-@pytest.mark.parametrize("kind", POLICIES)
+@pytest.mark.parametrize("kind", MIXING)
 @pytest.mark.parametrize("head", ["gmm", "deterministic", "flow"])
 def test_lora_old_outputs_stay_bit_identical(kind, head, tmp_path):
     policy, algorithm = make_policy(kind, head), LoRA(rank=2)
     kept = {}
     for task in range(3):
-        learn_small(algorithm, policy, task)
+        learn_frames(algorithm, policy, task)
         for old, value in kept.items():
             assert torch.equal(answers(algorithm, policy, old), value), f"task {old} moved with task {task}"
         kept[task] = answers(algorithm, policy, task)
@@ -186,7 +137,7 @@ def test_lora_old_outputs_stay_bit_identical(kind, head, tmp_path):
     later.load_state_dict(state["algorithm"], {})
     for old, value in kept.items():
         assert torch.equal(answers(later, later_policy, old), value)
-    learn_small(later, later_policy, 3)
+    learn_frames(later, later_policy, 3)
     for old, value in kept.items():
         assert torch.equal(answers(later, later_policy, old), value)
 
@@ -206,9 +157,9 @@ def test_lora_covers_every_kind_of_layer_and_running_statistics():
 
 def test_lora_changes_weights_by_matrices_of_its_rank():
     policy, algorithm = make_policy("bc_rnn"), LoRA(rank=2, own=())
-    learn_small(algorithm, policy, 0)
+    learn_frames(algorithm, policy, 0)
     base = copy.deepcopy(policy.state_dict())
-    learn_small(algorithm, policy, 1)
+    learn_frames(algorithm, policy, 1)
     for name, weight in policy.state_dict().items():
         change = (weight - base[name]).flatten(1) if weight.dim() > 1 else weight - base[name]
         if weight.dim() > 1:
@@ -242,9 +193,9 @@ def test_lora_gradients_are_those_of_the_factors():
 def test_lora_patterns_say_what_is_adapted_and_what_is_own():
     policy = make_policy()
     algorithm = LoRA(rank=2, adapted=("transformer.*", "head.trunk.*"), own=("head.means.*",))
-    learn_small(algorithm, policy, 0)
+    learn_frames(algorithm, policy, 0)
     before = copy.deepcopy(policy.state_dict())
-    learn_small(algorithm, policy, 1)
+    learn_frames(algorithm, policy, 1)
     moved = {n for n, v in policy.state_dict().items() if not torch.equal(v, before[n])}
     assert moved == {
         "transformer.layers.0.qkv.weight",
@@ -262,17 +213,17 @@ def test_lora_patterns_say_what_is_adapted_and_what_is_own():
 def test_lora_adapts_a_given_base_from_the_first_task_on():
     policy, algorithm = make_policy(), LoRA(rank=2, base_tasks=0)
     given = copy.deepcopy(policy.state_dict())
-    learn_small(algorithm, policy, 0)
+    learn_frames(algorithm, policy, 0)
     sequences.assert_same(algorithm.state_dict()["base"]["head.means.weight"], given["head.means.weight"])
     kept = answers(algorithm, policy, 0)
-    learn_small(algorithm, policy, 1)
+    learn_frames(algorithm, policy, 1)
     assert torch.equal(answers(algorithm, policy, 0), kept)
 
 
 def test_lora_tasks_learned_together_share_an_adapter():
     policy, algorithm = make_policy(), LoRA(rank=2)
     for last in (1, 3, 5):
-        learn_small(algorithm, policy, last)
+        learn_frames(algorithm, policy, last)
     for first, last in ((0, 1), (2, 3), (4, 5)):
         with algorithm.policy_for(first, policy):
             one = copy.deepcopy(policy.state_dict())
@@ -281,10 +232,6 @@ def test_lora_tasks_learned_together_share_an_adapter():
 
 
 # --- DMPEL
-
-
-def everything(task: int):
-    return sequences.dataset(task).batch(torch.arange(20))
 
 
 @pytest.mark.parametrize(
@@ -339,7 +286,7 @@ def test_dmpel_experts_do_not_compete():
 
 def test_dmpel_new_experts_start_at_zero_and_old_ones_never_change():
     policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
-    learn_small(algorithm, policy, 0)
+    learn_frames(algorithm, policy, 0)
     base, kept = copy.deepcopy(policy.state_dict()), {}
     begun = copy.deepcopy(algorithm)
     begun.begin_task(1, sequences.dataset(1), policy)
@@ -347,7 +294,7 @@ def test_dmpel_new_experts_start_at_zero_and_old_ones_never_change():
         begun_answers = acting.eval().predict(everything(1))
     assert torch.equal(begun_answers, policy.predict(everything(1)))
     for task in (1, 2, 3):
-        learn_small(algorithm, policy, task)
+        learn_frames(algorithm, policy, task)
         library = algorithm.state_dict()["library"]
         for old, experts in kept.items():
             sequences.assert_same(library[old], experts)
@@ -364,7 +311,7 @@ def test_dmpel_recall_keeps_the_coefficients_of_earlier_tasks():
     for steps in (0, 1000):
         policy, algorithm = make_policy(head="deterministic"), DMPEL(rank=2, pool=2, recall_steps=steps)
         for task in range(4):
-            learn_small(algorithm, policy, task, LONG)
+            learn_frames(algorithm, policy, task, settings=LONG)
         memory = algorithm.state_dict()["memory"]
         now = {t: algorithm.router(m["queries"]) for t, m in memory.items()}
         then = {t: m["coefficients"] for t, m in memory.items()}  # of the experts that there were
@@ -378,7 +325,7 @@ def test_dmpel_the_newest_experts_stay_alive(experts: int, tasks: int):
     """At the end of each task they still count, and their B still moves, also where more than `top_k` compete."""
     policy = make_policy(head="deterministic")
     algorithm = DMPEL(rank=2, pool=2, recall_steps=20, top_k=3, experts=experts)
-    learn_small(algorithm, policy, 0, LONG)
+    learn_frames(algorithm, policy, 0, settings=LONG)
     for task in range(1, tasks):
         dataset = sequences.dataset(task % 4)
         algorithm.begin_task(task, dataset, policy)
@@ -396,8 +343,7 @@ def test_dmpel_the_newest_experts_stay_alive(experts: int, tasks: int):
 
 def test_dmpel_routes_by_the_first_frame_of_a_demonstration():
     policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
-    for task in (0, 1):
-        learn_small(algorithm, policy, task)
+    learn_frames(algorithm, policy, 0, 1)
     algorithm.begin_task(2, sequences.dataset(2), policy)
     mixed = algorithm.mix(everything(2), generator(0))
     queries = mixed.observation.proprio["routing_query"][:, 0]
@@ -419,8 +365,7 @@ def test_dmpel_finds_demonstrations_in_composed_datasets():
 
 def test_dmpel_copies_of_a_policy_in_training_mix_experts_of_their_own_weights():
     policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
-    for task in (0, 1):
-        learn_small(algorithm, policy, task)
+    learn_frames(algorithm, policy, 0, 1)
     with algorithm.policy_for(1, policy) as acting, torch.no_grad():
         other = copy.deepcopy(acting).eval()
         assert torch.equal(other.predict(everything(1)), acting.eval().predict(everything(1)))
@@ -429,14 +374,13 @@ def test_dmpel_copies_of_a_policy_in_training_mix_experts_of_their_own_weights()
         assert not torch.equal(other.predict(everything(1)), acting.predict(everything(1)))
 
 
-@pytest.mark.parametrize("kind", POLICIES)
+@pytest.mark.parametrize("kind", MIXING)
 @pytest.mark.parametrize("head", ["gmm", "flow"])
 def test_dmpel_acts_as_it_was_trained(kind, head):
     """The frames of a demonstration one by one give what its first window gives; and rows do not mix."""
     policy, algorithm = make_policy(kind, head), DMPEL(rank=2, pool=2, recall_steps=20)
     policy.stochastic = False
-    for task in (0, 1, 2):
-        learn_small(algorithm, policy, task)
+    learn_frames(algorithm, policy, 0, 1, 2)
     batch = sequences.dataset(2).batch(torch.tensor([0, 10]))
     steps = policy.memory_steps
     with algorithm.policy_for(2, policy) as acting, torch.no_grad():
@@ -456,16 +400,9 @@ def test_dmpel_acts_as_it_was_trained(kind, head):
         torch.testing.assert_close(acting.predict(batch)[1:], alone, rtol=1e-4, atol=1e-5)
 
 
-def frame(observation: Observation, step: int) -> Observation:
-    at = slice(step, step + 1)
-    proprio = {k: v[:, at] for k, v in observation.proprio.items()}
-    return Observation(observation.images[:, at], proprio, observation.language)
-
-
 def test_dmpel_routes_once_in_an_episode():
     policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
-    for task in (0, 1):
-        learn_small(algorithm, policy, task)
+    learn_frames(algorithm, policy, 0, 1)
     observation, seen = everything(1).rows(slice(0, 3)).observation, []
     spied = algorithm.coefficients
     algorithm.coefficients = lambda o: seen.append(o) or spied(o)
@@ -483,7 +420,7 @@ def test_dmpel_computes_the_experts_that_count_and_no_others():
     policy, algorithm = make_policy(head="deterministic"), DMPEL(rank=2, pool=2, recall_steps=20, top_k=3)
     batch, flops = everything(1).rows(slice(0, 1)), {}
     for task in range(8):
-        learn_small(algorithm, policy, task)
+        learn_frames(algorithm, policy, task)
         with algorithm.policy_for(task, policy) as acting, torch.no_grad(), count_flops() as counter:
             answer = acting.eval().predict(batch)
         router = FlopCounterMode(display=False)
@@ -496,32 +433,6 @@ def test_dmpel_computes_the_experts_that_count_and_no_others():
     dense.coefficients = lambda observation: algorithm.coefficients(observation).clamp(min=1e-30)
     with dense.policy_for(7, policy) as acting, torch.no_grad():
         torch.testing.assert_close(acting.eval().predict(batch), answer, rtol=1e-5, atol=1e-6)
-
-
-def test_dmpel_leaves_the_policy_as_it_was():
-    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
-    for task in (0, 1):
-        learn_small(algorithm, policy, task)
-    plain = make_policy().eval()
-    plain.load_state_dict(policy.state_dict())
-    with algorithm.policy_for(1, policy):
-        assert "encode" in vars(policy)
-    assert "encode" not in vars(policy)
-    assert not any(module._forward_hooks for module in policy.modules())
-    policy.eval()
-    assert torch.equal(policy.predict(everything(1)), plain.predict(everything(1)))
-    assert not torch.equal(answers(algorithm, policy, 1), plain.predict(everything(1)))
-
-
-def test_dmpel_needs_no_task_number():
-    policy, algorithm = make_policy(), DMPEL(rank=2, pool=2, recall_steps=20)
-    for task in (0, 1, 2):
-        learn_small(algorithm, policy, task)
-    predicted = []
-    for task in (0, 2, 7):
-        with algorithm.policy_for(task, policy) as acting, torch.no_grad():
-            predicted.append(acting.eval().predict(everything(1)))
-    assert torch.equal(predicted[0], predicted[1]) and torch.equal(predicted[0], predicted[2])
 
 
 def test_policies_that_dmpel_cannot_route_are_named():

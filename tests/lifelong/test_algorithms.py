@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lifelong import checkpoints
-from lifelong.algorithms import ER, EWC, PackNet, Sequential
+from lifelong.algorithms import ER, EWC, PackNet
 from lifelong.algorithms.importance import BatchFisher, SampleFisher
 from lifelong.data.memory import ReplayMemory
 from lifelong.seeding import generator
@@ -131,33 +131,3 @@ def test_packnet_trains_norms_and_biases_with_the_first_task_only():
         assert not torch.equal(first[name], fresh[name])
         assert torch.equal(first[name], second[name])
     assert not torch.equal(first["head.weight"], second["head.weight"])
-
-
-def test_packnet_policy_for_leaves_the_policy_as_it_was():
-    policy, algorithm = DeepPolicy(), PackNet()
-    learn(algorithm, policy, 0)
-    learn(algorithm, policy, 1)
-    before = copy.deepcopy(policy.state_dict())
-    with algorithm.policy_for(0, policy):
-        assert not torch.equal(policy.head.weight, before["head.weight"])
-    assert all(torch.equal(v, before[n]) for n, v in policy.state_dict().items())
-
-
-# --- all of them
-
-
-@pytest.mark.parametrize("make", [Sequential, lambda: ER(memory=ReplayMemory(25)), EWC, PackNet])
-def test_a_state_restored_between_tasks_changes_nothing(make, tmp_path):
-    torch.manual_seed(1)
-    policy, algorithm = DeepPolicy(), make()
-    learn(algorithm, policy, 0)
-    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
-    learn(algorithm, policy, 1)
-
-    state = checkpoints.load(tmp_path / "s")
-    other_policy, other = DeepPolicy(), make()
-    other_policy.load_state_dict(state["policy"])
-    other.load_state_dict(state["algorithm"], {0: Windows(0)})
-    learn(other, other_policy, 1)
-    for name, value in policy.state_dict().items():
-        assert torch.equal(value, other_policy.state_dict()[name]), name

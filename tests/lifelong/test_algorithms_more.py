@@ -5,7 +5,6 @@ import copy
 import pytest
 import torch
 
-from lifelong import checkpoints
 from lifelong.algorithms import AGEM, MAS, SI, Algorithm, DERpp, LwF, Multitask, SingleTask
 from lifelong.algorithms.agem import project
 from lifelong.data.memory import ReplayMemory
@@ -18,13 +17,8 @@ from lifelong.sequence.stages import training_phases
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences
-from tests.harness.algorithms import SETTINGS, assert_resumed_equals_uninterrupted, learn
+from tests.harness.algorithms import SETTINGS, learn
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
-
-ALL = {
-    "agem": lambda: AGEM(memory=ReplayMemory(25)), "derpp": lambda: DERpp(budget=25, alpha=0.5), "lwf": LwF,
-    "mas": MAS, "multitask": Multitask, "si": SI, "single_task": SingleTask
-}  # fmt: skip
 
 
 class Distilled:
@@ -51,51 +45,6 @@ class Deep(Distilled, DeepPolicy):
 
 def everything(task: int, size: int = 20):
     return Windows(task, size=size).batch(torch.arange(size))
-
-
-# --- all of them
-
-
-@pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_a_state_restored_between_tasks_changes_nothing(make, tmp_path):
-    torch.manual_seed(1)
-    policy, algorithm = Deep(), make()
-    for task in (0, 1):
-        learn(algorithm, policy, task)
-    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
-    learn(algorithm, policy, 2)
-
-    state = checkpoints.load(tmp_path / "s")
-    other_policy, other = Deep(), make()
-    other_policy.load_state_dict(state["policy"])
-    other.load_state_dict(state["algorithm"], {0: Windows(0), 1: Windows(1)})
-    learn(other, other_policy, 2)
-    for name, value in policy.state_dict().items():
-        assert torch.equal(value, other_policy.state_dict()[name]), name
-    sequences.assert_same(other.state_dict(), algorithm.state_dict())
-
-
-@pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_the_first_task_is_learned_as_by_fine_tuning(make):
-    torch.manual_seed(0)
-    plain, policy, algorithm = Deep(), Deep(), make()
-    policy.load_state_dict(plain.state_dict())
-    fit(plain, Windows(0), sequences.Sequential(), settings=SETTINGS, seed=(0, 0))
-    learn(algorithm, policy, 0)
-    for name, value in plain.state_dict().items():
-        assert torch.equal(value, policy.state_dict()[name]), name
-
-
-@pytest.fixture
-def harness(monkeypatch):
-    """Return the harness of task sequences with these algorithms."""
-    monkeypatch.setattr(sequences, "ALGORITHMS", ALL)
-    return sequences
-
-
-@pytest.mark.parametrize("algo", ALL)
-def test_killed_and_resumed_equals_uninterrupted(harness, tmp_path, algo, monkeypatch):
-    assert_resumed_equals_uninterrupted(tmp_path, algo, monkeypatch)
 
 
 def test_what_an_algorithm_computes_has_the_precision_of_the_loss():
@@ -143,18 +92,18 @@ def test_single_task_begins_every_task_with_the_same_weights_and_acts_with_its_o
 # --- Multitask
 
 
-def test_multitask_learns_all_tasks_at_once_and_measures_them_at_the_end(harness, tmp_path):
-    harness.sequence(p := harness.run_context(tmp_path, "multitask")).run()
-    results, last = p.directory.log.read(), harness.TASKS - 1
+def test_multitask_learns_all_tasks_at_once_and_measures_them_at_the_end(tmp_path):
+    sequences.sequence(p := sequences.run_context(tmp_path, Multitask)).run()
+    results, last = p.directory.log.read(), sequences.TASKS - 1
     assert [r.task for r in results.of(TaskEndRecord)] == [last]
     cells = [(r.phase, r.learned, r.task) for r in results.of(EvalRecord)]
-    assert cells == [("matrix", last, task) for task in range(harness.TASKS)]
+    assert cells == [("matrix", last, task) for task in range(sequences.TASKS)]
     assert [(r.task, r.epoch) for r in results.of(LossRecord)] == [(last, 1), (last, 2)]
     assert not RunDirectory(tmp_path).checkpoints.best_path.exists()
 
 
-def test_fixed_steps_are_counted_for_each_of_the_tasks_learned_together(harness, tmp_path):
-    p = harness.run_context(tmp_path, "multitask")
+def test_fixed_steps_are_counted_for_each_of_the_tasks_learned_together(tmp_path):
+    p = sequences.run_context(tmp_path, Multitask)
     object.__setattr__(p, "fit", FitSettings(epochs=2, steps_per_epoch=3, precision="fp32"))
     assert [phase.steps_per_epoch for phase in training_phases(p, (0, 1, 2))] == [9]
     assert [phase.steps_per_epoch for phase in training_phases(p, (1,))] == [3]

@@ -1,17 +1,14 @@
 """What weight averaging between tasks promises, as properties."""
 
-import copy
-
 import pytest
 import torch
 
-from lifelong import checkpoints
 from lifelong.algorithms import Averaging, Sequential
 from lifelong.checkpoints import check
 from lifelong.errors import ConfigError
 from lifelong.settings import build
 from tests.harness import sequences
-from tests.harness.algorithms import assert_resumed_equals_uninterrupted, learn
+from tests.harness.algorithms import learn
 from tests.harness.configs import composed
 from tests.harness.fakes import DeepPolicy, Windows
 
@@ -98,28 +95,6 @@ def test_nothing_is_kept_from_task_to_task_but_a_number() -> None:
     assert learner.state_dict() == {"tasks": 2, "before": None}
     learner.begin_task(2, Windows(2), acting)
     check(learner.state_dict(), Averaging.state_form, "state", acting)
-
-
-def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(sequences, "ALGORITHMS", {"averaging": Averaging})
-    assert_resumed_equals_uninterrupted(tmp_path, "averaging", monkeypatch)
-
-
-def test_a_state_restored_within_a_task_changes_nothing(tmp_path) -> None:
-    whole, acting = Averaging(), policy()
-    for task in (0, 1):
-        learn(whole, acting, task)
-    whole.begin_task(2, Windows(2), acting)
-    checkpoints.save(tmp_path / "s", {"algorithm": whole.state_dict()})
-    other = Averaging()
-    other.load_state_dict(checkpoints.load(tmp_path / "s")["algorithm"], {})
-    copied = copy.deepcopy(acting)
-    for learner, found in ((whole, acting), (other, copied)):
-        with torch.no_grad():
-            for parameter in found.parameters():
-                parameter.add_(1)
-        learner.end_task(2, Windows(2), found, torch.Generator())
-    sequences.assert_same(dict(copied.state_dict()), dict(acting.state_dict()))
 
 
 def test_a_share_above_one_is_refused_in_one_line() -> None:

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from libero_env.errors import UnknownNameError
-from lifelong import checkpoints
 from lifelong.algorithms.importance import BatchFisher
 from lifelong.composition import compose_run
 from lifelong.seeding import generator
@@ -16,7 +15,7 @@ from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 from tests.harness import sequences
-from tests.harness.algorithms import assert_resumed_equals_uninterrupted, by_hand, learn, outputs
+from tests.harness.algorithms import assert_resumed_equals_uninterrupted, by_hand, outputs
 from tests.harness.configs import FILES, composed
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 
@@ -209,30 +208,13 @@ def test_the_sequence_sets_the_augmentation_of_its_algorithm(tmp_path):
     assert context.algorithm.augment is mirrored
 
 
-@pytest.mark.parametrize("overrides", [("er", "libero", "algo.memory.budget=5"), ("packnet", "libero")])
-def test_a_state_restored_between_tasks_changes_nothing(overrides, tmp_path):
-    torch.manual_seed(1)
-    policy, algorithm = DeepPolicy(), made(*overrides)
-    learn(algorithm, policy, 0)
-    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
-    learn(algorithm, policy, 1)
-
-    state = checkpoints.load(tmp_path / "s")
-    other_policy, other = DeepPolicy(), made(*overrides)
-    other_policy.load_state_dict(state["policy"])
-    other.load_state_dict(state["algorithm"], {0: Windows(0)})
-    learn(other, other_policy, 1)
-    sequences.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
-
-
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
     """EWC's estimate needs the augmentation even where a process was killed just before it."""
     run_context = sequences.run_context
-    monkeypatch.setitem(sequences.ALGORITHMS, "ewc", lambda: made("ewc", "libero"))
     monkeypatch.setattr(
         sequences, "run_context", lambda *a: dataclasses.replace(run_context(*a), augment=mirrored)
     )
-    assert_resumed_equals_uninterrupted(tmp_path, "ewc", monkeypatch)
+    assert_resumed_equals_uninterrupted(tmp_path, lambda: made("ewc", "libero"), monkeypatch)
 
 
 # --- the switch

@@ -20,7 +20,7 @@ from lifelong.streams import StageWindows
 from lifelong.training.costs import stored_bytes
 from lifelong.training.fit import fit
 from tests.harness import sequences
-from tests.harness.algorithms import SETTINGS, assert_resumed_equals_uninterrupted
+from tests.harness.algorithms import SETTINGS
 from tests.harness.policies import small_transformer
 
 BUDGET = 27_000
@@ -296,8 +296,3 @@ def test_with_a_large_budget_it_is_experience_replay_but_for_the_pictures():
     assert learned[0].keys() == learned[1].keys()
     close = [torch.allclose(v, learned[1][n], atol=2e-3) for n, v in learned[0].items()]
     assert all(close)
-
-
-def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
-    monkeypatch.setitem(sequences.ALGORITHMS, "compressed_er", lambda: CompressedER(budget=9_000))
-    assert_resumed_equals_uninterrupted(tmp_path, "compressed_er", monkeypatch)

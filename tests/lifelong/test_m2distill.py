@@ -6,40 +6,20 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lifelong import checkpoints
 from lifelong.algorithms import ER, M2Distill
-from lifelong.algorithms.base import load_algorithm
 from lifelong.algorithms.m2distill import distances
 from lifelong.data.memory import ReplayMemory
 from lifelong.errors import PolicyError
 from lifelong.nn.augmentation import RandomShift
 from lifelong.policies.history import HistoryPolicy
-from lifelong.seeding import generator, seeded
+from lifelong.seeding import generator
 from lifelong.training.costs import stored_bytes
 from lifelong.training.fit import fit
-from lifelong.training.settings import FitSettings
 from tests.harness import sequences
-from tests.harness.algorithms import assert_resumed_equals_uninterrupted
+from tests.harness.algorithms import POLICIES, SMALL, learn_frames, make_policy
 from tests.harness.fakes import LinearPolicy, Windows
-from tests.harness.policies import small_mlp, small_rnn, small_transformer, small_vilt
 
-SMALL = FitSettings(epochs=1, batch_size=8, lr=1e-2, precision="fp32")
-POLICIES = {
-    "bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt, "bc_mlp": small_mlp
-}  # fmt: skip
 KINDS = {"image", "language", "proprio", "policy"}
-
-
-def make_policy(kind: str = "bc_transformer", head: str = "gmm") -> HistoryPolicy:
-    with seeded(3):
-        return POLICIES[kind](sequences.SPEC, head)
-
-
-def learn(algorithm, policy, task: int) -> None:
-    dataset = sequences.dataset(task)
-    algorithm.begin_task(task, dataset, policy)
-    fit(policy, dataset, algorithm, settings=SMALL, seed=(task,), augment=algorithm.augment)
-    algorithm.end_task(task, dataset, policy, generator(task))
 
 
 def pair(kind: str = "bc_transformer", head: str = "gmm"):
@@ -148,7 +128,7 @@ def test_distillation_keeps_features_and_actions_nearer_than_replay_alone():
         M2Distill(budget=20, image=0.1, language=0.1, proprio=0.1, policy=1.0),
     ):
         policy = make_policy()
-        learn(algorithm, policy, 0)
+        learn_frames(algorithm, policy, 0)
         teacher = copy.deepcopy(policy).eval()
         fit(policy, sequences.dataset(1), algorithm, settings=replace(SMALL, epochs=6, lr=3e-3), seed=(1,))
         with torch.no_grad():
@@ -156,29 +136,6 @@ def test_distillation_keeps_features_and_actions_nearer_than_replay_alone():
             found.append(distances(policy.eval(), teacher, seen))
     replay, distilled = found
     assert all(distilled[kind] < replay[kind] for kind in KINDS)
-
-
-def test_the_first_task_is_learned_as_by_fine_tuning():
-    plain, policy = make_policy(), make_policy()
-    fit(plain, sequences.dataset(0), sequences.Sequential(), settings=SMALL, seed=(0,))
-    learn(M2Distill(), policy, 0)
-    sequences.assert_same(dict(policy.state_dict()), dict(plain.state_dict()))
-
-
-def test_a_state_restored_between_tasks_changes_nothing(tmp_path):
-    policy, algorithm = make_policy(), M2Distill(budget=25)
-    for task in (0, 1):
-        learn(algorithm, policy, task)
-    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
-    learn(algorithm, policy, 2)
-    state = checkpoints.load(tmp_path / "s")
-    other_policy, other = make_policy(), M2Distill()
-    other_policy.load_state_dict(state["policy"])
-    known = {task: sequences.dataset(task) for task in (0, 1)}
-    load_algorithm(other, state["algorithm"], known, other_policy, tmp_path / "s")
-    learn(other, other_policy, 2)
-    sequences.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
-    sequences.assert_same(other.state_dict(), algorithm.state_dict())
 
 
 def test_it_stores_the_windows_and_one_copy_of_the_weights():
@@ -192,8 +149,3 @@ def test_it_stores_the_windows_and_one_copy_of_the_weights():
 def test_a_policy_without_features_is_refused_in_a_line():
     with pytest.raises(PolicyError, match="LinearPolicy has no encode, over_time and head"):
         M2Distill().begin_task(0, Windows(0), LinearPolicy())
-
-
-def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
-    monkeypatch.setitem(sequences.ALGORITHMS, "m2distill", lambda: M2Distill(budget=12))
-    assert_resumed_equals_uninterrupted(tmp_path, "m2distill", monkeypatch)

@@ -7,45 +7,25 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lifelong import checkpoints
 from lifelong.algorithms import MLR
 from lifelong.algorithms.base import load_algorithm
 from lifelong.algorithms.mlr import adjust, describe, encoded, feature_parameters, similar_pairs
 from lifelong.data.latents import LatentMemory, LatentWindows
 from lifelong.errors import CheckpointError, DataError, PolicyError
 from lifelong.policies.history import HistoryPolicy
-from lifelong.seeding import generator, seeded
+from lifelong.seeding import generator
 from lifelong.streams import StageWindows
 from lifelong.training.costs import step_costs, stored_bytes
-from lifelong.training.fit import fit
-from lifelong.training.settings import FitSettings
 from tests.harness import sequences
-from tests.harness.algorithms import assert_resumed_equals_uninterrupted
+from tests.harness.algorithms import MIXING, POLICIES, learn_frames, make_policy
 from tests.harness.fakes import LinearPolicy, Windows
-from tests.harness.policies import small_mlp, small_rnn, small_transformer, small_vilt
 
-SMALL = FitSettings(epochs=1, batch_size=8, lr=1e-2, precision="fp32")
-MIXING = {"bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt}  # over time
-POLICIES = MIXING | {"bc_mlp": small_mlp}
 TWO_VIEWS = replace(sequences.SPEC, views=("a", "b"), proprio={"x": 2, "y": 3})
-
-
-def make_policy(kind: str = "bc_transformer", spec=sequences.SPEC):
-    with seeded(3):
-        return POLICIES[kind](spec)
-
-
-def learn(algorithm, policy, task: int, dataset=None) -> None:
-    dataset = dataset or sequences.dataset(task)
-    algorithm.begin_task(task, dataset, policy)
-    fit(policy, dataset, algorithm, settings=SMALL, seed=(task,))
-    algorithm.end_task(task, dataset, policy, generator(task))
 
 
 def learned(tasks: int, kind: str = "bc_transformer", **settings):
     policy, algorithm = make_policy(kind), MLR(**settings)
-    for task in range(tasks):
-        learn(algorithm, policy, task)
+    learn_frames(algorithm, policy, *range(tasks))
     return policy, algorithm
 
 
@@ -64,7 +44,7 @@ def random_observation(spec, windows: int = 2):
 
 @pytest.mark.parametrize("kind", POLICIES)
 def test_the_modalities_are_all_of_the_features_and_each_tells_of_its_own(kind):
-    policy = make_policy(kind, TWO_VIEWS).eval()
+    policy = make_policy(kind, spec=TWO_VIEWS).eval()
     observation = random_observation(TWO_VIEWS)
     parts = policy.modalities(policy.encode(observation))
     views = ["images"] if kind == "bc_vilt" else ["a", "b"]
@@ -88,7 +68,7 @@ def test_the_modalities_are_all_of_the_features_and_each_tells_of_its_own(kind):
 
 @pytest.mark.parametrize("kind", ["bc_transformer", "bc_rnn", "bc_mlp"])
 def test_without_a_camera_there_are_the_other_parts(kind):
-    policy = make_policy(kind, replace(sequences.SPEC, views=())).eval()
+    policy = make_policy(kind, spec=replace(sequences.SPEC, views=())).eval()
     observation = sequences.dataset(0).batch(torch.arange(3)).observation
     blind = replace(observation, images=observation.images[:, :, :0])
     assert sorted(policy.modalities(policy.encode(blind))) == ["language", "proprio"]
@@ -110,8 +90,7 @@ def test_features_stay_bit_identical_and_the_rest_learns(kind):
     policy, algorithm = learned(1, kind)
     dataset = sequences.dataset(0)
     before, weights = encoded(policy, dataset, torch.arange(20)), copy.deepcopy(policy.state_dict())
-    for task in (1, 2):
-        learn(algorithm, policy, task)
+    learn_frames(algorithm, policy, 1, 2)
     assert torch.equal(encoded(policy, dataset, torch.arange(20)), before)
     moved = {name for name, value in policy.state_dict().items() if not torch.equal(value, weights[name])}
     frozen = set(feature_parameters(make_policy(kind), dataset.batch(torch.arange(2))))
@@ -126,17 +105,11 @@ def test_frozen_modules_have_no_dropout_and_others_do():
     assert policy.transformer.training and policy.head.training
 
 
-def test_the_base_is_learned_as_by_fine_tuning():
-    plain, (policy, _) = make_policy(), learned(1)
-    fit(plain, sequences.dataset(0), sequences.Sequential(), settings=SMALL, seed=(0,))
-    sequences.assert_same(dict(policy.state_dict()), dict(plain.state_dict()))
-
-
 def test_a_pretrained_policy_is_frozen_at_once():
     policy = make_policy()
     before = encoded(policy, sequences.dataset(0), torch.arange(20))
     algorithm = MLR(base_tasks=0)
-    learn(algorithm, policy, 0)
+    learn_frames(algorithm, policy, 0)
     assert torch.equal(encoded(policy, sequences.dataset(0), torch.arange(20)), before)
     assert algorithm.memory.shares == {0: 20}
 
@@ -271,19 +244,6 @@ def test_instructions_that_are_learned_together_are_described_apart():
 # --- its state
 
 
-def test_a_state_restored_between_tasks_changes_nothing_and_reads_no_dataset(tmp_path):
-    policy, algorithm = learned(2)
-    checkpoints.save(tmp_path / "s", {"policy": policy.state_dict(), "algorithm": algorithm.state_dict()})
-    learn(algorithm, policy, 2)
-    state = checkpoints.load(tmp_path / "s")
-    other_policy, other = make_policy(), MLR()
-    other_policy.load_state_dict(state["policy"])
-    load_algorithm(other, state["algorithm"], {}, other_policy, tmp_path / "s")
-    learn(other, other_policy, 2)
-    sequences.assert_same(dict(other_policy.state_dict()), dict(policy.state_dict()))
-    sequences.assert_same(other.state_dict(), algorithm.state_dict())
-
-
 @pytest.mark.parametrize("name", ["codes", "low", "actions"])
 def test_a_state_whose_parts_do_not_fit_is_refused(name, tmp_path):
     policy, algorithm = learned(1)
@@ -307,8 +267,3 @@ def test_what_it_cannot_work_with_is_said_in_a_line():
     memory.add(0, torch.zeros(2, 3, 4), torch.zeros(2, 3, 7))
     with pytest.raises(DataError, match="task 0 is in the memory already"):
         memory.add(0, torch.zeros(2, 3, 4), torch.zeros(2, 3, 7))
-
-
-def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch):
-    monkeypatch.setitem(sequences.ALGORITHMS, "mlr", lambda: MLR(budget=30, adjustment=0.3))
-    assert_resumed_equals_uninterrupted(tmp_path, "mlr", monkeypatch)

@@ -5,12 +5,10 @@ import copy
 import pytest
 import torch
 
-from lifelong import checkpoints
 from lifelong.algorithms import OMLA, LoRA
-from lifelong.algorithms.base import load_algorithm
 from lifelong.errors import CheckpointError
 from tests.harness import sequences
-from tests.harness.algorithms import assert_resumed_equals_uninterrupted, learn, outputs
+from tests.harness.algorithms import learn, outputs
 from tests.harness.fakes import DeepPolicy, Windows
 
 SMALL = {"rank": 2, "alpha": 4.0}
@@ -106,25 +104,6 @@ def test_earlier_adapters_and_their_answers_never_change() -> None:
             if weights is not None:
                 sequences.assert_same(adapter(learner, earlier), weights)
         kept[task] = outputs(learner, acting, task), adapter(learner, task) if task else None
-
-
-def test_killed_and_resumed_equals_uninterrupted(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(sequences, "ALGORITHMS", {"omla": lambda: OMLA(**SMALL)})
-    assert_resumed_equals_uninterrupted(tmp_path, "omla", monkeypatch)
-
-
-def test_a_state_restored_between_tasks_changes_nothing(tmp_path) -> None:
-    learner, acting = OMLA(**SMALL), policy()
-    for task in (0, 1):
-        learn(learner, acting, task)
-    checkpoints.save(tmp_path / "s", {"policy": acting.state_dict(), "algorithm": learner.state_dict()})
-    state, other, copied = checkpoints.load(tmp_path / "s"), OMLA(**SMALL), policy()
-    copied.load_state_dict(state["policy"])
-    load_algorithm(other, state["algorithm"], {}, copied, tmp_path / "s")
-    for one, found in ((learner, acting), (other, copied)):
-        learn(one, found, 2)
-    sequences.assert_same(dict(copied.state_dict()), dict(acting.state_dict()))
-    sequences.assert_same(other.state_dict(), learner.state_dict())
 
 
 def test_a_prior_of_other_weights_is_refused(tmp_path) -> None:

