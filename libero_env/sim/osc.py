@@ -17,7 +17,6 @@ from libero_env.assets.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, REST_Q
 from libero_env.mujoco_compat import MASS_FIELD, mujoco
 from libero_env.parallel import compiled
 
-ACTION_DIM = 7
 POSITION_SCALE = 0.05  # [m] at full action
 ROTATION_SCALE = 0.5  # [rad] at full action
 GRIPPER_SPEED = 0.01  # change of the command, in [-1, 1], in each substep

@@ -13,11 +13,11 @@ from lifelong.algorithms.base import Algorithm, Phase
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
+from lifelong.nn.experts import freeze_statistics
 from lifelong.policies.base import Policy
 from lifelong.types import NonNegative
 
 _log = logging.getLogger(__name__)
-_NORMS = (nn.modules.batchnorm._BatchNorm, nn.modules.instancenorm._InstanceNorm)
 _DIVIDED = (nn.Linear, nn.Conv2d)  # layers whose weights LIBERO's code divides
 _UNTRAINED = (nn.modules.batchnorm._BatchNorm, nn.LayerNorm)  # layers that it never trains
 
@@ -104,9 +104,7 @@ class PackNet(Algorithm):
         """Set training mode, with running statistics frozen after the first task (`masks_only`: from the start)."""
         policy.train()
         if self.task_index > 0 or self.masks_only:
-            for module in policy.modules():
-                if isinstance(module, _NORMS):
-                    module.eval()
+            freeze_statistics(policy)
 
     def after_backward(self, policy: Policy) -> None:
         """Zero the gradients of frozen weights, so that they do not count in the gradient's norm."""

@@ -329,24 +329,12 @@ class CompressedMemory(TaskMemory[CompressedWindows]):
                 )
 
     def sample(self, n: int, generator: torch.Generator) -> Batch:
-        """Return windows drawn uniformly over all that are held, on the CPU, those of one task after those of another.
-
-        Args:
-            n: Number of windows. Beyond the number that are held, windows repeat.
-            generator: Draws the windows.
-
-        Raises:
-            DataError: The memory is empty.
-        """
+        """Return windows on the CPU; see `ReplayMemory.sample`."""
         drawn = self._draw(n, generator)
         if self.keep_decoded and not self._decoded:
             self._decoded = {task: _Decoded(windows) for task, windows in self.tasks.items()}
         held = self._decoded if self.keep_decoded else self.tasks
         return JoinedWindows(list(held.values())).batch(drawn)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the budget and everything that is kept, by task id."""
-        return {"budget": self.budget, "tasks": {task: w.state_dict() for task, w in self.tasks.items()}}
 
     def load_state_dict(
         self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows] | None = None

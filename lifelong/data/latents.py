@@ -107,18 +107,7 @@ class LatentMemory(TaskMemory[LatentWindows]):
                 self.tasks[known] = self.tasks[known].first(share)
 
     def sample(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return windows drawn uniformly over all that are held, on the CPU, those of one task after those of another.
-
-        Args:
-            n: Number of windows. Beyond the number that are held, windows repeat.
-            generator: Draws the windows.
-
-        Returns:
-            Latents (n, T, ...) and actions (n, T, A), float32.
-
-        Raises:
-            DataError: The memory is empty.
-        """
+        """Return latents (n, T, ...) and actions (n, T, A) of windows, on the CPU; see `ReplayMemory.sample`."""
         drawn, start = self._draw(n, generator), 0
         latents, actions = [], []
         for windows in self.tasks.values():
@@ -128,20 +117,14 @@ class LatentMemory(TaskMemory[LatentWindows]):
             actions.append(windows.actions[rows])
         return torch.cat(latents), torch.cat(actions)
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return the budget and all latents, by task id."""
-        return {"budget": self.budget, "tasks": {task: w.state_dict() for task, w in self.tasks.items()}}
-
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned.
 
         Raises:
             DataError: The state contradicts itself; the memory is unchanged.
         """
-        tasks = {
-            task: LatentWindows(**{name: kept[name].cpu() for name in _TENSORS})
-            for task, kept in state["tasks"].items()
-        }
-        for windows in tasks.values():
-            windows.check()
+        tasks = {}
+        for task, kept in state["tasks"].items():
+            tasks[task] = LatentWindows(**{name: kept[name].cpu() for name in _TENSORS})
+            tasks[task].check()
         self.budget, self.tasks = int(state["budget"]), tasks

@@ -50,6 +50,11 @@ class TaskMemory(Generic[Kept]):
         """Number of windows of each task, by task id."""
         return {task: len(windows) for task, windows in self.tasks.items()}
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return the budget and everything that is kept, by task id."""
+        tasks = {task: kept.state_dict() for task, kept in self.tasks.items()}  # type: ignore[attr-defined]
+        return {"budget": self.budget, "tasks": tasks}
+
     def _require_new(self, task: int) -> None:
         """Raise DataError where the task is in the memory already."""
         if task in self.tasks:

@@ -71,7 +71,7 @@ def add_object(
     Raises:
         LiberoError: The file cannot be used, or the name is taken; the message states the remedy.
     """
-    path, chosen = Path(path), Options.of(options)
+    path, chosen = Path(path), Options(**options)
     name = check_name(name or _name_of(path), reject_existing=not replace)
     directory = (Path(out) if out else objects_dir()) / name
     if directory.exists() and not replace:
@@ -104,7 +104,7 @@ def register_object_file(path: str | Path, name: str | None = None, **options: A
     Raises:
         LiberoError: The file cannot be used.
     """
-    path, chosen = Path(path), Options.of(options)
+    path, chosen = Path(path), Options(**options)
     if not path.is_file():
         raise LiberoError(f"{path}: no such file")
     name = name or _name_of(path)

@@ -1,7 +1,7 @@
 """Objects that are made from a mesh: their mass and collision geometry, and their MJCF, OBJ and PNG files."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 from xml.etree import ElementTree as ET
@@ -16,7 +16,7 @@ from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.objects.builtin.physics import FRICTION, SOLIMP, SOLREF
 from libero_env.objects.folder import MODEL
 from libero_env.objects.model import ROOT_BODY
-from libero_env.validation import validate_arguments
+from libero_env.validation import checked
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -29,7 +29,7 @@ _MAX_TEXTURE = 1024  # [pixels] longest side of a texture
 _SMALLEST = 0.0005  # [m] half the side of a box
 
 
-@dataclass(frozen=True)
+@checked
 class Options:
     """Options of the conversion. All but `container` are for meshes only.
 
@@ -53,19 +53,8 @@ class Options:
     container: bool = False
 
     def __post_init__(self) -> None:
-        validate_arguments(Options, {one.name: getattr(self, one.name) for one in fields(self)})
         if self.mass is not None and self.density is not None:
             raise InvalidInputError("mass and density are both given; give only one of them")
-
-    @classmethod
-    def of(cls, options: Mapping[str, Any]) -> "Options":
-        """Return options by their names.
-
-        Raises:
-            InvalidInputError: A name is unknown, or a value is not valid.
-        """
-        validate_arguments(cls, options)
-        return cls(**options)
 
     @property
     def mesh_options(self) -> tuple[str, ...]:
