@@ -1,6 +1,6 @@
 """Controllers of the arm with the configurations and attributes of robosuite 1.4.0 (`controllers/*.py` there)."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from operator import attrgetter
@@ -8,8 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from libero._adapters.lookup import answers
 from libero._adapters.sim import Domain
+from libero_env.assets.robot import GRIP_SITE
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.mujoco_compat import MASS_FIELD
 from libero_env.sim.controller import POINTING_DOWN, ControllerState, get_controller
 from libero_env.sim.osc import goals_from_poses, move_gripper, rotate
 from libero_env.text import shown
@@ -90,8 +93,58 @@ def controller_of(configs: Any) -> dict[str, Any]:
     return deepcopy({"type": kind, **DEFAULTS[kind], **config})
 
 
+def _jacobian(controller: Any) -> np.ndarray:
+    """Return the Jacobian of the grip site, (6, 7): hinge j moves it by axis x (site - anchor)."""
+    data = controller._env.sim.data
+    axes = data.xaxis[:7]
+    return np.concatenate([np.cross(axes, controller.ee_pos - data.xanchor[:7]), axes], axis=1).T
+
+
+def _at_rest(controller: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Return position (3,) and orientation (3, 3) of the grip site in the rest pose."""
+    simulations = controller._env.simulations
+    pos, mat = simulations._grip_site(simulations._rest_fields)
+    return pos[0], mat[0].reshape(3, 3)
+
+
+_INDICES = list(np.arange(7, dtype=np.int32))
+_NAMES: dict[str, Callable[[Any], Any]] = {  # m, rad, N m
+    "J_full": _jacobian,
+    "J_pos": lambda c: c.J_full[:3],
+    "J_ori": lambda c: c.J_full[3:],
+    "ee_pos": lambda c: c._env.view.eef_pos,
+    "ee_ori_mat": lambda c: c._env.view.eef_mat,
+    "ee_pos_vel": lambda c: c.J_pos @ c.joint_vel,
+    "ee_ori_vel": lambda c: c.J_ori @ c.joint_vel,
+    "joint_pos": lambda c: c._env.arm_seen[0],
+    "joint_vel": lambda c: c._env.arm_seen[1],
+    "mass_matrix": lambda c: c._env.simulations.fields[MASS_FIELD][0][c._env.simulations.arm.mass_address],
+    "torque_compensation": lambda c: c._env.sim.data.qfrc_bias[:7].copy(),
+    "torques": lambda c: c._env.robots[0].torques,
+    "goal_pos": lambda c: c._state.goal[0],
+    "goal_ori": lambda c: c._state.memory[0].reshape(3, 3),
+    "initial_ee_pos": lambda c: _at_rest(c)[0],
+    "initial_ee_ori_mat": lambda c: _at_rest(c)[1],
+    "actuator_max": lambda c: c._env.simulations.arm.torque_limit.copy(),
+    "actuator_min": lambda c: -c.actuator_max,
+    "actuator_limits": lambda c: (c.actuator_min, c.actuator_max),
+    "action_scale": lambda c: abs(c.output_max - c.output_min) / abs(c.input_max - c.input_min),
+    "action_input_transform": lambda c: (c.input_max + c.input_min) / 2.0,
+    "action_output_transform": lambda c: (c.output_max + c.output_min) / 2.0,
+    "use_ori": lambda c: c.name == "OSC_POSE",
+    "name_suffix": lambda c: c.name.partition("_")[2],
+    "sim": lambda c: c._env.sim,
+    "control_freq": lambda c: c._env.control_freq,
+    "model_timestep": lambda c: c._env.sim.model.opt.timestep,
+    "relative_ori": lambda c: np.zeros(3),
+}
+
+
+@answers(_NAMES)
 class Controller:
     """Goals, gains and limits of the arm. They may be set, and count from the next step to the next reset.
+
+    What it has measured is of the last substep, as in robosuite.
 
     Attributes:
         name: Name of the controller, such as `OSC_POSE`.
@@ -101,8 +154,15 @@ class Controller:
         initial_joint: Joints towards which operational space control pulls, (7,) rad.
     """
 
+    impedance_mode, orientation_limits, uncoupling, new_update = "fixed", None, True, True
+    interpolator_pos, interpolator_ori, ori_ref, eef_name, joint_dim = None, None, None, GRIP_SITE, 7
+    joint_index, qpos_index, qvel_index = list(range(7)), _INDICES, _INDICES
+
     def __init__(self, env: Domain, config: Mapping[str, Any]):
         self._env, self.name = env, config["type"]
+        for name, key in (("kp", "kp_limits"), ("damping_ratio", "damping_ratio_limits")):
+            for end, value in zip(("min", "max"), config.get(key, ()), strict=False):
+                setattr(self, f"{name}_{end}", np.full(6 if self.name.startswith("OSC") else 7, float(value)))
         self.use_delta = bool(config.get("control_delta", True))
         self.control_dim = self._law.action_dim - 1
         for key in ("input_max", "input_min", "output_max", "output_min"):
@@ -154,9 +214,8 @@ class Controller:
 
     def scale_action(self, action: Any) -> np.ndarray:
         """Return what an action without the gripper means, from the ranges of input and output."""
-        scale = abs(self.output_max - self.output_min) / abs(self.input_max - self.input_min)
-        middle, centre = (self.input_max + self.input_min) / 2.0, (self.output_max + self.output_min) / 2.0
-        return (np.clip(action, self.input_min, self.input_max) - middle) * scale + centre
+        clipped = np.clip(action, self.input_min, self.input_max)
+        return (clipped - self.action_input_transform) * self.action_scale + self.action_output_transform
 
     def _set_goals(self, ids, actions, qpos, site_pos, site_mat, goal, memory):
         """See `libero_env.sim.controller.Controller`."""
@@ -205,13 +264,6 @@ class Controller:
     # State --------------------------------------------------------------------------------------------------
 
     _state = property(attrgetter("_env.simulations.controller_state"))
-    goal_pos = property(lambda self: self._state.goal[0], doc="Goal of the grip site, (3,) m.")
-    goal_ori = property(
-        lambda self: self._state.memory[0].reshape(3, 3), doc="Goal of its orientation, (3, 3)."
-    )
-    ee_pos = property(attrgetter("_env.view.eef_pos"), doc="Position of the grip site, (3,) m.")
-    ee_ori_mat = property(attrgetter("_env.view.eef_mat"), doc="Orientation of the grip site, (3, 3).")
-    joint_pos = property(lambda self: self._env.sim.data.qpos[:7].copy(), doc="Joint positions, (7,) rad.")
 
     @property
     def kp(self) -> np.ndarray:

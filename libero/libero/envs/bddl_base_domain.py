@@ -318,6 +318,7 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def _restart_clock(self) -> None:
         self.timestep, self.cur_time, self.done, self._clock = 0, 0.0, False, 0.0
+        self._noted: list[np.ndarray] = []
 
     def _reset_internal(self) -> None:
         """Set the state to a sampled initial state; a subclass may change it afterwards."""
@@ -373,6 +374,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         fixtures = state[short:].reshape(1, -1, 7) if state.size == whole else None
         qpos, qvel = state[None, 1 : 1 + nq], state[None, 1 + nq : short]
         self.simulations.reset([0], qpos, qvel, float(state[0]), fixtures)
+        self._noted = []
 
     def step(self, action: Any) -> "tuple[OrderedDict[str, np.ndarray], float, bool, dict[str, Any]]":
         """Act for a control period; return observation, reward, success, and a dictionary with `success`.
@@ -393,7 +395,9 @@ class BDDLBaseDomain(RobosuiteMethods):
         command = self.robots[0].command(action)
         self.timestep += 1
         mujoco.mj_step1(self.sim.model._model, self.sim.data._data)  # what clients wrote since
+        self._noted, self._moment = [], 0
         self.simulations.step([0], command[None], watch=self._watch)
+        self.robots[0].recent_torques.push(self._noted[0][2])
         self.cur_time += 1.0 / self.control_freq
         reward, self.done, info = self._post_action(action)
         success = self._check_success()
@@ -402,6 +406,19 @@ class BDDLBaseDomain(RobosuiteMethods):
     def _watch(self, moment: int, _: np.ndarray) -> None:
         if moment == INTEGRATED:
             self._update_observables()
+            self._moment += 1
+            if self._moment in (1, self._substeps - 1):
+                self._noted.append(self._arm())
+
+    def _arm(self) -> np.ndarray:
+        """Return positions, velocities and torques of the arm's joints, (3, 7)."""
+        data = self.sim.data._data
+        return np.stack([data.qpos[:7], data.qvel[:7], data.ctrl[:7]])
+
+    @property
+    def arm_seen(self) -> np.ndarray:
+        """What the controller saw last, see `_arm`: of a step, the state before its last substep."""
+        return self._noted[-1] if self._noted else self._arm()
 
     def _pre_action(self, action: Any, policy_step: bool = False) -> None:
         """Do nothing; a subclass may change the simulation before each control step."""

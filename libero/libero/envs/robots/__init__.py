@@ -214,6 +214,7 @@ _ROBOT: dict[str, Callable[[Any], Any]] = {
     "ee_force": lambda robot: robot.get_sensor_measurement("gripper0_force_ee"),
     "ee_torque": lambda robot: robot.get_sensor_measurement("gripper0_torque_ee"),
     "gripper_joints": lambda robot: robot.gripper.joints,
+    "js_energy": lambda robot: abs(robot.recent_torques.average / robot.control_freq),
     "robot_joints": lambda robot: robot.robot_model.joints,
     "torque_limits": lambda robot: tuple(robot.sim.model.actuator_ctrlrange[:7].T.copy()),
     "torques": lambda robot: robot.sim.data.ctrl[:7].copy() if robot._env.timestep else None,
@@ -227,7 +228,8 @@ class SingleArm:
     """The arm with controller and gripper.
 
     Attributes:
-        recent_qpos, recent_actions: Joints, (7,) rad, and action of the last step and of the one before it.
+        recent_qpos, recent_torques, recent_actions: Joints, (7,) rad, torques, (7,) N m, and action at the beginning of
+            the last step and of the one before it.
     """
 
     idn, dof, has_gripper, gripper_type, mount_type = 0, 8, True, "default", "default"
@@ -269,7 +271,8 @@ class SingleArm:
     def reset(self) -> None:
         """Make the controller anew, from `controller_config`; it takes the present rest pose for its own."""
         self.controller = Controller(self._env, controller_of(self.controller_config))
-        self.recent_qpos, self.recent_actions = Recent(7), Recent(self.action_dim)
+        self.recent_qpos, self.recent_torques = Recent(7), Recent(7)
+        self.recent_actions = Recent(self.action_dim)
 
     def set_robot_joint_positions(self, jpos: Any) -> None:
         """Set the joint positions, (7,) rad."""
