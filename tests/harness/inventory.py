@@ -1,10 +1,11 @@
 """Names and values of what stands behind an environment: arm, controller, gripper, models, objects and their states.
 
 `python inventory.py OUT.json FILE ...` writes those of task files. It needs nothing but the package `libero` that is
-found, so that the original writes its own.
+found: the original wrote `tests/libero/data/original_names.json`.
 """
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -12,7 +13,8 @@ import numpy as np
 
 START = [0.1, -0.2, 0.05, -2.3, 0.1, 2.2, 0.8, 0.03, -0.03]  # joints of arm and fingers
 ACTIONS = [[0.3, -0.2, 0.4, 0.1, 0.05, -0.2, 1.0], [0.2, 0.1, 0.3, 0.0, -0.1, 0.1, -1.0]] * 2
-_LARGEST = 60  # numbers of an array that are kept
+_LARGEST = 60  # entries that are kept
+_PRIVATE = re.compile(r"_(?!hand_|eef_x|ref_|joint_|action_dim|visualizations)")  # names that nobody uses
 
 
 def plain(value):
@@ -22,6 +24,8 @@ def plain(value):
         return {"dtype": str(value.dtype), "shape": list(value.shape), "value": numbers}
     if isinstance(value, np.generic):
         return {"dtype": str(value.dtype), "value": value.item()}
+    if isinstance(value, str) and value.startswith("/"):
+        return "a path"
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, set):
@@ -39,7 +43,7 @@ def names_of(item, asked=()):
     """Return all names of an object, and those of `asked` that it knows besides, with their values."""
     found = {}
     for name in sorted({*dir(item), *asked}):
-        if name.startswith("__"):
+        if _PRIVATE.match(name):
             continue
         try:
             found[name] = plain(getattr(item, name))

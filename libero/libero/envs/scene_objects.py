@@ -70,6 +70,8 @@ class TaskModel:
         segments: `instance` and `class` -> number of each geom, (ngeom + 1,), from 1; 0 is everything else.
     """
 
+    name = "base"
+
     def __init__(
         self,
         scene: Scene,
