@@ -45,7 +45,6 @@ def surface_points(model: mujoco.MjModel, body: int, spacing: float = SPACING) -
 
     Args:
         model: Model that has the body.
-        body: Index of the body.
         spacing: Distance between neighbouring points, m.
 
     Returns:

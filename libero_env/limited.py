@@ -28,7 +28,6 @@ def call_limited(function: Callable[..., Any], *args: Any, about: str) -> Any:
     """Return what a function returns in a process with limits.
 
     Args:
-        function: Function of a module.
         args: Its arguments; they and the result can be pickled.
         about: What it reads, such as a path, for messages.
 

@@ -187,7 +187,6 @@ def run_each(
     """Call a function with each of several arguments, in this process or in a pool; yield position and result.
 
     Args:
-        function: Function of a module.
         arguments: Arguments of each call.
         workers: Number of processes; 1 calls it in this process.
         is_needed: Whether the call of a position shall still begin; asked after each result.

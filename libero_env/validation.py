@@ -53,7 +53,6 @@ def validate(
         source: Name of the file that the value comes from; empty for none.
         prefix: Path of the value in its source, which is shown before the paths in it.
         line_of: Function that returns the line of a path (with the prefix) in the source, from 1.
-        error: Type of the error.
 
     Raises:
         InvalidInputError: A key is unknown or missing, or a value is of another kind or outside of its range; or
@@ -93,7 +92,6 @@ def validate_arguments(
         target: Function or class.
         arguments: Plain data by the name of the parameter.
         prefix: Path of the arguments, which is shown before their names.
-        error: Type of the error.
 
     Raises:
         InvalidInputError: An argument is unknown, or of another kind or outside of its range; or `error`.

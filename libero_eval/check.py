@@ -40,7 +40,6 @@ class Examination:
     """The state of a run directory.
 
     Attributes:
-        path: The directory.
         counts: Number of records, checkpoints and evaluations that are intact.
         findings: Faults and notes.
     """

@@ -38,7 +38,6 @@ class TaskResult(Episodes):
 
     Attributes:
         task: Id of the task, such as `libero_goal/3`.
-        name: Name of the task.
         instruction: Instruction that the policy received.
         errors: Error of each episode that the protocol counts as a failure, or None; empty if there are none.
         actions: Digest of the actions of each episode, by which episodes can be compared to the bit; empty if they
@@ -113,7 +112,6 @@ class EvaluationResult:
         protocol: How episodes were run: the resolved protocol as plain data.
         init_states: Indices of the initial states of each task.
         versions: Versions of Python, of the packages and of the models.
-        tasks: Results by task.
         environment: What the numbers may also depend on: models, robot, drawing, renderer, processor, threads. Where
             the processes of an evaluation differ, a value is the list of the different ones.
         unit_starts: Number of episodes that were run in one batch; the bits of a policy may depend on it. None: all

@@ -306,7 +306,6 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
 
     Args:
         request: Request with the result's file as the policy; processes, folder and device are taken from it.
-        result: The result.
 
     Raises:
         ResultsError: The result does not say which policy it is of.
@@ -376,7 +375,6 @@ def check_same(
     """Check that an evaluation is the one of a result.
 
     Args:
-        result: The result.
         evaluated: What identifies the policy now.
         protocol: Protocol now.
         versions: Versions now.

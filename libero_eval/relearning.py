@@ -84,7 +84,6 @@ class Trial:
     """One task to be relearned.
 
     Attributes:
-        task: Position of the task.
         training: Windows of the demonstrations that the run learned from.
         measure: Function that returns the error of a policy on the task, or its share of failed rollouts.
         limit: Largest value of it with which the task counts as back.
@@ -101,8 +100,6 @@ def failure_share(policy: Policy, run: LoadedRun, task: int, env: VectorEnv, epi
 
     Args:
         policy: Policy; its mode is left as it is.
-        run: The run.
-        task: Position of the task.
         env: Environment of the task, with a simulation for each rollout.
         episodes: Number of rollouts, which start in the first initial states.
 

@@ -67,7 +67,6 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
     """Return the tree in a file.
 
     Args:
-        path: File to read.
         device: Device of the tensors.
 
     Raises:

@@ -101,9 +101,7 @@ def explained(error: Exception, words: Sequence[str], folders: Sequence[Path]) -
     """Return an error of Hydra's in one line, with the nearest name where a file or key does not exist.
 
     Args:
-        error: The error.
         words: Overrides.
-        folders: Folders of configuration files.
     """
     said = " ".join(str(error).split())
     if file := re.search(r"Could not find '([^']+)/([^/']+)'", said):

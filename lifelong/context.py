@@ -28,7 +28,6 @@ class RunContext:
         tasks: The K tasks in learning order.
         languages: (K, L) embeddings of `instructions`.
         demos: Number of demonstrations of each task.
-        data: Settings of the demonstrations and observations.
         policy: Policy, trained in place.
         algorithm: Lifelong algorithm.
         fit: Settings of training.
@@ -40,7 +39,6 @@ class RunContext:
         directory: Directory of checkpoints and records.
         tracker: Mirror of the metrics to Weights & Biases.
         seed: Seed from which all randomness of the run is derived.
-        device: Device of the policy.
         progress: Whether to show progress bars; None prints lines where demonstrations are recorded.
         ranks: Rank of this process among those that train together.
         perturb: Perturbations of each task, under which it is learned and evaluated; () for none at all.

@@ -87,7 +87,6 @@ def require_package(name: str, extra: str) -> None:
     """Check that an optional package is installed.
 
     Args:
-        name: Name of its module.
         extra: Extra of this distribution that installs it.
 
     Raises:

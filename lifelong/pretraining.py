@@ -48,7 +48,6 @@ def initial_policy(run: Path, *, weights: Path | None = None, allow: Sequence[st
     """Return a policy with the weights that a run began with, on the CPU.
 
     Args:
-        run: Directory of the run.
         weights: A finished run or a checkpoint with these weights. None: those of its seed, or its `init_from`.
         allow: Packages whose classes the configuration may name, too.
 
@@ -69,9 +68,7 @@ def policy_at_start(config: Configuration, spec: PolicySpec, seed: int, weights:
     """Build a policy with the weights that a run begins with.
 
     Args:
-        config: Configuration of the run.
         spec: What the policy observes and does.
-        seed: Seed of the run.
         weights: A finished run or a checkpoint with the weights. None: drawn by the seed.
 
     Raises:

@@ -88,7 +88,6 @@ class Sweep:
     """A sweep as its folder tells it.
 
     Attributes:
-        folder: Folder of the sweep.
         words: Words of the command.
         planned: Number of jobs; None where the sweeper chooses them as it goes.
         jobs: Records, by number.
@@ -214,7 +213,6 @@ def run_job(
     is waited for.
 
     Args:
-        file: File of the record.
         job: The job, running.
         learn: Function that learns and returns the directory of the run.
         report: Function that prints an error and returns the exit status and the line.

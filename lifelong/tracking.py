@@ -35,7 +35,6 @@ class Tracker:
         """Start a run, or resume the run of the same name.
 
         Args:
-            name: Name of the run.
             directory: Folder for the files of W&B.
             config: Configuration of the run.
 

@@ -87,7 +87,6 @@ def open_url(
     Args:
         url: Address.
         headers: Further headers of the request.
-        method: Method of the request.
 
     Raises:
         DownloadError: The address is not valid, or redirects to one that is not.
@@ -246,7 +245,6 @@ def unpack(archive: Path, folder: Path, *, overwrite: bool = False) -> list[Path
 
     Args:
         archive: File to read.
-        folder: Folder to write to.
         overwrite: Whether to replace files that exist; otherwise they are kept.
 
     Returns:

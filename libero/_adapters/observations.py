@@ -173,7 +173,6 @@ class Observable:
     """One observation, with the interface of robosuite's class, whose instances are accepted beside it.
 
     Args:
-        name: Name in observations.
         sensor: Function of the observations made before it, by name, that returns the value; None for the value that
             the environment has for this name.
         corrupter: Function of the value, such as noise.

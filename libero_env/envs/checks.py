@@ -50,7 +50,6 @@ def checked_numbers(
         value: Array, or what NumPy makes one of.
         name: Name of the value in messages.
         shapes: Shapes that are valid; where they are texts, the caller checks the shape.
-        error: Type of the error.
 
     Raises:
         InvalidInputError: The shape is wrong, or a value is not a finite real number; or `error`.

@@ -32,7 +32,6 @@ class LiberoEnv(gymnasium.Env):
 
     Attributes:
         config: Configuration of the environment.
-        task: Task of the environment.
         batch: The batch of one simulation of which this is a view.
         scene: Compiled scene of the task.
         simulations: Physics and controller.

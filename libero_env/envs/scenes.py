@@ -28,9 +28,7 @@ class TaskScenes:
 
     Attributes:
         task: Task as the perturbations change it.
-        scene: Its compiled scene.
         base_task: The task without perturbations.
-        base_scene: Compiled scene of that task.
         rest: Joints that the controller takes for the arm's rest pose, (7,) [rad].
         perturbed: Samples and filters; None without perturbations.
     """

@@ -321,7 +321,6 @@ class Failure:
     """A worker that did not answer.
 
     Attributes:
-        reason: Reason for the error message.
         lost: Whether its process has to be replaced.
         late: Whether it had no time left.
     """
@@ -337,7 +336,6 @@ def wait_for(
     """Wait for the answers to requests.
 
     Args:
-        workers: Workers by index.
         timeout: Largest time to wait, s.
         requests: Number of the request by index; by default the last one of each worker.
 

@@ -30,17 +30,12 @@ _WITHIN_BOUNDS = ("libero_tabletop", "libero_floor", "libero_coffee_table")
 
 
 class OriginalResets:
-    """The resets of one environment of the original.
-
-    Attributes:
-        scene: Compiled scene of the task.
-    """
+    """The resets of one environment of the original."""
 
     def __init__(self, scene: Scene, seed: int, loads: int = 1):
         """Seed the generator.
 
         Args:
-            scene: Compiled scene of the task.
             seed: Argument of the original's `env.seed`.
             loads: Number of times that the environment has loaded its model: once when it is made, and at each reset.
                 Each samples each joint that the task's initial conditions open, close, turn on or off.
@@ -159,7 +154,6 @@ class _Item:
     """An entity that an init atom places.
 
     Attributes:
-        name: Name.
         model: Its model, for radius and offsets.
         region: Region that it is placed in.
         fixture: Whether it is a fixture: those are placed wherever they are sampled.
@@ -239,9 +233,7 @@ def drawn_fixtures(scene: Scene, seed: int, resets: int, loads: int = 1) -> Iter
     """Yield the poses of the fixtures after each of the first resets of the original, (nfixtures, 7).
 
     Args:
-        scene: Compiled scene of the task.
         seed: Argument of the original's `env.seed`.
-        resets: Number of resets.
         loads: As in `OriginalResets`.
     """
     original = OriginalResets(scene, seed, loads)

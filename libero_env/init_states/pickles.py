@@ -140,9 +140,6 @@ def _read_pickle(content: bytes) -> object:
 def read_states(path: str | Path) -> np.ndarray:
     """Read a `.pruned_init` or `.init` file.
 
-    Args:
-        path: File to read.
-
     Returns:
         Rows [time, qpos, qvel], (n, size) float64.
 

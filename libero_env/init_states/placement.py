@@ -50,8 +50,6 @@ def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | 
     Objects hover by a millimetre and are not at rest; see `libero_env.init_states.placement`.
 
     Args:
-        scene: Scene to sample.
-        rng: Random generator.
         fixtures: Poses of the fixtures, (nfixtures, 7); None samples them.
 
     Raises:
@@ -277,7 +275,6 @@ def settle(
         simulations: Simulations, with a controller whose zero action holds the pose.
         i: Index of the simulation.
         qpos: Positions to start from, (nq,).
-        nq_robot: Number of positions of the robot.
         fixtures: Poses of the fixtures, (nfixtures, 7); None keeps them.
 
     Returns:
@@ -316,10 +313,7 @@ def sample_settled(
     """Sample a start that is at rest, where the init atoms are true and the goal is false.
 
     Args:
-        scene: Scene to sample.
-        simulations: Simulations of the scene.
         i: Index of the simulation to settle the objects in.
-        rng: Random generator.
         fixtures: Poses of the fixtures, (nfixtures, 7); None samples them.
 
     Raises:

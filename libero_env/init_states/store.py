@@ -29,8 +29,6 @@ def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -
     """Generate the initial states of a task.
 
     Args:
-        task: Task.
-        scene: Compiled scene of the task.
         num: Number of states.
 
     Returns:
@@ -42,10 +40,6 @@ def generate_init_states(task: Task, scene: Scene, num: int = NUM_INIT_STATES) -
 
 def load_init_states(task: Task, scene: Scene) -> InitialStates:
     """Return the initial states of a task: those of the package, or else of the cache, where they are generated once.
-
-    Args:
-        task: Task.
-        scene: Compiled scene of the task.
 
     Returns:
         The 50 states; of a variant that leaves objects in place, those of its base task.
@@ -93,7 +87,6 @@ def load_original_states(task: Task, scene: Scene | None = None) -> np.ndarray |
     They are in the folder `init_states` of the configuration file, laid out as LIBERO's `init_files`.
 
     Args:
-        task: Task.
         scene: Compiled scene that is to start in them, whose size is compared; None compares nothing.
 
     Raises:
@@ -140,7 +133,6 @@ def write_suite(path: Path, tasks: Sequence[Task], jobs: int = 1) -> None:
 
     Args:
         path: File to write, npz: for each task `<name>` with the states and `<name>.digest`.
-        tasks: Tasks of a suite.
         jobs: Number of processes; the states do not depend on it.
     """
     path.parent.mkdir(parents=True, exist_ok=True)  # fails now, not after the work

@@ -99,7 +99,6 @@ class SceneAppearance:
     """An appearance of one scene, with the indices of its model.
 
     Args:
-        appearance: Appearance.
         scene: Scene that is drawn.
 
     Raises:

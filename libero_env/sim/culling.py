@@ -60,7 +60,6 @@ class Culling:
 
         Args:
             data: State whose kinematics and cameras are up to date.
-            camera: Index of a camera.
             aspect: Width of the image over its height.
             geoms: Elements of the scene; those to leave out lose their type.
             mirrors: Whether reflections are drawn.

@@ -21,7 +21,6 @@ class Goals:
     They are looked at one after the other; predicates of `OF_ALL` in all simulations of MuJoCo Warp at once.
 
     Args:
-        goal: The goal.
         atoms: Atoms that `check` evaluates, such as `Scene.goal_atoms`.
         views: State view of each simulation.
         semantics: Semantics of the predicates, `original` or `strict`.

@@ -192,7 +192,6 @@ class Observer:
         """Render the observed images of simulations.
 
         Args:
-            ids: Indices of the simulations.
             images: Arrays of `empty_images`, whose rows `ids` are overwritten.
         """
         if not images:
@@ -215,7 +214,6 @@ class Observer:
 
         Args:
             i: Index of the simulation.
-            camera: Name of the camera in the model.
             kind: `rgb`, `depth`, or `segmentation_instance`, `_class` or `_element`.
 
         Returns:

@@ -49,7 +49,6 @@ class ArmIndex:
     Attributes:
         joints: Indices of the arm's joints, (7,).
         mass_address: Index of each entry of the arm's block in the sparse mass matrix, (7, 7).
-        site: Index of the grip site.
         torque_limit: Largest torque of each joint, (7,), N m.
         fingers: Indices of the finger joints, (2,).
         finger_range: Control range of the finger actuators, (2, 2), m.

@@ -87,7 +87,6 @@ def is_over(box: Box, point: np.ndarray, above: float = ON_ABOVE) -> Any:
     """Return whether a point (..., 3) is on top of a box; as in the original, rotated by R instead of its inverse.
 
     Args:
-        box: Box.
         point: Point in the world.
         above: Largest height of the point above the box, m.
     """
@@ -252,7 +251,6 @@ def evaluate(expression: Expression, view: StateView, semantics: str = "original
 
     Args:
         expression: Goal or atom.
-        view: State to evaluate it in.
         semantics: `original` or `strict`.
 
     Raises:

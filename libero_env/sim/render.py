@@ -116,7 +116,6 @@ class RenderTarget:
     """Arrays that the image of one camera is written to, first row on top. Arrays that are None are not rendered.
 
     Attributes:
-        camera: Index of the camera in the model.
         rgb: Colours, (height, width, 3) uint8.
         depth: Distance along the optical axis, (height, width) float32, m; that of the far plane in the background.
         depth_buffer: OpenGL's depth, (height, width) float32: 0 at the near plane and 1 at the far plane.

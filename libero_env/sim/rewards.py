@@ -52,9 +52,7 @@ class Reward:
         """Return the reward of a state.
 
         Args:
-            view: State.
             success: Whether the goal is true.
-            atoms: Atoms of the goal.
             held: Whether each atom holds.
         """
         if success or self.kind == "sparse":
@@ -107,7 +105,6 @@ def joint_progress(view: StateView, address: str, state: str) -> float:
     It is that of the most advanced joint for states that one joint suffices for, else of the least advanced.
 
     Args:
-        view: State.
         address: Name of an object or fixture, or address of a region.
         state: `open`, `close`, `turnon` or `turnoff`.
     """

@@ -45,7 +45,6 @@ class Scene:
         pack: Asset pack of the models.
         workspace: Table or floor.
         workspace_name: Name of the workspace in the task file, such as `main_table`.
-        model: Compiled model.
         objects: Movable objects by name, in the order of the task file.
         fixtures: Fixtures by name, without the workspace, in the order of the task file.
         drawing: How images are drawn, one of `DRAWINGS`.
@@ -163,7 +162,6 @@ class Scene:
         """Check that rows (k, n) begin with [time, qpos, qvel] of this scene, as those of the original do.
 
         Args:
-            states: States.
             source: Where they come from, for the message.
 
         Raises:
@@ -385,10 +383,7 @@ def fixture_pose(
 
     Args:
         problem: Problem that has the fixture.
-        workspace_name: Name of the workspace in the task file.
         workspace: Table or floor.
-        name: Name of the fixture.
-        item: Model of the fixture.
         rng: Generator to sample the region with; without it the middle of the region is taken.
 
     Returns:

@@ -251,7 +251,6 @@ class Simulations(ABC):
         """Advance simulations by one control period.
 
         Args:
-            ids: Indices of the simulations.
             actions: Action of each simulation, (num, action_dim), finite; rows of other simulations are not used.
             watch: Function that is called after each substep of `WATCHED`, with the number of substeps done and the
                 indices of the simulations whose fields are of that moment; by `LoopSimulations` with `INTEGRATED`

@@ -21,7 +21,6 @@ class StateView:
 
     Attributes:
         scene: Scene that is simulated.
-        simulations: Simulations of the scene.
         index: Index of the simulation; `slice(None)` stands for all.
     """
 

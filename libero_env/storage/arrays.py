@@ -50,7 +50,6 @@ def read_npz(path: Path, *, needs_checksum: bool = False) -> Arrays:
     """Read the arrays of a file of `atomic_write_npz`, or of one without the checksum at its end.
 
     Args:
-        path: File to read.
         needs_checksum: Whether a file without the checksum is broken.
 
     Raises:

@@ -67,10 +67,6 @@ def write_json(target: Path, value: Any, *, fsync: bool = False) -> None:
 def read_json(path: Path, error: type[LiberoError] = InvalidInputError) -> Any:
     """Return the content of a JSON file.
 
-    Args:
-        path: File to read.
-        error: Type of the error.
-
     Raises:
         LiberoError: The file cannot be read, or is not JSON, in one line; of the type `error`.
     """
@@ -86,7 +82,6 @@ def read_bounded(path: Path, most: int, *, within: Path | None = None) -> bytes:
     """Return the content of a file that may be somebody else's.
 
     Args:
-        path: File to read.
         most: Largest size, [bytes].
         within: Folder that a link must not lead out of; None for any.
 
@@ -105,7 +100,6 @@ def require_own_folders(folder: Path, *names: str, error: type[LiberoError] = In
     Args:
         folder: The folder; it may be a link itself.
         names: Relative paths of folders in it, which need not exist.
-        error: Type of the error.
 
     Raises:
         LiberoError: One leads out of the folder, or is not a folder; of the type `error`.

@@ -36,7 +36,6 @@ class Row:
     Attributes:
         name: `all`, a suite, or the id of a task.
         title: The instruction of a task; empty otherwise.
-        difference: The difference.
         adjusted: P-value adjusted by Holm over the family: all comparisons of this kind of row; for tasks, the tasks
             of this comparison. None for a control arm, which is not tested for being better.
     """

@@ -27,7 +27,6 @@ def render(comparison: Comparison, *, tasks: bool = False) -> str:
     """Return the tables of a comparison.
 
     Args:
-        comparison: The comparison.
         tasks: Whether to show every task instead of those that differ most.
     """
     blocks = [_rates(comparison)]
@@ -173,10 +172,6 @@ def _short(label: str, length: int = 16) -> str:
 
 def write_page(comparison: Comparison, path: Path) -> Path:
     """Write the page; it needs no other file and no network.
-
-    Args:
-        comparison: The comparison.
-        path: File to write.
 
     Raises:
         ResultsError: The file cannot be written.

@@ -105,8 +105,6 @@ def resolve_world(
     """Return a protocol with the models and initial states that are here, and a line for each that is not as it says.
 
     Args:
-        protocol: Protocol.
-        tasks: Tasks that are to be run.
         assets: Models that the user has chosen, see `libero_env.assets.pack.select_pack`.
 
     Raises:
@@ -139,10 +137,6 @@ def initial_states(
     """Return the states in which episodes of a protocol start, fixtures as the original's resets draw them.
 
     Args:
-        task: Task.
-        scene: Compiled scene of the task.
-        protocol: Protocol.
-        indices: Indices of the initial states.
         stored: Initial states of the task, rows that begin with [time, qpos, qvel].
 
     Returns:
@@ -187,7 +181,6 @@ def run_protocol(
     `libero`, episodes have the run's own length, settling and robot.
 
     Args:
-        base: Protocol.
         image_size: Height and width of the policy's images, [pixels].
         horizon: Maximum number of control steps of an episode of the run.
         settle_steps: Number of steps before the policy acts in the run.

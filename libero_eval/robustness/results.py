@@ -27,7 +27,6 @@ class Axis:
     """Success along the severities of one kind of perturbation.
 
     Attributes:
-        kind: Kind of the perturbation.
         severities: V severities in ascending order, from 0, the base.
         success: V success rates, means over tasks.
         area: Area under the line through these, over the measured severities and divided by their range: the success

@@ -136,7 +136,6 @@ class ServedPolicy:
     """A run's policy, for any number of clients.
 
     Args:
-        run: The run.
         seed: Seed of the generators of episodes whose client sends none.
     """
 
@@ -191,7 +190,6 @@ class ServedPolicy:
         """Return a client's message as a request.
 
         Args:
-            message: The message.
             before: Task of the client's last request.
 
         Raises:
@@ -275,7 +273,6 @@ class Session:
     """The episodes of one client: a policy with its own history.
 
     Args:
-        served: The policy that is served.
         number: Number of the client, from 0.
     """
 

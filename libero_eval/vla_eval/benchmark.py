@@ -62,7 +62,6 @@ class LiberoBenchmark(StepBenchmark):
     `num_steps_wait`, `max_steps`, `quat_no_antipodal` and `absolute_action` instead, as vla-eval's own benchmark does.
 
     Args:
-        suite: Name of the suite.
         card: Name of a protocol, or path of its file.
         task_ids: Indices of the tasks; None for all.
         send_wrist_image: Whether observations have the image of the wrist's camera.
@@ -72,7 +71,6 @@ class LiberoBenchmark(StepBenchmark):
         num_steps_wait: Number of steps before the policy acts.
         max_steps: Maximum number of steps of the policy.
         quat_no_antipodal: Whether rotation vectors keep the quaternion's sign.
-        absolute_action: Whether actions are absolute.
         observations: Names of our own observations to send, such as `agentview_rgb` and `joint_states`.
         camera_size: Height and width of the images of `observations`, [pixels].
         assets: Models: `builtin`, a folder, or None for the user's choice.

@@ -38,7 +38,6 @@ class Claim:
     """A claim on a unit.
 
     Attributes:
-        unit: Name of the unit.
         host: Name of the machine of the holder.
         machine: Identity of the machine's process numbers: host, boot, and namespace (containers).
         pid: Process of the holder.
@@ -59,7 +58,6 @@ class Held:
     """A claim as it was found in the folder.
 
     Attributes:
-        unit: Name of the unit.
         claim: Its content; None if its holder has not written it, or was killed before it could.
         silent: Time since it was touched, [s].
         text: Content of the file.

@@ -39,7 +39,6 @@ class Evaluation:
 
     Attributes:
         identity: Plain data that identify the policy; a folder holds results of one policy only.
-        tasks: Tasks of the benchmark.
         init_states: Initial states of each task.
         protocol: How episodes are run.
         out: Folder of the results.

@@ -20,10 +20,6 @@ class Progress:
     """How far an evaluation is, all processes together.
 
     Attributes:
-        units: Number of units.
-        done: Number of units that are done.
-        episodes: Number of episodes.
-        episodes_done: Number of episodes of the units that are done.
         running: Number of units that processes work on.
         failed: Number of units that are not done and ended with an error.
         per_hour: Episodes per hour of the recent units, over the time in which any process ran one; NaN at first.
@@ -60,7 +56,6 @@ def measure_progress(
 
     Args:
         units: Number of episodes of each unit, by its name.
-        done: Results by name of the unit.
         running: Number of units that processes work on.
         failed: Number of units with errors.
     """

@@ -52,7 +52,6 @@ class Unit:
     """A part of an evaluation, a task and a range of its initial states: all its episodes are run in one batch.
 
     Attributes:
-        task: Task of the benchmark.
         init_states: Indices of the initial states.
     """
 
@@ -73,7 +72,6 @@ def partition(tasks: Iterable[Task], init_states: Sequence[int], size: int) -> t
     its batch do not either.
 
     Args:
-        tasks: Tasks of the benchmark.
         init_states: Indices of the initial states of each task.
         size: Number of initial states of a unit; the last one of a task may have fewer.
 
@@ -145,7 +143,6 @@ class WorkStore:
     """The folder of an evaluation.
 
     Args:
-        path: The folder.
         plan: Plain data that define the evaluation: policy, protocol, size of units, simulation.
         probe: What the policy answers to a fixed observation, where that repeats.
         lease: Time after which a unit whose holder is silent is given to another process, [s].

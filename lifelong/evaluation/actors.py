@@ -58,7 +58,6 @@ class PolicyActor:
     Attributes:
         policy: Policy in evaluation mode.
         language: (L,) embedding of the instruction.
-        device: Device of the policy.
         precision: Precision of the policy, see `lifelong.training.settings.FitSettings`.
         draws: CPU generator of each simulation, for stochastic policies.
     """
@@ -97,7 +96,6 @@ def observe(obs: Obs, spec: PolicySpec, language: Tensor, device: torch.device) 
         obs: (B, ...) arrays by name.
         spec: Inputs of the policy.
         language: (L,) embedding of the instruction.
-        device: Device of the policy.
     """
     images = np.stack([obs[view] for view in spec.views], axis=1)[:, None]  # (B, 1, V, H, W, C)
     proprio = {name: torch.from_numpy(np.asarray(obs[name], np.float32))[:, None] for name in spec.proprio}

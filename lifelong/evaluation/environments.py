@@ -93,13 +93,11 @@ def run_environment(
     """Return an environment in which a run's policy acts.
 
     Args:
-        task: Task.
         simulations: Number of episodes that run side by side.
         spec: What the policy observes.
         settings: Back end, threads and horizon.
         drawing: How images are drawn; None for the default of the models.
         robot: Model of the arm.
-        perturb: Perturbations of the task.
         horizon: Maximum number of the policy's control steps; None for that of the settings.
     """
     return BatchEnv(
@@ -142,7 +140,6 @@ def held_out_shift(
     """Return a held-out shift, or None without one.
 
     Args:
-        shift: Its perturbations.
         tasks: Tasks without perturbations.
         own: Perturbations of each task, under which it is learned.
         languages: (K, L) embeddings of the instructions with which the tasks are learned.

@@ -39,8 +39,6 @@ class LoadedRun:
         policy: Policy in evaluation mode.
         algorithm: Algorithm with the state that `policy_for` needs.
         eval: Settings by which the run measured success.
-        seed: Seed of the run.
-        device: Device of the policy.
         language: Encoder of instructions; see `embed`.
         instructions: Instructions that are embedded together: those of the pretraining, then those of the run.
         robot: Model of the arm that the run was trained with.
@@ -107,7 +105,6 @@ class LoadedRun:
         """Return an environment of a task of the run, as it was learned: views, perturbations, drawing and robot.
 
         Args:
-            position: Position of the task.
             simulations: Number of episodes that run side by side.
             horizon: Maximum number of control steps of the policy.
         """

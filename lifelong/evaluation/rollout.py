@@ -139,7 +139,6 @@ def rollout(
         horizon: Maximum number of control steps of the policy per episode.
         settle_steps: Number of steps before the policy acts.
         seed: Integers from which stochastic policies get a generator per episode.
-        device: Device of the policy.
         precision: Precision of the policy, see `lifelong.training.settings.FitSettings`.
         record_every: Number of control steps between two recorded frames of the first simulation; 0 records none.
         label: Text before the progress bar.
@@ -192,7 +191,6 @@ def run_episodes(
         settle_steps: Number of steps before the actor acts, so that objects come to rest (LIBERO: 5).
         settle_action: Action of these steps; zeros by default.
         record_every: Number of control steps between two recorded frames; 0 records none.
-        recorded: Indices of the recorded simulations.
         label: Text before the progress bar.
         progress: Whether to show a progress bar.
 

@@ -57,7 +57,6 @@ class Panel:
     """One success matrix.
 
     Attributes:
-        title: Title of the panel.
         rates: (K, K) success rates, NaN where not evaluated.
         labels: K short task names.
     """

@@ -39,12 +39,9 @@ class Run:
 
     Attributes:
         path: Directory of the run.
-        results: Its recorded results.
-        record: Record that names the run.
         config: Its configuration; empty if it cannot be read.
         config_text: The configuration as text.
         notes: Remarks for the reader, such as that the run is not finished.
-        learned: Number of tasks learned.
         metrics: Metrics over these; None before the first task is learned.
     """
 

@@ -34,9 +34,6 @@ class ResultLog:
         An incomplete line that a killed process left at the end is removed first. If the line cannot be written
         whole (disk full), the part that was written is removed, so the file stays readable.
 
-        Args:
-            record: Record to append.
-
         Raises:
             ResultsError: The file cannot be written.
         """

@@ -156,7 +156,6 @@ def present_conditions(
     """Return the conditions of this process, by name.
 
     Args:
-        device: Device of the policy.
         processes: Number of processes that train together.
         renderer: Name of the OpenGL renderer, whose images depend on it; None where nothing is drawn.
     """
@@ -219,7 +218,6 @@ def changed_demonstrations(
     Args:
         earlier: Demonstrations before.
         later: Demonstrations after.
-        tasks: Names of the tasks.
     """
     pairs = zip(tasks, earlier.counts, later.counts, earlier.digests, later.digests, strict=True)
     names = [name for name, *values in pairs if values[0] != values[1] or values[2] != values[3]]

@@ -28,9 +28,7 @@ def measured_tasks(cells: MatrixCells, stage: Sequence[int], tasks: int, share: 
     """Return the tasks that are measured after a stage, ascending: its row of the success matrix.
 
     Args:
-        cells: Cells that the run measures.
         stage: Positions of the tasks that were learned together last, ascending and without gaps.
-        tasks: Number of tasks of the run.
         share: Share of the earlier tasks that `sampled` measures in each row but the last: the same ones in all runs.
     """
     final = stage[-1] == tasks - 1
@@ -272,7 +270,6 @@ class RelearnRecord:
     """Fine-tuning on a task of a finished run, from one start, in a file of its own beside the run's records.
 
     Attributes:
-        task: Position of the task.
         start: Weights that it began with: `final`, those that acted on the task at the end of the run, or `initial`,
             those that the run began with.
         learned_error: What was measured when the run had just learned the task: the error on held-out demonstrations,

@@ -16,7 +16,6 @@ class Savings:
     """One task, relearned and learned for the first time under the same conditions.
 
     Attributes:
-        task: Position of the task.
         learned_error: What was measured when the run had just learned it: the error on held-out demonstrations, or the
             share of failed rollouts.
         final_error: The same at the end of the run.

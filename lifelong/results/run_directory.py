@@ -40,7 +40,6 @@ class CheckpointFolder:
     """The folder `checkpoints` of a run.
 
     Args:
-        path: The folder.
         run: Function that returns the digest by which the run's checkpoints are known; None where it has none.
     """
 

@@ -20,7 +20,6 @@ class ShiftedTask:
     """Evaluations of one task with and without the shift, None where there are none.
 
     Attributes:
-        task: Position of the task.
         is_last: Whether nothing was learned after it, so that it cannot be forgotten.
         learned: Just after learning it, without the shift.
         learned_shifted: The same under the shift.

@@ -48,7 +48,6 @@ class PredicateRates:
 
     Attributes:
         predicate: Name of the predicate, such as In.
-        tasks: Positions of the tasks.
         learned: Rate right after learning each of the tasks.
         final: Rate after the last task learned.
         forgotten: Learned minus final; NaN where no task was followed by another.

@@ -148,7 +148,6 @@ def write_episodes(path: Path, runs: Iterable[tuple[str, Results]]) -> Path:
     """Write all episodes of runs as CSV, compressed if the name ends in .gz; equal runs give equal bytes.
 
     Args:
-        path: File to write.
         runs: Label of the method and results of each run.
 
     Raises:

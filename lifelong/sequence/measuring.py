@@ -180,7 +180,6 @@ def digest(circumstances: Mapping[str, Any], acting: Policy) -> str:
 
     Args:
         circumstances: Nested dictionaries, lists and tuples of tensors, numbers and strings.
-        acting: Policy that acts.
     """
     found = hashlib.sha256()
     tensors = {"parameters": dict(acting.named_parameters()), "buffers": dict(acting.named_buffers())}

@@ -21,7 +21,6 @@ class TrainingPhase:
         stage: Positions of the tasks.
         number: Number of the phase within the stage, from 0.
         kind: Phase as the algorithm defines it.
-        epochs: Number of epochs of the phase.
         steps_per_epoch: Number of steps per epoch; None: every window once.
         offset: Number of epochs of the stage's earlier phases.
         curve: Epochs of the phase at which its learning curve has points; empty where success is not its measure.

@@ -95,7 +95,6 @@ class Configuration:
         """Build what a group describes.
 
         Args:
-            group: Name of the group.
             arguments: Further keyword arguments of its target.
 
         Raises:

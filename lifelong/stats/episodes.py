@@ -86,7 +86,6 @@ class Difference:
         second: Success rate of the second in these.
         value: First minus second.
         counts: Pairs by outcome; None if a policy has several runs.
-        test: Name of the test.
         p_value: Two-sided p-value of equal success.
         score: Tango's score interval; None if a policy has several runs.
         bootstrap: Interval of the bootstrap that draws starts within each task: the tasks are fixed.
@@ -121,7 +120,6 @@ def difference(pairs: Pairs, *, draws: int = DRAWS, seed: int = SEED) -> Differe
         pairs: The outcomes, at least one pair.
         draws: Number of draws of each bootstrap and of the permutation test; 0 for no bootstrap, of policies with one
             run each.
-        seed: Seed of these.
 
     Raises:
         ValueError: There are no pairs.

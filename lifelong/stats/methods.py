@@ -34,7 +34,6 @@ class MethodRun:
 
     Attributes:
         scores: Success of the run.
-        seed: Its seed.
         order: Identifier of its task order.
     """
 

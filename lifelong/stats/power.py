@@ -173,7 +173,6 @@ def sequential_stopping(
         question: The difference.
         limit: Number of pairs after which the evaluation is given up.
         simulations: Number of simulated evaluations.
-        seed: Seed of the simulation.
     """
     rng = np.random.default_rng(seed)
     won = (question.differing + abs(question.difference)) / 2

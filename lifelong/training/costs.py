@@ -49,7 +49,6 @@ def step_costs(
     Args:
         policy: Policy in the middle of training.
         algorithm: Algorithm in the middle of training.
-        windows: Windows of the task.
         batch_size: Number of windows per step.
     """
     trained = algorithm.trained(policy)

@@ -81,7 +81,6 @@ def fit(
 
     Args:
         policy: Policy, trained in place.
-        dataset: Windows of the task.
         algorithm: Algorithm whose hooks are called at each step. The caller has called `begin_phase`, or loaded
             the algorithm's state.
         settings: Epochs, batch size and optimiser.

@@ -27,7 +27,6 @@ def autocast(device: torch.device, precision: str) -> torch.autocast:
     """Return the autocast context of a precision.
 
     Args:
-        device: Device of the computation.
         precision: `bf16`, `fp32`, or `auto`: bf16 where the processor supports it.
     """
     if precision == "auto":

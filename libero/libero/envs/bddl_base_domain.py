@@ -123,7 +123,6 @@ class BDDLBaseDomain(RobosuiteMethods):
         done: Whether the horizon is reached.
 
     Args:
-        bddl_file_name: Task file.
         controller_configs: Controller, `{"type": "OSC_POSE"}`, with gains, scales and limits of robosuite;
             `control_delta` or `use_delta` for absolute actions.
         initialization_noise: Noise of the arm's joints at a reset: `default`, None for none, or

@@ -67,7 +67,6 @@ class PDDLDefinition:
 
     Args:
         problem_name: Problem class, such as `LIBERO_Kitchen_Tabletop_Manipulation`.
-        domain: Domain in the task file.
     """
 
     def __init__(self, problem_name: str, domain: str = "robosuite"):
@@ -119,7 +118,6 @@ def get_xy_region(
 
     Args:
         region_name: Name of the region, such as `plate_init_region`.
-        target_name: Name of the workspace.
         region_centroid_xy: Centre (x, y) in the frame of the workspace, m; or several, one for each rectangle.
         region_half_len: Half size, m: one number, or one along x and one along y.
         yaw_rotation: Range (low, high) of the rotation about the vertical, rad.

@@ -60,7 +60,6 @@ def allocate(model: mujoco.MjModel, arm: ArmIndex, num: int, bodies: np.ndarray)
 
     Args:
         model: Model that is simulated.
-        arm: Indices of the arm.
         num: Number of simulations.
         bodies: Indices of the fixed bodies whose pose differs between simulations.
     """

@@ -61,7 +61,6 @@ class WarpObserver(Observer):
         """Render the observed images of simulations; the cost is that of all.
 
         Args:
-            ids: Indices of the simulations.
             images: Arrays of `empty_images`, whose rows `ids` are overwritten.
         """
         if images and len(ids):
@@ -74,7 +73,6 @@ class WarpObserver(Observer):
 
         Args:
             i: Index of the simulation.
-            camera: Name of the camera in the model.
             kind: `rgb` or `depth`, as is observed.
 
         Raises:
@@ -103,7 +101,6 @@ class _RayTracer:
     """Ray-tracer of some cameras of all simulations.
 
     Args:
-        simulations: The simulations.
         cameras: Index in the model of each camera, by name.
         kinds: Kinds of images, of `rgb` and `depth`.
         size: Height and width of the images, pixels.

@@ -186,9 +186,7 @@ class ObjectPropertySampler:
     Args:
         name: Name of the sampler in messages.
         state_type: State that the position stands for, such as `open`.
-        mujoco_objects: Object with the joint.
         joint_ranges: Range (low, high), rad or m.
-        rng: Generator of the position.
 
     Raises:
         UnknownNameError: The sampler does not have the state.
