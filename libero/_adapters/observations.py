@@ -159,7 +159,7 @@ class Observer:
             if camera.segmentations:
                 for kind in camera.segmentations:
                     element = kind == "element"
-                    numbers = render(segmentation=True, hidden_sites=element)[..., 1:]
+                    numbers = render(segmentation=True)[..., 1:]
                     # the background, -1, is the last entry
                     numbers = numbers if element else self.segments[kind][numbers]
                     values[f"{camera.name}_segmentation_{kind}"] = numbers.astype(np.int32)

@@ -227,7 +227,8 @@ class MjSim:
     """The simulation of an environment.
 
     Attributes:
-        model, data: Model and state with names. Sites are drawn while their alpha is above 0.
+        model, data: Model and state with names.
+        draws_sites: Whether sites are drawn, those whose alpha is above 0.
 
     Args:
         simulations: One simulation.
@@ -235,6 +236,8 @@ class MjSim:
         xml: Function that returns the scene as MJCF.
         faithful: Whether images are drawn as `libero_env.sim.render.Renderer` describes.
     """
+
+    draws_sites = True
 
     def __init__(
         self,
@@ -305,12 +308,11 @@ class MjSim:
         mode: str = "offscreen",
         device_id: int = -1,
         segmentation: bool = False,
-        hidden_sites: bool = True,
     ) -> Any:
         """Draw one picture in OpenGL's order, lowest row first.
 
-        Segmentations of the original contain sites that it hides from pictures, such as those of the gripper, because
-        robosuite hides them by a negative alpha; `hidden_sites=False`, an addition, leaves them out.
+        Segmentations contain sites that are hidden from pictures, such as those of the gripper, as in the original,
+        where robosuite hides them by a negative alpha.
 
         Returns:
             (H, W, 3) uint8; with `segmentation` (H, W, 2) int32 of kind and index, -1 for the background; with `depth`
@@ -326,7 +328,7 @@ class MjSim:
         target = RenderTarget(
             camera, depth_buffer=buffer, **{"segmentation" if segmentation else "rgb": image}
         )
-        sites = self._sites(segmentation and hidden_sites)
+        sites = self._sites(segmentation) if self.draws_sites else ()
         renderer.render(self.data._data, [target], sites)
         if segmentation:
             image = self._elements(image)

@@ -232,6 +232,22 @@ def test_observations_are_as_many_physics_steps_old_as_states_were_set_after_a_r
     assert (seen == env.sim.data.qpos[:7]).all()
 
 
+def test_pose_and_velocity_of_the_hand_are_in_the_frame_of_the_base(make_env):
+    env = make_env(**BLIND)
+    env.reset()
+    drive(env, steps=3)
+    hand = {
+        "_hand_pos": [0.453868, 0.025017, 0.364334],
+        "_hand_quat": [0.998078, 0.047319, -0.023921, 0.032065],
+        "_hand_vel": [0.112823, 0.316797, 0.109806],
+        "_hand_ang_vel": [-1.698902, -0.336817, 1.325826],
+    }
+    for name, value in hand.items():
+        np.testing.assert_allclose(getattr(env.robots[0], name), value, atol=1.5e-6, err_msg=name)
+    assert env.robots[0]._hand_quat.dtype == np.float32
+    np.testing.assert_allclose(env.robots[0]._hand_pose[:3, 3], hand["_hand_pos"], atol=1.5e-6)
+
+
 def test_noise_of_the_first_joints(make_env):
     spreads = {}
     for noise in (

@@ -220,6 +220,13 @@ _ROBOT: dict[str, Callable[[Any], Any]] = {
     "torques": lambda robot: robot.sim.data.ctrl[:7].copy() if robot._env.timestep else None,
     "_joint_positions": lambda robot: robot.sim.data.qpos[:7].copy(),
     "_joint_velocities": lambda robot: robot.sim.data.qvel[:7].copy(),
+    "_hand_pose": lambda robot: robot.pose_in_base_from_name(robot.robot_model.eef_name),
+    "_hand_pos": lambda robot: robot._hand_pose[:3, 3],
+    "_hand_orn": lambda robot: robot._hand_pose[:3, :3],
+    "_hand_quat": lambda robot: quat_xyzw(robot._hand_orn),
+    "_hand_total_velocity": lambda robot: np.concatenate([robot._hand_vel, robot._hand_ang_vel]),
+    "_hand_vel": lambda robot: robot.sim.data.get_body_xvelp(robot.robot_model.eef_name),
+    "_hand_ang_vel": lambda robot: robot.sim.data.get_body_xvelr(robot.robot_model.eef_name),
 }
 
 
@@ -257,10 +264,6 @@ class SingleArm:
             env.sim.model.site_name2id(sites[name]) for name in ("grip_site", "grip_cylinder")
         )
         self.reset()
-
-    _hand_pos = property(lambda self: self.sim.data.get_body_xpos(self.robot_model.eef_name).copy())
-    _hand_orn = property(lambda self: self.sim.data.get_body_xmat(self.robot_model.eef_name).copy())
-    _hand_quat = property(lambda self: np.roll(self.sim.data.get_body_xquat(self.robot_model.eef_name), -1))
 
     @property
     def action_limits(self) -> tuple[np.ndarray, np.ndarray]:
