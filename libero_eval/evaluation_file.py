@@ -7,6 +7,7 @@ stands apart, under `times`: two evaluations with the same outcomes have the sam
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
@@ -72,10 +73,13 @@ class TaskResult(Episodes):
         rows: dict[str, tuple] = {
             f.name: sum((getattr(part, f.name) for part in parts), ())
             for f in fields(cls)
-            if isinstance(getattr(parts[0], f.name), tuple) and f.name not in ("atoms", "errors")
+            if isinstance(getattr(parts[0], f.name), tuple)
+            and f.name not in ("atoms", "errors", "limits_reached")
         }
         if raised:
             rows["errors"] = sum((p.errors or (None,) * len(p.init_states) for p in parts), ())
+        limits = sum((Counter(dict(part.limits_reached)) for part in parts), Counter[str]())
+        rows["limits_reached"] = tuple(sorted(limits.items()))
         first = parts[0]
         return cls(first.task, first.name, first.instruction, atoms=first.atoms, **rows)
 
@@ -255,7 +259,7 @@ def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
 
 def _measured(result: TaskResult) -> dict[str, Any]:
     """Return what was measured, as plain data."""
-    return {k: v for k, v in asdict(result).items() if k != "actions"}
+    return {k: v for k, v in asdict(result).items() if k not in ("actions", "limits_reached")}
 
 
 def _digest(rows: Any) -> str:

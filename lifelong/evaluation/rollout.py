@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -61,6 +62,7 @@ class Rollouts:
         atoms: Atoms of the goal, in the order of the episodes' flags.
         recordings: Frames of each recorded simulation, (H, W, 3) uint8, upright.
         random: Whether the policy drew random numbers.
+        limits_reached: How often a simulation reached a limit of the solver without an error, by its name (Warp).
     """
 
     episodes: tuple[Episode, ...]
@@ -68,6 +70,7 @@ class Rollouts:
     atoms: tuple[str, ...] = ()
     recordings: tuple[tuple[np.ndarray, ...], ...] = field(default=(), repr=False)
     random: bool = False
+    limits_reached: tuple[tuple[str, int], ...] = ()
 
     @property
     def frames(self) -> tuple[np.ndarray, ...]:
@@ -111,6 +114,7 @@ class Rollouts:
             "simulation_errors": tuple(
                 (e.init_state, e.simulation_error) for e in self.episodes if e.simulation_error
             ),
+            "limits_reached": self.limits_reached,
         }
 
 
@@ -201,7 +205,7 @@ def run_episodes(
         raise ConfigError(
             f"{len(init_states)} initial states, but the environment has {env.num_envs} simulations"
         )
-    started = time.perf_counter()
+    started, limits = time.perf_counter(), _limits_reached(env)
     actor.reset(env.num_envs)
     _draw(env, not settle_steps)
     obs, info = env.reset(options={"init_state": np.asarray(init_states)})
@@ -239,7 +243,13 @@ def run_episodes(
         replace(one, attempts=tries, simulation_error=tracker.errors.get(i, ""))
         for i, (one, tries) in enumerate(zip(done, attempts, strict=True))
     )
-    return Rollouts(episodes, time.perf_counter() - started, tracker.atoms, tuple(map(tuple, recordings)))
+    return Rollouts(
+        episodes,
+        time.perf_counter() - started,
+        tracker.atoms,
+        tuple(map(tuple, recordings)),
+        limits_reached=tuple(sorted((_limits_reached(env) - limits).items())),
+    )
 
 
 def save_animation(frames: Sequence[np.ndarray], path: Path, *, seconds_per_frame: float) -> None:
@@ -302,6 +312,10 @@ class EpisodeTracker:
         """Return whether each atom holds, (B, atoms) bool."""
         shape = (self._env.num_envs, len(self.atoms))
         return np.asarray(info["progress"], bool).reshape(shape) if self.atoms else np.zeros(shape, bool)
+
+
+def _limits_reached(env: VectorEnv) -> Counter[str]:
+    return Counter(getattr(getattr(env, "simulations", None), "limits_reached", {}))
 
 
 def _draw(env: VectorEnv, wanted: bool) -> None:

@@ -124,6 +124,7 @@ class Episodes:
         atoms_ever: Whether each atom held at any time after the policy began to act, (episodes, atoms).
         atoms_at_end: Whether each atom held at the end, (episodes, atoms).
         simulation_errors: Initial state and reason of each episode that a simulation error ended.
+        limits_reached: How often a simulation reached a limit of the solver and went on, by its name (Warp).
     """
 
     init_states: tuple[Count, ...]
@@ -133,6 +134,7 @@ class Episodes:
     atoms_ever: tuple[tuple[bool, ...], ...] = ()
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
     simulation_errors: tuple[tuple[Count, str], ...] = ()
+    limits_reached: tuple[tuple[str, Count], ...] = ()
 
     OPTIONAL: ClassVar[tuple[str, ...]] = ()  # further columns, with an entry for each episode or none at all
     OF_ATOMS: ClassVar[tuple[str, ...]] = ("atoms_ever", "atoms_at_end")

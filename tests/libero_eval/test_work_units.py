@@ -7,8 +7,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -298,6 +300,25 @@ def test_errors_are_failures_only_where_the_protocol_says_so(tmp_path):
     assert alone.outcomes == result.outcomes
     with pytest.raises(RuntimeError, match="socket"):  # no episode has ever run: that is no failed one
         evaluate(tmp_path / "down", Raising(0, 1), errors_are_failures=True)
+
+
+class Limited(Countdown):
+    """Simulations that reach a limit of the solver in each step."""
+
+    def __init__(self, num_envs):
+        super().__init__(num_envs)
+        self.simulations = SimpleNamespace(limits_reached=Counter(LS_ITERATIONS=3))  # earlier
+
+    def step(self, actions):
+        self.simulations.limits_reached["ITERATIONS"] += 1
+        return super().step(actions)
+
+
+def test_limits_that_the_solver_reached_are_counted_and_change_no_outcome(tmp_path):
+    result = evaluate(tmp_path / "it", env=lambda task, count: Limited(count), **TWO)
+    assert [dict(task.limits_reached) for task in result.tasks] == [{"ITERATIONS": 4 + 10}] * 2
+    assert result.outcomes == evaluate(tmp_path / "without", **TWO).outcomes
+    assert EvaluationResult.read(tmp_path / "it") == result
 
 
 class Diverging(Countdown):
