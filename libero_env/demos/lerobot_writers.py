@@ -171,21 +171,17 @@ class ImageDatasetWriter(_Writer):
     def _write(
         self, columns: Mapping[str, np.ndarray], images: Mapping[str, np.ndarray], _: Mapping[str, Any]
     ) -> dict[str, Any]:
-        number = len(self._episodes)
-        arrays = {key: self._image_array(frames) for key, frames in images.items()}
-        arrays |= _arrays(self._pa, columns)
+        number, pa, arrays = len(self._episodes), self._pa, {}
+        for key, frames in images.items():
+            rows = [{"bytes": _png(frame), "path": f"frame_{t:06d}.png"} for t, frame in enumerate(frames)]
+            arrays[key] = pa.array(rows, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+        arrays |= _arrays(pa, columns)
         schema = {"info": {"features": self._hub_features()}}  # by which `datasets` decodes the images
-        table = self._pa.table(arrays).replace_schema_metadata({"huggingface": json.dumps(schema)})
+        table = pa.table(arrays).replace_schema_metadata({"huggingface": json.dumps(schema)})
         path = self.root / _V2_DATA_PATH.format(episode_chunk=number // FILES_PER_CHUNK, episode_index=number)
         path.parent.mkdir(parents=True, exist_ok=True)
         self._pq.write_table(table, path)
         return {}
-
-    def _image_array(self, frames: np.ndarray) -> Any:
-        pa = self._pa
-        kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-        rows = [{"bytes": _png(frame), "path": f"frame_{t:06d}.png"} for t, frame in enumerate(frames)]
-        return pa.array(rows, kind)
 
     def _hub_features(self) -> dict[str, Any]:
         layout = self.layout

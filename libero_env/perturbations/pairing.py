@@ -111,7 +111,11 @@ class Pairing:
                 x0, y0, x1, y1 = region.ranges[rng.integers(len(region.ranges))]
                 place = rng.uniform((x0, y0), (x1, y1)) + offset
                 moved = own + (place, (0.0, 0.0))
-                if _is_free(moved, taken):
+                apart = (
+                    np.abs(moved[:, None, 0] - taken[None, :, 0])
+                    > moved[:, None, 1] + taken[None, :, 1] + _GAP
+                )
+                if apart.any(axis=-1).all():
                     row[address : address + 2] = place
                     taken = np.concatenate([taken, moved])
                     break
@@ -166,12 +170,6 @@ class Pairing:
 def _stacked(boxes: Iterable[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
     """Return boxes seen from above as an array (n, 2, 2): centre and half size of each."""
     return np.array(list(boxes)).reshape(-1, 2, 2)
-
-
-def _is_free(boxes: np.ndarray, taken: np.ndarray) -> bool:
-    """Return whether boxes (n, 2, 2), seen from above, keep the gap to others (m, 2, 2)."""
-    apart = np.abs(boxes[:, None, 0] - taken[None, :, 0]) > boxes[:, None, 1] + taken[None, :, 1] + _GAP
-    return bool(apart.any(axis=-1).all())
 
 
 def moved(base: Problem, problem: Problem) -> Iterator[tuple[str, np.ndarray]]:

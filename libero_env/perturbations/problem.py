@@ -33,15 +33,10 @@ _PLACES = {  # category of a fixture and name of a region -> what an instruction
 
 
 def _goal(count: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
-    goals = _other_goals(task)
-    return goals[rng.integers(len(goals))]
+    """Return the task with another goal that its scene is known to have.
 
-
-def _other_goals(task: Task) -> list[Task]:
-    """Return the task with each other goal that its scene is known to have.
-
-    They are the goals of the benchmark's tasks that begin in the same way; without any, those of carrying other objects
-    to where the task's object belongs; without any, those of carrying that object elsewhere.
+    It is that of one of the benchmark's tasks that begin in the same way; without any, carrying another object to where
+    the task's object belongs; without any, carrying that object elsewhere.
 
     Raises:
         InvalidInputError: There is none.
@@ -49,22 +44,18 @@ def _other_goals(task: Task) -> list[Task]:
     goals = list(_of_same_scene(task)) or list(_of_other_objects(task)) or list(_of_other_places(task))
     if not goals:
         raise InvalidInputError(f"{task.id} has no other goal: no task of the benchmark begins as it does")
-    return goals
+    return goals[rng.integers(len(goals))]
 
 
 def _of_same_scene(task: Task) -> Iterator[Task]:
-    said = {task.language}
+    said, known = {task.language}, {region.address for region in task.problem.regions}
     for other in _by_scene().get(_scene_of(task.problem), ()):
         if other.problem.goal != task.problem.goal and other.language not in said:
             said.add(other.language)
-            yield _with_goal(task, other)
-
-
-def _with_goal(task: Task, other: Task) -> Task:
-    known = {region.address for region in task.problem.regions}
-    more = tuple(region for region in other.problem.regions if region.address not in known)
-    changes = {name: getattr(other.problem, name) for name in ("language", "goal", "obj_of_interest")}
-    return _with_words(task, _instructions(other), **changes, regions=(*task.problem.regions, *more))
+            more = tuple(region for region in other.problem.regions if region.address not in known)
+            changes = {name: getattr(other.problem, name) for name in ("language", "goal", "obj_of_interest")}
+            regions = (*task.problem.regions, *more)
+            yield _with_words(task, _instructions(other), **changes, regions=regions)
 
 
 def _with_words(task: Task, said: Sequence[str], **changes: Any) -> Task:
@@ -156,7 +147,7 @@ def _objects(share: float, rng: np.random.Generator, task: Task, scene: Scene) -
     }
     free = _unnamed(task, scene)
     roots = carried(problem)
-    instructions = f"{task.language} {task.bddl_language}".lower()
+    instructions = " ".join(_instructions(task)).lower()
     alone = [
         n for n in roots if not roots[n] and n not in used and not _is_named(problem.objects[n], instructions)
     ]
@@ -197,16 +188,12 @@ def _distractors(count: float, rng: np.random.Generator, task: Task, scene: Scen
 def _unnamed(task: Task, scene: Scene) -> list[str]:
     """Return categories of objects that the task neither has nor could mean."""
     known = {**task.problem.objects, **task.problem.fixtures}.values()
-    there, used = scene.pack.categories(), _words(task)
+    there, used = scene.pack.categories(), {*" ".join(_instructions(task)).lower().split()}
     return [
         category
         for category, words in read_yaml("perturbations/data/distractors.yaml")["categories"].items()
         if category not in known and category in there and not used & set(words or category.split("_"))
     ]
-
-
-def _words(task: Task) -> set[str]:
-    return set(f"{task.language} {task.bddl_language}".lower().split())
 
 
 def _free_name(category: str, taken: Iterable[str]) -> str:

@@ -106,7 +106,7 @@ def _files_in(
             files[task.id] = file
     if not (left := [task for task in tasks if task.id not in files]):
         return files
-    stated = [(path, one) for path in _demo_files_below(folder) if (one := _stated_task(path)) is not None]
+    stated = _stated_tasks(folder)
     for task in left:
         size = (data.image_size, data.image_size)
         own = demo_path(
@@ -135,16 +135,17 @@ def _files_in(
     return files
 
 
-def _demo_files_below(folder: Path) -> list[Path]:
-    return [p for p in sorted(folder.rglob("*.hdf5")) if not (p.is_symlink() or p.parent.suffix == ".parts")]
-
-
-def _stated_task(file: Path) -> Task | None:
-    try:
-        return recorded_task(file)
-    except DemoError as error:
-        print(f"not used: {error}", file=sys.stderr)
-        return None
+def _stated_tasks(folder: Path) -> list[tuple[Path, Task]]:
+    """Return the files in a folder, each with the task that it states; say which state none."""
+    stated = []
+    for path in sorted(folder.rglob("*.hdf5")):
+        if path.is_symlink() or path.parent.suffix == ".parts":
+            continue
+        try:
+            stated.append((path, recorded_task(path)))
+        except DemoError as error:
+            print(f"not used: {error}", file=sys.stderr)
+    return stated
 
 
 def _too_few(available: int, required: int) -> str:
