@@ -6,6 +6,7 @@ files one body is enough; what is missing is derived from its shape.
 """
 
 from collections.abc import Mapping
+from copy import deepcopy
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -38,13 +39,20 @@ def assets_folder() -> Path | None:
 
 
 def model_of(item: Any, category: str) -> ObjectModel:
-    """Return the model of an object with an MJCF file: of this package, or of a subclass of robosuite's class.
+    """Return the model of an object with an MJCF file or one that robosuite generates, such as its `BoxObject`.
+
+    Offsets and radius are those of the object's class where it defines them.
 
     Raises:
         LiberoError: The file is missing, is not MJCF, or has no body with a geom.
     """
-    duplicate = bool(getattr(item, "duplicate_collision_geoms", False))
-    xml, offsets = read_object(Path(item.file), category, duplicate)
+    file = Path(getattr(item, "file", f"{category}.xml"))
+    if hasattr(item, "file"):
+        duplicate = bool(getattr(item, "duplicate_collision_geoms", False))
+        xml, offsets = read_object(file, category, duplicate)
+    else:
+        xml, offsets = _generated(item, category), {}
+    offsets = {name: _own_offset(item, name, offsets.get(name)) for name in OFFSETS}
     specs = getattr(item, "joint_specs", None)
     listed = [{"type": "free"}] if specs == "default" else [j for j in specs or () if isinstance(j, dict)]
     free = [joint for joint in listed if joint.get("type") == "free"]
@@ -54,18 +62,39 @@ def model_of(item: Any, category: str) -> ObjectModel:
         rotation = {axis or "z": rotation}
     ranges = (getattr(item, "object_properties", None) or {}).get("articulation", {})
     articulation = {state: ranges.get(f"default_{state}_ranges") for state in STATES}
-    place: dict[str, Any] = {name: offsets[name] for name in OFFSETS}
     return ObjectModel(
         category=category,
-        spec=read_spec(xml, Path(item.file)),
+        spec=read_spec(xml, file),
         joint_damping=float(free[0].get("damping", _DAMPING)) if free else _DAMPING,
         rotation={axis: (float(low), float(high)) for axis, (low, high) in (rotation or {}).items()},
         rotation_axis=axis,
-        bottom_offset=place["bottom"],
-        top_offset=place["top"],
-        horizontal_radius=max(map(abs, place["horizontal_radius"][:2])),
+        bottom_offset=offsets["bottom"],
+        top_offset=offsets["top"],
+        horizontal_radius=max(map(abs, offsets["horizontal_radius"][:2])),
         articulation={state: (float(r[0]), float(r[1])) for state, r in articulation.items() if r},
     )
+
+
+def _generated(item: Any, category: str) -> str:
+    """Return the MJCF of an object of robosuite's without a file; names lose its prefix, which scenes add."""
+    body, assets = deepcopy(item.get_obj()), deepcopy(list(item.asset))
+    for site in body.findall("site"):
+        if (site.get("name") or "").endswith("default_site"):  # scenes add it, too
+            body.remove(site)
+    for element in (part for root in (body, *assets) for part in root.iter()):
+        for key, value in element.attrib.items():
+            element.set(key, value.removeprefix(item.naming_prefix))
+    return attachable_xml(category, assets, body)
+
+
+def _own_offset(item: Any, name: str, measured: tuple[float, ...] | None) -> Any:
+    """Return an offset or the radius as a user's class has it, (3,) m, or else the measured one."""
+    attribute = name if name.endswith("radius") else f"{name}_offset"
+    owner = next((cls for cls in type(item).__mro__ if attribute in vars(cls)), type(item))
+    if measured is not None and owner.__module__.startswith(("robosuite.", "libero.")):
+        return measured
+    value = np.ravel(getattr(item, attribute)).astype(float)
+    return tuple(value.tolist()) if value.size == 3 else (float(value[0]), 0.0, 0.0)
 
 
 def accept_plain_files(target_class: Any) -> None:

@@ -416,7 +416,8 @@ def _region(problem: Problem, region: Region, is_used: bool, count: int) -> Iter
         yield "region-ranges", " has no extent", "(:ranges ((X0 Y0 X1 Y1))), metres"
     elif kind != "workspace" and region.ranges:
         what = f": ranges are for the workspace only, but {region.target} is {_article(kind)}"
-        yield "region-ranges", what, "no :ranges; the region is then the site of that name"
+        valid = f"a fixture of {', '.join(WORKSPACES)}, or no :ranges, which is the site of that name"
+        yield "region-ranges", what, valid
 
 
 def _atom(

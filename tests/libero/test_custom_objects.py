@@ -339,11 +339,56 @@ def test_an_object_from_an_mjcf_file(tmp_path, suite):
             self.rotation, self.rotation_axis = (0.0, 0.0), "z"
 
     assert OBJECTS_DICT["red_brick"](name="red_brick_1").joints == ["red_brick_1_joint0"]
-    with open(suite.get_task_bddl_file_path(0)) as file:
-        text = file.read().replace("milk_1", "red_brick_1").replace("- milk", "- red_brick")
-    (tmp_path / "task.bddl").write_text(text)
-    env = ControlEnv(bddl_file_name=tmp_path / "task.bddl", use_camera_obs=False)
+    env = ControlEnv(bddl_file_name=task_with("red_brick", suite, tmp_path), use_camera_obs=False)
     assert "red_brick_1_pos" in env.reset()
     assert env.env.objects_dict["red_brick_1"].horizontal_radius == 0.03
     assert env.sim.model.body_mass[env.sim.model.body_name2id("red_brick_1_main")] == pytest.approx(0.048)
     env.close()
+
+
+def task_with(category, suite, folder):
+    """Return the path of a task that has an object of a category instead of the milk."""
+    text = Path(suite.get_task_bddl_file_path(0)).read_text()
+    (folder / "task.bddl").write_text(
+        text.replace("milk_1", f"{category}_1").replace("- milk", f"- {category}")
+    )
+    return folder / "task.bddl"
+
+
+def test_objects_that_robosuite_generates(tmp_path, suite, registries):
+    objects = pytest.importorskip("robosuite.models.objects")
+
+    @register_object
+    class SmallBox(objects.BoxObject):
+        def __init__(self, name="small_box", obj_name="small_box"):
+            super().__init__(name=name, size=[0.02, 0.02, 0.03], rgba=[1, 0, 0, 1])
+
+    OBJECTS_DICT["small_ball"] = lambda name: objects.BallObject(name=name, size=[0.025], rgba=[0, 1, 0, 1])
+    for category, bottom, mass in (
+        ("small_box", -0.03, 0.096),
+        ("small_ball", -0.025, 1000 * 4 / 3 * np.pi * 0.025**3),
+    ):
+        env = ControlEnv(bddl_file_name=task_with(category, suite, tmp_path), use_camera_obs=False)
+        assert env.reset()[f"{category}_1_pos"][2] == pytest.approx(-bottom, abs=2e-3)
+        assert env.env.get_object(f"{category}_1").bottom_offset[2] == bottom
+        body = env.sim.model.body_name2id(f"{category}_1_main")
+        assert env.sim.model.body_mass[body] == pytest.approx(mass)
+        assert env.env.check_contact(env.env.get_object(f"{category}_1")), (
+            "its geoms have their names in the scene"
+        )
+        env.close()
+
+
+def test_offsets_of_a_class_are_those_of_placement(tmp_path, suite, registries):
+    (tmp_path / "brick.xml").write_text(BRICK)
+
+    @register_object
+    class WideBrick(MujocoXMLObject):
+        horizontal_radius, bottom_offset = 0.09, np.array([0.0, 0.0, -0.05])
+
+        def __init__(self, name="wide_brick", obj_name="wide_brick"):
+            super().__init__(str(tmp_path / "brick.xml"), name=name)
+
+    model = get_object("wide_brick")
+    assert (model.horizontal_radius, model.bottom_offset) == (0.09, (0.0, 0.0, -0.05))
+    assert model.top_offset == (0.0, 0.0, 0.03), "of the file"

@@ -46,7 +46,7 @@ def category_of(name: str) -> str:
 def register_object(target_class: Any) -> Any:
     """Register a class by its name, and its MJCF file, if it has one, for the scenes that are built from now on."""
     category = category_of(target_class.__name__)
-    if hasattr(target_class, "_get_object_subtree"):
+    if hasattr(target_class, "_get_object_subtree") and hasattr(target_class, "save_model"):  # of a file
         accept_plain_files(target_class)
     OBJECTS_DICT[category] = target_class
     return target_class
