@@ -9,11 +9,9 @@ from hypothesis import strategies as st
 
 from libero_eval.check import examine
 from lifelong.results.log import ResultLog
-from lifelong.results.provenance import start_record
 from lifelong.results.records import (
     CostRecord,
     DemonstrationsRecord,
-    EvalRecord,
     LossRecord,
     PhaseRecord,
     RunEndRecord,
@@ -24,43 +22,25 @@ from lifelong.results.records import (
 from lifelong.results.summary import summarize
 from lifelong.stats.metrics import lifelong_metrics
 from tests.harness.fuzz import examples, survive
+from tests.harness.records import evaluation, run_start
 
 NAMES = ["first", "second"]
-START = start_record(
-    algo="er",
-    benchmark="libero_object",
-    policy="small",
-    seed=1,
-    preset="",
-    tasks=NAMES,
-    instructions=NAMES,
-    config={"seed": 1},
-)
-
-
-def evaluation(phase, learned: int, epoch: int, task: int) -> EvalRecord:
-    atoms = dict.fromkeys(("atoms_at_start", "atoms_ever", "atoms_at_end"), ((False,), (True,)))
-    return EvalRecord(
-        phase=phase,
-        learned=learned,
-        epoch=epoch,
-        task=task,
-        successes=(False, True),
-        lengths=(9, 4),
-        init_states=(0, 1),
-        seconds=1.5,
-        atoms=("(On a b)",),
-        **atoms,
-    )
+START = run_start(NAMES)
+TRUTHS = dict.fromkeys(("atoms_at_start", "atoms_ever", "atoms_at_end"), ((True,), (False,)))
+EVER = {"atoms": ("(On a b)",), **TRUTHS}
 
 
 RECORDS = [
     START,
     DemonstrationsRecord(counts=(50, 10), generators=("expert", ""), digests=("aa", "bb")),
     PhaseRecord(phase="demos", seconds=3.0),
-    *(evaluation("curve", task, epoch, task) for task in (0, 1) for epoch in (0, 1)),
+    *(evaluation("curve", task, epoch, task, 1, 2, **EVER) for task in (0, 1) for epoch in (0, 1)),
     *(LossRecord(task=task, epoch=1, loss=0.5 + task, seconds=2.0) for task in (0, 1)),
-    *(evaluation("matrix", learned, 1, task) for learned in (0, 1) for task in range(learned + 1)),
+    *(
+        evaluation("matrix", learned, 1, task, 1, 2, **EVER)
+        for learned in (0, 1)
+        for task in range(learned + 1)
+    ),
     CostRecord(task=0, costs={"stored_bytes": 3.0}),
     *(TaskEndRecord(task=task, best_epoch=1, seconds=3.0) for task in (0, 1)),
     RunEndRecord(seconds=9.0, finished="2026-01-01T00:00:00+00:00"),

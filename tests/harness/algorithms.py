@@ -69,27 +69,30 @@ def by_hand(policy: LinearPolicy, data: Windows) -> torch.Tensor:
     return 2 * error[:, :, None] * data.features[:, None, :]  # (N, A, D)
 
 
-def assert_resumed_equals_uninterrupted(folder, algo, monkeypatch):
+def assert_resumed_equals_uninterrupted(
+    folder, algo, monkeypatch, make_context=None, last: int = sequences.TASKS - 1
+):
     """Learn the sequence uninterrupted, and killed at every few writes; return how many processes that took."""
-    uninterrupted = sequences.run_context(folder / "whole", algo)
+    make_context = make_context or sequences.run_context
+    uninterrupted = make_context(folder / "whole", algo)
     sequences.sequence(uninterrupted).run()
-    records, state = sequences.outcome(folder / "whole", uninterrupted.directory.log)
-    starts, resumed = _killed_repeatedly(folder / "killed", algo, monkeypatch)
+    records, state = sequences.outcome(folder / "whole", uninterrupted.directory.log, last)
+    starts, resumed = _killed_repeatedly(folder / "killed", algo, monkeypatch, make_context)
     assert starts > 2
-    same_records, same_state = sequences.outcome(folder / "killed", resumed.directory.log)
+    same_records, same_state = sequences.outcome(folder / "killed", resumed.directory.log, last)
     assert same_records == records
     sequences.assert_same(same_state, state)
     return starts
 
 
-def _killed_repeatedly(path, algo, monkeypatch):
+def _killed_repeatedly(path, algo, monkeypatch, make_context):
     """Learn the sequence in processes that are killed; return how many there were, and the context of the last."""
     starts, writes = 0, 1
     while True:
         starts += 1
         assert starts < 100
         with monkeypatch.context() as patch:
-            p = sequences.run_context(path, algo)
+            p = make_context(path, algo)
             killer = sequences.Killer(patch, writes)
             patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
             try:

@@ -15,7 +15,7 @@ from lifelong.data.memory import ReplayMemory
 from lifelong.data.settings import DataSettings
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
-from lifelong.results.records import CostRecord
+from lifelong.results.records import CostRecord, RunRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator, seeded
 from lifelong.sequence import TaskSequence
@@ -67,14 +67,13 @@ class FakeEnv:
         self.closed = True
 
 
-def dataset(task: int) -> SequenceVLDataset:
-    draws = generator(task)
-    frames = 20
+def dataset(task: int, demos: int = 2) -> SequenceVLDataset:
+    draws, frames = generator(task), 20
     return SequenceVLDataset(
         torch.randint(0, 256, (frames, 1, 16, 16, 3), generator=draws, dtype=torch.uint8),
         {"x": torch.randn(frames, 2, generator=draws)},
         torch.rand(frames, 7, generator=draws) * 2 - 1,
-        torch.tensor([9] * 10 + [19] * 10),
+        torch.arange(1, demos + 1).mul(frames // demos).sub(1).repeat_interleave(frames // demos),
         torch.randn(4, generator=draws),
         task,
         SPEC.seq_len,
@@ -110,10 +109,12 @@ def sequence(context: RunContext, first: int = 0) -> TaskSequence:
     return TaskSequence(context, {task: dataset(task + first) for task in range(len(context.tasks))})
 
 
-def outcome(path, log):
-    """Return all records without their times, and the last weights and algorithm's state."""
+def outcome(path, log, last: int = TASKS - 1):
+    """Return all records without their times, and the weights and algorithm's state after the last task."""
     kept = {}
     for record in log.read().records:
+        if isinstance(record, RunRecord):  # says when the run was started
+            continue
         values = {k: v for k, v in asdict(record).items() if k != "seconds"}
         if isinstance(record, CostRecord):  # what is counted, not what is measured
             values["costs"] = {
@@ -122,7 +123,7 @@ def outcome(path, log):
         key = tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))
         key += tuple(values.get("costs", ()))
         assert kept.setdefault(key, values) == values, "a record was made twice, and differs"
-    return kept, checkpoints.load(RunDirectory(path).checkpoints.task_path(TASKS - 1))
+    return kept, checkpoints.load(RunDirectory(path).checkpoints.task_path(last))
 
 
 def assert_same(a, b):

@@ -8,10 +8,10 @@ import yaml
 
 from libero_env.cli.main import main
 from libero_eval.check import examine
-from lifelong.results.provenance import start_record
 from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, from_line
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
+from tests.harness.records import run_start
 from tests.harness.sequences import run_context, sequence
 
 
@@ -23,17 +23,7 @@ def finished(tmp_path_factory):
     with directory.opened({"seed": 1, "algo": {"_target_": "EWC"}}, resume=True):
         context = run_context(path, "ewc", tasks=2)
         names = [task.name for task in context.tasks]
-        start = start_record(
-            algo="ewc",
-            benchmark="libero_object",
-            policy="small",
-            seed=1,
-            preset="",
-            tasks=names,
-            instructions=names,
-            config={"seed": 1},
-        )
-        context.directory.log.append(start)
+        context.directory.log.append(run_start(names, algo="ewc"))
         sequence(context).run()
         context.directory.log.append(RunEndRecord(seconds=1.0, finished="2026-01-01T00:00:00+00:00"))
         write_summary(path / "results.json", context.directory.log.read(), {})

@@ -18,13 +18,13 @@ from lifelong.algorithms import Sequential
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
-from lifelong.results.provenance import start_record
 from lifelong.results.records import RelearnRecord, from_line, to_line
 from lifelong.results.relearning import FILE_NAME, read_relearning, savings, savings_rows, savings_tables
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Batch
 from tests.harness.fakes import LinearPolicy, Windows
+from tests.harness.records import run_start
 
 FIT = FitSettings(epochs=1, batch_size=10, lr=0.05, warmup_steps=5, weight_decay=0.0, precision="fp32")
 SETTINGS = RelearnSettings(steps=200, every=5, tolerance=0.05, held_out=1)
@@ -171,11 +171,7 @@ def test_success_is_back_where_it_falls_short_by_the_tolerance_at_most() -> None
 
 
 def test_the_page_of_a_run_shows_them_and_its_records_stay(tmp_path) -> None:
-    names = ["a", "b"]
-    kinds = {"algo": "x", "benchmark": "y", "policy": "z", "seed": 1, "preset": ""}
-    ResultLog(tmp_path / "results.jsonl").append(
-        start_record(**kinds, tasks=names, instructions=names, config={})
-    )
+    ResultLog(tmp_path / "results.jsonl").append(run_start(["a", "b"]))
     before = (tmp_path / "results.jsonl").read_bytes()
     assert "Relearning" not in write_report([tmp_path]).read_text(encoding="utf-8")
     log = ResultLog(tmp_path / FILE_NAME)

@@ -12,7 +12,7 @@ from libero_eval.protocols.files import load_protocol
 from lifelong.errors import ComparisonError, ConfigError, ProtocolError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.report.comparison import compare
-from lifelong.results.provenance import start_record
+from tests.harness.records import run_start
 from tests.harness.results import PROTOCOL, drawn_result
 
 
@@ -62,10 +62,7 @@ def test_runs_of_different_ones_are_not_compared():
 
 
 def test_the_record_of_a_run_names_it():
-    facts = {"algo": "er", "benchmark": "b", "policy": "p", "seed": 0, "preset": "", "tasks": ["t"]}
-    facts |= {"instructions": ["do"], "config": {}}
-    assert start_record(**facts).backend == "mujoco"
-    assert start_record(**facts, backend="warp").backend == "warp"
+    assert run_start(["t"]).backend == "mujoco" and run_start(["t"], backend="warp").backend == "warp"
 
 
 @pytest.mark.parametrize("backend", ["physx", "warp,contacts=none", "mujoco,device=cpu"])

@@ -14,22 +14,21 @@ from lifelong.context import RunContext
 from lifelong.evaluation.restore import LoadedRun
 from lifelong.report.page import comparison_text, write_report
 from lifelong.results.log import ResultLog
-from lifelong.results.provenance import start_record
 from lifelong.results.records import EvalRecord, RunRecord, TaskEndRecord, from_line, to_line
 from lifelong.results.summary import summarize
 from lifelong.stats.metrics import Curve, Scores, lifelong_metrics
 from lifelong.streams import StreamSettings
 from tests.harness import sequences
+from tests.harness.algorithms import assert_resumed_equals_uninterrupted
 from tests.harness.configs import FILES, composed
+from tests.harness.records import evaluation, run_start
 
 STREAM = StreamSettings(base_tasks=2)
 ALGORITHMS = sorted(f.stem for f in FILES if str(f.parent) == "algo")
 
 
 def record(sizes: tuple[int, ...]) -> RunRecord:
-    names = [f"t{k}" for k in range(sum(sizes))]
-    kinds = {"algo": "x", "benchmark": "y", "policy": "z", "seed": 1, "preset": ""}
-    return start_record(**kinds, tasks=names, instructions=names, config={}, group_sizes=sizes)
+    return run_start([f"t{k}" for k in range(sum(sizes))], group_sizes=sizes)
 
 
 def context(path: Path, algorithm) -> RunContext:
@@ -74,38 +73,14 @@ def test_adapters_have_the_base_stage_as_their_base(tmp_path) -> None:
 
 @pytest.mark.parametrize("name", ["er", "lora"])
 def test_a_run_killed_in_and_after_its_base_stage_ends_in_the_same_bits(tmp_path, monkeypatch, name) -> None:
-    sequences.sequence(context(tmp_path / "whole", algorithm(name))).run()
-    for writes in (2, 5, 9, 14):
-        with monkeypatch.context() as patch:
-            found = context(tmp_path / "killed", algorithm(name))
-            killer = sequences.Killer(patch, writes)
-            patch.setattr(found.directory.log, "append", killer.guard(found.directory.log.append))
-            with pytest.raises(sequences.Killed):
-                sequences.sequence(found).run()
-    found = context(tmp_path / "killed", algorithm(name))
-    sequences.sequence(found).run()
-    records, state = sequences.outcome(tmp_path / "whole", ResultLog(tmp_path / "whole" / "results.jsonl"))
-    again, end = sequences.outcome(tmp_path / "killed", found.directory.log)
-    kinds = [key for key in records if key[0] != "run"]
-    assert [again[key] for key in kinds] == [records[key] for key in kinds]
-    sequences.assert_same(end, state)
+    make = lambda path, name: context(path, algorithm(name))  # noqa: E731
+    assert_resumed_equals_uninterrupted(tmp_path, name, monkeypatch, make, last=3)
 
 
 def fill(log: ResultLog, cells: dict[tuple[str, int, int, int], float]) -> None:
     """Append evaluations of ten episodes, by (phase, task learned, epoch, task)."""
     for (phase, learned, epoch, task), rate in cells.items():
-        log.append(
-            EvalRecord(
-                phase=phase,
-                learned=learned,
-                epoch=epoch,
-                task=task,
-                successes=tuple(k < round(10 * rate) for k in range(10)),
-                lengths=(1,) * 10,
-                init_states=tuple(range(10)),
-                seconds=1.0,
-            )
-        )
+        log.append(evaluation(phase, learned, epoch, task, round(10 * rate), 10))
 
 
 def fill_base(log: ResultLog) -> None:

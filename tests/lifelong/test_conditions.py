@@ -15,22 +15,12 @@ from lifelong.results.provenance import (
     recorded_threads,
     resume_notes,
     source_digest,
-    start_record,
 )
 from lifelong.results.records import DemonstrationsRecord, from_line, to_line
 from lifelong.settings import RunSettings
+from tests.harness.records import run_start
 
-START = start_record(
-    algo="er",
-    benchmark="libero_object",
-    policy="bc_rnn",
-    seed=1,
-    preset="smoke",
-    tasks=["a"],
-    instructions=["do a"],
-    config={},
-    conditions=present_conditions(torch.device("cpu"), renderer="llvmpipe"),
-)
+START = run_start(["a"], conditions=present_conditions(torch.device("cpu"), renderer="llvmpipe"))
 SETTINGS = RunSettings(
     seed=1,
     device="cpu",

@@ -11,35 +11,18 @@ from torch import nn
 from lifelong.algorithms import EWC, Algorithm, Sequential
 from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.er import ER
-from lifelong.data import SequenceVLDataset
 from lifelong.data.memory import ReplayMemory
 from lifelong.data.windows import StageWindows, WindowSubset, count_frames
 from lifelong.nn import TemporalLSTM
-from lifelong.policies import BCTransformer
 from lifelong.seeding import generator, seeded
 from lifelong.training.costs import COSTS, action_costs, count_flops, peak_costs, step_costs, stored_bytes
-from lifelong.types import Batch, PolicySpec
-from tests.harness.policies import small_rnn, small_transformer
+from lifelong.types import Batch
+from tests.harness import sequences
+from tests.harness.algorithms import make_policy
+from tests.harness.policies import small_rnn
+from tests.harness.sequences import SPEC
 
-SPEC = PolicySpec(views=("agentview_rgb",), image_size=(16, 16), proprio={"x": 2}, language_dim=4, seq_len=3)
-
-
-def dataset(task: int = 0, frames: int = 20) -> SequenceVLDataset:
-    draws = generator(task)
-    return SequenceVLDataset(
-        torch.randint(0, 256, (frames, 1, 16, 16, 3), generator=draws, dtype=torch.uint8),
-        {"x": torch.randn(frames, 2, generator=draws)},
-        torch.rand(frames, 7, generator=draws) * 2 - 1,
-        torch.tensor([frames - 1] * frames),
-        torch.randn(4, generator=draws),
-        task,
-        SPEC.seq_len,
-    )
-
-
-def transformer() -> BCTransformer:
-    with seeded(7):
-        return small_transformer(SPEC)
+dataset = partial(sequences.dataset, demos=1)
 
 
 def counted(work) -> int:
@@ -64,7 +47,7 @@ KINDS = [Sequential(), ER(memory=ReplayMemory(9)), AGEM(memory=ReplayMemory(9)),
 
 @pytest.mark.parametrize("algorithm", KINDS, ids=lambda a: type(a).__name__)
 def test_costs_of_two_small_steps_determine_those_of_any(algorithm: Algorithm):
-    policy, first, second = transformer(), dataset(0), dataset(1)
+    policy, first, second = make_policy(), dataset(0), dataset(1)
     algorithm.begin_task(0, first, policy)
     algorithm.end_task(0, first, policy, generator(0))
     algorithm.begin_task(1, second, policy)
@@ -82,7 +65,7 @@ def test_costs_of_two_small_steps_determine_those_of_any(algorithm: Algorithm):
 
 
 def test_replay_doubles_a_step_and_its_gradient_costs_twice_the_loss():
-    policy, first, second = transformer(), dataset(0), dataset(1)
+    policy, first, second = make_policy(), dataset(0), dataset(1)
     costs = {}
     for algorithm in (Sequential(), ER(memory=ReplayMemory(9))):
         algorithm.end_task(0, first, policy, generator(0))
@@ -93,7 +76,7 @@ def test_replay_doubles_a_step_and_its_gradient_costs_twice_the_loss():
 
 
 def test_count_flops_changes_neither_policy_nor_algorithm():
-    policy, algorithm, windows = transformer(), AGEM(memory=ReplayMemory(9)), dataset(1)
+    policy, algorithm, windows = make_policy(), AGEM(memory=ReplayMemory(9)), dataset(1)
     algorithm.end_task(0, dataset(0), policy, generator(0))
     policy.train()
     before, state = copy.deepcopy(policy.state_dict()), torch.random.get_rng_state()
@@ -106,11 +89,11 @@ def test_count_flops_changes_neither_policy_nor_algorithm():
 
 
 def test_parameters_and_trained_parameters():
-    policy = transformer()
+    policy = make_policy()
     everything = sum(p.numel() for p in policy.parameters())
     for p in policy.encoders.parameters():
         p.requires_grad_(False)
-    costs = step_costs(policy, Sequential(), dataset(), 4)
+    costs = step_costs(policy, Sequential(), dataset(0), 4)
     frozen = sum(p.numel() for p in policy.encoders.parameters())
     assert costs["parameters"] == everything
     assert costs["parameters_trained"] == everything - frozen
@@ -127,7 +110,7 @@ def test_an_action_of_a_recurrent_policy_costs_less_with_carried_memory():
 
 
 def test_stored_bytes():
-    policy, first = transformer(), dataset(0)
+    policy, first = make_policy(), dataset(0)
     assert stored_bytes(Sequential()) == 0
     ewc = EWC()
     ewc.begin_task(0, first, policy)
@@ -141,7 +124,7 @@ def test_a_memory_stores_a_frame_of_several_windows_once(stage: bool):
     parts = [dataset(0), dataset(1)] if stage else [dataset(0)]
     learned = StageWindows(parts, 0) if stage else parts[0]
     er = ER(memory=ReplayMemory(9))
-    er.end_task(0, learned, transformer(), generator(0))
+    er.end_task(0, learned, make_policy(), generator(0))
     kept = er.state_dict()["memory"]["indices"]["0"].tolist()
     # a window covers three frames, fewer at the end of its demonstration
     ends = {i: 20 * (i // 20) + 20 for i in kept}

@@ -58,18 +58,19 @@ def arrays(batch: Batch) -> list[torch.Tensor]:
     st.lists(st.integers(1, 6), min_size=1, max_size=4),
     st.sampled_from([None, "libero", b"libero", "aligned", b"aligned"]),
     st.sampled_from(["aligned", "stored"]),
+    st.sampled_from(["expert", "executed"]),
     st.booleans(),
     st.none() | st.integers(1, 5),
 )
 @examples(short=25, long=400)
 def test_windows_do_not_depend_on_how_they_are_read_and_held(
-    tmp_path_factory, lengths, stated, pairing, labels, limit
+    tmp_path_factory, lengths, stated, pairing, read, labels, limit
 ):
     pytest.importorskip("robomimic.utils.dataset")
     path = write_file(tmp_path_factory.mktemp("x") / "x_demo.hdf5", lengths, stated, labels)
     shifted = pairing == "aligned" and stated in (None, "libero", b"libero")
     frames = sum(n - shifted for n in lengths[:limit])
-    source = DemoSource(path, SPEC, limit, pairing)
+    source = DemoSource(path, SPEC, limit, pairing, read)
     ways = [{"memory": memory} for memory in ("host", "disk", "device", "auto")]
     if not frames:
         for how in ways:
@@ -82,7 +83,7 @@ def test_windows_do_not_depend_on_how_they_are_read_and_held(
     for other in others:
         assert all(torch.equal(a, b) for a, b in zip(first, other, strict=True))
     with h5py.File(path) as file:  # written out: observation t with action t + 1, or with action t
-        key = "expert_actions" if labels else "actions"
+        key = "expert_actions" if labels and read == "expert" else "actions"
         expected = np.concatenate(
             [file[f"data/demo_{k}/{key}"][shifted:] for k in range(len(lengths))][:limit]
         )

@@ -10,13 +10,11 @@ import pytest
 from omegaconf import OmegaConf
 
 import libero_env.parallel as parallel
-from libero_env import LiberoEnv
 from libero_env.cli.main import main
 from libero_env.errors import LiberoError
 from libero_env.tasks import get_task
 from lifelong import experiment
 from lifelong.errors import ConfigError
-from lifelong.settings import build
 from lifelong.sweeps import read_sweep, sweep_name
 
 FIT = {"_target_": "lifelong.training.settings.FitSettings"}
@@ -199,19 +197,6 @@ def test_a_policy_with_a_history_that_is_given_single_frames_says_so(words, note
     assert found.endswith("error: the first task begins\n") and (note in found) == noted
 
 
-def test_values_fit_the_parameters_of_their_target():
-    assert build(OmegaConf.create({**FIT, "lr": 1, "steps_per_epoch": None})).lr == 1
-    assert build(OmegaConf.create({"_target_": "builtins.dict", "any": "key"})) == {"any": "key"}
-    for changes, message in [
-        ({"steps_per_epoch": "x"}, "steps_per_epoch is 'x'; expected a whole number or null"),
-        ({"epochs": True}, "epochs is True; expected a whole number"),
-        ({"epoch": 3}, "epoch is an unknown key. Did you mean 'epochs'?"),
-    ]:
-        with pytest.raises(ConfigError) as error:
-            build(OmegaConf.create({**FIT, **changes}))
-        assert message in str(error.value)
-
-
 def test_missing_commands_print_the_help(capsys):
     for words, shown in (([], "compare"), (["tasks"], "certify"), (["results"], "export")):
         assert main(words) == 2
@@ -234,17 +219,6 @@ def test_a_suite_is_no_task():
         LiberoError, match="libero_goal is a suite of 10 tasks, not a task; write libero_goal/0 to"
     ):
         get_task("libero_goal")
-
-
-@pytest.mark.sim
-def test_closed_environments_say_so():
-    env = LiberoEnv("libero_goal/7", cameras=())
-    env.reset(seed=0)
-    env.close()
-    for use in (env.reset, lambda: env.step(env.action_space.sample()), env.get_state):
-        with pytest.raises(LiberoError, match="environment.* is closed; make another"):
-            use()
-    env.close()  # twice is allowed
 
 
 class Terminal(io.StringIO):

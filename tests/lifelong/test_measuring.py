@@ -15,7 +15,6 @@ from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.report import write_report
 from lifelong.results.log import ResultLog
-from lifelong.results.provenance import start_record
 from lifelong.results.records import EvalRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import summarize
@@ -24,6 +23,7 @@ from lifelong.sequence import is_measured
 from lifelong.sequence.measuring import digest
 from lifelong.stats.metrics import lifelong_metrics
 from tests.harness.policies import small_transformer
+from tests.harness.records import run_start
 from tests.harness.sequences import SPEC, TASKS, FakeEnv, run_context, sequence
 
 FROZEN = {"packnet": PackNet, "lora": lambda: LoRA(rank=2), "single_task": SingleTask}
@@ -53,9 +53,7 @@ def learn(path, algorithm, *, policy=None, tasks=TASKS, env=Camera, **settings):
     )
     if not context.directory.log.read().records:
         names = [task.name for task in context.tasks]
-        given = {"algo": "own", "benchmark": "b", "policy": "p", "preset": "", "config": {}}
-        start = start_record(**given, seed=1, tasks=names, instructions=names, cells=context.eval.cells)
-        context.directory.log.append(start)
+        context.directory.log.append(run_start(names, cells=context.eval.cells))
     sequence(context).run()
     return context, episodes
 

@@ -1,6 +1,5 @@
 """Every key of a configuration is checked where its object is built, before anything is written or slow."""
 
-import copy
 import re
 from dataclasses import dataclass
 from typing import Any
@@ -20,29 +19,14 @@ from lifelong.training.distributed import Ranks
 from lifelong.training.memory import check_memory, policy_bytes, training_needs
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
-from tests.harness.configs import composed
+from tests.harness.configs import MISSING, changed, composed
 
-MISSING = object()
 SPEC = PolicySpec(image_size=(64, 64), seq_len=2)
 
 
 @pytest.fixture(scope="module")
 def whole():
     return plain_data(composed("preset=smoke", "algo=er", "device=cpu"))
-
-
-def changed(config, **changes):
-    config = copy.deepcopy(config)
-    for key, value in changes.items():
-        *parents, last = key.split("__")
-        node = config
-        for parent in parents:
-            node = node[parent]
-        if value is MISSING:
-            del node[last]
-        else:
-            node[last] = value
-    return config
 
 
 def checked(config):

@@ -36,6 +36,7 @@ from lifelong.settings import build
 from lifelong.streams import StreamSettings
 from tests.harness.configs import composed
 from tests.harness.demos import wander
+from tests.harness.records import evaluation, run_start
 from tests.harness.runs import make_run
 
 TASKS = get_suite("libero_object").tasks[:2]
@@ -302,20 +303,11 @@ def test_held_out_shifts_are_measured_besides(folder, tmp_path, quick, monkeypat
         run(folder, tmp_path / "onehot", "language=onehot", "eval.shift={instruction:0.5}")
 
 
-def record(phase, learned, task, wins, shift=""):
-    return EvalRecord(
-        phase=phase, learned=learned, epoch=1, task=task, shift=shift, init_states=(0, 1, 2, 3), lengths=(9,) * 4,
-        successes=tuple(i < wins for i in range(4)), seconds=1.0,
-    )  # fmt: skip
-
-
 def test_forgetting_under_shift_is_just_learned_minus_final():
-    first = RunRecord(
-        algo="er", benchmark="b", policy="p", seed=1, preset="", tasks=("a", "b"), instructions=("a", "b"),
-        config_digest="", versions={}, commit=None, cpu_count=1, started="",
-    )  # fmt: skip
-    matrix = [record("matrix", 0, 0, 4), record("matrix", 1, 0, 3), record("matrix", 1, 1, 4)]
-    shifted = [record("shift", *key, "light=0.5") for key in ((0, 0, 3), (1, 0, 0), (1, 1, 2))]
+    first = run_start(["a", "b"])
+    matrix = [evaluation("matrix", *key) for key in ((0, 1, 0, 4), (1, 1, 0, 3), (1, 1, 1, 4))]
+    keys = ((0, 1, 0, 3), (1, 1, 0, 0), (1, 1, 1, 2))
+    shifted = [evaluation("shift", *key, shift="light=0.5") for key in keys]
     results = Results((first, *matrix, *shifted))
     assert Results((first, *matrix)).success_matrix()[0].tolist()[1] == [0.75, 1.0]
     np.testing.assert_array_equal(results.success_matrix()[0], Results((first, *matrix)).success_matrix()[0])
@@ -331,7 +323,7 @@ def test_forgetting_under_shift_is_just_learned_minus_final():
     line = to_line(shifted[0])
     assert from_line(line) == shifted[0]
     with pytest.raises(ValueError, match="has the shift"):
-        record("matrix", 0, 0, 1, "light=0.5")
+        evaluation("matrix", 0, 1, 0, 1, shift="light=0.5")
 
 
 @pytest.mark.sim

@@ -1,15 +1,12 @@
 """Streams: groups of tasks, fewer demonstrations, blurred boundaries, pretraining and initial weights."""
 
 import math
-import shlex
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 
 from libero_env.tasks import get_suite
 from lifelong import checkpoints
@@ -20,14 +17,16 @@ from lifelong.errors import CheckpointError, ConfigError, LiberoError
 from lifelong.pretraining import load_initial_weights, pretraining_context
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
-from lifelong.results.provenance import start_record, utc_now
+from lifelong.results.provenance import utc_now
 from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.sequence import TaskSequence
 from lifelong.settings import BenchmarkSettings, PretrainSettings
 from lifelong.stats.metrics import lifelong_metrics
 from lifelong.streams import StageData, StageWindows, StreamSettings, learning_stages
+from tests.harness.algorithms import assert_resumed_equals_uninterrupted
 from tests.harness.fakes import Windows
+from tests.harness.records import evaluation, run_start
 from tests.harness.sequences import Killed, Killer, assert_same, dataset, run_context, sequence
 
 ROOT = Path(__file__).parents[2]
@@ -181,36 +180,17 @@ def test_pretraining_takes_a_suite_or_nothing() -> None:
 def four(path: Path, algorithm, **changes) -> RunContext:
     """Four tasks in groups of two, of one epoch each."""
     context = run_context(path, "sequential", tasks=4)
-    record = start_record(
-        algo="x",
-        benchmark="y",
-        policy="z",
-        seed=1,
-        preset="",
-        tasks="abcd",
-        instructions="abcd",
-        config={},
-        group_sizes=changes.get("group_sizes", (2, 2)),
-    )
     if not context.directory.log.read().records:
-        context.directory.log.append(record)
+        context.directory.log.append(run_start("abcd", group_sizes=changes.get("group_sizes", (2, 2))))
     fit = replace(context.fit, epochs=1, steps_per_epoch=2)
     return replace(context, algorithm=algorithm, fit=fit, **({"group_sizes": (2, 2)} | changes))
-
-
-def kept(path: Path) -> tuple[dict, dict]:
-    records = {}
-    for record in RunDirectory(path).log.read().records:
-        if isinstance(record, EvalRecord | LossRecord | TaskEndRecord):
-            values = {k: v for k, v in asdict(record).items() if k != "seconds"}
-            records[tuple(values.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))] = values
-    return records, checkpoints.load(RunDirectory(path).checkpoints.task_path(3))
 
 
 @pytest.mark.parametrize("algorithm", [lambda: DERpp(budget=12), SingleTask])
 def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorithm) -> None:
     blurred = {"stream": StreamSettings(blur=0.2)}
-    sequence(four(tmp_path / "whole", algorithm(), **blurred)).run()
+    make = lambda path, algorithm: four(path, algorithm(), **blurred)  # noqa: E731
+    assert_resumed_equals_uninterrupted(tmp_path, algorithm, monkeypatch, make, last=3)
     results = ResultLog(tmp_path / "whole" / "results.jsonl").read()
     evals = results.of(EvalRecord)
     assert {(r.learned, r.task) for r in evals if r.phase == "matrix"} == {
@@ -228,50 +208,15 @@ def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorit
         for epoch in (0, 1)
     }
     assert [r.task for r in results.of(TaskEndRecord)] == [1, 3]
-    for writes in (3, 9, 12):
-        with monkeypatch.context() as patch:
-            p = four(tmp_path / "killed", algorithm(), **blurred)
-            killer = Killer(patch, writes)
-            patch.setattr(p.directory.log, "append", killer.guard(p.directory.log.append))
-            with pytest.raises(Killed):
-                sequence(p).run()
-    sequence(four(tmp_path / "killed", algorithm(), **blurred)).run()
-    (records, state), (again, end) = kept(tmp_path / "whole"), kept(tmp_path / "killed")
-    assert again == records
-    assert_same(end, state)
 
 
 def test_metrics_count_a_group_as_one_task(tmp_path) -> None:
     log = ResultLog(tmp_path / "results.jsonl")
-    log.append(
-        start_record(
-            algo="er",
-            benchmark="b",
-            policy="p",
-            seed=1,
-            preset="",
-            tasks="abcd",
-            instructions="abcd",
-            config={},
-            group_sizes=(2, 2),
-        )
-    )
+    log.append(run_start("abcd", group_sizes=(2, 2)))
 
     def evaluated(phase: str, learned: int, epoch: int, rates: dict[int, float]) -> None:
         for task, rate in rates.items():
-            successes = tuple(k < round(10 * rate) for k in range(10))
-            log.append(
-                EvalRecord(
-                    phase=phase,
-                    learned=learned,
-                    epoch=epoch,
-                    task=task,
-                    successes=successes,
-                    lengths=(1,) * 10,
-                    init_states=tuple(range(10)),
-                    seconds=1.0,
-                )
-            )
+            log.append(evaluation(phase, learned, epoch, task, round(10 * rate), 10))
 
     evaluated("curve", 1, 0, {0: 0.0, 1: 0.0})
     evaluated("curve", 1, 5, {0: 0.6, 1: 0.8})  # the best of the group: 0.7
@@ -376,25 +321,6 @@ def test_single_task_starts_each_task_from_the_pretrained_weights(tmp_path) -> N
     sequence(p).run()
     initial = checkpoints.load(p.directory.checkpoints.task_path(2))["algorithm"]["initial"]
     assert_same(dict(initial), trained)
-
-
-def shown() -> list[list[str]]:
-    """Return the overrides of every command in docs/streams.md."""
-    lines = (ROOT / "docs" / "streams.md").read_text(encoding="utf-8").splitlines()
-    return [shlex.split(line, comments=True)[2:] for line in lines if line.startswith("python train.py")]
-
-
-@pytest.mark.parametrize("overrides", shown(), ids=" ".join)
-def test_the_commands_of_the_guide_are_valid(overrides) -> None:
-    with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
-        config = compose("config", overrides)
-    benchmark, stream, before = (
-        instantiate(config[group], _convert_="all") for group in ("benchmark", "stream", "pretrain")
-    )
-    tasks = benchmark.sequence()
-    groups = stream.group_sizes(len(tasks), benchmark.group_size)
-    assert len(stream.demos(config.data.demos, len(tasks), groups[0])) == len(tasks)
-    assert bool(before.sequence()) == any(o.startswith("pretrain") for o in overrides)
 
 
 def test_orders_by_seed_hold_the_same_tasks():

@@ -7,6 +7,7 @@ import pytest
 
 from lifelong.results.records import EvalRecord
 from lifelong.results.subgoals import predicate_of, subgoals
+from tests.harness.records import evaluation
 
 POT = ("(Turnon stove_1)", "(On pot_1 stove_1)")
 TWO = ("(In soup_1 basket_1)", "(In milk_1 basket_1)", "(Close drawer_1)")
@@ -18,20 +19,9 @@ def record(
     """Ten episodes; atom a is reached in the first `ever[a]` of them, and holds from the start in `start[a]`."""
     first = lambda counts: tuple(tuple(i < n for n in counts) for i in range(10))  # noqa: E731
     start = start or [0] * len(atoms)
-    return EvalRecord(
-        phase="matrix",
-        learned=learned,
-        epoch=0,
-        task=task,
-        successes=tuple(all(r) for r in first(ever)),
-        lengths=(5,) * 10,
-        init_states=tuple(range(10)),
-        seconds=1.0,
-        atoms=atoms,
-        atoms_at_start=first(start),
-        atoms_ever=first(ever),
-        atoms_at_end=first([n // 2 for n in ever]),
-    )
+    truths = {"atoms_at_start": start, "atoms_ever": ever, "atoms_at_end": [n // 2 for n in ever]}
+    truths = {name: first(counts) for name, counts in truths.items()}
+    return evaluation("matrix", learned, 0, task, min(ever), 10, atoms=atoms, **truths)
 
 
 RUN = [

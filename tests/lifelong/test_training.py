@@ -8,7 +8,6 @@ import torch
 from torch import nn
 
 from libero_env.errors import InvalidInputError
-from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, Sequential
 from lifelong.data import fake_batch
 from lifelong.data.memory import ReplayMemory
@@ -91,30 +90,6 @@ def test_statistics_adapt_to_a_task_before_its_first_step_and_nothing_else_does(
     fit(again, Windows(), Sequential(), settings=settings, seed=(0,), resume=copy.deepcopy(at_start[0]))
     for name, value in policy.state_dict().items():
         assert torch.equal(value, again.state_dict()[name]), name
-
-
-@pytest.mark.parametrize("stop", [0, 1, 4, 5])
-def test_killed_and_resumed_equals_uninterrupted(tmp_path, stop):
-    torch.manual_seed(0)
-    fresh = DeepPolicy()
-    path = tmp_path / "state"
-    epochs = []
-
-    def keep(end):
-        epochs.append((end.epoch, end.loss, end.penalty))
-        if end.epoch == stop:
-            checkpoints.save(path, end.state())
-
-    reference = trained(copy.deepcopy(fresh), on_epoch=keep)
-    again = []
-    resumed = trained(
-        DeepPolicy(),
-        resume=checkpoints.load(path),
-        on_epoch=lambda e: again.append((e.epoch, e.loss, e.penalty)),
-    )
-    for name, value in reference.items():
-        assert torch.equal(value, resumed[name]), name
-    assert str(again) == str(epochs[stop:])
 
 
 def test_a_run_repeats_to_the_bit_and_leaves_the_global_generator_alone():

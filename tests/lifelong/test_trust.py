@@ -14,6 +14,7 @@ from libero_eval.requests import EvalRequest
 from lifelong.errors import ConfigError
 from lifelong.evaluation.restore import restore
 from lifelong.settings import GROUPS, find_target
+from tests.harness import configs
 from tests.harness.configs import CONFIGS
 from tests.harness.runs import make_run
 
@@ -45,14 +46,7 @@ def changed(run):
     before = file.read_text()
 
     def change(**changes):
-        config = yaml.safe_load(before)
-        for key, value in changes.items():
-            *parents, last = key.split("__")
-            node = config
-            for parent in parents:
-                node = node[parent]
-            node[last] = value
-        file.write_text(yaml.safe_dump(config))
+        file.write_text(yaml.safe_dump(configs.changed(yaml.safe_load(before), **changes)))
         return run
 
     yield change

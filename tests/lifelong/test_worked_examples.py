@@ -9,23 +9,10 @@ from numpy.lib.stride_tricks import sliding_window_view
 from torch import distributions, nn
 
 from lifelong.nn import GMMHead, ResNetFiLMEncoder
-from lifelong.results.provenance import start_record
-from lifelong.results.records import EvalRecord, TaskEndRecord
+from lifelong.results.records import TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.results.summary import summarize
-
-
-def evaluation(phase: str, learned: int, epoch: int, task: int, wins: int) -> EvalRecord:
-    return EvalRecord(
-        phase=phase,
-        learned=learned,
-        epoch=epoch,
-        task=task,
-        successes=tuple(i < wins for i in range(20)),
-        lengths=(9,) * 20,
-        init_states=tuple(range(20)),
-        seconds=1.0,
-    )
+from tests.harness.records import evaluation, run_start
 
 
 def test_metrics_of_three_tasks_from_their_records():
@@ -33,14 +20,11 @@ def test_metrics_of_three_tasks_from_their_records():
     curves = [(0, 16, 12), (2, 8, 10), (0, 12, 12)]
     rows = [(16,), (10, 10), (4, 7, 12)]
     names = [f"task_{k}" for k in range(3)]
-    records = [
-        start_record(algo="er", benchmark="b", policy="p", seed=1, preset="", tasks=names, instructions=names,
-         config={}),
-    ]  # fmt: skip
+    records = [run_start(names)]
     for task, (curve, row) in enumerate(zip(curves, rows, strict=True)):
-        records += [evaluation("curve", task, 5 * i, task, wins) for i, wins in enumerate(curve)]
+        records += [evaluation("curve", task, 5 * i, task, wins, 20) for i, wins in enumerate(curve)]
         best = (5, 10, 5)[task]
-        records += [evaluation("matrix", task, best, other, wins) for other, wins in enumerate(row)]
+        records += [evaluation("matrix", task, best, other, wins, 20) for other, wins in enumerate(row)]
         records.append(TaskEndRecord(task=task, best_epoch=best, seconds=1.0))
     metrics = summarize(Results(tuple(records)))["metrics"]
     # FWT_k: c[k,k,e] averaged over e, after the best held: (0 + .8 + .8)/3, (.1 + .4 + .5)/3, (0 + .6 + .6)/3
