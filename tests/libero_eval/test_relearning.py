@@ -192,7 +192,7 @@ def test_rollouts_are_those_of_the_run(monkeypatch) -> None:
 
     def rollout(found, env, states, **settings):
         called.update(settings, policy=found, env=env, states=list(states))
-        return SimpleNamespace(rate=0.75)
+        return SimpleNamespace(rate=0.75, failed={})
 
     protocol = SimpleNamespace(horizon=70, settle_steps=3, precision="fp32")
     run = SimpleNamespace(
