@@ -212,6 +212,21 @@ def test_an_algorithm_of_the_user_shows_its_own_frames(here, monkeypatch, capsys
     assert not Path("runs").exists()
 
 
+def test_closed_streams_lead_nowhere(here):
+    """Files that are opened would take their numbers; the status is that of the command, as in a cron job."""
+    command = [sys.executable, "-m", "libero_env.cli"]
+    for closed in (">&-", "2>&-", "<&- >&- 2>&-"):
+        for words, status in ((["protocols", "list"], 0), (["eval", "nowhere", "--out", "out"], 2)):
+            line = " ".join(["exec", '"$@"', closed])
+            environment = os.environ | {"PYTHONPATH": str(ROOT)}
+            done = subprocess.run(
+                ["sh", "-c", line, "sh", *command, *words], env=environment, capture_output=True
+            )
+            assert done.returncode == status, done
+            assert b"Traceback" not in done.stdout + done.stderr
+    assert not Path("out").exists()
+
+
 def test_mistyped_options_are_one_line(capsys):
     for words in (["eval", "--sise", "3"], ["tasks", "list", "--order", "x"]):
         with pytest.raises(SystemExit, match="2"):

@@ -29,6 +29,7 @@ def main() -> int:
     failed = 0
     with tempfile.TemporaryDirectory() as scratch:
         folder, wholes = Path(args.out or scratch), {}
+        folder.mkdir(parents=True, exist_ok=True)
         demos = folder / "demos"
         print("| series | algorithm | kills | while files were written | seconds | ends in the same bits |")
         print("|---|---|---|---|---|---|", flush=True)

@@ -89,7 +89,16 @@ def interruptible() -> Iterator[None]:
 
 @contextmanager
 def debugging(words: Sequence[str]) -> Iterator[list[str]]:
-    """Yield the words of a command line without `--debug`, which counts for this command and its processes."""
+    """Yield the words of a command line without `--debug`, which counts for this command and its processes.
+
+    Standard streams that are closed lead nowhere, as else the first files that are opened would take their place.
+    """
+    for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
+        if getattr(sys, name) is None:
+            os.set_inheritable(
+                os.open(os.devnull, os.O_RDWR), True
+            )  # the lowest free number, which is this one
+            setattr(sys, name, open(number, mode))  # noqa: SIM115 - until the process ends
     rest = [word for word in words if word != DEBUG]
     before = os.environ.get(DEBUG_VARIABLE)
     if len(rest) < len(words):

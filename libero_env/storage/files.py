@@ -64,14 +64,14 @@ def write_json(target: Path, value: Any, *, fsync: bool = False) -> None:
     atomic_write_text(target, to_json(value), fsync=fsync)
 
 
-def read_json(path: Path, error: type[LiberoError] = InvalidInputError) -> Any:
+def read_json(path: Path, error: type[LiberoError] = InvalidInputError, *, most: int = MAX_JSON_BYTES) -> Any:
     """Return the content of a JSON file.
 
     Raises:
         LiberoError: The file cannot be read, or is not JSON, in one line; of the type `error`.
     """
     try:
-        return json.loads(read_bounded(path, MAX_JSON_BYTES))
+        return json.loads(read_bounded(path, most))
     except OSError as failure:
         raise error(f"{path}: {failure.strerror or failure}") from failure
     except (ValueError, RecursionError) as failure:

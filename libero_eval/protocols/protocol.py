@@ -15,7 +15,7 @@ from pydantic import Field
 
 from libero_env.errors import LiberoError
 from libero_env.tasks import Task
-from libero_env.text import plain, suggest
+from libero_env.text import plain, shown, suggest
 from libero_env.validation import validate
 from lifelong.errors import ProtocolError, ProtocolMismatchError
 
@@ -461,7 +461,7 @@ class EvalProtocol:
         by_section = {k: v for k, v in announced.items() if k in SECTIONS and isinstance(v, Mapping)}
         stated = {**announced, **{f"{s}.{k}": v for s, part in by_section.items() for k, v in part.items()}}
         wrong = [
-            f"{name}: protocol {self.name} has {value!r}, the policy {stated[name]!r}"
+            f"{name}: protocol {self.name} has {value!r}, the policy {shown(stated[name])}"
             for name, value in expected.items()
             if stated.get(name) is not None and plain(stated[name]) != plain(value)
         ]

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from libero_env.perturbations import format_perturbations, get_kind, parse_perturbations
+from libero_env.storage import require_own_folders
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
 from libero_eval.plan import load_policy, plan_evaluation, policy_threads, work_quietly
 from libero_eval.policies import PolicyUnderTest
@@ -33,7 +34,11 @@ def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_:
     """
     conditions = conditions_of(request)
     policy = load_policy(request)
-    request = replace(request, out=request.out or policy.out / "robustness")
+    if request.out is None:
+        require_own_folders(policy.out, "robustness", error=ConfigError)
+    out = request.out or policy.out / "robustness"
+    require_own_folders(out, *(f"{CONDITIONS}/{one or 'none'}" for one in conditions), error=ConfigError)
+    request = replace(request, out=out)
     if request.again:
         for _, evaluation in _evaluations(request, policy, conditions):
             evaluation.store.clear()
@@ -42,10 +47,9 @@ def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_:
         with Workers(min(request.workers, len(conditions)) - 1, _help, request) as workers:
             _work(request, policy, conditions, workers, on_condition)
     except KeyboardInterrupt as error:
-        error.add_note(f"{request.out} keeps what is done; the same command goes on")
+        error.add_note(f"{out} keeps what is done; the same command goes on")
         raise
-    assert request.out is not None
-    return _name(policy), request.out
+    return _name(policy), out
 
 
 def _help(request: RobustnessRequest) -> None:

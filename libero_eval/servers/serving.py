@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from http import HTTPStatus
 from itertools import count
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -60,8 +60,8 @@ class _Array(TypedDict):
 
 
 class _Actions(_Array):
-    chunk: int
-    replan: int
+    chunk: Literal[1]
+    replan: Literal[1]
 
 
 class Announced(TypedDict):
@@ -71,7 +71,7 @@ class Announced(TypedDict):
     format: int
     versions: dict[str, str]
     run: str
-    after: int
+    after: Annotated[int, Field(ge=0)]
     weights: Annotated[str, Field(min_length=1)]
     protocol: str
     horizon: int
@@ -80,9 +80,9 @@ class Announced(TypedDict):
     robot: str
     selection: tuple[Annotated[int, Field(ge=0, lt=NUM_INIT_STATES)], ...]
     observation: dict[str, _Array]
-    images: str
+    images: Literal["upright: first row on top, not mirrored"]
     actions: _Actions
-    gripper: str
+    gripper: Literal["opens at -1, closes at +1"]
     openpi_names: bool
     tasks: dict[str, str]
     reset: str
@@ -96,7 +96,7 @@ def announced_run(about: Mapping[str, Any], address: str) -> Announced:
     """
     if about.get("format") != FORMAT:
         raise ServerError(
-            f"{address} is of format {about.get('format')!r}; this version reads {FORMAT}: "
+            f"{address} is of format {shown(about.get('format'))}; this version reads {FORMAT}: "
             "serve the run with the version that evaluates it"
         )
     run: Announced = validate(Announced, about, source=f"the metadata of {address}", error=ServerError)
@@ -408,8 +408,10 @@ class PolicyServer:
         serve = need("websockets.asyncio.server").serve
         row = sum(8 * math.prod(one["shape"]) for one in self._metadata["observation"].values())
         most = (1 << 20) + MAX_ROWS * row  # of a request, [bytes]
-        options = {"compression": None, "max_size": most, "process_request": self._respond}
-        async with serve(self._handle, self._host, self._port, **options) as server:
+        options = {"compression": None, "max_size": most, "max_queue": 1}
+        async with serve(
+            self._handle, self._host, self._port, process_request=self._respond, **options
+        ) as server:
             on_ready(server.sockets[0].getsockname()[1])
             await server.serve_forever()
 

@@ -13,24 +13,24 @@ import json
 import os
 import secrets
 import socket
-import stat
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 
 from libero_env.errors import InvalidInputError
 from libero_env.parallel import is_running, process_start, this_machine
+from libero_env.storage import regular_file
 from libero_env.validation import validate
 
 LEASE = 120.0  # s; network file systems may show a time of modification that is a minute old
 BEATS = 8  # of a lease: how often a holder touches its claim
-MAX_BYTES = 64 << 20  # of a file in the folder of an evaluation
+_MAX_BYTES = 1 << 16  # of a claim
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class Held:
     unit: str
     claim: Claim | None
     silent: float
-    text: str
+    text: bytes
 
     @property
     def holder(self) -> str:
@@ -174,8 +174,12 @@ class Claims:
         if found is None:
             return None
         try:
-            claim = validate(Claim, parse(found[0]))
-        except InvalidInputError:  # its holder has only just begun to write it, or it is damaged
+            claim = validate(Claim, json.loads(found[0]))
+        except (
+            InvalidInputError,
+            ValueError,
+            RecursionError,
+        ):  # it is being written, or damaged
             claim = None
         return Held(unit, claim, now - found[1], found[0])
 
@@ -210,43 +214,14 @@ class Claims:
                 probe.unlink(missing_ok=True)
 
 
-def _text_of(path: Path) -> tuple[str, float] | None:
+def _text_of(path: Path) -> tuple[bytes, float] | None:
     """Return the text of a claim, empty if it cannot be read, and when it was touched; None if there is none."""
-    try:
+    with suppress(FileNotFoundError):
         try:
-            return read_regular(path)
-        except InvalidInputError:
-            return "", path.lstat().st_mtime
-    except FileNotFoundError:
-        return None
-
-
-def read_regular(path: Path) -> tuple[str, float]:
-    """Return the text of a file in the folder of an evaluation, and when it was modified; it may be of a stranger.
-
-    Raises:
-        FileNotFoundError: There is none.
-        InvalidInputError: It is a pipe or device, too large, not text, or cannot be read.
-    """
-    try:
-        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
-            about = os.fstat(stream.fileno())
-            if not stat.S_ISREG(about.st_mode) or about.st_size > MAX_BYTES:
-                raise InvalidInputError(f"{path} is not a file of at most {MAX_BYTES >> 20} MiB")
-            return stream.read(MAX_BYTES).decode(), about.st_mtime
-    except FileNotFoundError:
-        raise
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInputError(f"{path} cannot be read ({error})") from None
-
-
-def parse(text: str) -> Any:
-    """Return the JSON of a text.
-
-    Raises:
-        InvalidInputError: It is not JSON.
-    """
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise InvalidInputError(f"not JSON ({error}): broken or incomplete") from None
+            with open(path, "rb", opener=regular_file(_MAX_BYTES)) as stream:
+                return stream.read(), os.fstat(stream.fileno()).st_mtime
+        except FileNotFoundError:
+            raise
+        except OSError:
+            return b"", path.lstat().st_mtime
+    return None

@@ -27,13 +27,13 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from libero_env.errors import InvalidInputError
-from libero_env.storage import create_text, require_own_folders, write_json
+from libero_env.storage import create_text, read_json, require_own_folders, write_json
 from libero_env.tasks import Task
 from libero_env.text import flatten, json_safe, shorten, to_json
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, TaskResult
 from libero_eval.policies import PROBE_TOLERANCE
-from libero_eval.work.claims import LEASE, Claim, Claims, Held, parse, read_regular
+from libero_eval.work.claims import LEASE, Claim, Claims, Held
 from lifelong.errors import ConfigError, LifelongError, ResultsError
 from lifelong.results.provenance import utc_now
 
@@ -43,6 +43,7 @@ UNIT_FORMAT = "libero-evaluation-unit/1"
 AGAIN = "name another folder with --out, or repeat the evaluation with --again"
 PARTS = (PLAN_NAME, FILE_NAME, "units", "claims", "errors")
 FOLDERS = ("units", "claims", "errors", "videos")
+MAX_BYTES = 64 << 20  # of a file in the folder
 MAX_ERROR = 20_000  # characters of a traceback that is kept
 Seconds = Annotated[float, Field(ge=0, le=1e11)]  # since the epoch
 
@@ -328,7 +329,7 @@ def read_unit(path: Path) -> tuple[UnitResult, str]:
         values = _of_format(path, UNIT_FORMAT)
         content = {f.name: values[f.name] for f in fields(UnitResult) if f.name in values}
         return validate(UnitResult, content), str(values.get("digest"))
-    except (OSError, InvalidInputError, LifelongError) as error:
+    except (InvalidInputError, LifelongError) as error:
         raise LifelongError(
             f"{path} is not a valid result of a unit ({error}); nothing of it is counted: remove it, and "
             "the unit is run again"
@@ -356,7 +357,7 @@ def _of_format(path: Path, wanted: str) -> dict[str, Any]:
     Raises:
         InvalidInputError: It has another one, or cannot be read.
     """
-    values = parse(read_regular(path)[0])
+    values = read_json(path, most=MAX_BYTES)
     stated = values.get("format") if isinstance(values, dict) else None
     if stated != wanted:
         raise InvalidInputError(f"the format is {stated!r}, not {wanted!r}")
@@ -406,8 +407,8 @@ class _Errors(TypedDict):
 def _read_errors(path: Path) -> list[_Error]:
     """Return the errors in a file; a broken one says nothing that counts."""
     try:
-        return validate(_Errors, parse(read_regular(path)[0]))["errors"]
-    except (OSError, InvalidInputError):
+        return validate(_Errors, read_json(path, most=MAX_BYTES))["errors"]
+    except InvalidInputError:
         return []
 
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from libero_env.storage import MAX_YAML_BYTES, read_bounded
+from libero_env.errors import InvalidInputError
+from libero_env.storage import MAX_YAML_BYTES, parse_yaml_text, read_bounded
 from libero_env.text import flatten
 from lifelong.errors import ComparisonError, LifelongError, ResultsError
 from lifelong.results.log import ResultLog
@@ -290,7 +289,7 @@ def _load_config(path: Path) -> tuple[dict[str, Any], str, list[str]]:
     except OSError as error:
         return {}, "", [f"{path.name} is not read: {error}; the configuration is not shown."]
     try:
-        config = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        return {}, text, [f"{path.name} is not valid YAML ({' '.join(str(error).split())})."]
+        config = parse_yaml_text(text, path.name).data
+    except InvalidInputError as error:
+        return {}, text, [f"{error}."]
     return (config if isinstance(config, dict) else {}), text, []

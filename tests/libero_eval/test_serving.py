@@ -1,5 +1,6 @@
 """Serving of a run's policy: the same actions as in process, episodes of clients, requests that are refused."""
 
+import json
 import re
 import urllib.error
 import urllib.request
@@ -14,7 +15,7 @@ from websockets.sync.client import connect
 from libero_env.tasks import get_suite, get_task
 from libero_eval.servers.actors import ServedActor
 from libero_eval.servers.openpi import OPENPI, OpenpiClient
-from libero_eval.servers.serving import ServedPolicy
+from libero_eval.servers.serving import PREFIX, ServedPolicy, announced_run
 from libero_eval.servers.transport import EpisodeStart, Limits
 from lifelong.errors import PolicyError, ServerError
 from lifelong.evaluation.actors import PolicyActor
@@ -153,6 +154,41 @@ def test_requests_that_are_refused(folder):
     session.infer(good)
     with pytest.raises(PolicyError, match="2 rows in an episode that began with 1"):
         session.infer({f"observation/{k}": v for k, v in both.items()} | {"prompt": task.language})
+
+
+def test_metadata_of_other_kinds_are_refused_in_one_line(folder):
+    """Whatever is missing, of another type, out of range, nested or huge."""
+    about = json.loads(json.dumps(run_of(folder, "algo=er").metadata))
+    assert announced_run(about, "ws://it")["weights"] == about["weights"]
+    odd = [5.5, [[1]], {"x": {"y": []}}, None, ["a"]]
+    odd_parts = {
+        "format": [2, "x" * 100_000, None, {}],
+        "selection": [[50], [-1], [1.5], ["1"], "x" * 100_000],
+        "actions": [
+            about["actions"] | one
+            for one in ({"chunk": 5}, {"replan": -1}, {"shape": [0]}, {"shape": [1] * 4})
+        ],
+        "images": ["upside down"],
+        "gripper": ["opens at +1, closes at -1"],
+        "tasks": [["libero_goal/0"], {"libero_goal/0": 5}],
+        "observation": [
+            {},
+            {PREFIX + "ee_pos": {"dtype": "float64", "shape": [3]}},
+            about["observation"] | {PREFIX + "depth": {"dtype": "uint8", "shape": [4, 4, 3]}},
+            {PREFIX + "agentview_rgb": {"dtype": "uint8", "shape": [64, 64]}},
+            {PREFIX + "agentview_rgb": {"dtype": "uint8", "shape": [10**9, 64, 3]}},
+            {PREFIX + "agentview_rgb": {"dtype": "uint8"}},
+        ],
+    }
+    cases = [(key, {k: v for k, v in about.items() if k != key}) for key in about if key != "server"]
+    cases += [(key, about | {key: one}) for key, parts in odd_parts.items() for one in parts]
+    cases += [(key, about | {key: one}) for key in about.keys() - {"server", "drawing"} for one in odd]
+    for key, values in cases:
+        with pytest.raises(ServerError, match=key) as caught:
+            announced_run(values, "ws://it")
+        assert (
+            "ws://it" in str(caught.value) and "\n" not in str(caught.value) and len(str(caught.value)) < 1000
+        )
 
 
 def test_instructions_of_several_tasks(folder):

@@ -614,6 +614,9 @@ def test_a_report_follows_no_link_out_of_a_run_and_waits_for_no_pipe(tmp_path: P
     (run / "config.yaml").unlink()
     os.mkfifo(run / "config.yaml")
     assert "config.yaml is not read" in write_report([run]).read_text()
+    (run / "config.yaml").unlink()
+    (run / "config.yaml").write_text("[" * 100_000)
+    assert "config.yaml: lists within lists" in write_report([run]).read_text()
 
 
 @pytest.mark.parametrize("place", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
