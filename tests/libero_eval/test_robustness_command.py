@@ -81,6 +81,16 @@ def test_mistakes_take_one_line_before_anything_is_run(still, words, told, capsy
     assert told in error and len(error.strip().splitlines()[-1:]) == 1 and not (still / "found").exists()
 
 
+@pytest.mark.parametrize("link", ["robustness", "robustness/conditions", "robustness/conditions/none"])
+def test_nothing_is_removed_where_a_link_leads(still, link, capsys) -> None:
+    (still / "mine" / "units").mkdir(parents=True)
+    path = still / "eval" / "still_policy.make" / link
+    path.parent.mkdir(parents=True)
+    path.symlink_to(still / "mine")
+    assert main(["robustness", *WORDS, *KINDS, "--again"]) == 2
+    assert "link that leads out of" in capsys.readouterr().err and (still / "mine" / "units").is_dir()
+
+
 def test_default_kinds_and_pairs_exist() -> None:
     from libero_env.perturbations import KINDS as ALL
     from libero_env.perturbations import parse_perturbations
