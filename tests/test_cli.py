@@ -168,12 +168,8 @@ def test_doctor_reports_what_is_broken_and_how_to_fix_it(monkeypatch, capsys):
     found = json.loads(capsys.readouterr().out)
     assert found["ok"] is False and [entry["essential"] for entry in found["findings"]] == [False, True]
     assert found["findings"][1] == {
-        "title": "GL",
-        "detail": "no picture",
-        "ok": False,
-        "remedy": "install one",
-        "essential": True,
-    }
+        "title": "GL", "detail": "no picture", "ok": False, "remedy": "install one", "essential": True
+    }  # fmt: skip
 
 
 @pytest.mark.sim

@@ -24,22 +24,7 @@ NAMES = st.sampled_from(
 # whole operations that are put between those of a valid pickle
 INSERTED = st.sampled_from(
     (
-        b"}",
-        b"]",
-        b"(",
-        b"t",
-        b"b",
-        b"R",
-        b"0",
-        b"1",
-        b"2",
-        b"N",
-        b"Q",
-        b"\x81",
-        b"\x85",
-        b"\x94",
-        b"}b",
-        b")R",
+        b"}", b"]", b"(", b"t", b"b", b"R", b"0", b"1", b"2", b"N", b"Q", b"\x81", b"\x85", b"\x94", b"}b", b")R"
     )
     + (
         b"}X\x05\x00\x00\x00dtypeK\x01sb",
@@ -55,7 +40,7 @@ INSERTED = st.sampled_from(
         b"(" * 3000,
         b"\x85" * 3000,
     )
-)
+)  # fmt: skip
 
 
 def pickled(protocol: int) -> bytes:

@@ -36,15 +36,11 @@ RECORDS = [
     PhaseRecord(phase="demos", seconds=3.0),
     *(evaluation("curve", task, epoch, task, 1, 2, **EVER) for task in (0, 1) for epoch in (0, 1)),
     *(LossRecord(task=task, epoch=1, loss=0.5 + task, seconds=2.0) for task in (0, 1)),
-    *(
-        evaluation("matrix", learned, 1, task, 1, 2, **EVER)
-        for learned in (0, 1)
-        for task in range(learned + 1)
-    ),
+    *(evaluation("matrix", learned, 1, task, 1, 2, **EVER) for learned in (0, 1) for task in range(learned + 1)),
     CostRecord(task=0, costs={"stored_bytes": 3.0}),
     *(TaskEndRecord(task=task, best_epoch=1, seconds=3.0) for task in (0, 1)),
     RunEndRecord(seconds=9.0, finished="2026-01-01T00:00:00+00:00"),
-]
+]  # fmt: skip
 LINES = [to_line(record) for record in RECORDS]
 ODD = st.sampled_from(
     [None, True, -1, 0, 1.5, 10**30, 10**400, 1e308, float("nan"), "", "zero", [], [[]], {}, [1, "a"]]

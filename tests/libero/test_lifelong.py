@@ -171,11 +171,8 @@ def test_checkpoints_hold_data_only(tmp_path):
 def test_json_encoder_of_arrays():
     value = {"a": np.arange(2), "b": np.float32(0.5), "c": torch.ones(1), "d": np.bool_(True)}
     assert json.loads(json.dumps(value, cls=utils.NpEncoder)) == {
-        "a": [0, 1],
-        "b": 0.5,
-        "c": [1.0],
-        "d": True,
-    }
+        "a": [0, 1], "b": 0.5, "c": [1.0], "d": True
+    }  # fmt: skip
     with pytest.raises(TypeError):
         json.dumps(object(), cls=utils.NpEncoder)
 

@@ -62,11 +62,8 @@ def test_a_run_and_the_evaluation_of_its_checkpoint(folder, capsys):
     assert path == Path("experiments/two_tasks/PackNet/BCTransformerPolicy_seed10000/run_001")
     result = torch.load(path / "result.pt")
     assert {k: tuple(result[k].shape) for k in ("L_conf_mat", "S_conf_mat", "L_fwd", "S_fwd")} == {
-        "L_conf_mat": (2, 2),
-        "S_conf_mat": (2, 2),
-        "L_fwd": (2,),
-        "S_fwd": (2,),
-    }
+        "L_conf_mat": (2, 2), "S_conf_mat": (2, 2), "L_fwd": (2,), "S_fwd": (2,)
+    }  # fmt: skip
     assert (result["L_conf_mat"] != 0).tolist() == [[True, False], [True, True]]
     assert (result["S_conf_mat"] == 0).all(), "no policy succeeds in four steps"
     for key in ("k1_p0", "k0_e1"):

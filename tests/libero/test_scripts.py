@@ -80,16 +80,10 @@ def test_create_dataset(collected, tmp_path, capsys):
     assert f"{made}\ndemos: 2\ntransitions: 12\n" in capsys.readouterr().out
     first = read_demos(made)[0]
     assert {key: value.shape[1:] for key, value in first.obs.items()} == {
-        "agentview_rgb": (16, 16, 3),
-        "agentview_depth": (16, 16),
-        "eye_in_hand_rgb": (16, 16, 3),
-        "eye_in_hand_depth": (16, 16),
-        "joint_states": (7,),
-        "gripper_states": (2,),
-        "ee_pos": (3,),
-        "ee_ori": (3,),
-        "ee_states": (6,),
-    }
+        "agentview_rgb": (16, 16, 3), "agentview_depth": (16, 16), "eye_in_hand_rgb": (16, 16, 3),
+        "eye_in_hand_depth": (16, 16), "joint_states": (7,), "gripper_states": (2,), "ee_pos": (3,), "ee_ori": (3,),
+        "ee_states": (6,)
+    }  # fmt: skip
     assert (
         demonstrations.create_dataset([*argv, "--use-actions", "--no-proprio", "--dataset-name", "acted"])
         == 0
@@ -157,12 +151,8 @@ def test_templates_work_unchanged(tmp_path, capsys, monkeypatch):
         assert files.create_template(["-t", kind, "-n", name, "-o", str(tmp_path)]) == 0
     made = capsys.readouterr().out.split()
     assert [Path(path).name for path in made] == [
-        "my_problem.py",
-        "my_kitchen_scene2.py",
-        "my_box_3.py",
-        "my_box_3.xml",
-        "my_room.py",
-    ]
+        "my_problem.py", "my_kitchen_scene2.py", "my_box_3.py", "my_box_3.xml", "my_room.py"
+    ]  # fmt: skip
     monkeypatch.chdir(tmp_path)
     spaces = {path: runpy.run_path(path, run_name="__main__") for path in made if path.endswith(".py")}
     task = capsys.readouterr().out

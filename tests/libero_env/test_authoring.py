@@ -133,12 +133,9 @@ def test_objects_are_added_to_a_scene_and_those_of_the_scene_can_be_moved():
     )
     problem = task.problem
     assert dict(problem.objects) == {
-        "akita_black_bowl_1": "akita_black_bowl",
-        "plate_1": "plate",
-        "plate_2": "plate",
-        "butter_1": "butter",
-        "butter_2": "butter",
-    }
+        "akita_black_bowl_1": "akita_black_bowl", "plate_1": "plate", "plate_2": "plate", "butter_1": "butter",
+        "butter_2": "butter"
+    }  # fmt: skip
     assert Atom("On", ("butter_1", "plate_2")) in problem.init
     assert Atom("In", ("butter_2", "wooden_cabinet_1_top_region")) in problem.init
     assert [a.args[1] for a in problem.init if a.args[0] == "plate_1"] == ["kitchen_table_plate_1_start"]

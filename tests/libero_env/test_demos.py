@@ -62,16 +62,9 @@ def test_file_has_the_originals_layout(path):
     with h5py.File(path) as handle:
         data = handle["data"]
         assert {
-            "env_name",
-            "problem_info",
-            "macros_image_convention",
-            "bddl_file_name",
-            "bddl_file_content",
-            "env_args",
-            "num_demos",
-            "total",
-            "tag",
-        } <= set(data.attrs)
+            "env_name", "problem_info", "macros_image_convention", "bddl_file_name", "bddl_file_content", "env_args",
+            "num_demos", "total", "tag"
+        } <= set(data.attrs)  # fmt: skip
         assert data.attrs["num_demos"] == 3 and data.attrs["total"] == 33 and data.attrs["tag"] == "libero-v1"
         assert data.attrs["env_name"] == "Libero_Floor_Manipulation"
         info = json.loads(data.attrs["problem_info"])

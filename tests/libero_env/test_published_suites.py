@@ -186,11 +186,8 @@ def test_both_readings_of_the_arms_pose(plus):
 def test_suites_of_libero_pro_are_read(pro, states):
     assert {kind: task.name for kind, task in pro.items()} == {kind: f"{BASE}_{kind}" for kind in pro}
     assert {kind: task.has_own_start for kind, task in pro.items()} == {
-        "swap": True,
-        "object": True,
-        "language": False,
-        "task": False,
-    }
+        "swap": True, "object": True, "language": False, "task": False
+    }  # fmt: skip
     assert not any(task.lacks for task in pro.values())
     assert pro["task"].problem.goal != pro["language"].problem.goal == base_task().problem.goal
     np.testing.assert_array_equal(load_original_states(pro["swap"]), states)

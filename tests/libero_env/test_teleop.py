@@ -89,13 +89,8 @@ def test_reports_of_a_mouse():
 
 def test_keys_of_windows_and_terminals():
     assert [key_name(code) for code in (256, 32, ord("W"), ord("Q"), ord("M"), 300)] == [
-        QUIT,
-        GRIPPER,
-        "w",
-        "q",
-        None,
-        None,
-    ]
+        QUIT, GRIPPER, "w", "q", None, None
+    ]  # fmt: skip
     keyboard = Keyboard()
     press_typed(keyboard, "\x1b[A")
     assert (keyboard.command, keyboard.steps) == (None, {})

@@ -354,19 +354,15 @@ def maps(count: int) -> bytes:
     return b"\x81\xa7actions\xdd" + struct.pack(">I", count) + b"\x80" * count
 
 
-@pytest.mark.parametrize(
-    ("answer", "message"),
-    [
-        (deep(500), "within each other, more than 30 deep"),
-        (deep(31), "within each other, more than 30 deep"),
-        (maps(1 << 20), "more than 10000 lists and maps"),
-        ("X" * (1 << 20), r"its traceback:\n\.\.\. X{2000}$"),
-        ({"k" * 100_000: 1}, "without `actions`"),
-        ({str(i): 1 for i in range(10_000)}, "without `actions`"),
-        ({"actions": [["x" * 100_000] * 7] * 2}, "dtype"),
-    ],
-    ids=["deep", "deeper than allowed", "many maps", "long text", "long key", "many keys", "long values"],
-)
+@pytest.mark.parametrize(("answer", "message"), [
+    (deep(500), "within each other, more than 30 deep"),
+    (deep(31), "within each other, more than 30 deep"),
+    (maps(1 << 20), "more than 10000 lists and maps"),
+    ("X" * (1 << 20), r"its traceback:\n\.\.\. X{2000}$"),
+    ({"k" * 100_000: 1}, "without `actions`"),
+    ({str(i): 1 for i in range(10_000)}, "without `actions`"),
+    ({"actions": [["x" * 100_000] * 7] * 2}, "dtype"),
+], ids=["deep", "deeper than allowed", "many maps", "long text", "long key", "many keys", "long values"])  # fmt: skip
 def test_large_answers_end_in_a_short_message(answer, message):
     with (
         policy_servers.openpi(lambda _: answer) as address,
@@ -402,19 +398,16 @@ def test_answers_that_nobody_has_asked_for_are_refused(when):
         actor.note(np.array([True]), np.array([True]))
 
 
-@pytest.mark.parametrize(
-    ("hello", "message"),
-    [
-        ({"action_spec": [1]}, r"action_spec is \[1\]; expected keys with values"),
-        ({"action_spec": "x"}, "action_spec"),
-        ({"action_spec": {"position": 5}}, "action_spec.position"),
-        ({"observation_params": [1]}, "observation_params"),
-        ({"observation_params": "x"}, "observation_params"),
-        *(({"observation_params": {"seed": x}}, "observation_params.seed") for x in ("abc", [1])),
-        ({"observation_params": {"max_steps": float("inf")}}, "observation_params.max_steps"),
-        ({"observation_params": {"max_steps": np.zeros(3)}}, "observation_params.max_steps"),
-    ],
-)
+@pytest.mark.parametrize(("hello", "message"), [
+    ({"action_spec": [1]}, r"action_spec is \[1\]; expected keys with values"),
+    ({"action_spec": "x"}, "action_spec"),
+    ({"action_spec": {"position": 5}}, "action_spec.position"),
+    ({"observation_params": [1]}, "observation_params"),
+    ({"observation_params": "x"}, "observation_params"),
+    *(({"observation_params": {"seed": x}}, "observation_params.seed") for x in ("abc", [1])),
+    ({"observation_params": {"max_steps": float("inf")}}, "observation_params.max_steps"),
+    ({"observation_params": {"max_steps": np.zeros(3)}}, "observation_params.max_steps"),
+])  # fmt: skip
 def test_hellos_of_vla_eval_that_are_not_valid(hello, message):
     with (
         policy_servers.vla_eval(lambda _: {}, hello, []) as address,
@@ -485,20 +478,12 @@ def test_vla_eval_episodes():
                 np.testing.assert_array_equal(actor.act(observations(1, step))[0, :2], [0, 2 * step])
             actor.note(np.array([True]), np.array([True]))
     assert [m["type"] for m in heard] == [
-        "hello",
-        "hello",
-        "episode_start",
-        "observation",
-        "observation",
-        "episode_end",
-    ]
+        "hello", "hello", "episode_start", "observation", "observation", "episode_end"
+    ]  # fmt: skip
     assert [m["seq"] for m in heard] == [1, 1, 2, 3, 4, 5]
     assert heard[2]["payload"]["task"] == {
-        "name": TASK.language,
-        "suite": "libero_goal",
-        "task_id": 0,
-        "episode_idx": 4,
-    }
+        "name": TASK.language, "suite": "libero_goal", "task_id": 0, "episode_idx": 4
+    }  # fmt: skip
     sent = heard[3]["payload"]
     assert sent["images"]["wrist"].shape == (4, 4, 3) and sent["task_description"] == TASK.language
     assert sent["controller_states"].dtype == np.float32

@@ -36,16 +36,8 @@ def test_each_value_of_the_packages_protocols_has_a_source(name):
 
 def test_the_protocols_of_the_field_are_there():
     assert set(protocol_names()) == {
-        "libero",
-        "openpi",
-        "openvla-oft",
-        "lerobot",
-        "groot",
-        "simplevla-rl",
-        "starvla",
-        "rlinf",
-        "vla-eval",
-    }
+        "libero", "openpi", "openvla-oft", "lerobot", "groot", "simplevla-rl", "starvla", "rlinf", "vla-eval"
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", RUNNABLE)
@@ -246,11 +238,8 @@ def test_a_policy_of_the_protocols_inputs_is_asked_again_after_replan_actions():
     taken = [actor.act(observations())[0, 0] for _ in range(7)]
     assert taken == [0, 1, 2, 3, 4, 0, 1] and len(policy.given) == 2
     assert policy.given[0] == {
-        "agentview": (2, 224, 224, 3),
-        "robot0_eye_in_hand": (2, 224, 224, 3),
-        "state": (2, 8),
-        "instruction": (),
-    }
+        "agentview": (2, 224, 224, 3), "robot0_eye_in_hand": (2, 224, 224, 3), "state": (2, 8), "instruction": ()
+    }  # fmt: skip
     assert policy.resets == [(TASK.language, 2)]
     short = ProtocolActor(Chunks(4), (), ProtocolAdapter(load_protocol("openpi"), TASK), 5)
     short.reset(2)

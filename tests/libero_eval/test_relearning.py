@@ -135,11 +135,8 @@ def test_savings_pair_the_starts_of_each_task() -> None:
     ]
     found = savings(records)
     assert [(s.task, s.again, s.first, s.share) for s in found] == [
-        (0, 10, 40, 0.75),
-        (1, 20, 10, -1.0),
-        (2, 0, None, None),
-        (3, None, 10, None),
-    ]
+        (0, 10, 40, 0.75), (1, 20, 10, -1.0), (2, 0, None, None), (3, None, 10, None)
+    ]  # fmt: skip
     assert savings_rows(records)[0] == ("1", "0.100", "0.300", "10", "40", "75 %")
     assert savings_rows(records)[3][3:] == ("> 10", "10", "–")
     assert savings_tables(records).count("\n") == 4

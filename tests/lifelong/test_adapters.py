@@ -198,15 +198,10 @@ def test_lora_patterns_say_what_is_adapted_and_what_is_own():
     learn_frames(algorithm, policy, 1)
     moved = {n for n, v in policy.state_dict().items() if not torch.equal(v, before[n])}
     assert moved == {
-        "transformer.layers.0.qkv.weight",
-        "transformer.layers.0.out.weight",
-        "transformer.layers.0.mlp.0.weight",
-        "transformer.layers.0.mlp.3.weight",
-        "head.trunk.0.weight",
-        "head.trunk.2.weight",
-        "head.means.weight",
-        "head.means.bias",
-    }
+        "transformer.layers.0.qkv.weight", "transformer.layers.0.out.weight", "transformer.layers.0.mlp.0.weight",
+        "transformer.layers.0.mlp.3.weight", "head.trunk.0.weight", "head.trunk.2.weight", "head.means.weight",
+        "head.means.bias"
+    }  # fmt: skip
     assert not any(p.requires_grad for n, p in policy.named_parameters() if n.startswith("encoders"))
 
 

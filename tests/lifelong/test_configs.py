@@ -114,23 +114,11 @@ def test_values_on_the_command_line_win_over_the_preset(preset):
 def test_the_paper_preset_is_the_published_protocol():
     config = composed("preset=paper")
     assert OmegaConf.to_container(config.train) == {
-        "_target_": "lifelong.training.FitSettings",
-        "epochs": 50,
-        "batch_size": 32,
-        "steps_per_epoch": None,
-        "lr": 1e-4,
-        "lr_min": 1e-5,
-        "warmup_steps": 0,
-        "betas": [0.9, 0.999],
-        "weight_decay": 1e-4,
-        "grad_clip": 100.0,
-        "lr_every": "step",
-        "last_batch": "filled",
-        "statistics_first": False,
-        "precision": "auto",
-        "accumulate": 1,
-        "compile": "off",
-    }
+        "_target_": "lifelong.training.FitSettings", "epochs": 50, "batch_size": 32, "steps_per_epoch": None,
+        "lr": 1e-4, "lr_min": 1e-5, "warmup_steps": 0, "betas": [0.9, 0.999], "weight_decay": 1e-4,
+        "grad_clip": 100.0, "lr_every": "step", "last_batch": "filled", "statistics_first": False,
+        "precision": "auto", "accumulate": 1, "compile": "off"
+    }  # fmt: skip
     assert (config.data.demos, config.data.image_size, config.data.seq_len) == (50, 128, 10)
     e = config.eval
     assert (e.episodes, e.curve_episodes, e.every, e.horizon, e.settle_steps) == (20, 20, 5, 600, 5)

@@ -45,11 +45,7 @@ MISTAKES = {
     "lr=3e-4": ("unknown key lr", "Did you mean train.lr?"),
     "temporal.layers=2 policy=bc_rnn_small": ("Did you mean policy.temporal.layers?",),
     "policy=act": ("'act'", "policy=lerobot policy.type=act"),
-    "policy=mine --config-dir own": (
-        "my_policy.Mine",
-        "neither installed nor in",
-        "No module named 'my_policy'",
-    ),
+    "policy=mine --config-dir own": ("my_policy.Mine", "neither installed nor in", "No module named 'my_policy'"),
     "policy=mine policy/head=gmm --config-dir own": ("policy/head", "policy has no group head"),
     "--cfg job train.epochs=abc": ("train.epochs", "'abc'"),
     "--cfg job benchmark.tasks=[3,99]": ("libero_goal 99",),
@@ -87,7 +83,7 @@ MISTAKES = {
     "-m algo=er,ewc --cfg job": ("cannot be composed", "--multirun", "--cfg"),
     "-m algo=er,ewk": ("ewk", "Did you mean 'ewc'?"),
     "-m algo=ewc,er algo/estimator=batch": ("algo/estimator", "algo=NAME"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("words", MISTAKES)

@@ -457,11 +457,8 @@ def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Pat
     ]
     groups = group_runs([load_run(r) for r in runs])
     assert [(g.label, len(g.runs)) for g in groups] == [
-        ("ewc (strength 10)", 2),
-        ("ewc (strength 500)", 1),
-        ("er", 1),
-        ("er (drop_path 0.1)", 1),
-    ]
+        ("ewc (strength 10)", 2), ("ewc (strength 500)", 1), ("er", 1), ("er (drop_path 0.1)", 1)
+    ]  # fmt: skip
 
 
 def test_runs_that_learned_from_other_demonstrations_are_told(tmp_path: Path):

@@ -137,13 +137,8 @@ def test_a_run_has_perturbations_of_every_task_or_none():
         "kind": "run", "algo": "er", "benchmark": "b", "policy": "p", "seed": 1, "preset": "", "tasks": ["t"]
     }  # fmt: skip
     values |= {
-        "instructions": ["t"],
-        "config_digest": "",
-        "versions": {},
-        "commit": None,
-        "cpu_count": 1,
-        "started": "",
-    }
+        "instructions": ["t"], "config_digest": "", "versions": {}, "commit": None, "cpu_count": 1, "started": ""
+    }  # fmt: skip
     record = from_line(signed_line(values))
     assert record.perturbed == () and from_line(to_line(record)) == record
     with pytest.raises(ValueError, match="has 2 perturbations"):

@@ -194,13 +194,8 @@ def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorit
     results = ResultLog(tmp_path / "whole" / "results.jsonl").read()
     evals = results.of(EvalRecord)
     assert {(r.learned, r.task) for r in evals if r.phase == "matrix"} == {
-        (1, 0),
-        (1, 1),
-        (3, 0),
-        (3, 1),
-        (3, 2),
-        (3, 3),
-    }
+        (1, 0), (1, 1), (3, 0), (3, 1), (3, 2), (3, 3)
+    }  # fmt: skip
     assert {(r.learned, r.task, r.epoch) for r in evals if r.phase == "curve"} == {
         (last, task, epoch)
         for last, group in ((1, (0, 1)), (3, (2, 3)))
