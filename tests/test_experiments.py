@@ -4,10 +4,14 @@ import ast
 import importlib
 import importlib.util
 import json
+import lzma
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from lifelong.results.records import from_line
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SCRIPTS = sorted(EXPERIMENTS.rglob("*.py"))
@@ -87,4 +91,18 @@ def test_a_page_of_the_study_is_of_all_its_records(page):
     named = {run for group in groups for run in group["runs"]}
     files = (RECORDS / page.parent.name).rglob("*.json.xz")
     kept = {file.relative_to(RECORDS).as_posix().removesuffix(".json.xz") for file in files}
+    for run in kept:  # what was kept is read today
+        content = json.loads(lzma.decompress((RECORDS / f"{run}.json.xz").read_bytes()))
+        assert from_line(content["records"].encode().partition(b"\n")[0]).seed == int(run[-1])
     assert named == kept, "the page is outdated: experiments/algorithms/study.py report writes it again"
+
+
+def test_records_of_the_study_are_of_todays_configuration(monkeypatch):
+    """Otherwise its report would leave them out as missing."""
+    script = RECORDS.parent / "study.py"
+    spec = importlib.util.spec_from_file_location("study", script)
+    study = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "study", study)
+    spec.loader.exec_module(study)
+    for one in study.STUDIES:
+        assert study.Planned(one, one.algorithms[-1], one.seeds).is_done()

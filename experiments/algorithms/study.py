@@ -16,6 +16,7 @@ import lzma
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -34,6 +35,7 @@ from hydra import compose, initialize_config_dir
 from libero_env.storage import atomic_path
 from lifelong.composition import config_folder
 from lifelong.data.demonstrations import find_demos
+from lifelong.report.comparison import Plan
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import result_relevant
@@ -126,7 +128,7 @@ class Planned:
         saved = yaml.safe_load(_read(self.record)["config"])
         known = set(result_relevant(self.config))  # a saved configuration also names how pictures were drawn
         was = {k: v for k, v in result_relevant(saved).items() if k in known}
-        now = {k: v for k, v in result_relevant(self.config).items() if v is not None}
+        now = {k: v for k, v in result_relevant(self.config).items() if v not in (None, [])}  # new keys
         return {k: v for k, v in was.items() if k in now} == now
 
     def keep(self, directory: Path) -> None:
@@ -282,14 +284,19 @@ def report(runs: Sequence[Planned]) -> None:
         found = [run for run in runs if run.study == study and run.is_done()]
         if not found:
             continue
-        with tempfile.TemporaryDirectory() as scratch, chdir(scratch):  # runs are named by relative paths
-            page = write_report(
+        references = tuple(name for name in REFERENCES if name in study.algorithms)
+        with (
+            tempfile.TemporaryDirectory() as scratch,
+            chdir(scratch),
+        ):  # runs are named relative to their page
+            write_report(
                 [run.unpack(Path()) for run in found],
-                HERE / study.name / "report.html",
-                references=[name for name in REFERENCES if name in study.algorithms],
-                other_worlds=True,  # README.md says which runs are of which models
+                Path("report.html"),
+                Plan(references, other_worlds=True),  # README.md says which runs are of which models
             )
-        print(f"{len(found)} runs: {page}")
+            for file in Path().glob("*.*"):
+                shutil.move(file, HERE / study.name / file.name)
+        print(f"{len(found)} runs: {HERE / study.name / 'report.html'}")
 
 
 def main() -> int:
