@@ -26,6 +26,7 @@ from libero_env.text import printable, suggest
 from lifelong import experiment
 from lifelong.composition import REFUSALS, compose_first, config_folders, explained, swept
 from lifelong.errors import ConfigError
+from lifelong.report.comparison import Plan
 from lifelong.report.page import comparison_text, write_report
 from lifelong.results.provenance import config_digest
 from lifelong.settings import plain_data
@@ -126,6 +127,7 @@ def _launch(options: argparse.Namespace, ranks: Ranks) -> int:
         )  # as it goes, so their number is not known
         if ranks.first and not (options.cfg or options.info):
             begin_sweep(sweep, job.words, None if chooses else jobs)
+            print(f"a sweep, in {sweep}: libero sweep status {sweep} says how far it is", flush=True)
     with_value = [
         f"{name}={value}" for name in VALUED if (value := getattr(options, name[2:].replace("-", "_")))
     ]
@@ -249,7 +251,7 @@ def _end_sweep(folder: Path, ranks: Ranks) -> int:
         return 0
     sweep = read_sweep(folder)
     if len(sweep.runs) > 1:
-        page = write_report(sweep.runs, sweep.folder / "report.html", other_worlds=True)
+        page = write_report(sweep.runs, sweep.folder / "report.html", Plan(other_worlds=True))
         print("\n".join([f"{len(sweep.runs)} runs compared: {page}", *comparison_text(page)]))
     if sweep.exit_status:
         print("\n".join(status_lines(sweep)), file=sys.stderr)

@@ -16,7 +16,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -194,9 +194,7 @@ def read_job(file: Path) -> JobRecord | None:
     """
     if not file.is_file():
         return None
-    known = {f.name for f in fields(JobRecord)}
-    content = {key: value for key, value in _read_json(file).items() if key in known}
-    return validate(JobRecord, content, prefix=(str(file),), error=ResultsError)
+    return validate(JobRecord, _read_json(file), prefix=(str(file),), error=ResultsError)
 
 
 def run_job(

@@ -87,18 +87,12 @@ def report(
         margin: Difference in success from which on two methods are not equivalent.
         other_worlds: Compare runs in other models or with another MuJoCo, too.
     """
+    from lifelong.report.comparison import Plan
     from lifelong.report.page import comparison_text, shift_text, write_report
 
     for folder in run_dirs:
         _check_run(folder)
-    page = write_report(
-        list(run_dirs),
-        out,
-        references=reference,
-        all_pairs=all_pairs,
-        margin=margin,
-        other_worlds=other_worlds,
-    )
+    page = write_report(run_dirs, out, Plan(reference, all_pairs, margin, other_worlds))
     print(page)
     for line in comparison_text(page) if len(run_dirs) > 1 else shift_text(run_dirs[0]):
         print(line)

@@ -28,7 +28,7 @@ class Plan:
     """Which pairs of methods are compared, as it was decided before their results were seen.
 
     Attributes:
-        references: Labels of the methods that each other one is compared with.
+        references: Labels of the methods that each other one is compared with; two methods are compared in any case.
         all_pairs: Whether every method is compared with every other instead.
         margin: Difference in success from which on two methods are not equivalent.
         other_worlds: Whether runs in other models or other physics may be compared.
@@ -40,12 +40,12 @@ class Plan:
     other_worlds: bool = False
 
 
-def compare(groups: Sequence[Group], plan: Plan | None = None) -> dict[str, Any]:
+def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # noqa: B008 - frozen
     """Compute all statistics of the groups, as plain data with NaN where something is unknown.
 
     Args:
         groups: Groups of runs that differ in seed and order only. Runs without a learned task are ignored.
-        plan: Pairs to be compared; None for the default one. Two groups are compared in any case.
+        plan: Pairs to be compared.
 
     Returns:
         `groups`: by label, with `runs`, `seeds`, `orders`, `metrics` (mean, standard_error, low, high, the value of
@@ -59,7 +59,6 @@ def compare(groups: Sequence[Group], plan: Plan | None = None) -> dict[str, Any]
     Raises:
         ComparisonError: The runs are of different back ends or worlds, or a reference is not a method.
     """
-    plan = plan or Plan()
     measured = {g.label: [r for r in g.runs if r.metrics is not None] for g in groups}
     check_same_back_end(
         {f"{g.label} ({r.path})": r.record.backend for g in groups for r in measured[g.label]}

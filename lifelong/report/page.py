@@ -40,7 +40,6 @@ from lifelong.results.relearning import by_measure, read_relearning, savings_hea
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_scores
 from lifelong.results.summary import write_episodes
-from lifelong.stats.methods import MARGIN
 from lifelong.stats.metrics import METRIC_NAMES, Metrics, average_success, metric_values
 
 METRIC_TEXTS = {
@@ -68,11 +67,7 @@ MEDIA_LIMIT = 48 * 2**20  # [bytes] of rollout recordings in one page
 def write_report(
     run_dirs: Sequence[Path],
     out: Path | None = None,
-    *,
-    references: Sequence[str] = (),
-    all_pairs: bool = False,
-    margin: float = MARGIN,
-    other_worlds: bool = False,
+    plan: Plan = Plan(),  # noqa: B008 - frozen
 ) -> Path:
     """Write report.html and heatmap.png, .pdf; of several runs also forgetting.png, comparison.json, episodes.csv.gz.
 
@@ -80,10 +75,7 @@ def write_report(
         run_dirs: Directory of one run to describe, or of several to compare. Runs need not be finished.
         out: File of the page, or a folder for it. Default: the run directory; for several runs, `comparison` in the
             current folder, which git ignores.
-        references: Labels of the methods that each other one is compared with; two methods are compared in any case.
-        all_pairs: Whether every method is compared with every other instead.
-        margin: Difference in success from which on two methods are not equivalent.
-        other_worlds: Whether runs in other models or with another MuJoCo may be compared.
+        plan: What is compared, of several runs.
 
     Returns:
         Path of the page. It needs no other file and no network.
@@ -91,7 +83,6 @@ def write_report(
     Raises:
         LifelongError: No run is given, a run directory has no results, or `out` cannot be written.
     """
-    plan = Plan(tuple(references), all_pairs, margin, other_worlds)
     if not run_dirs:
         raise LifelongError("no run directory given; name one or more, such as runs/libero_object/er/seed1")
     runs = [load_run(Path(d)) for d in run_dirs]

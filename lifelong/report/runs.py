@@ -1,5 +1,6 @@
 """Loading of run directories: single runs, finished or not, and groups that differ in seed and order only."""
 
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from libero_env.text import flatten
 from lifelong.errors import ComparisonError, LifelongError, ResultsError
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import few_of, resume_notes
-from lifelong.results.records import RunRecord
+from lifelong.results.records import RunRecord, TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.stats.metrics import Metrics, lifelong_metrics
 
@@ -88,8 +89,13 @@ def load_run(path: Path) -> Run:
     log = path / "results.jsonl"
     if not log.is_file():
         present = ", ".join(sorted(p.name for p in path.iterdir())[:8]) or "nothing"
+        inner = next(
+            (f"{path}/{depth}" for depth in ("*", "*/*", "*/*/*") if any(path.glob(f"{depth}/{log.name}"))),
+            "",
+        )
+        advice = f"; the runs in it are {inner}" if inner else ""
         raise LifelongError(
-            f"{path}: results.jsonl is missing, so this is not a run directory (it contains: {present})"
+            f"{path}: {log.name} is missing, so this is not a run directory (it contains: {present}){advice}"
         )
     results = ResultLog(log).read()
     try:
@@ -107,18 +113,16 @@ def load_run(path: Path) -> Run:
 
 
 def _untrained(results: Results) -> list[str]:
-    """Return a sentence about the tasks that nothing was learned on, though they count as learned."""
-    tasks = range(len(results.run.tasks))
-    kept = [
-        f"task {t + 1}" for t in tasks if (end := results.task_end(t)) is not None and end.best_epoch == 0
-    ]
-    full = [f"task {t + 1}" for t in tasks if results.costs(t).get("parameters_trained") == 0]
-    notes = (
-        [f"No epoch was better than none, so the weights from before are kept of {few_of(kept)}."]
-        if kept
-        else []
-    )
-    return notes + ([f"No weight was free, so nothing was trained on {few_of(full)}."] if full else [])
+    """Return sentences about the tasks that next to nothing was learned on, though they count as learned."""
+    kept = [f"task {end.task + 1}" for end in results.of(TaskEndRecord) if end.best_epoch == 0]
+    counts = {t: costs.get("parameters_trained", math.inf) for t, costs in results.costs_by_task().items()}
+    usual = max((count for task, count in counts.items() if task and count < math.inf), default=0.0)
+    full = [f"task {task + 1}" for task, count in counts.items() if count < max(1.0, 0.01 * usual)]
+    told = {
+        "No epoch was better than none, so the weights from before are kept of": kept,
+        "Next to no weight was free, so nothing was trained on, or hardly anything:": full,
+    }
+    return [f"{text} {few_of(list(dict.fromkeys(tasks)))}." for text, tasks in told.items() if tasks]
 
 
 def short_labels(instructions: Sequence[str]) -> list[str]:

@@ -12,6 +12,7 @@ from lifelong.algorithms import LoRA
 from lifelong.algorithms.multitask import Multitask
 from lifelong.context import RunContext
 from lifelong.evaluation.restore import LoadedRun
+from lifelong.report.comparison import Plan
 from lifelong.report.page import comparison_text, write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.records import EvalRecord, RunRecord, TaskEndRecord, from_line, to_line
@@ -137,7 +138,7 @@ def test_a_comparison_measures_the_later_tasks_alone(tmp_path) -> None:
         fill_base(log)
         if learned is not None:
             fill_later(log, learned)
-    page = write_report(list(runs.values()), tmp_path / "page", all_pairs=True)
+    page = write_report(list(runs.values()), tmp_path / "page", Plan(all_pairs=True))
     found = json.loads((page.parent / "comparison.json").read_text(encoding="utf-8"))
     later = found["after_base_stage"]
     assert list(later["metrics"]) == ["first", "second"], "without a later task there is nothing to measure"

@@ -17,6 +17,7 @@ from PIL import Image
 from libero_env.tasks import get_suite
 from libero_env.text import json_safe
 from lifelong.errors import LifelongError
+from lifelong.report.comparison import Plan
 from lifelong.report.figures import Line, Panel, forgetting_figure, heatmap_figure, learning_figure
 from lifelong.report.page import comparison_text, write_report
 from lifelong.report.runs import group_runs, load_run, short_labels
@@ -696,7 +697,7 @@ def test_what_differs_besides_the_method_is_said_and_other_worlds_are_refused(tm
             LifelongError, match=f"other-worlds: .*{name.replace('_', ' ')} .*{value}: ewc seed 2"
         ):
             write_report(runs, tmp_path / "page")
-    text = write_report(runs, tmp_path / "page", other_worlds=True).read_text()
+    text = write_report(runs, tmp_path / "page", Plan(other_worlds=True)).read_text()
     assert "Runs differ in mujoco (3.3.2: er seed 1, er seed 2, ewc seed 1; 4.0.0: ewc seed 2)." in text
 
 
@@ -712,3 +713,5 @@ def test_a_page_says_what_forward_transfer_is_the_mean_of_and_which_weights_were
     notes = load_run(run).notes
     assert any("weights from before" in note and "task 2" in note for note in notes)
     assert any("nothing was trained" in note and "task 2" in note for note in notes)
+    with pytest.raises(LifelongError, match=f"the runs in it are {re.escape(str(tmp_path))}/\\*$"):
+        load_run(tmp_path)
