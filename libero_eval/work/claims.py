@@ -175,11 +175,7 @@ class Claims:
             return None
         try:
             claim = validate(Claim, json.loads(found[0]))
-        except (
-            InvalidInputError,
-            ValueError,
-            RecursionError,
-        ):  # it is being written, or damaged
+        except (InvalidInputError, ValueError, RecursionError):  # it is being written, or damaged
             claim = None
         return Held(unit, claim, now - found[1], found[0])
 

@@ -150,11 +150,7 @@ class WorkStore:
     """
 
     def __init__(
-        self,
-        path: Path,
-        plan: Mapping[str, Any],
-        probe: Sequence[float] | None = None,
-        lease: float = LEASE,
+        self, path: Path, plan: Mapping[str, Any], probe: Sequence[float] | None = None, lease: float = LEASE
     ):
         self.path, self._plan, self._probe = path, json_safe(plan), probe
         self.claims = Claims(path / "claims", lease)

@@ -1,6 +1,3 @@
 from .encoder import LanguageEncoder, embed
 
-__all__ = [
-    "LanguageEncoder",
-    "embed",
-]
+__all__ = ["LanguageEncoder", "embed"]

@@ -3,9 +3,4 @@ from .results import Results
 from .run_directory import RunDirectory
 from .summary import write_summary
 
-__all__ = [
-    "ResultLog",
-    "Results",
-    "RunDirectory",
-    "write_summary",
-]
+__all__ = ["ResultLog", "Results", "RunDirectory", "write_summary"]
