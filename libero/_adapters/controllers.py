@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from libero._adapters.lookup import answers
+from libero._adapters.lookup import Named
 from libero._adapters.sim import Domain
 from libero_env.assets.robot import GRIP_SITE
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
@@ -140,8 +140,7 @@ _NAMES: dict[str, Callable[[Any], Any]] = {  # m, rad, N m
 }
 
 
-@answers(_NAMES)
-class Controller:
+class Controller(Named, names=_NAMES):
     """Goals, gains and limits of the arm. They may be set, and count from the next step to the next reset.
 
     What it has measured is of the last substep, as in robosuite.

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from libero_env.errors import UnknownNameError
 
@@ -28,16 +28,17 @@ def alias_modules(package: str, modules: str) -> None:
         setattr(whole, name, whole)
 
 
-def answers(table: Mapping[str, Callable[[Any], Any]]) -> Callable[[type], type]:
-    """Return a decorator that gives a class a read-only property for each entry of a table.
+class Named:
+    """A class with read-only properties from a table, `class Arm(Named, names=TABLE)`.
 
-    Args:
-        table: Name of the original or of robosuite -> function of the instance that returns its value.
+    The table has names of the original or of robosuite -> function of the instance that returns the value.
     """
 
-    def decorated(cls: type) -> type:
-        for name, function in table.items():
+    def __init_subclass__(cls, names: Mapping[str, Callable[[Any], Any]] | None = None, **kwargs: Any):
+        super().__init_subclass__(**kwargs)
+        for name, function in (names or {}).items():
             setattr(cls, name, property(function))
-        return cls
 
-    return decorated
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...

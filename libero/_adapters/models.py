@@ -52,7 +52,7 @@ def model_of(item: Any, category: str) -> ObjectModel:
         xml, offsets = read_object(file, category, duplicate)
     else:
         xml, offsets = _generated(item, category), {}
-    offsets = {name: _own_offset(item, name, offsets.get(name)) for name in OFFSETS}
+    place: dict[str, Any] = {name: _own_offset(item, name, offsets.get(name)) for name in OFFSETS}
     specs = getattr(item, "joint_specs", None)
     listed = [{"type": "free"}] if specs == "default" else [j for j in specs or () if isinstance(j, dict)]
     free = [joint for joint in listed if joint.get("type") == "free"]
@@ -68,9 +68,9 @@ def model_of(item: Any, category: str) -> ObjectModel:
         joint_damping=float(free[0].get("damping", _DAMPING)) if free else _DAMPING,
         rotation={axis: (float(low), float(high)) for axis, (low, high) in (rotation or {}).items()},
         rotation_axis=axis,
-        bottom_offset=offsets["bottom"],
-        top_offset=offsets["top"],
-        horizontal_radius=max(map(abs, offsets["horizontal_radius"][:2])),
+        bottom_offset=place["bottom"],
+        top_offset=place["top"],
+        horizontal_radius=max(map(abs, place["horizontal_radius"][:2])),
         articulation={state: (float(r[0]), float(r[1])) for state, r in articulation.items() if r},
     )
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from libero._adapters.lookup import answers, lookup
+from libero._adapters.lookup import Named, lookup
 from libero._adapters.sim import MjSim
 from libero_env.assets.robot import GRIP_SITE
 from libero_env.errors import LiberoError, UnknownNameError
@@ -236,19 +236,15 @@ for _setting in _SETTERS:
     setattr(Observable, f"set_{_setting}", partialmethod(Observable.set, _setting))
 
 
-def _those(env: Any, is_so: Callable[[Any], bool]) -> set[str]:
-    return {name for name, observable in env._observables.items() if is_so(observable)}
+_SETS: dict[str, Callable[[Any], Any]] = {
+    "observation_names": lambda env: set(env._observables),
+    "enabled_observables": lambda env: {name for name, o in env._observables.items() if o.is_enabled()},
+    "active_observables": lambda env: {name for name, o in env._observables.items() if o.is_active()},
+    "observation_modalities": lambda env: {o.modality for o in env._observables.values()},
+}
 
 
-@answers(
-    {
-        "observation_names": lambda env: set(env._observables),
-        "enabled_observables": lambda env: _those(env, lambda observable: observable.is_enabled()),
-        "active_observables": lambda env: _those(env, lambda observable: observable.is_active()),
-        "observation_modalities": lambda env: {o.modality for o in env._observables.values()},
-    }
-)
-class RobosuiteMethods:
+class RobosuiteMethods(Named, names=_SETS):
     """Contacts and observables of an environment with `sim`, `observer` and `control_freq`."""
 
     sim: MjSim

@@ -7,7 +7,7 @@ The model is the environment's own copy, so clients may write to it; a new pose 
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -379,8 +379,6 @@ class Domain(Protocol):
     fixtures_dict: dict[str, Any]
     control_freq: float
     initialization_noise: Any
-    robots: Sequence[Any]
-    arm_seen: np.ndarray
     simulations: ClientSimulations
     sim: MjSim
     view: StateView

@@ -3,14 +3,16 @@
 import copy
 import json
 import re
+from xml.etree.ElementTree import Element
 
 import mujoco
 import numpy as np
 import pytest
 
 from libero._adapters.observations import Observable
-from libero.libero.envs import TASK_MAPPING, ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv
+from libero.libero.envs import TASK_MAPPING, ControlEnv, OffScreenRenderEnv, SegmentationRenderEnv, arenas
 from libero.libero.envs.bddl_base_domain import BDDLBaseDomain, EpisodeOverError
+from libero.libero.envs.objects import TargetZone, get_object_fn
 from libero_env.assets.robot import REST_QPOS
 from libero_env.errors import (
     ActionError,
@@ -270,6 +272,49 @@ def test_absolute_actions_and_other_controllers(make_env):
     env = make_env(controller="OSC_POSITION", **BLIND)
     env.reset()
     env.step(np.zeros(7))
+
+
+def test_a_problem_class_may_load_everything_as_the_originals_do(suite, registries):
+    """They fill dictionaries of objects, append sites of regions, and keep settings of their own."""
+
+    class Libero_Floor_Manipulation(TASK_MAPPING["libero_floor_manipulation"]):
+        extra: tuple = ()
+
+        def __init__(self, bddl_file_name, *args, **kwargs):
+            self.workspace_name, self.visualization_sites_list, self.z_offset = "floor", [], -0.025
+            kwargs |= {"workspace_offset": (0, 0, -0.035), "arena_type": "floor"}
+            super().__init__(bddl_file_name, *args, **kwargs)
+
+        def _load_objects_in_arena(self, mujoco_arena):
+            for category, names in self.parsed_problem["objects"].items():
+                for name in (*names, *self.extra):
+                    self.objects_dict[name] = get_object_fn(category)(name=name)
+
+        def _load_sites_in_arena(self, mujoco_arena):
+            for name, region in self.parsed_problem["regions"].items():
+                if region["ranges"]:
+                    zone = TargetZone(name=name, zone_size=(0.1, 0.1))
+                    mujoco_arena.floor_body.append(Element("site", name=zone.name, quat=str(zone.quat)))
+                    self.object_sites_dict[name] = zone
+
+        def _setup_references(self):
+            super()._setup_references()
+            self.is_set_up = True
+
+        def set_visualization(self):
+            for name in self.visualization_sites_list:
+                assert self.get_object(name).object_properties["vis_site_names"] == {}
+
+    env = Libero_Floor_Manipulation(suite.get_task_bddl_file_path(0), use_camera_obs=False)
+    env.reset()
+    assert env.is_set_up and not env.step(np.zeros(env.action_dim))[2]
+    assert set(env.objects_dict) == set(env.scene.objects)
+    env.close()
+    Libero_Floor_Manipulation.extra = ("second_milk",)
+    with pytest.raises(LiberoError, match="unknown object or fixture of the task file 'second_milk'"):
+        Libero_Floor_Manipulation(suite.get_task_bddl_file_path(0), use_camera_obs=False)
+    with pytest.raises(LiberoError, match="<geom name='box'> cannot be appended"):
+        arenas.EmptyArena().floor_body.append(Element("geom", name="box"))
 
 
 def test_a_problem_class_can_move_a_camera(suite):

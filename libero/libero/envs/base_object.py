@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from libero._adapters.lookup import answers, lookup
+from libero._adapters.lookup import Named, lookup
 from libero._adapters.models import STATES, accept_plain_files, assets_folder, facade_pack, model_of
 from libero._adapters.sim import MjSim
 from libero_env.objects import ObjectModel, get_object
@@ -94,8 +94,7 @@ _NAMES: dict[str, Callable[[Any], Any]] = {  # lengths in m, quaternions wxyz
 }
 
 
-@answers(_NAMES)
-class BaseObject:
+class BaseObject(Named, names=_NAMES):
     """An instance of a category in a scene: names of its elements, rotation at rest, and joint ranges.
 
     `is_open`, `is_close`, `turn_on` and `turn_off` tell whether a joint position is in the range of that state.

@@ -20,7 +20,7 @@ from libero._adapters.arguments import (
     substeps_of,
     with_room,
 )
-from libero._adapters.lookup import answers, lookup
+from libero._adapters.lookup import lookup
 from libero._adapters.models import facade_pack
 from libero._adapters.observations import Observer, RobosuiteMethods, cameras, quat_xyzw
 from libero._adapters.sim import ClientSimulations, MjSim, MjSimState, Window
@@ -65,13 +65,11 @@ _KEPT: dict[str, Any] = {
 }
 _FLOOR_OFFSET = (0.0, 0.0, -0.035)  # the original's origin of regions on the floor, m
 
+_CONFIGURED = ("controller_config", "mount_type", "initialization_noise", "control_freq", "gripper_type")
 _NAMES: dict[str, Callable[[Any], Any]] = {
-    **{
-        f"camera_{column}s": lambda env, column=column: [
-            getattr(camera, column) for camera in env.camera_list
-        ]
-        for column in ("height", "width", "depth")
-    },
+    "camera_heights": lambda env: [camera.height for camera in env.camera_list],
+    "camera_widths": lambda env: [camera.width for camera in env.camera_list],
+    "camera_depths": lambda env: [camera.depth for camera in env.camera_list],
     "camera_segmentations": lambda env: [list(camera.segmentations) or None for camera in env.camera_list],
     "num_cameras": lambda env: len(env.camera_list),
     "num_robots": lambda env: len(env.robots),
@@ -86,7 +84,6 @@ _NAMES: dict[str, Callable[[Any], Any]] = {
     "viewer_get_obs": lambda env: False,
     "sim_state_initial": lambda env: MjSimState(0.0, env.sim.model.qpos0.copy(), np.zeros(env.sim.model.nv)),
     "custom_asset_dir": lambda env: get_assets_path(),
-    "visualization_sites_list": lambda env: [s.object_name for s in env.tracking_object_states_change],
     "language_instruction": lambda env: env.problem.language,
     "action_spec": lambda env: env.robots[0].action_limits,
     "action_dim": lambda env: env.robots[0].action_dim,
@@ -96,7 +93,6 @@ _NAMES: dict[str, Callable[[Any], Any]] = {
     "_eef_xmat": lambda env: env.sim.data.site_xmat[env.robots[0].eef_site_id].reshape(3, 3).copy(),
     "_eef_xquat": lambda env: quat_xyzw(env._eef_xmat),
 }
-_CONFIGURED = ("controller_config", "mount_type", "initialization_noise", "control_freq", "gripper_type")
 
 
 class EpisodeOverError(LiberoError, ValueError):
@@ -109,8 +105,7 @@ def register_problem(target_class: type["BDDLBaseDomain"]) -> type["BDDLBaseDoma
     return target_class
 
 
-@answers(_NAMES)
-class BDDLBaseDomain(RobosuiteMethods):
+class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
     """One simulation of a task file.
 
     Attributes:
@@ -207,7 +202,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
         self._controller_configs, self._robots, self._xml = controller_configs, robots, ""
         self._load_model()
-        self._setup_references(controller_configs, robots)
+        self._setup_references()
 
     # Hooks of subclasses ------------------------------------------------------------------------------------
 
@@ -229,14 +224,18 @@ class BDDLBaseDomain(RobosuiteMethods):
     def _load_model(self) -> None:
         pack = facade_pack()
         self.scene = build_scene(self.problem, pack, drawing=self.drawing, robot=self.robot)
+        self._setup_workspace()
         hooks = ("_load_fixtures_in_arena", "_load_objects_in_arena", "_load_sites_in_arena", "_setup_camera")
         model = self.scene.model
         if any(getattr(type(self), hook) is not getattr(BDDLBaseDomain, hook) for hook in hooks):
             from libero.libero.envs.arenas import Arena
 
             arena = Arena(scene_spec(self.problem, pack, drawing=self.drawing, robot=self.robot))
+            self.objects_dict, self.fixtures_dict, self.object_sites_dict = {}, {}, {}
             for hook in hooks:
                 getattr(self, hook)(arena)
+            for name in {**self.objects_dict, **self.fixtures_dict}:
+                lookup(self.scene.entities, "object or fixture of the task file", name)
             model = arena.spec.compile()
         self._simulate(model)
 
@@ -248,9 +247,8 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.view = StateView(self.scene, self.simulations, 0)
         self.simulations.domain = weakref.ref(self)
 
-    def _setup_references(self, controller_configs: Any, robots: Any) -> None:
+    def _setup_references(self) -> None:
         scene = self.scene
-        self._setup_workspace()
         self.objects_dict, self.fixtures_dict = scene_objects(scene), scene_fixtures(scene)
         self.object_sites_dict = scene_sites(scene)
         self.objects, self.fixtures = list(self.objects_dict.values()), list(self.fixtures_dict.values())
@@ -262,7 +260,8 @@ class BDDLBaseDomain(RobosuiteMethods):
             self.object_states_dict[name] = SiteObjectState(self, name, site.parent_name)
         states = self.object_states_dict.values()
         self.tracking_object_states_change = [s for s in states if getattr(s, "has_turnon_affordance", 0)]
-        self.robots = [SingleArm(self, controller_configs, robots)]
+        self.visualization_sites_list = [state.object_name for state in self.tracking_object_states_change]
+        self.robots = [SingleArm(self, self._controller_configs, self._robots)]
         parts = [*self.objects, *self.fixtures]
         self.model = TaskModel(scene, self.sim.model._model, self.get_xml, parts, self.robots[0].robot_model)
         self.visualize(dict.fromkeys(self._visualizations, False))
@@ -311,7 +310,7 @@ class BDDLBaseDomain(RobosuiteMethods):
             self.sim.free()
             self._xml = ""
             self._load_model()
-            self._setup_references(self._controller_configs, self._robots)
+            self._setup_references()
         else:
             self.sim.restore_model()
             self.robots[0] = SingleArm(self, self._controller_configs, self._robots)
@@ -433,7 +432,7 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def _post_process(self) -> None:
         """Update the states of objects that can be turned on; as in the original, they begin to glow only now."""
-        self.set_visualization()
+        BDDLBaseDomain.set_visualization(self)
         for state in self.tracking_object_states_change:
             state.update_state()
 
@@ -492,9 +491,9 @@ class BDDLBaseDomain(RobosuiteMethods):
 
     def set_visualization(self) -> None:
         """Show the sites that glow while their object is on."""
-        names, on = self.sim.model.site_names, glowing_sites(self.view)
-        for site in np.flatnonzero(self.sim.model.site_group == GLOW_GROUP).tolist():
-            self.sim.show_sites([names[site]], site in on)
+        model, on = self.sim.model, list(glowing_sites(self.view))
+        sites = np.flatnonzero(model.site_group == GLOW_GROUP)
+        model.site_rgba[sites, 3] = np.where(np.isin(sites, on), 1.0, -1.0) * abs(model.site_rgba[sites, 3])
 
     # Properties and helpers ---------------------------------------------------------------------------------
 
@@ -550,7 +549,7 @@ class BDDLBaseDomain(RobosuiteMethods):
         self.sim.free()
         self.scene, self._xml = replace(self.scene, model=model), xml_string
         self._simulate(model)
-        self._setup_references(self._controller_configs, self._robots)
+        self._setup_references()
 
     def set_xml_processor(self, processor: Callable[[str], str] | None) -> None:
         """Let a function change the scene, as MJCF, at each reset; None for none."""

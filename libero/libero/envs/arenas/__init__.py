@@ -3,11 +3,13 @@
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Any, ClassVar
+from xml.etree.ElementTree import Element
 
 from libero._adapters.lookup import alias_modules, lookup
 from libero._adapters.models import facade_pack
 from libero_env.assets.arena import load_workspace
 from libero_env.assets.original_arena import TEXTURES
+from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import mujoco
 
 STYLE_KINDS = ("floor", "wall")
@@ -31,6 +33,15 @@ class Arena:
         self.spec = spec
 
     worldbody = property(attrgetter("spec.worldbody"), doc="The world body.")
+    floor_body = table_body = coffee_table_body = living_room_table_body = property(lambda self: self)
+
+    def append(self, element: Element) -> None:
+        """Accept the site of a region, which the scene has; raise a LiberoError for anything else."""
+        if element.tag != "site" or self.spec.site(element.get("name", "")) is None:
+            what = f"<{element.tag} name={element.get('name')!r}>"
+            raise LiberoError(
+                f"{what} cannot be appended to the arena: add it to its `spec`, a mujoco.MjSpec"
+            )
 
     def set_camera(
         self,

@@ -29,7 +29,7 @@ class BaseObjectState:
         self, env: Domain, object_name: str, parent_name: str | None = None, is_fixture: bool = False
     ):
         self.env, self.object_name, self.is_fixture = env, object_name, is_fixture
-        self.parent_name = parent_name or object_name
+        self.parent_name: str | None = parent_name or object_name
         self.query_dict: dict[str, Any] = env.fixtures_dict if is_fixture else env.objects_dict
 
     def _holds(self, predicate: str, *names: str) -> bool:

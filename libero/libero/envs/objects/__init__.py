@@ -138,7 +138,7 @@ class TargetZone(BuiltinObject):
         **kwargs: Any,
     ):
         super().__init__(name, **kwargs)
-        self.zone_height, self.rgba = zone_height, rgba
+        self.zone_height, self.rgba, self.quat = zone_height, rgba, np.array([1.0, 0.0, 0.0, 0.0])
         self.size = np.array([*zone_size[:2], zone_height], np.float64)
         self.pos = np.array([*zone_centroid_xy[:2], z_offset], np.float64)
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from libero._adapters.controllers import Controller, controller_of
-from libero._adapters.lookup import alias_modules, answers
+from libero._adapters.lookup import Named, alias_modules
 from libero._adapters.observations import quat_xyzw
 from libero._adapters.sim import Domain, MjModel, MjSim
 from libero_env.assets.robot import ARM_JOINTS, GRIP_SITE, OPEN_FINGERS, REST_QPOS, add_panda
@@ -17,17 +17,19 @@ from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import mujoco
 from libero_env.sim.osc import GRIPPER_SPEED
 
-_ELEMENTS = ("body", "joint", "actuator", "site", "sensor", "camera")
 _PART: dict[str, Callable[[Any], Any]] = {
-    {"body": "bodies"}.get(kind, f"{kind}s"): lambda part, kind=kind: part._names(kind) for kind in _ELEMENTS
-}
-_PART |= {
-    f"{use}_geoms": lambda part, group=i: part._geoms(group) for i, use in enumerate(("contact", "visual"))
+    "bodies": lambda part: part._names("body"),
+    "joints": lambda part: part._names("joint"),
+    "actuators": lambda part: part._names("actuator"),
+    "sites": lambda part: part._names("site"),
+    "sensors": lambda part: part._names("sensor"),
+    "cameras": lambda part: part._names("camera"),
+    "contact_geoms": lambda part: part._geoms(0),
+    "visual_geoms": lambda part: part._geoms(1),
 }
 
 
-@answers(_PART)
-class ModelPart:
+class ModelPart(Named, names=_PART):
     """A part of the robot: `bodies`, `joints`, `contact_geoms` and so on are names of elements in the scene.
 
     Args:
@@ -230,8 +232,7 @@ _ROBOT: dict[str, Callable[[Any], Any]] = {
 }
 
 
-@answers(_ROBOT)
-class SingleArm:
+class SingleArm(Named, names=_ROBOT):
     """The arm with controller and gripper.
 
     Attributes:
