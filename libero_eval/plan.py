@@ -30,7 +30,7 @@ from libero_eval.work.evaluation import Evaluation, iso_time
 from libero_eval.work.progress import Progress
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError, ResultsError
-from lifelong.results.provenance import installed_versions
+from lifelong.results.provenance import installed_versions, source_digest
 
 
 def evaluate(
@@ -73,6 +73,13 @@ def run(
         store.clear()
     store.join(units)
     done = store.done(units)
+    here = str(evaluation.versions.get("source"))
+    if others := sorted({str(one.versions.get("source")) for one in done.values()} - {here}):
+        print(
+            f"note: {store.path}: units that are done are of another source of this package ({', '.join(others)}; "
+            f"here {here}), as the result will say; --again repeats them",
+            file=sys.stderr,
+        )
     if len(done) == len(units):
         count, when = 1, iso_time(max(one.finished for one in done.values()))
         print(f"note: {store.path}: finished {when}, nothing was run; --again repeats it", file=sys.stderr)
@@ -146,7 +153,7 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
     require_available(tasks)
     protocol = _protocol(request, policy.protocol(base), tasks)
     identity = {**policy.identity, "seed": request.seed}
-    versions = installed_versions(request.assets)
+    versions = {**installed_versions(request.assets), "source": source_digest()}
     if earlier is None:
         init_states = choose_init_states(request.starts, _episodes(request, tasks), policy.selection)
     else:

@@ -37,7 +37,9 @@ def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_:
     if request.out is None:
         require_own_folders(policy.out, "robustness", error=ConfigError)
     out = request.out or policy.out / "robustness"
-    require_own_folders(out, *(f"{CONDITIONS}/{one or 'none'}" for one in conditions), error=ConfigError)
+    require_own_folders(
+        out, CONDITIONS, *(f"{CONDITIONS}/{one or 'none'}" for one in conditions), error=ConfigError
+    )
     request = replace(request, out=out)
     if request.again:
         for _, evaluation in _evaluations(request, policy, conditions):

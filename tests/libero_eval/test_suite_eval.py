@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shutil
 import signal
 import sys
 from dataclasses import replace
@@ -13,13 +14,15 @@ import pytest
 from libero_env import memory
 from libero_env.cli import main as cli
 from libero_eval.evaluation_file import EvaluationResult, overall
-from libero_eval.plan import choose_init_states, plan_evaluation
+from libero_eval.plan import choose_init_states, plan_evaluation, run
 from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
 from libero_eval.user_policy import ORIGINAL_NAMES, CallableActor, UserPolicy, as_original, load_callable
 from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
+from lifelong.results.run_directory import CheckpointFolder
 from lifelong.stats.intervals import wilson_interval
 from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate, evaluation
+from tests.harness.runs import make_run
 
 MODULE = """
 import numpy as np
@@ -83,6 +86,79 @@ def test_results_of_another_evaluation_are_not_mixed_in(tmp_path, changes):
     name = {"identity": "evaluated.policy", "versions": "simulation.mujoco"}.get(*changes, "protocol")
     with pytest.raises(ConfigError, match=rf"another evaluation: {name}.* there and .* here.*--again"):
         evaluate(tmp_path, **changes)
+
+
+def test_another_source_of_the_package_is_told_and_stated(tmp_path, capsys):
+    """As after another commit: what is done stays, and the result names both."""
+    first = evaluation(tmp_path, unit_starts=2, tasks=TASKS[:1], versions={"mujoco": "3", "source": "aaa"})
+    request = EvalRequest(policy="expert")
+    run(first, request)
+    assert "another source" not in capsys.readouterr().err
+    grown = run(evaluation(tmp_path, unit_starts=2, versions={"mujoco": "3", "source": "bbb"}), request)
+    assert "another source of this package (aaa; here bbb)" in capsys.readouterr().err
+    assert grown.versions == {"mujoco": "3", "source": ["aaa", "bbb"]}
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    path = tmp_path_factory.mktemp("runs") / "run"
+    make_run(path)
+    return path
+
+
+@pytest.mark.parametrize(("policy", "change", "told"), [
+    ("run", {"seed": 1}, "evaluated.seed is 0 there and 1 here"),
+    ("run", {"horizon": 7}, "protocol.episode.horizon"),
+    ("run", {"perturb": "light=0.5"}, "protocol.world.perturb"),
+    ("run", {"unit_starts": 3}, "unit_starts"),
+    ("run", {"after": 0}, "evaluated.after is 1 there and 0 here; evaluated.weights"),
+    ("run", {"episodes": 1}, "can grow, but not shrink"),
+    ("run", {"suite": ("libero_goal/0",)}, "holds also the tasks"),
+    ("expert", {"seed": 1}, "evaluated.seed"),
+    ("expert", {"policy": "run"}, "evaluated.policy is"),
+])  # fmt: skip
+def test_what_an_evaluation_is_asked_for_is_part_of_it(learned, policy, change, told, tmp_path):
+    """A folder of one's own is refused to another evaluation; equal ones and larger ones go on in it."""
+    names = {"run": str(learned), "expert": "expert"}
+    suite = ("libero_object/0", "libero_object/1")
+    words = {"policy": names[policy], "suite": suite, "episodes": 2, "device": "cpu", "out": tmp_path}
+
+    def join(**more):
+        more = {key: names.get(value, value) if key == "policy" else value for key, value in more.items()}
+        plan = plan_evaluation(EvalRequest(**{**words, **more}))
+        plan.store.join(plan.units)
+
+    join()
+    with pytest.raises(ConfigError, match=told):
+        join(**change)
+    join(workers=2, retries=3, threads=1)
+    join(episodes=4, suite=(*suite, "libero_object/2"))
+
+
+def test_other_weights_in_the_same_run_are_another_policy(learned, tmp_path):
+    shutil.copytree(learned, tmp_path / "run")
+    request = EvalRequest(policy=str(tmp_path / "run"), episodes=2, device="cpu")
+    first = plan_evaluation(request)
+    first.store.join(first.units)
+    saved = CheckpointFolder(tmp_path / "run" / "checkpoints")
+    state = saved.load_task(saved.task_path(1))
+    next(iter(state["policy"].values())).add_(0.1)
+    saved.save_task(1, state["policy"], state["algorithm"])
+    second = plan_evaluation(request)
+    assert second.out == first.out, "the folder of the run"
+    with pytest.raises(ConfigError, match="evaluated.weights is"):
+        second.store.join(second.units)
+    assert plan_evaluation(replace(request, after=0)).out != first.out
+
+
+def test_another_version_of_the_expert_is_another_policy(tmp_path, monkeypatch):
+    request = EvalRequest(policy="expert", suite=("libero_goal/0",), out=tmp_path)
+    first = plan_evaluation(request)
+    first.store.join(first.units)
+    monkeypatch.setattr("libero_env.demos.config.GENERATOR", "expert-999")
+    second = plan_evaluation(request)
+    with pytest.raises(ConfigError, match="evaluated.generator is"):
+        second.store.join(second.units)
 
 
 def test_an_evaluation_grows_by_starts_and_tasks_and_never_shrinks(tmp_path):
