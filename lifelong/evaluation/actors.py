@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lifelong.evaluation.environments import Obs
 from lifelong.policies.base import Policy
-from lifelong.training.precision import autocast
+from lifelong.training.precision import autocast, float32_products
 from lifelong.types import Observation, PolicySpec
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class PolicyActor:
     def act(self, obs: Obs) -> np.ndarray:
         """Return (B, A) float64 actions; see `Actor`."""
         observation = observe(obs, self.policy.spec, self.language, self.device)
-        with autocast(self.device, self.precision):
+        with autocast(self.device, self.precision), float32_products(self.precision):
             return self.policy.act(observation, self.draws).cpu().numpy().astype(np.float64)
 
 

@@ -69,7 +69,7 @@ class EvalSettings:
     selection: Literal["apart", "reporting"] = "apart"
     select: Selection = "best"
     transfer: Literal["unbiased", "published"] = "unbiased"
-    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    precision: Literal["auto", "bf16", "fp32", "fp32_strict"] = "auto"
     record_every: Natural = 4
     open_environments: Count = 4
     sim_threads: Natural = 0

@@ -172,6 +172,8 @@ def present_conditions(
     }
     if device.type == "cuda":
         found |= {"cuda": str(torch.version.cuda), "cudnn": str(torch.backends.cudnn.version())}
+        tf32 = {"convolutions": torch.backends.cudnn, "products": torch.backends.cuda.matmul}
+        found["tf32"] = ", ".join(name for name, kind in tf32.items() if kind.allow_tf32) or "none"
     if renderer is not None:
         found["renderer"] = renderer
     return found | {name: os.environ[name] for name in _VARIABLES if name in os.environ}

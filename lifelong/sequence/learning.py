@@ -23,6 +23,7 @@ from lifelong.sequence.stages import TrainingPhase, lacks_row, mean_rate, missin
 from lifelong.streams import StageData, learning_stages
 from lifelong.training import costs
 from lifelong.training.fit import EpochEnd, fit
+from lifelong.training.precision import float32_products
 
 
 class TaskSequence:
@@ -178,7 +179,8 @@ class TaskSequence:
         """Let the algorithm end the task, record the costs, and write the task's checkpoint."""
         policy, algorithm, seed = self.context.policy, self.context.algorithm, self.context.seed
         began = time.perf_counter()
-        with seeded(seed, END_TASK, task, 1, device=self.context.device):  # for dropout
+        strict = float32_products(self.context.fit.precision)
+        with seeded(seed, END_TASK, task, 1, device=self.context.device), strict:  # for dropout
             algorithm.end_task(task, dataset, policy, generator(seed, END_TASK, task))
         spent = {
             "end_task_seconds": time.perf_counter() - began,

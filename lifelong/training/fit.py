@@ -19,6 +19,7 @@ from lifelong.errors import CheckpointError, TrainingError
 from lifelong.policies.base import Policy, device_of
 from lifelong.seeding import generator, seeded
 from lifelong.training.distributed import Ranks
+from lifelong.training.precision import float32_products
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import BatchAugmentation, Step
 from lifelong.types import Batch
@@ -110,7 +111,7 @@ def fit(
     if resume is not None:
         first, loss, penalty = _load(policy, optimizer, resume)
     elif settings.statistics_first:
-        with seeded(*seed, 0, 2, device=device):
+        with seeded(*seed, 0, 2, device=device), float32_products(settings.precision):
             _adapt_statistics(policy, dataset, algorithm, size, augment, generator(*seed, 0, 3))
     own_draws = () if ranks.first else (ranks.rank,)  # dropout differs between ranks
     on_epoch(EpochEnd(first, loss, penalty, 0.0, policy, optimizer))
@@ -121,7 +122,7 @@ def fit(
             order = _shuffled_indices(len(dataset), windows, draws)
             default_step.synchronise()
             algorithm.mode_train(policy)
-            with seeded(*seed, epoch, 1, *own_draws, device=device):
+            with seeded(*seed, epoch, 1, *own_draws, device=device), float32_products(settings.precision):
                 rates = _rates(epoch, steps, settings)
                 losses = _take_steps(step, load(order.split(size)), rates, draws, bar)
             loss, penalty = ranks.sum(losses.mean(0)).tolist()

@@ -27,7 +27,7 @@ def autocast(device: torch.device, precision: str) -> torch.autocast:
     """Return the autocast context of a precision.
 
     Args:
-        precision: `bf16`, `fp32`, or `auto`: bf16 where the processor supports it.
+        precision: `bf16`, `fp32`, `fp32_strict`, or `auto`: bf16 where the processor supports it.
     """
     if precision == "auto":
         if device.type == "cuda":
@@ -36,6 +36,21 @@ def autocast(device: torch.device, precision: str) -> torch.autocast:
             fast = device.type == "cpu" and bf16_runs_on_cpu()
         precision = "bf16" if fast else "fp32"
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
+
+
+@contextmanager
+def float32_products(precision: str) -> Iterator[None]:
+    """With `fp32_strict` keep a GPU from rounding factors of float32 products to TF32's ten bits within the context.
+
+    By PyTorch's defaults cuDNN does so in convolutions and recurrent layers; matrix products are in float32.
+    """
+    before = torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32
+    if precision == "fp32_strict":
+        torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = False
+    try:
+        yield
+    finally:
+        torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32 = before
 
 
 @cache

@@ -38,7 +38,8 @@ class FitSettings:
         statistics_first: Whether BatchNorm's running statistics adapt to a task before its first step: all windows
             pass the network once in training mode, as where the original measures the loss at epoch 0. Without
             effect on policies without such layers.
-        precision: `bf16` autocast, `fp32`, or `auto`: bf16 where the processor supports it.
+        precision: `bf16` autocast, `fp32`, `fp32_strict` (without TF32 on a GPU), or `auto`: bf16 where the
+            processor supports it.
         accumulate: Number of micro-batches that a batch is divided into, one after the other in memory. The
             gradient is that of the whole batch, up to rounding and to what the policy draws itself (dropout).
         compile: `torch.compile` of the policy's loss: `off`, `default`, or `reduce-overhead`, which on a GPU
@@ -57,6 +58,6 @@ class FitSettings:
     lr_every: Literal["step", "epoch"] = "step"
     last_batch: Literal["filled", "short"] = "filled"
     statistics_first: bool = False
-    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    precision: Literal["auto", "bf16", "fp32", "fp32_strict"] = "auto"
     accumulate: Count = 1
     compile: Annotated[Literal["off", "default", "reduce-overhead"], BeforeValidator(_read_off)] = "off"

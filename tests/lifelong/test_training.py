@@ -415,21 +415,23 @@ def test_only_copies_to_a_gpu_are_asynchronous(device, asynchronous, monkeypatch
     assert len(asked) >= 6 and set(asked) == {asynchronous}
 
 
-def test_counters_of_a_resumed_optimiser_are_on_the_host():
-    from lifelong.training.fit import _load_optimizer
+@pytest.mark.parametrize(("precision", "tf32"), [("fp32", True), ("fp32_strict", False)])
+def test_only_strict_steps_have_no_tf32(precision, tf32, monkeypatch):
+    seen = []
+    monkeypatch.setattr(Step, "__call__", lambda *_: seen.append(_allowed()) or (torch.zeros(()),) * 2)
+    before, ends = _allowed(), []
+    settings = FitSettings(epochs=1, batch_size=8, precision=precision)
+    fit(
+        LinearPolicy(),
+        Windows(),
+        Sequential(),
+        settings=settings,
+        seed=(1,),
+        on_epoch=lambda _: ends.append(_allowed()),
+    )
+    assert set(seen) == {(tf32 and before[0], tf32 and before[1])} != {(False, True)}
+    assert ends[-1] == _allowed() == before and before[0]
 
-    weight = torch.nn.Parameter(torch.ones(2))
-    optimizer = torch.optim.AdamW([weight])
-    weight.grad = torch.ones(2)
-    optimizer.step()
-    state = optimizer.state_dict()
-    state["state"][0] = {
-        k: v.to("cpu") if k != "step" else v.to("meta") for k, v in state["state"][0].items()
-    }
-    moved = []
-    real = torch.Tensor.cpu
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(torch.Tensor, "cpu", lambda t: (moved.append(t.device.type), real(torch.zeros(())))[1])
-        patch.setattr("lifelong.training.fit.check", lambda *_: None)
-        _load_optimizer(optimizer, state)
-    assert moved == ["meta"] and optimizer.state[weight]["step"].device.type == "cpu"
+
+def _allowed():
+    return torch.backends.cudnn.allow_tf32, torch.backends.cuda.matmul.allow_tf32
