@@ -7,10 +7,10 @@ import re
 import subprocess
 import sys
 from ctypes.util import find_library
+from dataclasses import replace
 from importlib.machinery import PathFinder
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 
@@ -22,6 +22,7 @@ from libero_env.errors import MAX_LISTED, UnknownNameError
 from libero_env.tasks import bddl, get_suite, get_task
 from lifelong.cli import gpu
 from lifelong.cli.runs import check_torch
+from tests.harness.demos import episode, write
 
 ROOT = Path(__file__).parents[1]
 
@@ -102,19 +103,9 @@ def test_a_folder_of_runs_is_no_run(inside, shown, tmp_path, capsys):
 
 @pytest.fixture
 def demo_file(tmp_path) -> Path:
-    from libero_env.demos.read import Episode
-    from libero_env.demos.write import DemoWriter, make_header
-
-    frames = np.zeros((4, 8, 8, 3), np.uint8)
-    obs = {"agentview_rgb": frames, "ee_pos": np.zeros((4, 3)), "ee_ori": np.zeros((4, 3))}
-    episode = Episode(
-        np.zeros((4, 7)), np.zeros((4, 30)), np.zeros((4, 9)), obs, attrs={"failed_attempts": 2}
-    )
-    header = make_header(problem_name="P", language="l", bddl_name="a/b.bddl", bddl_text="", env_kwargs={})
-    writer = DemoWriter(tmp_path / "suite" / "a_demo.hdf5", header)
-    writer.write(0, episode)
-    writer.write(1, episode)
-    return writer.finish()
+    one = replace(episode(0, steps=4, size=8), attrs={"failed_attempts": 2})
+    (tmp_path / "suite").mkdir()
+    return write(tmp_path / "suite" / "a_demo.hdf5", [one, one])
 
 
 def test_demonstrations_are_described_and_checked(demo_file, tmp_path, capsys):

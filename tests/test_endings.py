@@ -19,7 +19,7 @@ from libero_env.cli import ending
 from libero_env.cli import main as cli
 from libero_env.errors import DEBUG_VARIABLE, LiberoError, code_of
 from libero_env.parallel import spawn_pool
-from libero_env.tasks import get_task, read_task
+from libero_env.tasks import get_task
 from libero_eval.protocols.files import load_protocol
 from libero_eval.work.evaluation import Evaluation
 from lifelong import launch
@@ -235,34 +235,19 @@ def test_mistyped_options_are_one_line(capsys):
         assert found.startswith("error: ") and found.count("\n") == 1 and "--help" in found
 
 
-@pytest.mark.parametrize("words", [
-    ["eval", "m:f", "--size", "0"],
+@pytest.mark.parametrize("words", [  # of each kind; that every number has a range is tested in tests/fuzz
     ["eval", "m:f", "--seed", "-1"],
     ["eval", "m:f", "--timeout", "nan"],
     ["eval", "m:f", "--timeout", "inf"],
-    ["eval", "m:f", "--horizon", "0"],
     ["eval", "m:f", "--policy-threads", "1000000000"],
     ["eval", "m:f", "--episodes", "1.5"],
     ["eval", "m:f", "--out", " "],
-    ["eval", "m:f", "--after", "-1"],
-    ["eval", "m:f", "--in-flight", "0"],
     ["eval", "m:f", "--device", "zz"],
-    ["serve", "run", "--port", "99999"],
-    ["saliency", "run", "--stride", "nan"],
     ["power", "--tests", "1" + 400 * "0"],
-    ["power", "--episodes", "1" + 30 * "0"],
-    ["power", "--alpha", "nan"],
     ["compare", "a", "b", "--alpha", "0"],
-    ["demos", "generate", "--task", "libero_goal/3", "--seed", "-1"],
-    ["demos", "generate", "--task", "libero_goal/3", "--noise", "nan"],
     ["demos", "generate", "--task", "libero_goal/3", "--workers", "-3"],
     ["demos", "generate", "--task", "libero_goal/3", "--size", "99999999"],
-    ["demos", "export", "a", "--out", "b", "--settle", "-1"],
-    ["tasks", "preview", "libero_goal/3", "--starts", "0"],
-    ["tasks", "certify", "libero_goal/3", "--require", "7"],
-    ["tasks", "lint", "libero_goal/3", "--starts", "10000000"],
     ["objects", "add", "a.obj", "--mass", "-1"],
-    ["teleop", "libero_goal/3", "--pos-sensitivity", "nan"],
 ], ids=" ".join)  # fmt: skip
 def test_numbers_out_of_range_are_one_line(words, capsys):
     with pytest.raises(SystemExit, match="2"):
@@ -277,8 +262,6 @@ def test_numbers_out_of_range_are_one_line(words, capsys):
     (["tasks", "show", ""], "the word after show is empty"),
     (["eval", "ending_policy:make", "--suite", "libero_goal/0", "--after", "9"], "--after is of runs"),
     (["eval", "ending_policy:make", "--suite", "libero_goal/0", "--despite", "x"], "--despite is of results"),
-    (["tasks", "new", "../elsewhere"], "is not the name of a task"),
-    (["tasks", "new", "mine", "--goal", "()"], "is not an atom"),
     (["tasks", "preview", "libero_goal/3", "--out", "a.zzz"], "the name of a picture ends in .png"),
     (["objects", "preview", "plate", "--out", "a.zzz"], "the name of a picture ends in .png"),
 ])  # fmt: skip
@@ -318,14 +301,6 @@ def test_warnings_of_mujoco_are_logged_once_and_make_no_file(here, caplog):
     assert [record.name for record in caplog.records] == ["libero_env.mujoco"]
     assert "Nan, Inf or huge value in QVEL at DOF 3" in caplog.text
     assert not (here / "MUJOCO_LOG.TXT").exists()
-
-
-def test_a_new_task_may_have_any_instruction_of_one_line(here, capsys):
-    language = "put: [the 'bowl'] #1 on the plate"
-    assert cli.main(["tasks", "new", "mine", "--language", language]) == 0
-    assert read_task("mine.yaml").language == language
-    assert cli.main(["tasks", "new", "two", "--language", "put it\nthere"]) == 2
-    assert "expected one line without ( ) and ;" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["libero", "openpi"])  # one horizon, and one for each suite
@@ -452,13 +427,15 @@ def test_a_signal_ends_an_evaluation_and_its_workers(name, here):
 
 
 @pytest.mark.sim
-def test_sighup_ends_a_recording_and_its_workers(here, heeded):
+@pytest.mark.parametrize("name", ["SIGHUP", "SIGKILL"])
+def test_a_signal_ends_a_recording_and_its_workers(name, here, heeded):
     words = ["demos", "generate", "--task", "libero_goal/7", "--n", "40", "--workers", "2", "--size", "16"]
     process = started([*words, "--folder", "kept"], here, lambda pid: len(descendants(pid)) > 2)
     workers = descendants(process.pid)
-    process.send_signal(signal.SIGHUP)
+    process.send_signal(getattr(signal, name))
     _, told = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 129
-    assert "interrupted by SIGHUP; what is recorded is kept; the same command goes on" in told
-    assert "Traceback" not in told
     assert within(lambda: not any(map(is_running, workers)))
+    if name == "SIGHUP":
+        assert process.returncode == 129
+        assert "interrupted by SIGHUP; what is recorded is kept; the same command goes on" in told
+        assert "Traceback" not in told
