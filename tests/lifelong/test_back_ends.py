@@ -3,13 +3,16 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from libero_env.cli.main import main
+from libero_env.envs.batch import BatchEnv
 from libero_eval.judging.comparability import Group, backend_of, check_comparable, check_same_back_end
 from libero_eval.judging.comparison import compare_groups
 from libero_eval.protocols.files import load_protocol
 from lifelong.errors import ComparisonError, ConfigError, ProtocolError
+from lifelong.evaluation.rollout import run_episodes
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.report.comparison import compare
 from tests.harness.records import run_start
@@ -77,3 +80,28 @@ def test_the_command_names_what_is_not_valid(capsys, tmp_path):
     )
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "mujoco" in error and "warp" in error
+
+
+@pytest.mark.sim
+@pytest.mark.parametrize("backend", ["mujoco", pytest.param("warp,device=cpu", marks=pytest.mark.slow)])
+def test_a_simulation_that_diverges_ends_its_own_episode_on_each(backend):
+    if backend != "mujoco":
+        pytest.importorskip("mujoco_warp")
+
+    class Breaking:
+        action_dim, views, calls = 7, (), 0
+
+        def reset(self, num_envs): ...
+
+        def act(self, obs):
+            self.calls += 1
+            if self.calls == 3:
+                on_device = getattr(env.simulations, "device_data", None)
+                qvel = env.simulations.fields["qvel"] if on_device is None else on_device.qvel.numpy()
+                qvel[1, 12] = np.nan
+            return np.zeros((3, 7))
+
+    with BatchEnv("libero_object/3", 3, num_threads=1, cameras=(), backend=backend) as env:
+        done = run_episodes(Breaking(), env, [0, 1, 2], horizon=6, settle_steps=1)
+    assert [e.length for e in done.episodes] == [6, 3, 6] and "diverged" in done.episodes[1].simulation_error
+    assert done.columns()["init_states"] == (0, 2) and list(done.failed) == [1]
