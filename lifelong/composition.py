@@ -107,10 +107,11 @@ def explained(error: Exception, words: Sequence[str], folders: Sequence[Path]) -
     if file := re.search(r"Could not find '([^']+)/([^/']+)'", said):
         if file[1] == "hydra/launcher" and file[2] in LAUNCHERS:
             require_package(*LAUNCHERS[file[2]])
-        unknown = UnknownNameError(file[1], file[2], _names(file[1], folders))
         if file[1] == "policy" and file[2] in LEROBOT_TYPES:
-            unknown = ConfigError(f"{unknown} A policy of LeRobot: policy=lerobot policy.type={file[2]}")
-        return unknown
+            return ConfigError(
+                f"unknown policy {file[2]!r}; LeRobot's is policy=lerobot policy.type={file[2]}"
+            )
+        return UnknownNameError(file[1], file[2], _names(file[1], folders))
     key = re.search(r"Could not override '([^']+)'", said)
     try:
         if key:

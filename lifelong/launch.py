@@ -244,6 +244,10 @@ class _Named(io.TextIOBase):
         """Write out what the stream has kept."""
         self._stream.flush()
 
+    def fileno(self) -> int:
+        """Return the number of the stream's file, for processes that are given it."""
+        return self._stream.fileno()
+
 
 def _end_sweep(folder: Path, ranks: Ranks) -> int:
     """Say what became of the jobs, compare the runs that are finished, and return the exit status."""

@@ -54,7 +54,7 @@ def robosuite_assets() -> Path:
     if spec is None or spec.origin is None:
         raise _not_installed()
     assets = Path(spec.origin).parent / "models" / "assets"
-    for name in (_ARM_FILE, _GRIPPER_FILE):
+    for name in (_ARM_FILE, _GRIPPER_FILE, "mounts/rethink_mount.xml"):  # which robosuite 1.5 has not
         if not (assets / name).is_file():
             missing = f"the robot's model files are missing: {assets / name} does not exist"
             raise MissingPackageError(

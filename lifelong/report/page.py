@@ -198,9 +198,9 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
                 if n
             ],
         ],
-        "notes": [f"{r.path}: {note}" for r in runs for note in r.notes]
+        "notes": [f"{os.path.relpath(r.path, folder)}: {note}" for r in runs for note in r.notes]
         + [
-            f"{r.path}: a further run of seed {r.record.seed} of {g.label}; it is not counted"
+            f"{os.path.relpath(r.path, folder)}: a further run of seed {r.record.seed} of {g.label}; it is not counted"
             for g in groups
             for r in g.repeats
         ]

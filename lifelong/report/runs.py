@@ -141,10 +141,10 @@ def group_runs(runs: Sequence[Run]) -> list[Group]:
     for run in runs:
         groups.setdefault(_identity(run), []).append(run)
     identities = [dict(key) for key in groups]
-    return [
-        _one_of_each(_label(identity, identities), members)
-        for identity, members in zip(identities, groups.values(), strict=True)
-    ]
+    short = [_label(identity, identities) for identity in identities]
+    whole = [_label(identity, identities, whole=True) for identity in identities]
+    labels = [a if short.count(a) == 1 else b for a, b in zip(short, whole, strict=True)]
+    return [_one_of_each(label, members) for label, members in zip(labels, groups.values(), strict=True)]
 
 
 def _one_of_each(label: str, members: Sequence[Run]) -> Group:
@@ -156,8 +156,14 @@ def _one_of_each(label: str, members: Sequence[Run]) -> Group:
     return Group(label, tuple(counted), tuple(run for run in members if not any(run is k for k in counted)))
 
 
-def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
-    """Return the algorithm's name and what else distinguishes the group; settings only within one algorithm."""
+def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]], *, whole: bool = False) -> str:
+    """Return the algorithm's name and what else distinguishes the group; settings only within one algorithm.
+
+    Args:
+        identity: What the group's runs have in common.
+        others: That of all groups.
+        whole: Whether to name all settings by their whole keys, so that no other group has the label.
+    """
     rivals = [o for o in others if o["algo"] == identity["algo"]]
     differs = {
         k: v
@@ -165,7 +171,9 @@ def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
         if k != "algo" and any(o.get(k) != v for o in (others if k in _BASICS else rivals))
     }
     words = [str(v) if k in _BASICS else f"{k.rpartition('.')[2]} {v}" for k, v in differs.items()]
-    if len(words) > 3:
+    if whole:
+        words = [f"{key} {value!r}" for key, value in differs.items()]
+    elif len(words) > 3:
         words = [*words[:3], "…"]
     return f"{identity['algo']} ({', '.join(words)})" if words else str(identity["algo"])
 

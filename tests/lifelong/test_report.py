@@ -299,7 +299,7 @@ def test_two_runs_of_one_seed_count_once(tmp_path: Path):
     assert len(group.runs) == 2 and {r.record.seed for r in group.runs} == {1, 2}
     assert partial in {r.path for r in group.repeats} and len(group.repeats) == 2
     page = Page(write_report([first, partial, other], tmp_path / "out").read_text())
-    assert f"{partial}: a further run of seed 1 of er; it is not counted" in page.text
+    assert "../partial: a further run of seed 1 of er; it is not counted" in page.text
 
 
 def test_intervals_stay_where_the_metric_can_be(tmp_path: Path, monkeypatch):
@@ -460,6 +460,16 @@ def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Pat
     assert [(g.label, len(g.runs)) for g in groups] == [
         ("ewc (strength 10)", 2), ("ewc (strength 500)", 1), ("er", 1), ("er (drop_path 0.1)", 1)
     ]  # fmt: skip
+
+
+def test_no_two_methods_have_one_label(tmp_path: Path):
+    """Or one would take the place of the other in every table."""
+    runs = []
+    for number in range(32):
+        values = {key: number >> bit & 1 for bit, key in enumerate("abcd")} | {"e": (1, "1")[number >> 4]}
+        runs.append(make_run(tmp_path / str(number), "er", 1, tasks=1, epochs=(0, 1), **values))
+    labels = [group.label for group in group_runs([load_run(run) for run in runs])]
+    assert len(set(labels)) == 32, labels
 
 
 def test_runs_that_learned_from_other_demonstrations_are_told(tmp_path: Path):
