@@ -175,6 +175,7 @@ class Controller(Named, names=_NAMES):
             law = replace(law, kernel=_given_torques)
         env.simulations.controller_state = ControllerState(1, law)
         self.initial_joint = env.simulations.rest
+        self.reset_goal()
 
     def _gains(self, config: Mapping[str, Any]) -> np.ndarray:
         gains = self._law.gains.copy()

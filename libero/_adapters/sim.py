@@ -180,10 +180,9 @@ class ClientSimulations(LoopSimulations):
         return np.concatenate([self.model.body_pos[bodies], self.model.body_quat[bodies]], axis=1)
 
     def set_rest(self, joints: np.ndarray) -> None:
-        """Let the controller take these joints, (7,) rad, for the arm's rest pose."""
-        if not np.array_equal(joints, self.rest):
-            self.rest = joints
-            vars(self).pop("_rest_fields", None)  # computed from it
+        """Let the controller take these joints, (7,) rad, for the arm's rest pose, as the model is now."""
+        self.rest = joints
+        vars(self)["_rest_fields"] = self._fields_at_rest()
 
 
 class BuiltModel:

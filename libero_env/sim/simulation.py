@@ -221,10 +221,16 @@ class Simulations(ABC):
 
     @cached_property
     def _rest_fields(self) -> dict[str, np.ndarray]:
-        """Fields of a simulation whose arm is in its rest pose, (1, ...)."""
-        data = mujoco.MjData(self.model)
+        return self._fields_at_rest()
+
+    def _fields_at_rest(self) -> dict[str, np.ndarray]:
+        """Return the fields of a simulation whose arm is in its rest pose, (1, ...)."""
+        data, options = mujoco.MjData(self.model), self.model.opt
         data.qpos[: len(self.rest)] = self.rest
+        flags, contacts = options.disableflags, int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        options.disableflags = flags | contacts  # of objects that are all at the origin
         mujoco.mj_forward(self.model, data)
+        options.disableflags = flags
         return {name: np.array(rows) for name, rows in self._views_of(data).items()}
 
     def _views_of(self, data: mujoco.MjData) -> dict[str, np.ndarray]:

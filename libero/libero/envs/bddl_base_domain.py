@@ -326,13 +326,13 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         start = self._sample()
         qpos = start.qpos.copy()
         qpos[:7], qpos[7:9] = self._arm_start(start.qpos[:7]), OPEN_FINGERS
-        self.simulations.set_rest(qpos[:7].copy())
-        self.robots[0].reset()
         if self.placement_initializer is not None:
             for name, (pos, quat, *_) in self.placement_initializer.sample().items():
                 joint = self.scene.pose_address(name)
                 qpos[joint : joint + 7] = [*pos, *quat]
         self.restart(np.concatenate([[0.0], qpos, np.zeros(self.scene.model.nv), start.fixtures.ravel()]))
+        self.simulations.set_rest(qpos[:7].copy())
+        self.robots[0].reset()
 
     def _arm_start(self, sampled: np.ndarray) -> np.ndarray:
         """Return the joints of the arm at a reset, (7,) rad; those of a placement have robosuite's default noise."""
