@@ -85,7 +85,9 @@ def points(e: Estimate) -> str:
 
 def interval_text(e: Estimate) -> str:
     """Format an interval in percentage points; nothing where it is unknown."""
-    return f"[{100 * e.low:.1f}, {100 * e.high:.1f}]".replace("-", "−") if math.isfinite(e.low) else ""
+    return (
+        f"[{100 * e.low:.1f}, {100 * e.high:.1f}]".replace("-", "−") if math.isfinite(e.low + e.value) else ""
+    )
 
 
 def p_text(p: float) -> str:

@@ -1,6 +1,7 @@
 """A self-contained page about the robustness of policies with its figures, and the same as text and JSON."""
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -63,7 +64,7 @@ def render(policy: Robustness) -> str:
                 *("–" if e is None else f"{100 * e.value:.0f}" for e in successes),
                 f"{100 * axis.area.value:.0f}",
                 interval_text(axis.area),
-                f"{100 * axis.kept.value:.0f}",
+                "–" if math.isnan(axis.kept.value) else f"{100 * axis.kept.value:.0f}",
                 severity_text(axis.half.value),
                 p_text(policy.adjusted[axis.kind]),
             ]
@@ -111,14 +112,14 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         policies=policies,
         units=units,
         curves=as_svg(curves_figure(axes, units)),
-        radar=as_svg(radar_figure(axes)),
+        radar=as_svg(radar_figure(axes)) if len(first.axes) > 2 else "",
         interactions=[
             {"label": policy.label, "name": name_of(pair.condition), "pair": pair}
             for policy in policies
             for pair in policy.interactions
         ],
         redrawn=[(name, count, episodes) for name, count in first.redrawn.items() if count],
-        paths=[path for policy in policies for path in policy.paths],
+        paths=[os.path.relpath(path, folder) for policy in policies for path in policy.paths],
         interval=interval_text,
         p_text=p_text,
         severity=severity_text,

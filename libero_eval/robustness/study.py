@@ -2,7 +2,7 @@
 
 import io
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import replace
 from pathlib import Path
@@ -41,13 +41,14 @@ def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_:
         out, CONDITIONS, *(f"{CONDITIONS}/{one or 'none'}" for one in conditions), error=ConfigError
     )
     request = replace(request, out=out)
+    evaluations = _plan(request, policy, conditions)
     if request.again:
-        for _, evaluation in _evaluations(request, policy, conditions):
+        for evaluation in evaluations.values():
             evaluation.store.clear()
         request = replace(request, again=False)
     try:
         with Workers(min(request.workers, len(conditions)) - 1, _help, request) as workers:
-            _work(request, policy, conditions, workers, on_condition)
+            _work(evaluations, workers, on_condition)
     except KeyboardInterrupt as error:
         error.add_note(f"{out} keeps what is done; the same command goes on")
         raise
@@ -59,23 +60,21 @@ def _help(request: RobustnessRequest) -> None:
 
     def work() -> None:
         with redirect_stderr(io.StringIO()):  # the other process says the same
-            policy = load_policy(request)
-        _work(request, policy, conditions_of(request))
+            evaluations = _plan(request, load_policy(request), conditions_of(request))
+        _work(evaluations)
 
     work_quietly(work)
 
 
 def _work(
-    request: RobustnessRequest,
-    policy: PolicyUnderTest,
-    conditions: Sequence[str],
+    evaluations: Mapping[str, Evaluation],
     workers: Workers | None = None,
     on_condition: Told = lambda *_: None,
 ) -> None:
     """Take units of all conditions until none is free; the first process waits for those of others at the end."""
     units: dict[str, int] = {}  # of the conditions that are done
     for wait in (False, True) if workers else (False,):
-        for condition, evaluation in _evaluations(request, policy, conditions):
+        for condition, evaluation in evaluations.items():
             if condition in units:
                 continue
 
@@ -87,18 +86,20 @@ def _work(
                 result = Worker(evaluation, on_wait=supervise).work(wait=wait)
             if result is not None:
                 units[condition] = len(evaluation.units)
-                on_condition(condition, result, len(units), len(conditions))
+                on_condition(condition, result, len(units), len(evaluations))
 
 
-def _evaluations(
+def _plan(
     request: RobustnessRequest, policy: PolicyUnderTest, conditions: Sequence[str]
-) -> Iterator[tuple[str, Evaluation]]:
-    """Yield the evaluation of each condition."""
+) -> dict[str, Evaluation]:
+    """Return the evaluation of each condition; notes are said once."""
     assert request.out is not None
-    for number, condition in enumerate(conditions):
-        with redirect_stderr(io.StringIO() if number else sys.stderr):  # notes are said once
+    planned: dict[str, Evaluation] = {}
+    for condition in conditions:
+        with redirect_stderr(io.StringIO() if planned else sys.stderr):
             out = request.out / CONDITIONS / (condition or "none")
-            yield condition, plan_evaluation(request.condition(condition, out), policy)
+            planned[condition] = plan_evaluation(request.condition(condition, out), policy)
+    return planned
 
 
 def conditions_of(request: RobustnessRequest) -> list[str]:

@@ -43,6 +43,11 @@ def still(tmp_path, monkeypatch):
 def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> None:
     assert main(["robustness", *WORDS, *KINDS, "--out", "found"]) == 0
     said = capsys.readouterr().out
+    assert "nan" not in said
+    page = (still / "found" / "robustness.html").read_text()
+    assert ", inf]" not in page and str(still) not in page and page.count("<svg") == 1, (
+        "no radar of two kinds"
+    )
     folders = sorted(path.parent.name for path in still.glob("found/conditions/*/eval.json"))
     assert folders == ["noise=0.5", "noise=1", "none", "robot=0.5", "robot=0.5,noise=0.5", "robot=1"]
     assert "6/6" in said and "nothing to lose" in said
@@ -79,6 +84,12 @@ def test_mistakes_take_one_line_before_anything_is_run(still, words, told, capsy
     assert status == 2
     error = capsys.readouterr().err
     assert told in error and len(error.strip().splitlines()[-1:]) == 1 and not (still / "found").exists()
+
+
+def test_notes_are_said_once(still, capsys) -> None:
+    words = ["--kinds", "noise", "--severities", "1", "--pairs", "--protocol", "openpi", "--names", "native"]
+    assert main(["robustness", *WORDS, *words]) == 0
+    assert capsys.readouterr().err.count("note: models: builtin") == 1
 
 
 @pytest.mark.parametrize("link", ["robustness", "robustness/conditions", "robustness/conditions/none"])
