@@ -203,6 +203,20 @@ importlib.import_module = without_egl
     assert finding.ok and finding.detail.startswith("osmesa on"), finding.detail
 
 
+@pytest.mark.sim
+def test_renderers_that_fail_or_draw_on_the_processor_are_told(monkeypatch):
+    for device, detail in (
+        ("H100", "all draw on the GPU"),
+        ("llvmpipe", "0 failed, .* on the processor: .*llvmpipe"),
+    ):
+        found = json.dumps({"device": device, "milliseconds": 1.0})
+        monkeypatch.setattr(doctor, "_PROBE", f"print({found!r})")
+        assert re.match(detail, doctor.check_renderers(2).detail)
+    monkeypatch.setattr(doctor, "_PROBE", "import os; os.abort()")
+    finding = doctor.check_renderers(2)
+    assert finding.detail.startswith("2 failed") and not finding.ok and "MUJOCO_GL=osmesa" in finding.remedy
+
+
 def test_doctor_says_in_one_line_that_there_is_no_gpu(monkeypatch, capsys):
     monkeypatch.setenv("PATH", "")
     assert cli.main(["doctor", "--gpu"]) == 1

@@ -9,8 +9,8 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -255,26 +255,15 @@ def run_probe(words: Sequence[str], seconds: float = PROBE_SECONDS) -> tuple[boo
 
 def check_renderers(count: int) -> Finding:
     """Draw with several processes at once: some drivers hang in that for ever."""
-    title = f"{count} renderers at once"
-    remedy = "record and evaluate with fewer --workers, or MUJOCO_GL=osmesa"
-    path = os.pathsep.join(filter(None, (PACKAGE_ROOT, os.environ.get("PYTHONPATH"))))
-    command, env = [sys.executable, "-c", _PROBE], {**os.environ, "PYTHONPATH": path}
-    started = [subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) for _ in range(count)]
-    end, texts = time.monotonic() + PROBE_SECONDS, []
-    try:
-        for process in started:
-            texts.append(process.communicate(timeout=max(0.0, end - time.monotonic()))[0])
-    except subprocess.TimeoutExpired:
-        return Finding(title, f"{count - len(texts)} have no frame within {PROBE_SECONDS} s", False, remedy)
-    finally:
-        for process in started:
-            process.kill()
-            process.wait()
-            if process.stdout:
-                process.stdout.close()
-    failed = [text for text in texts if '"milliseconds"' not in text]
-    if failed or any("llvmpipe" in text for text in texts):
-        answer = (failed or texts)[0].strip()
+    title, remedy = (
+        f"{count} renderers at once",
+        "record and evaluate with fewer --workers, or MUJOCO_GL=osmesa",
+    )
+    with ThreadPoolExecutor(count) as pool:
+        answers = list(pool.map(run_probe, [["-c", _PROBE]] * count))
+    failed = [text for _, text in answers if '"milliseconds"' not in text]
+    if failed or any("llvmpipe" in text for _, text in answers):
+        answer = (failed or [answers[0][1]])[0]
         return Finding(title, f"{len(failed)} failed, or they draw on the processor: {answer}", False, remedy)
     return Finding(title, "all draw on the GPU")
 
