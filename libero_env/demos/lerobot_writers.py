@@ -259,7 +259,6 @@ class VideoDatasetWriter(_Writer):
         return {f"videos/{key}/{name}": value for name, value in {**place, **times}.items()}
 
     def close(self) -> None:
-        """Close all files."""
         for file in (self._data, *self._videos.values()):
             if file is not None:
                 file.close()

@@ -57,7 +57,6 @@ class RenderJob(DemoJob):
 
     @cached_property
     def writer(self) -> DemoWriter:
-        """Writer of the file."""
         return DemoWriter(self.path, rendered_header(self.file, self.config, self.task))
 
     def missing(self, n: int) -> set[int]:

@@ -31,7 +31,6 @@ class RobotJoints(StartChange):
     qpos: tuple[float, ...]
 
     def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
-        """Return the state with these joints; see `StartChange`."""
         return _with_arm(row, np.asarray(self.qpos))
 
 
@@ -46,7 +45,6 @@ class RobotOffset(StartChange):
     offset: tuple[float, ...]
 
     def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
-        """Return the state with the offset; see `StartChange`."""
         model, arm = scene.model, row[1:8] + self.offset
         low, high = model.jnt_range[:7].T
         if not ((arm > low + _LIMIT_MARGIN) & (arm < high - _LIMIT_MARGIN)).all():
@@ -72,7 +70,6 @@ class ScatteredObjects(StartChange):
     seed: int
 
     def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
-        """Return the state with the objects moved; see `StartChange`."""
         rng, before, moved = np.random.default_rng(self.seed), contacts(scene, row), row
         for name, load in carried(scene.problem).items():
             for _ in range(_DIRECTIONS):

@@ -127,7 +127,6 @@ class SpaceMouse(Keyboard):
             self.deflection[3:] = scaled[1], scaled[0], -scaled[2]
 
     def action(self) -> np.ndarray:
-        """Return the action for the next control step, (7,)."""
         action = super().action()
         action[:6] = np.clip(action[:6] + self.deflection * self.mouse_gains, -1.0, 1.0)
         action[6] = 1.0 if self.button or self.closed else -1.0

@@ -83,5 +83,4 @@ class Averaging(Algorithm):
         return {"tasks": self.tasks, "before": self._before}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
         self.tasks, self._before = int(state["tasks"]), state["before"]

@@ -51,7 +51,6 @@ class FrozenBase(Algorithm):
         return {"task_index": self.task_index, "base_left": self._base_left, "seed": self._seed}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
         self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
         self._seed = int(state["seed"])
 
@@ -132,7 +131,6 @@ class RoutedExperts(FrozenBase):
         return {**super().state_dict(), "library": self.library.state()}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
         super().load_state_dict(state, datasets)
         self.library.load(state["library"])
 

@@ -100,6 +100,5 @@ class LwF(Algorithm):
         return {"weights": dict(self.teacher.weights), "languages": dict(self._languages)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
         self.teacher.become(state["weights"])
         self._languages = dict(state["languages"])

@@ -173,7 +173,6 @@ class PackNet(Algorithm):
         return {"task_index": self.task_index, "pruned": self._pruned, "owner": dict(self._owner)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
         self.task_index = int(state["task_index"])
         self._pruned = bool(state["pruned"])
         self._owner = dict(state["owner"])

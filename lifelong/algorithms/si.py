@@ -87,6 +87,5 @@ class SI(Anchored):
         return {"anchor": super().state_dict(), "omega": dict(self._omega), "way": dict(self._displacement)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
         super().load_state_dict(state["anchor"], datasets)
         self._omega, self._displacement = dict(state["omega"]), dict(state["way"])

@@ -58,6 +58,5 @@ class SingleTask(Algorithm):
         return {"initial": self._initial, "learned": dict(self._learned)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned."""
         self._initial = state["initial"]
         self._learned = dict(state["learned"])

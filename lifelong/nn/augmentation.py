@@ -48,7 +48,6 @@ class Compose(Augmentation):
         self.augmentations = tuple(augmentations)
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return changed images; see `Augmentation`."""
         for augmentation in self.augmentations:
             images = augmentation.images(images, generator)
         return images
@@ -65,7 +64,6 @@ class RandomShift(Augmentation):
         self.pixels = pixels
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return changed images; see `Augmentation`."""
         b, _, v, h, w, _ = images.shape
         padded, moved = repeat_border(images, self.pixels), torch.empty_like(images)
         for row, per_view in enumerate(self._corners(b, v, generator).tolist()):
@@ -119,7 +117,6 @@ class ColorJitter(Augmentation):
         self.hue, self.keep = hue, keep
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return changed images; see `Augmentation`."""
         b, t, v, h, w, c = images.shape
         matrix, contrast, brightness = self._draw(b * v, generator)
         x = images.to(torch.float32).transpose(1, 2).reshape(b * v, t * h * w, c)
@@ -196,7 +193,6 @@ class SharedJitter(Augmentation):
         self.keep = keep
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Return changed images; see `Augmentation`."""
         windows, orders, drawn = [], [], []
         for window in range(len(images)):
             if torch.rand((), generator=generator) >= self.keep:

@@ -33,7 +33,6 @@ class ER(Sequential):
     """
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
-        """See `Sequential`."""
         return algorithms.ER(memory=ReplayMemory(cfg.lifelong.n_memories))
 
     def end_task(self, dataset: Dataset, task_id: int, benchmark: Any, env: Any = None) -> None:
@@ -46,7 +45,6 @@ class AGEM(ER):
     """Projects out of the gradient what would raise the loss on ER's memory; see `lifelong.algorithms.AGEM`."""
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
-        """See `Sequential`."""
         return algorithms.AGEM(memory=ReplayMemory(cfg.lifelong.n_memories))
 
 
@@ -57,7 +55,6 @@ class EWC(Sequential):
     """
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
-        """See `Sequential`."""
         return algorithms.EWC(
             strength=float(cfg.lifelong.e_lambda),
             gamma=cfg.lifelong.gamma,
@@ -83,7 +80,6 @@ class PackNet(Sequential):
     """Trains, prunes, and retrains the weights that the task keeps; see `lifelong.algorithms.PackNet`."""
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
-        """See `Sequential`."""
         return algorithms.PackNet(prune_perc=cfg.lifelong.prune_perc)
 
     def end_task(self, dataset: Dataset, task_id: int, benchmark: Any, env: Any = None) -> None:
@@ -122,7 +118,6 @@ class SingleTask(Sequential):
     """Trains every task from the initial weights and acts with its own; see `lifelong.algorithms.SingleTask`."""
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
-        """See `Sequential`."""
         return algorithms.SingleTask()
 
 
@@ -130,7 +125,6 @@ class Multitask(Sequential):
     """Trains on the windows of all tasks, shuffled together."""
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
-        """See `Sequential`."""
         return algorithms.Multitask()
 
     def learn_all_tasks(

@@ -133,7 +133,6 @@ class NativePolicy(BasePolicy):
         return action.clamp(-1, 1).cpu().numpy()
 
     def reset(self) -> None:
-        """See `BasePolicy`."""
         self.latent_queue = []
 
     def _latest_latent(self, data: Mapping[str, Any]) -> Tensor:
@@ -175,7 +174,6 @@ class BCRNNPolicy(NativePolicy):
         return (dist, state) if return_state else dist
 
     def reset(self) -> None:
-        """See `BasePolicy`."""
         super().reset()
         self._state, self._age = None, 0
 
