@@ -1,7 +1,11 @@
 """Small demonstrations of random numbers, and an expert that fails."""
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+from libero_env.demos.generate import generate
 from libero_env.demos.read import Episode
 from libero_env.demos.write import DemoWriter, make_header
 from libero_env.expert.expert import Attempt
@@ -53,3 +57,10 @@ def wander(env, experts, noise, max_steps):
         Attempt(True, np.array(s), np.array(a), np.array(a), 0, "", env.simulations.fixtures[i].copy())
         for i, (s, a) in enumerate(zip(states, actions, strict=True))
     ]
+
+
+def record_wander(path: Path, task: str, size: tuple[int, int]) -> Path:
+    """Record two demonstrations of random walks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("libero_env.demos.record.run_experts", wander)
+        return generate(task, 2, path=path, camera_size=size, workers=1, progress=False)

@@ -1,6 +1,5 @@
 """Workspaces: the original's parameters, and visuals that stay light."""
 
-import json
 from itertools import product
 
 import mujoco
@@ -37,9 +36,8 @@ def collides(model, geom):
 
 
 @pytest.fixture(params=MEASURED)
-def measured(request, shared):
-    figures = json.loads((shared / "official/workspaces.json").read_text())[MEASURED[request.param]]
-    return request.param, figures
+def measured(request, measured_workspaces):
+    return request.param, measured_workspaces[MEASURED[request.param]]
 
 
 def test_collision_geometry_is_the_originals(measured):

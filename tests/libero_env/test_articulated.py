@@ -1,7 +1,5 @@
 """Fixtures with drawers, doors and knobs: parameters of their joints, and their range of motion."""
 
-import json
-
 import mujoco
 import numpy as np
 import pytest
@@ -10,6 +8,7 @@ from libero_env.objects import get_object, object_names
 from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.model import GLOW_GROUP
 from libero_env.sim.render import Renderer, RenderTarget
+from tests.harness.models import bounds
 
 pytestmark = pytest.mark.sim
 
@@ -32,12 +31,6 @@ FIRM = 1e-3  # kg, kg m^2: what a part has at least, so that a force moves it at
 def category(request) -> str:
     """Articulated category, each in turn."""
     return request.param
-
-
-@pytest.fixture(scope="module")
-def measured(shared) -> dict:
-    """Measurements of the original, category -> record."""
-    return json.loads((shared / "official" / "objects.json").read_text())
 
 
 def fixture_spec(category: str) -> mujoco.MjSpec:
@@ -71,9 +64,9 @@ def test_there_are_ten():
     assert len(ARTICULATED) == 10
 
 
-def test_joints(category, measured):
+def test_joints(category, measured_objects):
     model = get_object(category).spec.compile()
-    records = [joint for joint in measured[category]["joints"] if joint["type"] != "free"]
+    records = [joint for joint in measured_objects[category]["joints"] if joint["type"] != "free"]
     assert model.njnt == len(records)
     for index, record in enumerate(records):
         joint = model.jnt(index)
@@ -89,15 +82,15 @@ def test_joints(category, measured):
             assert getattr(model, f"dof_{key}")[dof] == pytest.approx(record[key])
 
 
-def test_bodies(category, measured):
+def test_bodies(category, measured_objects):
     model = get_object(category).spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     names = [model.body(body).name for body in range(1, model.nbody)]
     assert [name.removeprefix(f"{category}_") for name in names] == [
-        b["name"] for b in measured[category]["bodies"]
+        b["name"] for b in measured_objects[category]["bodies"]
     ]
-    for name, record in zip(names[1:], measured[category]["bodies"][1:], strict=True):
+    for name, record in zip(names[1:], measured_objects[category]["bodies"][1:], strict=True):
         body = model.body(name)
         assert model.body(body.parentid[0]).name.removeprefix(f"{category}_") == record["parent"]
         assert body.mass[0] == pytest.approx(record["mass"], rel=0.1, abs=1e-4)
@@ -106,15 +99,15 @@ def test_bodies(category, measured):
         assert turned == pytest.approx(1.0, abs=1e-4)
 
 
-def test_sites_move_with_their_part(category, measured):
+def test_sites_move_with_their_part(category, measured_objects):
     model = get_object(category).spec.compile()
-    for record in measured[category]["sites"]:
+    for record in measured_objects[category]["sites"]:
         body = model.body(model.site(record["name"]).bodyid[0]).name
         assert body.removeprefix(f"{category}_") == record["body"]
 
 
-def test_articulation_ranges(category, measured):
-    ranges = measured[category]["object_properties"]["articulation"]
+def test_articulation_ranges(category, measured_objects):
+    ranges = measured_objects[category]["object_properties"]["articulation"]
     expected = {key.split("_")[1]: tuple(value) for key, value in ranges.items() if value}
     assert dict(get_object(category).articulation) == expected
 
@@ -129,28 +122,11 @@ def test_each_moving_part_carries_a_visual(category):
 def test_visual_geoms_coincide_with_collision_geoms(category):
     """The box around the visual geoms of a moving part is that around its collision geoms."""
     model = fixture_spec(category).compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
     for joint in range(model.njnt):
         of_body = np.flatnonzero(model.geom_bodyid == model.jnt_bodyid[joint])
         seen, solid = ([g for g in of_body if model.geom_group[g] == group] for group in (1, 0))
         # A capsule's or a turned box's bounds are a little wide: 6 mm.
-        assert around(model, data, seen) == pytest.approx(around(model, data, solid), abs=0.006)
-
-
-def around(model: mujoco.MjModel, data: mujoco.MjData, geoms: list[int]) -> np.ndarray:
-    """Return the axis-aligned box around geoms in the world, (2, 3): low, high."""
-    corners = np.array(np.meshgrid(*[(-1, 1)] * 3)).reshape(3, -1).T
-    points = []
-    for geom in geoms:
-        center, half = model.geom_aabb[geom].reshape(2, 3)
-        local = center + corners * half
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-            mesh = model.geom_dataid[geom]
-            local = model.mesh_vert[model.mesh_vertadr[mesh] :][: model.mesh_vertnum[mesh]]
-        points.append(local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
-    points = np.concatenate(points)
-    return np.stack([points.min(axis=0), points.max(axis=0)])
+        assert bounds(model, seen) == pytest.approx(bounds(model, solid), abs=0.006)
 
 
 def test_closed_stays_closed(category):

@@ -10,7 +10,6 @@ import pytest
 from libero_env.cli.main import main
 from libero_env.demos.config import RenderConfig, rendered_perturbations
 from libero_env.demos.curate import describe, examine
-from libero_env.demos.generate import generate
 from libero_env.demos.observe import recorded_rendering
 from libero_env.demos.read import read_demos, read_episodes
 from libero_env.demos.rendering import rerender
@@ -18,7 +17,7 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError, InvalidInputError
 from libero_env.perturbations import parse_perturbations
 from libero_env.tasks import get_task
-from tests.harness.demos import STEPS, wander
+from tests.harness.demos import STEPS, record_wander
 
 TASK, SIZE = "libero_goal/3", (24, 32)
 MIXED = "instruction=0.6,camera=0.5,light=0.5,noise=0.2,proprio_bias=0.5"
@@ -27,10 +26,7 @@ KEPT = ("actions", "expert_actions", "states", "robot_states")
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("libero_env.demos.record.run_experts", wander)
-        out = tmp_path_factory.mktemp("demos") / "goal.hdf5"
-        return generate(TASK, 2, path=out, camera_size=SIZE, workers=1, progress=False)
+    return record_wander(tmp_path_factory.mktemp("demos") / "goal.hdf5", TASK, SIZE)
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from libero_env.errors import DemoError
 from libero_env.expert import UnsupportedGoalError
 from libero_env.expert.expert import Attempt
 from libero_env.tasks import get_task
-from tests.harness.demos import STEPS, wander
+from tests.harness.demos import STEPS, record_wander, wander
 
 pytestmark = pytest.mark.sim
 TASK, SIZE = "libero_goal/3", (24, 32)
@@ -29,11 +29,7 @@ TASK, SIZE = "libero_goal/3", (24, 32)
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    """Record two demonstrations of a scene with fixtures, without an expert."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("libero_env.demos.record.run_experts", wander)
-        out = tmp_path_factory.mktemp("demos") / "goal.hdf5"
-        return generate(TASK, 2, path=out, camera_size=SIZE, workers=1, progress=False)
+    return record_wander(tmp_path_factory.mktemp("demos") / "goal.hdf5", TASK, SIZE)
 
 
 def test_poses_of_fixtures_are_recorded(path):

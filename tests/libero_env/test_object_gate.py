@@ -13,8 +13,7 @@ from PIL import Image
 
 from libero_env.design.objects import add_object
 from libero_env.errors import LiberoError
-from libero_env.limited import limited_process
-from libero_env.objects import catalog, folder, get_object
+from libero_env.objects import folder, get_object
 from libero_env.objects.mjcf import read_mjcf
 
 pytestmark = pytest.mark.sim
@@ -25,23 +24,13 @@ PAINT = '<material name="p" texture="t"/>'
 PAINTED = '<geom type="box" size=".02 .02 .02" mass=".1" material="p"/>'
 
 
-@pytest.fixture(autouse=True, scope="module")
-def one_process():
-    """All files are read in the same process with limits."""
-    with limited_process():
-        yield
-
-
 @pytest.fixture(autouse=True)
-def home(tmp_path, monkeypatch) -> Path:
+def home(objects_home) -> Path:
     """A folder `own` for the files of an object, and objects and caches beside it."""
-    monkeypatch.setenv("LIBERO_OBJECTS", str(tmp_path / "objects"))
-    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(catalog, "_registered", {})
     for name in ("own", "secret"):
-        (tmp_path / name).mkdir()
-        trimesh.creation.box((0.04, 0.05, 0.06)).export(tmp_path / name / "m.stl")
-    return tmp_path
+        (objects_home / name).mkdir()
+        trimesh.creation.box((0.04, 0.05, 0.06)).export(objects_home / name / "m.stl")
+    return objects_home
 
 
 def mjcf(home: Path, *, geom: str = BOX, assets: str = "", inside: str = "", around: str = "") -> Path:

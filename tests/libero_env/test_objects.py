@@ -1,7 +1,6 @@
 """Every object of the catalog: parameters, stability, visuals, and behaviour in a scene."""
 
 import itertools
-import json
 
 import mujoco
 import numpy as np
@@ -12,6 +11,7 @@ from libero_env.objects import ObjectModel, catalog, get_object, object_names, r
 from libero_env.objects.builtin import builtin_names
 from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.model import rest_quat
+from tests.harness.models import bounds
 
 pytestmark = pytest.mark.sim
 
@@ -33,18 +33,12 @@ def category(request) -> str:
     return request.param
 
 
-@pytest.fixture(scope="module")
-def measured(shared) -> dict:
-    """The original's figures, category -> record."""
-    return json.loads((shared / "official" / "objects.json").read_text())
-
-
 @pytest.fixture
-def record(category, measured) -> dict:
+def record(category, measured_objects) -> dict:
     """The original's figures of the category; it names cherries, corn and mayo, but has no model of them."""
-    if "error" in measured[category]:
+    if "error" in measured_objects[category]:
         pytest.skip("the original has no model of it")
-    return measured[category]
+    return measured_objects[category]
 
 
 @pytest.fixture
@@ -56,31 +50,6 @@ def scratch_catalog(monkeypatch):
 def collision_geoms(model: mujoco.MjModel) -> np.ndarray:
     """Indices of the geoms that collide."""
     return np.flatnonzero(model.geom_contype | model.geom_conaffinity)
-
-
-def bounds(model: mujoco.MjModel, geoms) -> np.ndarray:
-    """Axis-aligned box around geoms at the pose of the compiled model, (2, 3): low, high."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    points = []
-    for geom in geoms:
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
-            start = model.mesh_vertadr[model.geom_dataid[geom]]
-            local = model.mesh_vert[start : start + model.mesh_vertnum[model.geom_dataid[geom]]]
-        else:
-            local = np.array(list(itertools.product((-1, 1), repeat=3))) * half_extent(model, geom)
-        points.append(local @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom])
-    points = np.concatenate(points)
-    return np.stack([points.min(axis=0), points.max(axis=0)])
-
-
-def half_extent(model: mujoco.MjModel, geom: int) -> np.ndarray:
-    """Half the size of the box around a primitive, in its own frame, (3,)."""
-    size, kind = model.geom_size[geom], model.geom_type[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_BOX:
-        return size
-    cap = size[0] if kind == mujoco.mjtGeom.mjGEOM_CAPSULE else 0.0
-    return np.array([size[0], size[0], size[1] + cap])
 
 
 def scene_spec() -> mujoco.MjSpec:
@@ -104,10 +73,6 @@ def attach(scene: mujoco.MjSpec, model: ObjectModel, prefix: str, pos, quat) -> 
 def damp(joint: mujoco.MjsJoint, damping: float) -> None:
     """Sets linear damping: a number in MuJoCo 3, the first of three coefficients in 4."""
     joint.damping = damping if np.isscalar(joint.damping) else (damping, 0.0, 0.0)
-
-
-def test_builtin_pack_covers_libero_object():
-    assert {*GROCERIES, "basket"} <= set(object_names())
 
 
 def test_conventions_of_the_model(category):

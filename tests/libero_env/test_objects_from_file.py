@@ -16,13 +16,12 @@ from libero_env.design.objects.collision import boxes_of, collision_pieces, is_c
 from libero_env.design.objects.mesh_file import bounds, read_mesh
 from libero_env.design.objects.mesh_object import DENSITY, merge_vertices
 from libero_env.errors import LiberoError
-from libero_env.limited import limited_process
-from libero_env.objects import catalog, folder, get_object, object_names
+from libero_env.objects import folder, get_object, object_names
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
 from libero_env.tasks.builder import model_regions
 
-pytestmark = pytest.mark.sim
+pytestmark = [pytest.mark.sim, pytest.mark.usefixtures("objects_home")]
 
 DOOR = """<mujoco><compiler angle="radian"/>
   <default><default class="look"><geom contype="0" conaffinity="0" group="2" mass="0"/></default></default>
@@ -37,22 +36,6 @@ ORIGINAL = """<mujoco><worldbody><body>
   <body name="object"><geom type="box" size="0.02 0.02 0.03" mass="0.05" group="0"/>
     <geom type="box" size="0.02 0.02 0.03" rgba="0.9 0.1 0.1 1" group="1" contype="0" conaffinity="0"/></body>
   <site name="bottom_site" pos="0 0 -0.03"/></body></worldbody></mujoco>"""
-
-
-@pytest.fixture(autouse=True, scope="module")
-def one_process():
-    """All files are read in the same process with limits."""
-    with limited_process():
-        yield
-
-
-@pytest.fixture(autouse=True)
-def home(tmp_path, monkeypatch) -> Path:
-    """An empty folder of objects, and registrations that end with the test."""
-    monkeypatch.setenv("LIBERO_OBJECTS", str(tmp_path / "objects"))
-    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(catalog, "_registered", {})
-    return tmp_path
 
 
 def box(path: Path, extents=(0.04, 0.05, 0.06)) -> Path:

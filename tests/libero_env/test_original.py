@@ -1,6 +1,5 @@
-"""The original's assets: physics as measured from the original, rooms as it had them, level of detail."""
+"""The original's assets: physics as measured_objects from the original, rooms as it had them, level of detail."""
 
-import json
 from pathlib import Path
 
 import mujoco
@@ -19,6 +18,7 @@ from libero_env.objects import ObjectModel, register_object
 from libero_env.objects.catalog import _registered
 from libero_env.sim.scene import scene_spec
 from libero_env.tasks import get_task
+from tests.harness.models import bounds
 
 pytestmark = pytest.mark.sim
 
@@ -30,17 +30,6 @@ _CUT = {"window": {"slide": "window_slide"}, "faucet": {"link2": "faucet_link2"}
 @pytest.fixture(scope="module")
 def pack(shared):
     return OriginalPack(str(shared / "official" / "assets"))
-
-
-@pytest.fixture(scope="module")
-def measured(shared):
-    return json.loads((shared / "official" / "objects.json").read_text())
-
-
-@pytest.fixture(scope="module")
-def rooms(shared):
-    found = json.loads((shared / "official" / "workspaces.json").read_text())
-    return {name.casefold(): room for name, room in found.items()}
 
 
 @pytest.fixture(scope="module")
@@ -58,22 +47,22 @@ def test_the_folder_is_recognised(shared, tmp_path):
     assert is_original(shared / "official" / "assets") and not is_original(tmp_path)
 
 
-def test_all_that_the_original_could_build_is_there(pack, measured):
-    assert set(pack.categories()) == {name for name, found in measured.items() if "mass" in found}
+def test_all_that_the_original_could_build_is_there(pack, measured_objects):
+    assert set(pack.categories()) == {name for name, found in measured_objects.items() if "mass" in found}
 
 
-def test_masses(pack, measured, compiled):
+def test_masses(pack, measured_objects, compiled):
     for category in pack.categories():
         names = _CUT.get(category, {})
-        for body in measured[category]["bodies"]:
+        for body in measured_objects[category]["bodies"]:
             mass = compiled(category).body(names.get(body["name"], body["name"])).mass[0]
             assert mass == pytest.approx(body["mass"], abs=6e-6), (category, body["name"])
 
 
-def test_joints_are_in_order_and_move_the_same_way(pack, measured, compiled):
+def test_joints_are_in_order_and_move_the_same_way(pack, measured_objects, compiled):
     for category in pack.categories():
         model, names = compiled(category), _CUT.get(category, {})
-        expected = [joint for joint in measured[category]["joints"] if joint["type"] != "free"]
+        expected = [joint for joint in measured_objects[category]["joints"] if joint["type"] != "free"]
         assert [model.joint(j).name for j in range(model.njnt)] == [
             names.get(j["name"], j["name"]) for j in expected
         ]
@@ -85,28 +74,28 @@ def test_joints_are_in_order_and_move_the_same_way(pack, measured, compiled):
             assert np.ravel(found.damping)[0] == pytest.approx(joint["damping"])
 
 
-def test_sites_are_where_regions_expect_them(pack, measured, compiled):
+def test_sites_are_where_regions_expect_them(pack, measured_objects, compiled):
     for category in pack.categories():
         model = compiled(category)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         assert [model.site(s).name for s in range(model.nsite)] == [
-            s["name"] for s in measured[category]["sites"]
+            s["name"] for s in measured_objects[category]["sites"]
         ]
-        for i, site in enumerate(measured[category]["sites"]):
+        for i, site in enumerate(measured_objects[category]["sites"]):
             np.testing.assert_allclose(data.site_xpos[i], site["pos"], atol=2e-5, err_msg=category)
             np.testing.assert_allclose(data.site_xmat[i], site["xmat"], atol=2e-4, err_msg=category)
             used = {"box": 3, "cylinder": 2, "sphere": 1}.get(site["type"], 3)
             np.testing.assert_allclose(model.site_size[i][:used], site["size"][:used], atol=2e-5)
 
 
-def test_collision_geoms(pack, measured, compiled):
+def test_collision_geoms(pack, measured_objects, compiled):
     for category in pack.categories():
         model = compiled(category)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
         solid = np.flatnonzero((model.geom_contype | model.geom_conaffinity) > 0)
-        expected = measured[category]["collision_geoms"]
+        expected = measured_objects[category]["collision_geoms"]
         assert len(solid) == len(expected), category
         for geom, found in zip(solid, expected, strict=True):
             np.testing.assert_allclose(data.geom_xpos[geom], found["pos"], atol=3e-5, err_msg=category)
@@ -122,9 +111,9 @@ def test_visual_geoms_weigh_nothing_and_collision_geoms_are_hidden(pack, compile
         assert (model.geom_group[meshes] == 1).all(), category
 
 
-def test_placement_figures_are_those_of_the_files(pack, measured):
+def test_placement_figures_are_those_of_the_files(pack, measured_objects):
     for category in pack.categories():
-        model, expected = pack.build(category), measured[category]
+        model, expected = pack.build(category), measured_objects[category]
         np.testing.assert_allclose(model.bottom_offset, expected["bottom_offset"], atol=1e-5)
         np.testing.assert_allclose(model.top_offset, expected["top_offset"], atol=1e-5)
         assert model.horizontal_radius == pytest.approx(expected["horizontal_radius"], abs=1e-5)
@@ -204,11 +193,11 @@ def _room(pack, workspace, properties=None):
 
 
 @pytest.mark.parametrize("workspace", [name for name in WORKSPACES if name != "coffee_table"])
-def test_rooms_are_the_original(pack, rooms, workspace):
+def test_rooms_are_the_original(pack, measured_workspaces, workspace):
     model = _room(pack, workspace)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    room = rooms[load_workspace(workspace).problem.casefold()]
+    room = measured_workspaces[load_workspace(workspace).problem.lower()]
     assert model.ngeom == len(room["arena_geoms"])
     for geom, expected in enumerate(room["arena_geoms"]):
         assert (model.geom(geom).name, model.body(model.geom_bodyid[geom]).name) == (
@@ -257,16 +246,8 @@ def test_level_of_detail_leaves_physics_alone(pack, shared, tmp_path, monkeypatc
     for name in ("geom_pos", "geom_quat", "geom_size", "geom_friction", "geom_solref", "geom_solimp"):
         np.testing.assert_array_equal(getattr(whole, name)[solid], getattr(light, name)[solid])
     assert list(tmp_path.rglob("lod-*.npz"))
-    np.testing.assert_allclose(_box(whole), _box(light), atol=2e-3)
-
-
-def _box(model):
-    """Bounding box of the visual mesh, in the frame of the root."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    geom = int(np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_MESH)[0])
-    points = model.mesh_vert @ data.geom_xmat[geom].reshape(3, 3).T + data.geom_xpos[geom]
-    return points.min(axis=0), points.max(axis=0)
+    meshes = [np.flatnonzero(m.geom_type == mujoco.mjtGeom.mjGEOM_MESH)[:1] for m in (whole, light)]
+    np.testing.assert_allclose(bounds(whole, meshes[0]), bounds(light, meshes[1]), atol=2e-3)
 
 
 def test_simplifying_keeps_the_picture_in_place():

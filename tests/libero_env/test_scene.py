@@ -1,6 +1,5 @@
 """Scene, placement, predicates and images."""
 
-import json
 import os
 import subprocess
 import sys
@@ -51,8 +50,8 @@ def test_joints_are_robot_gripper_objects_in_file_order(task):
     assert names[9:] == [f"{name}_joint0" for name in task.problem.objects]
 
 
-def test_the_workspace_has_the_measured_parameters(scene, shared):
-    figures = json.loads((shared / "official/workspaces.json").read_text())["libero_floor_manipulation"]
+def test_the_workspace_has_the_measured_parameters(scene, measured_workspaces):
+    figures = measured_workspaces["libero_floor_manipulation"]
     model, data = scene.model, mujoco.MjData(scene.model)
     data.qpos[:9] = figures["arm_qpos"]
     mujoco.mj_forward(model, data)

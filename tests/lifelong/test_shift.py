@@ -15,7 +15,6 @@ from libero_env.cli.main import main
 from libero_env.demos import generate as recording
 from libero_env.demos import rendering
 from libero_env.demos.config import RenderConfig
-from libero_env.demos.generate import generate
 from libero_env.demos.read import read_episodes
 from libero_env.demos.rendering import RenderJob, ensure_rendered
 from libero_env.perturbations import parse_perturbations, reword_task
@@ -35,7 +34,7 @@ from lifelong.sequence.learning import TaskSequence
 from lifelong.settings import build
 from lifelong.streams import StreamSettings
 from tests.harness.configs import composed
-from tests.harness.demos import wander
+from tests.harness.demos import record_wander
 from tests.harness.records import evaluation, run_start
 from tests.harness.runs import make_run
 
@@ -58,11 +57,8 @@ class Stop(BaseException):
 def folder(tmp_path_factory):
     """Record two demonstrations of two tasks without an expert, where `data.folder` finds them."""
     root = tmp_path_factory.mktemp("demos")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("libero_env.demos.record.run_experts", wander)
-        for task in TASKS:
-            path = root / task.suite / f"{task.name}_demo.hdf5"
-            generate(task, 2, path=path, camera_size=(32, 32), workers=1, progress=False)
+    for task in TASKS:
+        record_wander(root / task.suite / f"{task.name}_demo.hdf5", task, (32, 32))
     return root
 
 
