@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from libero._adapters.models import assets_folder
-from libero_env.assets.furnishing import load_styles
 from libero_env.assets.original_arena import SCENES
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.init_states.placement import ARM_NOISE
@@ -103,34 +101,20 @@ def with_room(problem: Problem, scene_xml: Any, scene_properties: Any) -> Proble
 
     Raises:
         InvalidInputError: The file is not a scene of the task's workspace.
-        UnknownNameError: There is no such property or style.
     """
     if scene_xml is None and scene_properties is None:
         return problem
     workspace = workspace_of(problem)[1]
     room = {**workspace.parameters["styles"], **problem.scene_properties}
     if scene_xml is not None:
-        names = ("base", *_SCENE_STYLES.get(workspace.name, ()))
-        files = {f"scenes/{SCENES[workspace.name]}_{style}_style.xml": style for style in names}
-        whole = (
-            {str(folder / file): style for file, style in files.items()}
-            if (folder := assets_folder())
-            else {}
-        )
-        if str(scene_xml) not in files | whole:
-            raise InvalidInputError(
-                f"scene_xml={shown(scene_xml)}: not supported; expected {' or '.join(files)}"
-            )
-        room["scene"] = (files | whole)[str(scene_xml)]
+        styles = ("base", *_SCENE_STYLES.get(workspace.name, ()))
+        files = {f"scenes/{SCENES[workspace.name]}_{style}_style.xml": style for style in styles}
+        if str(scene_xml) not in files:
+            valid = " or ".join(files)
+            raise InvalidInputError(f"scene_xml={shown(scene_xml)}: not supported; expected {valid}")
+        room["scene"] = files[str(scene_xml)]
     if scene_properties is not None:
         if not isinstance(scene_properties, Mapping):
             raise InvalidInputError(f"scene_properties={shown(scene_properties)}; expected a dictionary")
-        styles = load_styles()
-        for key, name in scene_properties.items():
-            kind = str(key).removesuffix("_style")
-            if kind not in _USUAL_STYLES:
-                raise UnknownNameError("key of scene_properties", key, [f"{k}_style" for k in _USUAL_STYLES])
-            if name not in styles[kind]:
-                raise UnknownNameError(f"{kind} style", name, styles[kind])
         room |= _USUAL_STYLES | {str(k).removesuffix("_style"): v for k, v in scene_properties.items()}
     return replace(problem, scene_properties=room)

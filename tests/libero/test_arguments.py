@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from libero._adapters.controllers import DEFAULTS
+from libero._adapters.observations import Observable
 from libero.libero.envs import TASK_MAPPING, ControlEnv
 from libero_env.assets.robot import REST_QPOS
 from libero_env.errors import LiberoError, UnknownNameError
@@ -135,17 +136,15 @@ def test_a_hard_reset_undoes_what_was_changed_and_another_keeps_it(make_env, har
     assert DEFAULTS["OSC_POSE"]["output_max"][0] == 0.05
 
 
-def test_a_hard_reset_returns_from_a_model_of_text(make_env):
+def test_a_hard_reset_returns_from_a_model_of_text_and_observables_are_kept(make_env):
     env = make_env(**BLIND)
     env.reset()
-    text = env.sim.model.get_xml()
-    env.reset_from_xml_string(text.replace('gravity="0 0 -9.81"', 'gravity="0 0 -1"'))
-    camera = env.sim.model.camera_name2id("agentview")
-    env.sim.model.cam_pos[camera] = 1.0
+    env.env.add_observable(Observable("two", lambda seen: 2.0, modality="own"))
+    env.reset_from_xml_string(env.sim.model.get_xml().replace('density="1.2"', 'density="3"'))
+    assert env.sim.model.opt.density == 3.0
     env.reset()
-    assert env.sim.model.cam_pos[camera].tolist() == env.env.scene.model.cam_pos[camera].tolist()
-    assert env.sim.model._model is not None
-    env.step(np.zeros(7))
+    assert env.sim.model.opt.density == 1.2
+    assert env.step(np.zeros(7))[0]["two"] == 2.0
 
 
 @pytest.mark.parametrize(("calls", "lag"), [(0, 0), (1, 1), (2, 2), (25, 0)])
@@ -242,7 +241,7 @@ def test_rooms_of_the_arguments(make_env):
         ({"scene_xml": "does/not/exist.xml"}, "scene_xml='does/not/exist.xml': not supp.* scenes/libero_f"),
         ({"scene_xml": "scenes/libero_tabletop_base_style.xml"}, "scene_xml"),
         ({"scene_properties": {"floor_style": "lava"}}, "unknown floor style 'lava'"),
-        ({"scene_properties": {"roof_style": "dark"}}, "unknown key of scene_properties 'roof_style'"),
+        ({"scene_properties": {"roof_style": "dark"}}, "unknown scene property 'roof'"),
         ({"initialization_noise": {"magnitude": 0.1, "type": "pink"}}, "initialization_noise=.*; expected 'default'"),
         ({"initialization_noise": 0.1}, "initialization_noise=0.1; expected 'default'"),
     ],

@@ -200,6 +200,7 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         self._restart_clock()
         self._is_sampled = self._closed = False
         self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
+        self._observables: OrderedDict[str, Any] = OrderedDict()
         self._controller_configs, self._robots, self._xml = controller_configs, robots, ""
         self._load_model()
         self._setup_references()
@@ -271,7 +272,7 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         )  # robosuite shrinks them to nothing
         observed = list(scene.objects) if self.use_object_obs else []
         self.observer = Observer(self.sim, observed, drawn, self.model.segments)
-        self._observables = self._setup_observables()
+        self._observables = self._observables or self._setup_observables()
         self._add_placement_initializer()
 
     def _setup_workspace(self) -> None:
