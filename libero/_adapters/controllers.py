@@ -17,43 +17,28 @@ from libero_env.sim.controller import POINTING_DOWN, ControllerState, get_contro
 from libero_env.sim.osc import goals_from_poses, move_gripper, rotate
 from libero_env.text import shown
 
-# robosuite's controllers/config/*.json
-_MOVES, _TURNS = [0.05] * 3, [0.5] * 3  # m and rad
-_INPUT = {"input_max": 1, "input_min": -1}
 _GAINS = {
     "damping_ratio": 1,
     "impedance_mode": "fixed",
     "kp_limits": [0, 300],
     "damping_ratio_limits": [0, 10],
 }
-_RAMP = {"interpolation": None, "ramp_ratio": 0.2}
-_POSE = {"output_max": _MOVES + _TURNS, "output_min": [-x for x in _MOVES + _TURNS], "kp": 150}
-_POSITION = {"output_max": _MOVES, "output_min": [-x for x in _MOVES], "kp": 150}
-_JOINTS = {"output_max": 0.05, "output_min": -0.05, "kp": 50}
-_SPEEDS = {"output_max": 0.5, "output_min": -0.5, "kp": 3.0, "velocity_limits": [-1, 1]}
-_TORQUES = {"output_max": 0.1, "output_min": -0.1, "torque_limits": None}
 _POSES = {"orientation_limits": None, "uncouple_pos_ori": True}
-DEFAULTS: dict[str, dict[str, Any]] = {
-    "OSC_POSE": {
-        **_INPUT,
-        **_POSE,
-        **_GAINS,
-        "position_limits": None,
-        **_POSES,
-        "control_delta": True,
-        **_RAMP,
-    },
-    "OSC_POSITION": {
-        **_INPUT,
-        **_POSITION,
-        **_GAINS,
-        "position_limits": None,
-        "control_delta": True,
-        **_RAMP,
-    },
-    "JOINT_POSITION": {**_INPUT, **_JOINTS, **_GAINS, "qpos_limits": None, **_RAMP},
-    "JOINT_VELOCITY": {**_INPUT, **_SPEEDS, **_RAMP},
-    "JOINT_TORQUE": {**_INPUT, **_TORQUES, **_RAMP},
+_OSC = {"kp": 150, **_GAINS, "position_limits": None, "control_delta": True}
+
+
+def _ranges(most: Any) -> dict[str, Any]:
+    least = [-x for x in most] if isinstance(most, list) else -most
+    ranges = {"input_max": 1, "input_min": -1, "output_max": most, "output_min": least}
+    return {**ranges, "interpolation": None, "ramp_ratio": 0.2}
+
+
+DEFAULTS: dict[str, dict[str, Any]] = {  # robosuite's controllers/config/*.json; m, rad, rad/s and N m
+    "OSC_POSE": {**_ranges([0.05] * 3 + [0.5] * 3), **_OSC, **_POSES},
+    "OSC_POSITION": {**_ranges([0.05] * 3), **_OSC},
+    "JOINT_POSITION": {**_ranges(0.05), "kp": 50, **_GAINS, "qpos_limits": None},
+    "JOINT_VELOCITY": {**_ranges(0.5), "kp": 3.0, "velocity_limits": [-1, 1]},
+    "JOINT_TORQUE": {**_ranges(0.1), "torque_limits": None},
 }
 _PANDA = {"type": "JOINT_VELOCITY", "kp": 0.03}  # default_panda.json
 # Keys that have one value here; the others of robosuite are obeyed, or have no effect with these values.
@@ -127,6 +112,7 @@ _NAMES: dict[str, Callable[[Any], Any]] = {  # m, rad, N m
     "initial_ee_ori_mat": lambda c: _at_rest(c)[1],
     "actuator_max": lambda c: c._env.simulations.arm.torque_limit.copy(),
     "actuator_min": lambda c: -c.actuator_max,
+    "control_limits": lambda c: (c.input_min, c.input_max),
     "actuator_limits": lambda c: (c.actuator_min, c.actuator_max),
     "action_scale": lambda c: abs(c.output_max - c.output_min) / abs(c.input_max - c.input_min),
     "action_input_transform": lambda c: (c.input_max + c.input_min) / 2.0,
@@ -137,6 +123,9 @@ _NAMES: dict[str, Callable[[Any], Any]] = {  # m, rad, N m
     "control_freq": lambda c: c._env.control_freq,
     "model_timestep": lambda c: c._env.sim.model.opt.timestep,
     "relative_ori": lambda c: np.zeros(3),
+    "impedance_mode": lambda c: "fixed",
+    "uncoupling": lambda c: True,
+    **dict.fromkeys(("orientation_limits", "interpolator_pos", "interpolator_ori"), lambda c: None),
 }
 
 
@@ -150,20 +139,18 @@ class Controller(Named, names=_NAMES):
         control_dim: Length of an action without the gripper.
         input_min, input_max, output_min, output_max: Ranges of an action, and what they mean, (control_dim,).
         position_limits, velocity_limits, torque_limits: Bounds of goals, (2, n): m, rad, rad/s or N m; None for none.
-        initial_joint: Joints towards which operational space control pulls, (7,) rad.
     """
 
-    impedance_mode, orientation_limits, uncoupling, new_update = "fixed", None, True, True
-    interpolator_pos, interpolator_ori, ori_ref, eef_name, joint_dim = None, None, None, GRIP_SITE, 7
+    new_update, ori_ref, eef_name, joint_dim = True, None, GRIP_SITE, 7
     joint_index, qpos_index, qvel_index = list(range(7)), _INDICES, _INDICES
 
     def __init__(self, env: Domain, config: Mapping[str, Any]):
         self._env, self.name = env, config["type"]
-        for name, key in (("kp", "kp_limits"), ("damping_ratio", "damping_ratio_limits")):
-            for end, value in zip(("min", "max"), config.get(key, ()), strict=False):
-                setattr(self, f"{name}_{end}", np.full(6 if self.name.startswith("OSC") else 7, float(value)))
         self.use_delta = bool(config.get("control_delta", True))
         self.control_dim = self._law.action_dim - 1
+        for name in ("kp", "damping_ratio"):
+            for end, value in zip(("min", "max"), config.get(f"{name}_limits", ()), strict=False):
+                setattr(self, f"{name}_{end}", self._numbers({name: value}, name, self._law.gains.shape[1]))
         for key in ("input_max", "input_min", "output_max", "output_min"):
             setattr(self, key, self._numbers(config, key, self.control_dim))
         self.position_limits = self.velocity_limits = self.torque_limits = None
@@ -174,7 +161,6 @@ class Controller(Named, names=_NAMES):
         if self.name == "JOINT_TORQUE":
             law = replace(law, kernel=_given_torques)
         env.simulations.controller_state = ControllerState(1, law)
-        self.initial_joint = env.simulations.rest
         self.reset_goal()
 
     def _gains(self, config: Mapping[str, Any]) -> np.ndarray:
@@ -220,11 +206,8 @@ class Controller(Named, names=_NAMES):
     def _set_goals(self, ids, actions, qpos, site_pos, site_mat, goal, memory):
         """See `libero_env.sim.controller.Controller`."""
         move, limits = actions[0, : self.control_dim], self.position_limits
-        wanted = (
-            self.scale_action(move)
-            if self.use_delta
-            else np.clip(move, self._law.low[:-1], self._law.high[:-1])
-        )
+        absolute = np.clip(move, self._law.low[:-1], self._law.high[:-1])
+        wanted = self.scale_action(move) if self.use_delta else absolute
         if self.name == "OSC_POSE" and not self.use_delta:
             goals_from_poses(ids, wanted[None], goal, memory)
         elif self.name == "OSC_POSE" and wanted[3:].any():
@@ -254,13 +237,6 @@ class Controller(Named, names=_NAMES):
         name = "joint_position" if is_torque and value else self.name.lower()
         self._law = get_controller(name, bool(value))
 
-    @property
-    def control_limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest action without the gripper; a range of input is that of relative actions."""
-        if self.use_delta:
-            return self.input_min, self.input_max
-        return self._law.low[:-1], self._law.high[:-1]
-
     # State --------------------------------------------------------------------------------------------------
 
     _state = property(attrgetter("_env.simulations.controller_state"))
@@ -283,6 +259,15 @@ class Controller(Named, names=_NAMES):
     @kd.setter
     def kd(self, value: Any) -> None:
         self._set_gains(1, value)
+
+    @property
+    def initial_joint(self) -> np.ndarray:
+        """Joints towards which operational space control pulls, (7,) rad."""
+        return self._env.simulations.rest
+
+    @initial_joint.setter
+    def initial_joint(self, value: Any) -> None:
+        self._env.simulations.rest = self._numbers({"initial_joint": value}, "initial_joint", 7)
 
     def _set_gains(self, row: int, value: Any) -> None:
         if self.name in ("JOINT_VELOCITY", "JOINT_TORQUE"):

@@ -37,7 +37,9 @@ class Named:
     def __init_subclass__(cls, names: Mapping[str, Callable[[Any], Any]] | None = None, **kwargs: Any):
         super().__init_subclass__(**kwargs)
         for name, function in (names or {}).items():
-            setattr(cls, name, property(function))
+            shown = property(function)
+            shown.__set_name__(cls, name)  # type: ignore[attr-defined]  # messages have the name
+            setattr(cls, name, shown)
 
     if TYPE_CHECKING:
 

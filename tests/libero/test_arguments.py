@@ -91,6 +91,26 @@ def test_gains_and_scales_of_a_controller_can_be_set_until_the_next_reset(make_e
     np.testing.assert_allclose(drive(env), far, atol=1.5e-6)
 
 
+def test_the_rest_pose_and_absolute_poses_of_a_controller(make_env):
+    env = make_env(**BLIND)
+    env.reset()
+    env.robots[0].controller.initial_joint = np.array(REST_QPOS) + [0.5, -0.3, 0.5, 0.2, 0.3, -0.2, 0.4]
+    pulled = [0.142325, -0.210039, -0.015118, -2.389578, 0.118885, 2.237281, 0.740729]
+    np.testing.assert_allclose(drive(env), pulled, atol=1.5e-6)
+    env.reset()
+    assert env.robots[0].controller.initial_joint.tolist() == list(REST_QPOS)
+    env.robots[0].controller.use_delta = False
+    rng = np.random.RandomState(0)
+    for _ in range(8):
+        env.step([*rng.uniform(-0.3, 0.3, 6) + [-0.15, 0.0, 0.4, 3.0, 0.0, 0.0], 1.0])
+    reached = [-0.073575, -0.361918, 0.085319, -2.186173, 0.093406, 1.774122, 1.230745]
+    np.testing.assert_allclose(env.sim.data.qpos[:7], reached, atol=5e-6)
+    assert env.env.action_spec[1].tolist() == [1.0] * 7
+    for name in ("impedance_mode", "uncoupling", "orientation_limits", "interpolator_pos"):
+        with pytest.raises(AttributeError, match=name):
+            setattr(env.robots[0].controller, name, 3)
+
+
 def test_scales_of_joint_controllers_are_of_seven_joints(make_env):
     for name, scale, gain in (
         ("JOINT_POSITION", 0.05, 50.0),

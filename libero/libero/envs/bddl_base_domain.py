@@ -227,7 +227,6 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         self.scene = build_scene(self.problem, pack, drawing=self.drawing, robot=self.robot)
         self._setup_workspace()
         hooks = ("_load_fixtures_in_arena", "_load_objects_in_arena", "_load_sites_in_arena", "_setup_camera")
-        model = self.scene.model
         if any(getattr(type(self), hook) is not getattr(BDDLBaseDomain, hook) for hook in hooks):
             from libero.libero.envs.arenas import Arena
 
@@ -237,8 +236,8 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
                 getattr(self, hook)(arena)
             for name in {**self.objects_dict, **self.fixtures_dict}:
                 lookup(self.scene.entities, "object or fixture of the task file", name)
-            model = arena.spec.compile()
-        self._simulate(model)
+            self.scene = replace(self.scene, model=arena.spec.compile())
+        self._simulate(self.scene.model)
 
     def _simulate(self, model: mujoco.MjModel) -> None:
         self.simulations = ClientSimulations(model, 1, self.scene.fixture_bodies.tolist())
