@@ -231,7 +231,9 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
             from libero.libero.envs.arenas import Arena
 
             arena = Arena(scene_spec(self.problem, pack, drawing=self.drawing, robot=self.robot))
-            self.objects_dict, self.fixtures_dict, self.object_sites_dict = {}, {}, {}
+            self.objects_dict: dict[str, Any] = {}
+            self.fixtures_dict: dict[str, Any] = {}
+            self.object_sites_dict: dict[str, Any] = {}
             for hook in hooks:
                 getattr(self, hook)(arena)
             for name in {**self.objects_dict, **self.fixtures_dict}:
