@@ -323,7 +323,8 @@ class Session:
 
 
 def _tasks() -> list[Task]:
-    return [task for name in suite_names() for task in get_suite(name).tasks]
+    tasks = (task for name in suite_names() for task in get_suite(name).tasks)
+    return list({task.id: task for task in tasks}.values())  # suites of all tasks hold those of others
 
 
 def _words(message: Mapping[str, Any], key: str) -> str | None:

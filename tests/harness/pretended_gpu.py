@@ -58,16 +58,8 @@ def _register_device() -> None:
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder, "device.so")
         flags = [
-            "-shared",
-            "-fPIC",
-            "-std=c++20",
-            f"-I{torch_folder}/include",
-            "-x",
-            "c++",
-            "-",
-            "-o",
-            library,
-        ]
+            "-shared", "-fPIC", "-std=c++20", f"-I{torch_folder}/include", "-x", "c++", "-", "-o", library
+        ]  # fmt: skip
         subprocess.run(["g++", *flags], input=_DEVICE, text=True, check=True)
         ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
 
