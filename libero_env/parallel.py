@@ -15,6 +15,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessP
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from multiprocessing import connection
+from multiprocessing.context import SpawnContext
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -104,22 +105,30 @@ def _same(own: Any, value: Any) -> bool:
     return isinstance(own, dict) and own == value
 
 
+def spawn_context() -> SpawnContext:
+    """Return the context of processes that start with a new interpreter: an OpenGL context that a fork inherits hangs.
+
+    They are told the method of this process, and end where they do not know it, as that of joblib's processes.
+    """
+    if multiprocessing.get_start_method(True) not in (None, *multiprocessing.get_all_start_methods()):
+        multiprocessing.set_start_method("spawn", force=True)
+    return multiprocessing.get_context("spawn")
+
+
 def spawn_pool(
     workers: int, *, initializer: Callable[[], None] | None = None, picture_seconds: float = PICTURE_SECONDS
 ) -> ProcessPoolExecutor:
     """Return a pool of processes that start with a new interpreter and end when this process ends.
 
-    They are spawned, not forked: an OpenGL context that a fork inherits hangs. As a context manager, the pool is waited
-    for after an error, and killed where the work is interrupted.
+    As a context manager, the pool is waited for after an error, and killed where the work is interrupted.
 
     Args:
         workers: Number of processes.
         initializer: Function of a module that each process calls when it starts.
         picture_seconds: See `limit_first_picture`.
     """
-    spawn = multiprocessing.get_context("spawn")
     arguments = initializer, user_entries(), picture_seconds
-    return _Pool(workers, mp_context=spawn, initializer=_start_worker, initargs=arguments)
+    return _Pool(workers, mp_context=spawn_context(), initializer=_start_worker, initargs=arguments)
 
 
 def check_main_guard() -> None:

@@ -15,7 +15,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing import connection, get_context
+from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
 from multiprocessing.shared_memory import SharedMemory
@@ -27,7 +27,7 @@ from gymnasium import spaces
 from gymnasium.vector.utils import CloudpickleWrapper
 
 from libero_env.errors import InvalidInputError, LiberoError, is_debugging
-from libero_env.parallel import end_with_parent, user_entries, with_entries
+from libero_env.parallel import end_with_parent, spawn_context, user_entries, with_entries
 
 _JOIN_TIMEOUT = 5.0  # [s] for a worker to end by itself
 _PIPE_TIMEOUT = 60.0  # [s] for a message that has begun to go on, in either direction
@@ -215,7 +215,7 @@ class Worker:
 
     def start(self) -> None:
         """Start the process and have it make its environment; `wait_for` collects the answer to that."""
-        context = get_context("spawn")
+        context = spawn_context()
         self.pipe, other = context.Pipe()
         _limit_waiting(self.pipe)
         self.requests = 0

@@ -1,7 +1,6 @@
 """Processes of an evaluation: each takes units from the folder until all are done, and writes the result."""
 
 import math
-import multiprocessing
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -16,6 +15,7 @@ from libero_env.parallel import (
     PICTURE_SECONDS,
     end_with_parent,
     limit_first_picture,
+    spawn_context,
     user_entries,
     with_entries,
 )
@@ -224,7 +224,7 @@ class Workers:
     ):
         self._count, self._function, self._argument = count, function, argument
         self._picture_seconds = picture_seconds
-        self._context = multiprocessing.get_context("spawn")  # an OpenGL context that a fork inherits hangs
+        self._context = spawn_context()
         self._processes: list[BaseProcess] = []
         self._deaths, self._done = 0, 0
 

@@ -49,6 +49,17 @@ def _limited() -> bool:
     return parallel._picture_limit is not None
 
 
+def test_a_process_of_joblib_starts_processes():
+    """As where a job of a sweep records demonstrations: its own method of starting processes is joblib's."""
+    joblib = pytest.importorskip("joblib")
+    assert joblib.Parallel(2, backend="loky")(joblib.delayed(_largest)(one) for one in (2, 5)) == [2, 5]
+
+
+def _largest(value: int) -> int:
+    with spawn_pool(1) as pool:
+        return pool.submit(max, value, 1).result()
+
+
 @pytest.mark.sim
 def test_a_process_that_nobody_watches_says_so_itself():
     code = (
