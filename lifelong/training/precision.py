@@ -40,7 +40,7 @@ def autocast(device: torch.device, precision: str) -> torch.autocast:
 
 @contextmanager
 def float32_products(precision: str) -> Iterator[None]:
-    """With `fp32_strict` keep a GPU from rounding factors of float32 products to TF32's ten bits within the context.
+    """Keep a GPU from rounding factors of float32 products to TF32's ten bits within the context, if `fp32_strict`.
 
     By PyTorch's defaults cuDNN does so in convolutions and recurrent layers; matrix products are in float32.
     """

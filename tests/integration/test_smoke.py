@@ -145,7 +145,7 @@ def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
 @pytest.mark.parametrize(("override", "message"), [
     ("algo=evc", "unknown algo 'evc'. Did you mean 'ewc'? Valid: agem, "),
     ("benchmark.tasks=[butter]", "unknown task of libero_object 'butter'"),
-    ("eval.select=first", "eval.select is 'first'; expected one of 'best' or 'last'"),
+    ("eval.select=first", "eval.select is 'first'; expected one of 'best', 'first_best' or 'last'"),
     ("device=tpu", "valid: auto, cpu, cuda"),
 ])  # fmt: skip
 def test_errors_of_the_command_line_are_one_line(home, tmp_path, override, message):

@@ -135,7 +135,7 @@ def test_an_unknown_choice_lists_the_valid_ones(override):
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"select": "worst"}, "expected one of 'best' or 'last'"),
+    ({"select": "worst"}, "expected one of 'best', 'first_best' or 'last'"),
     ({"selection": "apart", "episodes": 40, "curve_episodes": 20}, "need 60 initial states"),
     ({"episodes": 0}, "at least 1"),
 ])  # fmt: skip

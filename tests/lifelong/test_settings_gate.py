@@ -74,7 +74,7 @@ def test_an_unknown_key_anywhere_is_told_with_the_nearest(whole):
     ({"train": MISSING}, "train is missing; choose a file of that group with train=NAME"),
     ({"train": {"lr": 1}}, "a file of that group is chosen with train=NAME"),
     ({"train__betas": [2, 0]}, "train.betas.0 is 2; expected below 1"),
-    ({"train__precision": "bf61"}, "expected one of 'auto', 'bf16' or 'fp32'. Did you mean 'bf16'?"),
+    ({"train__precision": "bf61"}, "expected one of 'auto', 'bf16', 'fp32' or 'fp32_strict'. Did you mean 'bf16'?"),
     ({"algo__memory": 5}, "algo.memory is 5; expected a component"),
     ({"algo__memory__budget": MISSING}, "algo.memory.budget is missing"),
     ({"algo__memory___target_": "lifelong.data.fake.FakeWindows"}, "algo.memory._target_ names"),
