@@ -56,7 +56,7 @@ from libero_env.tasks import bddl
 from libero_env.tasks.problem import WORKSPACES, And, Expression, Problem, ProblemError, Region
 from libero_env.tasks.source import Source, Trace, read_definition, scene_file
 from libero_env.tasks.task import FILE, Task, check_name
-from libero_env.text import suggest
+from libero_env.text import shown, suggest
 from libero_env.validation import validate
 
 EMPTY: Mapping[str, str] = {
@@ -531,10 +531,10 @@ def _fill(node: Any, values: Values, where: str) -> Any:
         UnknownNameError: A parameter has no value.
     """
     if isinstance(node, Mapping):
-        filled = {_fill(key, values, where): _fill(value, values, where) for key, value in node.items()}
-        if wrong := [key for key in filled if not isinstance(key, str)]:
-            raise LiberoError(f"{where}: the key {wrong[0]!r:.60} is not a text")
-        return filled
+        keys = [_fill(key, values, where) for key in node]
+        if wrong := [key for key in keys if not isinstance(key, str)]:
+            raise LiberoError(f"{where}: the key {shown(wrong[0])} is not a text")
+        return {key: _fill(value, values, where) for key, value in zip(keys, node.values(), strict=True)}
     if isinstance(node, list | tuple):
         return [_fill(item, values, where) for item in node]
     if not isinstance(node, str) or "$" not in node:

@@ -112,7 +112,7 @@ class Configuration:
 
     def is_own(self, group: str) -> bool:
         """Return whether a group and all of its components are classes of this package."""
-        return all(name.startswith(f"{_PACKAGE}.") for name in _targets(self.values[group]))
+        return all(name.startswith(f"{_PACKAGE}.") for name in _targets(self._node(group)))
 
     def _node(self, group: str) -> Any:
         if group not in self.values:

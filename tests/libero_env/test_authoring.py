@@ -158,6 +158,9 @@ def test_a_scene_may_be_a_file_beside_the_task(tmp_path):
     assert list(task.problem.objects) == ["milk_1", "butter_1"]
     assert Atom("On", ("milk_1", "floor_middle")) in task.problem.init
     assert Atom("On", ("butter_1", "floor_butter_1_start")) in task.problem.init
+    yaml_file(tmp_path / "list.yaml", facts | {"with": {"other": ["butter", "milk"]}})
+    with pytest.raises(LiberoError, match=r"the key \['butter', 'milk'\] is not a text"):
+        read_task(tmp_path / "list.yaml")
 
 
 @pytest.mark.parametrize(("changes", "message"), [

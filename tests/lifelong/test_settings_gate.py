@@ -92,6 +92,12 @@ def test_what_is_wrong_is_said_with_key_value_and_what_is_valid(changes, said, w
     assert "\n" not in str(error.value)
 
 
+def test_whose_classes_a_group_names_is_asked_of_a_group_that_is_there(whole):
+    assert Configuration(whole).is_own("policy")
+    with pytest.raises(ConfigError, match="policy is missing; choose a file"):
+        Configuration({key: value for key, value in whole.items() if key != "policy"}).is_own("policy")
+
+
 @dataclass
 class Part:
     size: int
