@@ -96,9 +96,6 @@ class DMPEL(RoutedExperts):
         self._memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
         self.episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
         self._held: Tensor | None = None  # (B, G, N), coefficients of the present episodes
-        # of each group, the tasks (counted in the library) whose experts count in some row of the present pass, and
-        # their coefficients (B, experts of these tasks)
-        self._counting: list[tuple[list[int], Tensor]] = []
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Store the episodes' contexts; after the base, add experts and build a new router."""
@@ -201,7 +198,7 @@ class DMPEL(RoutedExperts):
         def add(name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
             if self._now is None:
                 return None
-            counting, coefficients = self._counting[groups[name]]
+            counting, coefficients = self._now[1][groups[name]]
             if not counting:
                 return None
             pairs = [of_task[name] for of_task in self.library.values()]
@@ -211,13 +208,14 @@ class DMPEL(RoutedExperts):
 
         def encode(policy: Any, own: Any, observation: Observation) -> Tensor:
             now = self.coefficients(observation) if self._held is None else self._held
-            if now is not self._now:  # the same during an episode
-                self._now = now
+            if self._now is None or now is not self._now[0]:  # the same during an episode
                 of_tasks = now.unflatten(2, (-1, self.experts))  # (B, G, tasks, experts)
-                self._counting = [
+                # of each group, the tasks (by place in the library) whose experts count, and their coefficients
+                counting = [
                     _counting(of_tasks[:, group], counts)
                     for group, counts in enumerate(of_tasks.detach().any(3).any(0).tolist())
                 ]
+                self._now = now, counting
             return own(observation)
 
         return layers, add, encode

@@ -70,7 +70,7 @@ class RoutedExperts(FrozenBase):
         super().__init__(**settings)
         self._attachment = Attachment()
         self._learning: int | None = None  # task whose experts all samples use; None: each has its own
-        self._now: Tensor | None = None  # what `encode` chose for the rows of the present forward pass
+        self._now: Any = None  # what `encode` chose for the rows of the present forward pass
 
     def _begin(self, task_index: int, policy: Policy) -> torch.Generator | None:
         """Begin a task; see `FrozenBase`.
