@@ -290,7 +290,8 @@ def _is_within(name: str, packages: Sequence[str]) -> bool:
 def _resolve(name: str) -> Target:
     """Return the class or function of a name; modules are looked for in the current folder, too, after all others."""
     try:
-        if os.getcwd() not in sys.path and find_spec(name.partition(".")[0]) is None:
+        package = name.partition(".")[0]
+        if package not in sys.modules and os.getcwd() not in sys.path and find_spec(package) is None:
             sys.path.append(os.getcwd())  # for good: processes that this one starts need it as well
         target = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:

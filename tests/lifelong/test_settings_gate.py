@@ -1,7 +1,9 @@
 """Every key of a configuration is checked where its object is built, before anything is written or slow."""
 
 import re
+import sys
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -14,7 +16,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError
 from lifelong.results.run_directory import RunDirectory
-from lifelong.settings import GROUPS, Configuration, build, plain_data
+from lifelong.settings import GROUPS, Configuration, build, find_target, plain_data
 from lifelong.training.distributed import Ranks
 from lifelong.training.memory import check_memory, policy_bytes, training_needs
 from lifelong.training.settings import FitSettings
@@ -96,6 +98,14 @@ def test_whose_classes_a_group_names_is_asked_of_a_group_that_is_there(whole):
     assert Configuration(whole).is_own("policy")
     with pytest.raises(ConfigError, match="policy is missing; choose a file"):
         Configuration({key: value for key, value in whole.items() if key != "policy"}).is_own("policy")
+
+
+def test_a_class_of_a_notebook_is_found(monkeypatch):
+    """The module `__main__` of an interactive session has no specification."""
+    session = ModuleType("__main__")
+    session.Mine = dict
+    monkeypatch.setitem(sys.modules, "__main__", session)
+    assert session.__spec__ is None and find_target("__main__.Mine") is dict
 
 
 @dataclass
