@@ -40,7 +40,7 @@ from lifelong.results.relearning import by_measure, read_relearning, savings_hea
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_scores
 from lifelong.results.summary import write_episodes
-from lifelong.stats.metrics import METRIC_NAMES, Metrics, average_success, metric_values
+from lifelong.stats.metrics import METRIC_NAMES, Metrics, metric_values
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -137,8 +137,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
     rates, _ = run.results.success_matrix()
     save(heatmap_figure([Panel(f"{record.algo}, {record.benchmark}", rates, labels)]), folder / "heatmap")
     curves, losses = run.results.curves(), run.results.losses()
-    average = np.full((1, len(record.tasks)), np.nan)
-    average[0, : run.learned] = average_success(rates[: run.learned, : run.learned])
+    average = run.results.average_success()[None]
     times = {k: v for k, v in run.results.seconds_by_phase().items() if v > 0}
     return {
         "title": f"{record.algo} on {record.benchmark}",
@@ -231,9 +230,7 @@ def _success_of(group: Group) -> tuple[Panel, dict[str, Any], Line]:
     present = ~np.isnan(matrices)
     mean = np.where(present, matrices, 0).sum(0) / np.where(present.any(0), present.sum(0), np.nan)
     table = run_heatmap(runs[0].results, labels) if len(runs) == 1 else mean_heatmap(matrices, mean, labels)
-    values = np.full((len(runs), matrices.shape[1]), np.nan)
-    for row, run, rates in zip(values, runs, matrices, strict=True):
-        row[: run.learned] = average_success(rates[: run.learned, : run.learned])
+    values = np.stack([run.results.average_success() for run in runs])
     titled = table | {"title": group.label, "seeds": [run.record.seed for run in runs]}
     return Panel(group.label, mean, labels), titled, Line(group.label, values)
 

@@ -22,6 +22,7 @@ _BASICS = ("algo", "benchmark", "policy", "preset")
 # of keys that change no result by themselves
 _IGNORED = (
     "benchmark.order",
+    "benchmark.order_seed",
     "benchmark.horizon",
     "language.cache_dir",
     "data.memory",

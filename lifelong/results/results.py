@@ -30,6 +30,7 @@ from lifelong.stats.metrics import (
     Metrics,
     Scores,
     Transfer,
+    average_success,
     estimate_cells,
     lifelong_metrics,
     mean_curve,
@@ -196,6 +197,18 @@ class Results:
                     best[row, task] = self._curve_points[task][int(curve.epochs[curve.best])]
         return {"matrix": _matrix(size, best | cells), "curve": _matrix(size, cells | best)}
 
+    def _estimated(self, rates: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return success rates with the cells that a sample left out estimated; see `estimate_cells`."""
+        if self.run.cells != "sampled":
+            return rates
+        return estimate_cells(rates, [(group[-1], group.start) for group in self.run.groups])
+
+    def average_success(self) -> NDArray[np.float64]:
+        """Return the mean success over the tasks learned so far, after each task, (K,); NaN from the next task on."""
+        size, average = self.learned_tasks(), np.full(len(self.run.tasks), np.nan)
+        average[:size] = average_success(self._estimated(self.success_matrix()[0])[:size, :size])
+        return average
+
     @property
     def transfer(self) -> Transfer:
         """Estimate of forward transfer."""
@@ -214,8 +227,7 @@ class Results:
         groups = [g for g in self.run.groups if g.stop <= size]
         rates, episodes = self.success_matrix(diagonal)
         rows = [g[-1] for g in groups]
-        if self.run.cells == "sampled":
-            rates = estimate_cells(rates, [(g[-1], g.start) for g in groups])
+        rates = self._estimated(rates)
         return Scores(
             tuple(self._group_curves.get(row, _curve(())) for row in rows),
             np.stack([rates[rows, g.start : g.stop].mean(1) for g in groups], axis=1),
