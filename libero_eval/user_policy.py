@@ -9,6 +9,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -290,6 +291,12 @@ def _imported(module: str, text: str) -> ModuleType:
         )
     if not all(part.isidentifier() for part in parts):
         raise LifelongError(f"{text}: {module!r} is not a name of a module; {_WRITE}")
+    loaded, found = getattr(sys.modules.get(parts[0]), "__file__", None), PathFinder.find_spec(parts[0])
+    if loaded and found and found.origin and not os.path.samefile(loaded, found.origin):
+        raise LifelongError(
+            f"{text}: this process has already imported {parts[0]} from {loaded}, which is not {found.origin}; "
+            "evaluate the other in a process of its own"
+        )
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

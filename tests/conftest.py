@@ -1,10 +1,50 @@
 """Fixtures shared by all tests."""
 
 import contextlib
+import importlib
 import os
+import sys
+from collections import UserDict
 from pathlib import Path
 
 import pytest
+
+from libero_env import parallel
+
+REGISTRIES = (  # which users add to, besides those that are sent to workers
+    "libero.libero.benchmark:BENCHMARK_MAPPING", "libero.libero.utils.mu_utils:MU_DICT",
+    "libero.libero.utils.mu_utils:SCENE_DICT", "libero.libero.utils.object_utils:EXCEPTION_DICT",
+    "libero.libero.utils.task_generation_utils:TASK_INFO", "libero.lifelong.algos:REGISTERED_ALGOS",
+    "libero.lifelong.models.base_policy:REGISTERED_POLICIES"
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def forgetting(tmp_path_factory):
+    """Take back what a test registers, and the modules that it imports from a temporary folder."""
+    known, path = (*parallel._tables, *REGISTRIES), list(sys.path)
+    before = {one: copied(registry(one)) for one in known if one.partition(":")[0] in sys.modules}
+    yield
+    for address, entries in {**parallel._tables, **before}.items():
+        table = registry(address)
+        table.clear()
+        table.update(copied(entries))
+    sys.path[:] = path
+    base = tmp_path_factory.getbasetemp()
+    for name, module in list(sys.modules.items()):
+        if base in Path(getattr(module, "__file__", None) or "").parents:
+            del sys.modules[name]
+
+
+def registry(address: str) -> dict:
+    """Return a table by its address; of one that registers in others too, the table alone."""
+    module, _, name = address.partition(":")
+    table = getattr(importlib.import_module(module), name)
+    return table.data if isinstance(table, UserDict) else table
+
+
+def copied(table: dict) -> dict:
+    return {key: value.copy() if isinstance(value, dict | list) else value for key, value in table.items()}
 
 
 @pytest.fixture(scope="session")

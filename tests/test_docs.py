@@ -101,7 +101,6 @@ def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
     assert "libero_object/0 Estimate(value=0.0" in capsys.readouterr().out
     assert main(["eval", "--status", "eval/my_policy.make"]) == 0
     assert "1 of 1 units, 2 of 2 episodes" in capsys.readouterr().out
-    monkeypatch.delitem(sys.modules, "my_policy")
 
 
 def test_the_algorithm_of_the_guide():

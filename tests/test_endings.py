@@ -86,9 +86,7 @@ def here(tmp_path, monkeypatch) -> Path:
     Path("ending_policy.py").write_text(POLICY)
     Path("ending_broken.py").write_text("def make(:\n")
     Path("ending_lacking.py").write_text("import a_package_that_is_not_there\n")
-    yield tmp_path
-    for name in [name for name in sys.modules if name.startswith("ending_")]:
-        del sys.modules[name]
+    return tmp_path
 
 
 def test_a_fault_of_ours_is_a_traceback_and_a_request(monkeypatch, capsys):

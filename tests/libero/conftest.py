@@ -31,23 +31,3 @@ def make_env(suite):
     yield make
     for env in made:
         env.close()
-
-
-@pytest.fixture
-def registries(monkeypatch):
-    """Remove after the test what it registers: scenes, tasks, regions, objects and problem classes."""
-    from libero.libero.envs import TASK_MAPPING
-    from libero.libero.envs.base_object import OBJECTS_DICT
-    from libero.libero.utils import mu_utils, object_utils, task_generation_utils
-    from libero_env.objects import catalog
-
-    monkeypatch.setattr(mu_utils, "MU_DICT", dict(mu_utils.MU_DICT))
-    monkeypatch.setattr(mu_utils, "SCENE_DICT", {k: list(v) for k, v in mu_utils.SCENE_DICT.items()})
-    monkeypatch.setattr(task_generation_utils, "TASK_INFO", {})
-    monkeypatch.setattr(object_utils, "EXCEPTION_DICT", {})
-    monkeypatch.setattr(catalog, "_registered", dict(catalog._registered))
-    before = [(registry, dict(registry)) for registry in (OBJECTS_DICT, TASK_MAPPING)]
-    yield
-    for registry, entries in before:
-        registry.clear()
-        registry.update(entries)

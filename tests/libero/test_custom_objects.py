@@ -20,7 +20,7 @@ from libero.libero.utils.task_generation_utils import generate_bddl_from_task_in
 from libero_env.errors import LiberoError
 from libero_env.objects import get_object
 
-pytestmark = [pytest.mark.sim, pytest.mark.usefixtures("registries")]
+pytestmark = pytest.mark.sim
 
 # As the walkthrough prints it: one body, one mesh, no groups, no sites.
 PLAIN = """
@@ -355,7 +355,7 @@ def task_with(category, suite, folder):
     return folder / "task.bddl"
 
 
-def test_objects_that_robosuite_generates(tmp_path, suite, registries):
+def test_objects_that_robosuite_generates(tmp_path, suite):
     objects = pytest.importorskip("robosuite.models.objects")
 
     @register_object
@@ -379,7 +379,7 @@ def test_objects_that_robosuite_generates(tmp_path, suite, registries):
         env.close()
 
 
-def test_offsets_of_a_class_are_those_of_placement(tmp_path, suite, registries):
+def test_offsets_of_a_class_are_those_of_placement(tmp_path, suite):
     (tmp_path / "brick.xml").write_text(BRICK)
 
     @register_object

@@ -274,7 +274,7 @@ def test_absolute_actions_and_other_controllers(make_env):
     env.step(np.zeros(7))
 
 
-def test_a_problem_class_may_load_everything_as_the_originals_do(suite, registries):
+def test_a_problem_class_may_load_everything_as_the_originals_do(suite):
     """They fill dictionaries of objects, append sites of regions, and keep settings of their own."""
 
     class Libero_Floor_Manipulation(TASK_MAPPING["libero_floor_manipulation"]):
@@ -320,21 +320,16 @@ def test_a_problem_class_may_load_everything_as_the_originals_do(suite, registri
 def test_a_problem_class_can_move_a_camera(suite):
     from libero.libero.envs.bddl_base_domain import register_problem
 
-    original = TASK_MAPPING["libero_floor_manipulation"]
-    try:
+    @register_problem
+    class Libero_Floor_Manipulation(BDDLBaseDomain):
+        def _setup_camera(self, mujoco_arena):
+            mujoco_arena.set_camera("agentview", (2.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
 
-        @register_problem
-        class Libero_Floor_Manipulation(BDDLBaseDomain):
-            def _setup_camera(self, mujoco_arena):
-                mujoco_arena.set_camera("agentview", (2.0, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0))
-
-        env = ControlEnv(bddl_file_name=suite.get_task_bddl_file_path(0), **BLIND)
-        for _ in range(2):
-            assert env.sim.data.model.camera("agentview").pos.tolist() == [2.0, 0.0, 1.0]
-            env.reset()
-        env.close()
-    finally:
-        TASK_MAPPING["libero_floor_manipulation"] = original
+    env = ControlEnv(bddl_file_name=suite.get_task_bddl_file_path(0), **BLIND)
+    for _ in range(2):
+        assert env.sim.data.model.camera("agentview").pos.tolist() == [2.0, 0.0, 1.0]
+        env.reset()
+    env.close()
 
 
 def test_observations_match_the_recordings(shared, make_env):

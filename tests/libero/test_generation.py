@@ -18,11 +18,9 @@ from libero_env.errors import BDDLError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl, get_suite
 from libero_env.tasks.problem import And, Atom, Or, differences
 
-pytestmark = pytest.mark.usefixtures("registries")
-
 
 @pytest.fixture
-def demo_scene(registries):
+def demo_scene():
     """As the procedural creation walkthrough defines a scene."""
 
     @register_mu(scene_type="kitchen")

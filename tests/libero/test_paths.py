@@ -133,9 +133,9 @@ def test_benchmarks():
         benchmark.LIBERO_90(1)
 
 
-def test_a_user_defined_benchmark():
-    names = libero_task_map["libero_spatial"][:3]
-    benchmark.task_maps["mine"] = {name: benchmark.task_maps["libero_spatial"][name] for name in names}
+def test_a_user_defined_benchmark(monkeypatch):
+    names, maps = libero_task_map["libero_spatial"][:3], benchmark.task_maps
+    monkeypatch.setitem(maps, "mine", {name: maps["libero_spatial"][name] for name in names})
 
     @benchmark.register_benchmark
     class Mine(benchmark.Benchmark):
@@ -144,10 +144,7 @@ def test_a_user_defined_benchmark():
             self.name = "mine"
             self._make_benchmark()
 
-    try:
-        assert benchmark.get_benchmark("mine")().get_task_names() == names
-    finally:
-        del benchmark.BENCHMARK_MAPPING["mine"], benchmark.task_maps["mine"]
+    assert benchmark.get_benchmark("mine")().get_task_names() == names
 
 
 @pytest.fixture

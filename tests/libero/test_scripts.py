@@ -143,7 +143,6 @@ def test_create_libero_task_example(tmp_path, capsys):
 
 
 @pytest.mark.sim
-@pytest.mark.usefixtures("registries")
 def test_templates_work_unchanged(tmp_path, capsys, monkeypatch):
     for kind, name in (
         ("problem_class", "MyProblem"), ("scene", "MyKitchenScene2"), ("object", "MyBox3"), ("arena", "MyRoom")

@@ -237,8 +237,7 @@ def test_invalid_actions_are_refused(answer, message):
 def module(tmp_path, monkeypatch):
     (tmp_path / "my_own_policy.py").write_text(MODULE.replace("{key!r}", "'robot0_eef_pos'"))
     monkeypatch.chdir(tmp_path)
-    yield "my_own_policy"
-    sys.modules.pop("my_own_policy", None)
+    return "my_own_policy"
 
 
 def test_a_policy_from_a_module_of_the_working_directory(module):
@@ -252,6 +251,15 @@ def test_a_policy_from_a_module_of_the_working_directory(module):
     ):
         with pytest.raises(LifelongError, match=message):
             load_callable(text)
+
+
+def test_a_module_of_another_folder_with_the_same_name_is_refused(module, tmp_path, monkeypatch):
+    load_callable(f"{module}:make")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / f"{module}.py").write_text(MODULE.replace("{key!r}", "'robot0_eef_pos'"))
+    monkeypatch.chdir(tmp_path / "other")
+    with pytest.raises(LifelongError, match="already imported my_own_policy from .*, which is not .*other"):
+        load_callable(f"{module}:make")
 
 
 @pytest.mark.sim

@@ -1,4 +1,4 @@
-"""A reader's folder: demonstrations, meshes, no configuration; and registries that forget what a chapter registers."""
+"""A reader's folder: demonstrations, meshes, no configuration."""
 
 from pathlib import Path
 
@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 
 from libero.libero.benchmark import get_benchmark
-from libero.libero.envs import base_object
-from libero.libero.utils import mu_utils, object_utils, task_generation_utils
-from libero.lifelong.algos import REGISTERED_ALGOS
 from libero_env.demos.generate import generate
 from libero_env.demos.read import Episode
 from libero_env.demos.write import DemoWriter
-from libero_env.objects import catalog
 from tests.walkthroughs.blocks import Block, load_blocks
 
 SIZE, STEPS = 128, 6
@@ -80,20 +76,9 @@ def folder(tmp_path, monkeypatch, demos) -> Path:
     monkeypatch.setenv("MPLBACKEND", "agg")
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.setattr(mu_utils, "MU_DICT", dict(mu_utils.MU_DICT))
-    monkeypatch.setattr(mu_utils, "SCENE_DICT", {k: list(v) for k, v in mu_utils.SCENE_DICT.items()})
-    monkeypatch.setattr(task_generation_utils, "TASK_INFO", {})
-    monkeypatch.setattr(object_utils, "EXCEPTION_DICT", {})
-    monkeypatch.setattr(catalog, "_registered", dict(catalog._registered))
-    before = dict(base_object.OBJECTS_DICT)
     GlobalHydra.instance().clear()
-    algorithms = dict(REGISTERED_ALGOS)
     yield tmp_path
     GlobalHydra.instance().clear()
-    base_object.OBJECTS_DICT.clear()
-    base_object.OBJECTS_DICT.update(before)
-    REGISTERED_ALGOS.clear()
-    REGISTERED_ALGOS.update(algorithms)
 
 
 def write_box(path: Path, half: float) -> None:
