@@ -37,7 +37,7 @@ class Watched(CLARE):
 
     def uses(self, task: int, name: str) -> int:
         """Return the task whose adapter a layer was learned with."""
-        return self._chosen[task][name]
+        return self.chosen[task][name]
 
     def _acting(self) -> int | None:
         return self.told

@@ -12,8 +12,6 @@ from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
 from lifelong.policies.base import Policy
 
-ANCHOR_FORM = {"importance": Weights(), "anchor": Weights()}
-
 
 class Anchored(Algorithm):
     """Surrogate `strength * sum_i Omega_i (theta_i - anchor_i)^2` of the loss on earlier tasks when weights move.
@@ -26,7 +24,7 @@ class Anchored(Algorithm):
         anchor: Anchored values by parameter name; empty before the first task ends.
     """
 
-    state_form: ClassVar[Any] = ANCHOR_FORM
+    state_form: ClassVar[Any] = {"importance": Weights(), "anchor": Weights()}
 
     def __init__(self, strength: float) -> None:
         self.strength = strength
@@ -58,10 +56,6 @@ class Anchored(Algorithm):
             self.importance[name] = value if old is None else old.mul(decay).add_(value)
         self.anchor = {n: p.detach().clone() for n, p in policy.named_parameters() if n in added}
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return importance and anchor, by parameter name."""
-        return {"importance": dict(self.importance), "anchor": dict(self.anchor)}
-
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
 
@@ -70,4 +64,4 @@ class Anchored(Algorithm):
         """
         if odd := sorted(state["importance"].keys() ^ state["anchor"].keys()):
             raise CheckpointError(f"{odd[0]} has an importance or an anchor, but not both")
-        self.importance, self.anchor = dict(state["importance"]), dict(state["anchor"])
+        super().load_state_dict(state, datasets)

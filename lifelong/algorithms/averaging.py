@@ -1,8 +1,5 @@
 """Weight averaging between tasks."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -47,7 +44,7 @@ class Averaging(Algorithm):
                 one.
         """
         self.share, self.base_tasks, self.tasks = share, base_tasks, 0
-        self._before: dict[str, Tensor] | None = None  # weights and buffers when the present task began
+        self.before: dict[str, Tensor] | None = None  # weights and buffers when the present task began
 
     def share_of(self, number: int) -> float:
         """Return the share that the solution of a task is given.
@@ -63,7 +60,7 @@ class Averaging(Algorithm):
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Store the weights that the task begins with, if they are needed at its end."""
         if self.share_of(self.tasks + 1) < 1:
-            self._before = copy_weights(policy)
+            self.before = copy_weights(policy)
 
     @torch.no_grad()
     def end_task(
@@ -71,16 +68,9 @@ class Averaging(Algorithm):
     ) -> None:
         """Average the task's weights with those before it; numbers that are no weights stay as they are."""
         self.tasks += 1
-        if self._before is None:
+        if self.before is None:
             return
         for name, value in policy.state_dict().items():  # shares memory with the policy
             if value.is_floating_point():
-                value.copy_(torch.lerp(self._before[name], value, self.share_of(self.tasks)))
-        self._before = None
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the number of tasks learned and, while one is, the weights before it."""
-        return {"tasks": self.tasks, "before": self._before}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        self.tasks, self._before = int(state["tasks"]), state["before"]
+                value.copy_(torch.lerp(self.before[name], value, self.share_of(self.tasks)))
+        self.before = None

@@ -92,8 +92,9 @@ class Algorithm:
     Attributes:
         augment: Augmentation of training batches, for algorithms that also apply it elsewhere; None for no
             augmentation.
-        state_form: Form of what the class's own `state_dict` returns, see `lifelong.checkpoints.check`. A state from a
-            file is checked by it before `load_state_dict` gets it; without one it is not checked.
+        state_form: Form of the state, see `lifelong.checkpoints.check`. By default its keys are the attributes that
+            `state_dict` returns. A state from a file is checked by it before `load_state_dict` gets it; that of a class
+            with a `state_dict` of its own and no form is not checked.
         acts_by_weights: Whether `policy_for` of the same class changes values of the policy's parameters and buffers
             only.
         tuned: Settings that decide what is kept and what is learned, with the values that `libero tune` tries; the
@@ -209,8 +210,11 @@ class Algorithm:
         return {} if plain or by_weights else self.state_dict()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that later tasks depend on: nested dictionaries of tensors, numbers and strings."""
-        return {}
+        """Return everything that later tasks depend on: nested dictionaries of tensors, numbers and strings.
+
+        By default the attributes that `state_form` names; of one with a `state_dict`, such as a memory, that.
+        """
+        return {name: _plain(getattr(self, name)) for name in self.state_form}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -219,6 +223,38 @@ class Algorithm:
             state: State from `state_dict`.
             datasets: Windows of the tasks learned so far, by position; each is read when it is accessed.
         """
+        for name in self.state_form:
+            part = getattr(self, name)
+            if hasattr(part, "load_state_dict"):
+                part.load_state_dict(state[name], datasets)
+            else:
+                setattr(self, name, _plain(state[name]))
+
+
+def _plain(part: Any) -> Any:
+    if hasattr(part, "state_dict"):
+        return part.state_dict()
+    return dict(part) if isinstance(part, Mapping) else part
+
+
+@contextmanager
+def acting_with(policy: Policy, values: Mapping[str, Tensor]) -> Iterator[Policy]:
+    """Yield the policy with other values of some parameters and buffers, by name, which it has back afterwards."""
+    own = policy.state_dict()
+    present = {name: own[name].clone() for name in values}
+    put_weights(policy, values)
+    try:
+        yield policy
+    finally:
+        put_weights(policy, present)
+
+
+@torch.no_grad()
+def put_weights(policy: Policy, values: Mapping[str, Tensor]) -> None:
+    """Set parameters and buffers of a policy, by name, in place."""
+    own = policy.state_dict()  # which shares their memory
+    for name, value in values.items():
+        own[name].copy_(value)
 
 
 def load_algorithm(

@@ -83,23 +83,23 @@ class CLARE(RoutedExperts):
         super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
         self.threshold, self.hidden, self.windows = threshold, hidden, windows
         self.discriminator_steps, self.discriminator_lr = discriminator_steps, discriminator_lr
-        self._discriminators: dict[int, dict[str, Discriminator]] = {}  # task -> layer -> autoencoder
-        self._chosen: dict[int, dict[str, int]] = {}  # task -> layer -> task whose adapter it uses, or BASE
+        self.discriminators: dict[int, dict[str, Discriminator]] = {}  # task -> layer -> autoencoder
+        self.chosen: dict[int, dict[str, int]] = {}  # task -> layer -> task whose adapter it uses, or BASE
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Decide which layers get adapters; none while the base is learned."""
         modules = adaptable_modules(policy, self.adapted)
         draws = self._begin(task_index, policy)
         if draws is None:
-            self._chosen[task_index] = dict.fromkeys(modules, BASE)
+            self.chosen[task_index] = dict.fromkeys(modules, BASE)
             return
         uses = dict.fromkeys(modules, task_index)
-        if self._discriminators:
+        if self.discriminators:
             compared = self.compare(self._collect(dataset, policy, draws))
             uses = {name: compared[name] for name in modules}
         if task_index not in uses.values():
             uses[next(iter(uses))] = task_index
-        self._chosen[task_index] = uses
+        self.chosen[task_index] = uses
         new = {name: matrix_of(modules[name]) for name, used in uses.items() if used == task_index}
         self.library.add(task_index, new, self.rank, draws)
 
@@ -109,30 +109,30 @@ class CLARE(RoutedExperts):
         """Train the task's autoencoders on the inputs that the layers have with its adapters."""
         samples = self._collect(dataset, policy, generator, task_index)
         settings = self.hidden, self.discriminator_steps, self.discriminator_lr
-        self._discriminators[task_index] = {
+        self.discriminators[task_index] = {
             name: Discriminator.fit(x, *settings, generator) for name, x in samples.items()
         }
         self._draw_seed(generator)
 
     def _acting(self) -> int | None:
         """Return the present task while it is learned, as it has no autoencoders yet; then each sample chooses."""
-        unfinished = self.task_index in self.library and self.task_index not in self._discriminators
+        unfinished = self.task_index in self.library and self.task_index not in self.discriminators
         return self.task_index if unfinished else None
 
     def route(self, name: str, samples: Tensor) -> Tensor:
         """Return the task whose adapter acts on each sample (n, tokens, D) of an input, (n,) int64 on the CPU."""
-        known = [(t, of[name]) for t, of in self._discriminators.items()]
-        uses = torch.tensor([self._chosen[t][name] for t, _ in known])
+        known = [(t, of[name]) for t, of in self.discriminators.items()]
+        uses = torch.tensor([self.chosen[t][name] for t, _ in known])
         return uses[torch.stack([d.errors(samples) for _, d in known]).argmin(0).cpu()]
 
     def compare(self, samples: Samples) -> dict[str, int]:
         """Return for each layer the task whose adapter the present task uses: its own where the samples are new."""
         uses = {}
         for name, x in samples.items():
-            known = {t: of[name] for t, of in self._discriminators.items()}
+            known = {t: of[name] for t, of in self.discriminators.items()}
             new = all(d.z_scores(x).mean() > self.threshold for d in known.values())
             nearest = min(known, key=lambda t: float(known[t].errors(x).mean()))
-            uses[name] = self.task_index if new else self._chosen[nearest][name]
+            uses[name] = self.task_index if new else self.chosen[nearest][name]
         return uses
 
     def _hooks(self, policy: Policy) -> tuple[Mapping[str, nn.Module], Add]:
@@ -142,7 +142,7 @@ class CLARE(RoutedExperts):
     def _added(self, name: str, layer: nn.Module, x: Tensor) -> Tensor | None:
         """Return the adapters' outputs, each on its rows; None where all rows use the base alone."""
         if self._learning is not None:
-            groups: list[tuple[int, Tensor | None]] = [(self._chosen[self._learning][name], None)]
+            groups: list[tuple[int, Tensor | None]] = [(self.chosen[self._learning][name], None)]
         else:
             groups = groups_of_rows(self.route(name, _samples(layer, x)))
         return self._grouped_output(name, layer, x, groups)
@@ -168,9 +168,8 @@ class CLARE(RoutedExperts):
 
     def state_dict(self) -> dict[str, Any]:
         """Return all adapters and autoencoders, and which belong together."""
-        known = {task: {n: d.weights for n, d in of.items()} for task, of in self._discriminators.items()}
-        chosen = {task: dict(of) for task, of in self._chosen.items()}
-        return {**super().state_dict(), "discriminators": known, "chosen": chosen}
+        known = {task: {n: d.weights for n, d in of.items()} for task, of in self.discriminators.items()}
+        return {**super().state_dict(), "discriminators": known}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -184,8 +183,7 @@ class CLARE(RoutedExperts):
         if not fits or any(of.keys() != chosen.get(task, {}).keys() for task, of in known.items()):
             raise CheckpointError("the adapters and their autoencoders do not go together")
         super().load_state_dict(state, datasets)
-        self._chosen = {task: dict(of) for task, of in chosen.items()}
-        self._discriminators = {t: {n: Discriminator(w) for n, w in of.items()} for t, of in known.items()}
+        self.discriminators = {t: {n: Discriminator(w) for n, w in of.items()} for t, of in known.items()}
 
 
 def _samples(layer: nn.Module, x: Tensor) -> Tensor:

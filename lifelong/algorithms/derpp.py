@@ -47,7 +47,7 @@ class DERpp(Rehearsal):
         super().__init__(ReplayMemory(budget), ratio)
         self.alpha = alpha
         self._kept: dict[int, Tensor] = {}  # task -> (n,) windows in the memory
-        self._outputs: dict[int, dict[str, Tensor]] = {}  # task -> z of each of them, each (n, T, ...)
+        self.outputs: dict[int, dict[str, Tensor]] = {}  # task -> z of each of them, each (n, T, ...)
         self._replayed: Batch | None = None  # drawn by `mix`, used by `penalty`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
@@ -70,7 +70,7 @@ class DERpp(Rehearsal):
         for task, kept in self._kept.items():
             self._kept[task] = kept = to_device(kept, batch.window_ids.device)
             rows = (batch.window_ids[:, None] == kept).int().argmax(1)
-            for name, values in self._outputs[task].items():
+            for name, values in self.outputs[task].items():
                 found = values[rows].to(batch.actions)
                 mine = (batch.task_ids == task).view(-1, *(1,) * (found.dim() - 1))
                 outputs[name] = torch.where(mine, found, outputs.get(name, found))
@@ -81,26 +81,17 @@ class DERpp(Rehearsal):
     ) -> None:
         """Add the task's windows to the memory, with the policy's outputs on them."""
         super().end_task(task_index, dataset, policy, generator)
-        before, self._kept = set(self._kept), self._held()
+        before, self._kept = set(self._kept), dict(self.memory.tasks)
         for task, kept in self._kept.items():
             if task in before:  # a smaller share is a prefix of the larger one
-                self._outputs[task] = {n: z[: len(kept)].clone() for n, z in self._outputs[task].items()}
+                self.outputs[task] = {n: z[: len(kept)].clone() for n, z in self.outputs[task].items()}
             else:
-                self._outputs[task] = _outputs(policy, dataset, kept)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return which windows are kept, and their outputs, which cannot be computed again later."""
-        outputs = {task: dict(answers) for task, answers in self._outputs.items()}
-        return {**super().state_dict(), "outputs": outputs}
+                self.outputs[task] = _outputs(policy, dataset, kept)
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned; the frames come from the datasets."""
         super().load_state_dict(state, datasets)
-        self._kept = self._held()
-        self._outputs = {task: dict(answers) for task, answers in state["outputs"].items()}
-
-    def _held(self) -> dict[int, Tensor]:
-        return {int(task): kept for task, kept in self.memory.state_dict()["indices"].items()}
+        self._kept = dict(self.memory.tasks)
 
 
 @torch.no_grad()

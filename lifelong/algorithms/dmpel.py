@@ -53,7 +53,7 @@ class DMPEL(RoutedExperts):
 
     state_form = {
         **RoutedExperts.state_form,
-        "router": ({}, _ROUTER),
+        "router": (None, _ROUTER),
         "memory": {int: {"queries": Tensor, "coefficients": Tensor}},
         "episodes": ({}, {"queries": Tensor, "of_window": Tensor}),
     }
@@ -93,7 +93,7 @@ class DMPEL(RoutedExperts):
         self.experts, self.top_k, self.hidden, self.pool = experts, top_k, hidden, pool
         self.recall_steps, self.recall_lr, self.replay_size = recall_steps, recall_lr, replay_size
         self.router: SigmoidRouter | None = None
-        self._memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
+        self.memory: dict[int, dict[str, Tensor]] = {}  # task -> queries (n, Q), coefficients (n, G, N then)
         self.episodes: dict[str, Tensor] = {}  # of the present task: queries (D, Q), of_window (W,)
         self._held: Tensor | None = None  # (B, G, N), coefficients of the present episodes
 
@@ -137,7 +137,7 @@ class DMPEL(RoutedExperts):
             coefficients = queries.new_zeros(len(queries), groups, 0)
         else:
             coefficients = self.router(queries, self.experts).detach()
-        self._memory[task_index] = {"queries": queries, "coefficients": coefficients}
+        self.memory[task_index] = {"queries": queries, "coefficients": coefficients}
         self._recall()
         self.episodes = {}
         self._draw_seed(generator)
@@ -179,9 +179,9 @@ class DMPEL(RoutedExperts):
         """Let the router give the stored coefficients again, and zeros for experts that came later."""
         if self.router is None:
             return
-        queries = torch.cat([m["queries"] for m in self._memory.values()])
+        queries = torch.cat([m["queries"] for m in self.memory.values()])
         count = self.router.bias.shape[1]
-        stored = [m["coefficients"] for m in self._memory.values()]
+        stored = [m["coefficients"] for m in self.memory.values()]
         then = torch.cat([functional.pad(c, (0, count - c.shape[-1])) for c in stored])
         optimizer = torch.optim.AdamW(self.router.parameters(), lr=self.recall_lr)
         for _ in range(self.recall_steps):
@@ -220,22 +220,17 @@ class DMPEL(RoutedExperts):
 
         return layers, add, encode
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return experts, router, stored contexts, and those of the present task's windows."""
-        router = {} if self.router is None else {n: p.detach() for n, p in self.router.named_parameters()}
-        kept = {"memory": dict(self._memory), "episodes": dict(self.episodes)}
-        return {**super().state_dict(), "router": router, **kept}
-
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
 
         Raises:
             CheckpointError: The shapes of the router, the experts or the stored contexts do not go together.
         """
-        self.router = SigmoidRouter(state["router"], top_k=self.top_k) if state["router"] else None
-        _check_shapes(state, self.router)
+        router = SigmoidRouter(state["router"], top_k=self.top_k) if state["router"] else None
+        _check_shapes(state, router)
+        self.router = None
         super().load_state_dict(state, datasets)
-        self._memory, self.episodes = dict(state["memory"]), dict(state["episodes"])
+        self.router = router
 
 
 def _check_shapes(state: Mapping[str, Any], router: SigmoidRouter | None) -> None:

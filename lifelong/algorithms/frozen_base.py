@@ -1,6 +1,6 @@
 """What methods share that freeze a base and learn low-rank experts on it: how experts begin, act, and are stored."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, ClassVar
 
@@ -8,7 +8,6 @@ import torch
 from torch import Tensor, nn
 
 from lifelong.algorithms.base import Algorithm, Phase
-from lifelong.data.windows import TaskWindows
 from lifelong.errors import PolicyError
 from lifelong.nn.experts import Attachment, ExpertLibrary, expert_output, freeze_statistics
 from lifelong.policies.base import Policy
@@ -18,41 +17,36 @@ from lifelong.types import to_device
 class FrozenBase(Algorithm):
     """The first tasks train the whole policy, which is frozen then; each later one has low-rank experts on it."""
 
-    state_form: ClassVar[Any] = dict.fromkeys(("task_index", "base_left", "seed"), int)
+    state_form: ClassVar[Any] = {
+        **dict.fromkeys(("task_index", "base_left", "seed"), int),
+        "library": ExpertLibrary.form,
+    }
 
     def __init__(self, *, rank: int, alpha: float, adapted: Sequence[str], base_tasks: int):
         """Create the algorithm; see the subclasses for the arguments."""
         self.rank, self.scale, self.adapted = rank, alpha / rank, tuple(adapted)
-        self.task_index, self._base_left = -1, base_tasks
-        self._seed = 0  # of the draws at the next task's beginning, drawn when a task ends
+        self.task_index, self.base_left = -1, base_tasks
+        self.seed = 0  # of the draws at the next task's beginning, drawn when a task ends
         self.library = ExpertLibrary()
 
     def _begin(self, task_index: int, policy: Policy) -> torch.Generator | None:
         """Go on to a task and return the generator of its experts' draws; None where it trains the whole policy."""
         self.task_index = task_index
-        if self._base_left:
-            self._base_left -= 1
+        if self.base_left:
+            self.base_left -= 1
             return None
         policy.zero_grad()  # the optimiser, which does it at each step, no longer has the base
-        return torch.Generator().manual_seed(self._seed)
+        return torch.Generator().manual_seed(self.seed)
 
     def _draw_seed(self, generator: torch.Generator) -> None:
         """Draw the seed of the next task's experts."""
-        self._seed = int(torch.randint(2**62, (), generator=generator))
+        self.seed = int(torch.randint(2**62, (), generator=generator))
 
     def mode_train(self, policy: Policy) -> None:
         """Set training mode, with running statistics frozen with the base."""
         policy.train()
         if self.library:
             freeze_statistics(policy)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the place in the sequence of tasks."""
-        return {"task_index": self.task_index, "base_left": self._base_left, "seed": self._seed}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        self.task_index, self._base_left = int(state["task_index"]), int(state["base_left"])
-        self._seed = int(state["seed"])
 
 
 class RoutedExperts(FrozenBase):
@@ -62,7 +56,6 @@ class RoutedExperts(FrozenBase):
     the policy acts.
     """
 
-    state_form: ClassVar[Any] = {**FrozenBase.state_form, "library": ExpertLibrary.form}
     relu: ClassVar[bool] = False  # whether a ReLU lies between the A and the B of an expert
 
     def __init__(self, **settings: Any):
@@ -125,14 +118,6 @@ class RoutedExperts(FrozenBase):
                 yield
         finally:
             self._learning, self._now = learning, None
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the place in the sequence of tasks, and all experts."""
-        return {**super().state_dict(), "library": self.library.state()}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        super().load_state_dict(state, datasets)
-        self.library.load(state["library"])
 
     def _grouped_output(
         self, name: str, layer: nn.Module, x: Tensor, groups: Iterable[tuple[int, Tensor | None]]

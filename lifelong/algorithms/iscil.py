@@ -65,7 +65,7 @@ class IsCiL(RoutedExperts):
         """
         super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
         self.bases, self.states = bases, states
-        self._prototypes: dict[int, Tensor] = {}  # task -> (bases, F)
+        self.prototypes: dict[int, Tensor] = {}  # task -> (bases, F)
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Compute the task's prototypes and start its adapter, once the base is learned."""
@@ -73,10 +73,10 @@ class IsCiL(RoutedExperts):
         if draws is None:
             return
         states, nearest = self._embed_windows(dataset, policy, draws), None
-        if self._prototypes:
-            nearest = int(nearest_key(states, self._prototypes).mode().values)
+        if self.prototypes:
+            nearest = int(nearest_key(states, self.prototypes).mode().values)
         self.library.add(task_index, weights_of(layers), self.rank, draws, start=nearest)
-        self._prototypes[task_index] = cluster_centres(states, self.bases, draws)
+        self.prototypes[task_index] = cluster_centres(states, self.bases, draws)
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
@@ -84,12 +84,12 @@ class IsCiL(RoutedExperts):
         """Compute the prototypes of the base, which were not known before it was learned."""
         if task_index not in self.library:
             states = self._embed_windows(dataset, policy, generator)
-            self._prototypes[task_index] = cluster_centres(states, self.bases, generator)
+            self.prototypes[task_index] = cluster_centres(states, self.bases, generator)
         self._draw_seed(generator)
 
     def retrieve(self, states: Tensor) -> Tensor:
         """Return the task whose adapter acts on each embedding (B, F), (B,) int64 on the CPU."""
-        return nearest_key(states, self._prototypes)
+        return nearest_key(states, self.prototypes)
 
     def _hooks(self, policy: Policy) -> tuple[Any, Any, Any]:
         """Return the layers with adapters, what is added to their outputs, and the `encode` that retrieves."""
@@ -120,10 +120,6 @@ class IsCiL(RoutedExperts):
             seen = (dataset.batch(part).to(device).observation for part in chosen.split(_CHUNK))
             return torch.cat([_embedding(encode(observation)) for observation in seen])
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return all adapters and prototypes."""
-        return {**super().state_dict(), "prototypes": dict(self._prototypes)}
-
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
 
@@ -137,7 +133,6 @@ class IsCiL(RoutedExperts):
         if not fits or any(of_task.keys() != library[0].keys() for of_task in library):
             raise CheckpointError("the adapters and their prototypes do not go together")
         super().load_state_dict(state, datasets)
-        self._prototypes = dict(prototypes)
 
 
 def _embedding(features: Tensor) -> Tensor:

@@ -7,11 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lifelong.algorithms.base import acting_with, put_weights
 from lifelong.algorithms.frozen_base import FrozenBase
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
-from lifelong.nn.experts import ExpertLibrary, Pair, matches, matching
+from lifelong.nn.experts import Pair, matches, matching
 from lifelong.policies.base import Policy
 from lifelong.types import Natural, NonNegative, Width
 
@@ -38,8 +39,7 @@ class LoRA(FrozenBase):
         **FrozenBase.state_form,
         "base_last": int,
         "base": Weights(),
-        "pairs": ExpertLibrary.form,
-        "own": {int: Weights()},
+        "kept": {int: Weights()},
     }
 
     def __init__(
@@ -63,16 +63,16 @@ class LoRA(FrozenBase):
                 which is frozen afterwards; 0 for a pretrained policy.
         """
         super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
-        self.own, self._base_last = tuple(own), -1
+        self.own, self.base_last = tuple(own), -1
         self.base: dict[str, Tensor] = {}  # frozen values of all that a task may change
-        self._kept: dict[int, dict[str, Tensor]] = {}  # learned task -> its own copies
+        self.kept: dict[int, dict[str, Tensor]] = {}  # learned task -> its own copies
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Freeze the base once it is learned, and initialise the task's adapter."""
         names = self._choose(policy) if not self.base else []
         draws = self._begin(task_index, policy)
         if draws is None:
-            self._base_last = task_index
+            self.base_last = task_index
             return
         if not self.base:
             self.base = {n: p.detach().clone() for n, p in policy.named_parameters() if n in names}
@@ -118,28 +118,19 @@ class LoRA(FrozenBase):
         if task_index in self.library:
             params = dict(policy.named_parameters())
             names = self.base.keys() - self.library[task_index].keys()
-            self._kept[task_index] = {n: params[n].detach().clone() for n in sorted(names)}
+            self.kept[task_index] = {n: params[n].detach().clone() for n in sorted(names)}
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
         """Yield the policy with the task's adapter; unchanged for the present task and those not begun."""
-        learned = [-1] if task_index <= self._base_last else [t for t in self._kept if t >= task_index]
-        if not self.base or not learned:
+        learned = [-1] if task_index <= self.base_last else [t for t in self.kept if t >= task_index]
+        values: dict[str, Tensor] = {}
+        if self.base and learned:
+            stage = min(learned)  # index of the last task of a stage
+            sums = {name: self._sum(name, pair) for name, pair in self.library.get(stage, {}).items()}
+            values = self.base | sums | self.kept.get(stage, {})
+        with acting_with(policy, values):
             yield policy
-            return
-        present = {n: p.detach().clone() for n, p in policy.named_parameters() if n in self.base}
-        stage = min(learned)  # index of the last task of a stage
-        sums = {name: self._sum(name, pair) for name, pair in self.library.get(stage, {}).items()}
-        put_weights(policy, self.base | sums | self._kept.get(stage, {}))
-        try:
-            yield policy
-        finally:
-            put_weights(policy, present)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the base, and every task's A, B and own copies."""
-        state = {"base": dict(self.base), "pairs": self.library.state(), "own": dict(self._kept)}
-        return {**super().state_dict(), "base_last": self._base_last, **state}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -147,12 +138,9 @@ class LoRA(FrozenBase):
         Raises:
             CheckpointError: An adapter does not fit its weight.
         """
-        self.library.load(state["pairs"])
-        for of_task in state["pairs"].values():
-            check_pairs(of_task, state["base"])
         super().load_state_dict(state, datasets)
-        self._base_last = int(state["base_last"])
-        self.base, self._kept = dict(state["base"]), dict(state["own"])
+        for of_task in state["library"].values():
+            check_pairs(of_task, self.base)
 
     def _present(self) -> Mapping[str, Mapping[str, nn.Parameter]]:
         """Return the present task's pairs; none while the base is learned."""
@@ -183,11 +171,3 @@ def check_pairs(pairs: Mapping[str, Mapping[str, Tensor]], base: Mapping[str, Te
         fits = a.dim() == b.dim() == 2 and len(a) == b.shape[1]
         if weight is None or not fits or (len(b), a.shape[1]) != weight.flatten(1).shape:
             raise CheckpointError(f"the adapter of {name} does not fit a weight of the base")
-
-
-@torch.no_grad()
-def put_weights(policy: Policy, values: Mapping[str, Tensor]) -> None:
-    """Set parameters of a policy, by name, in place."""
-    for name, p in policy.named_parameters():
-        if name in values:
-            p.copy_(values[name])

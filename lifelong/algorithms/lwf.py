@@ -32,6 +32,14 @@ class Teacher:
         """Take over weights."""
         self.weights, self._policy = dict(weights), None
 
+    def state_dict(self) -> dict[str, Tensor]:
+        """Return its weights."""
+        return dict(self.weights)
+
+    def load_state_dict(self, state: Mapping[str, Tensor], datasets: Mapping[int, TaskWindows]) -> None:
+        """Restore what `state_dict` returned."""
+        self.become(state)
+
     def like(self, policy: P) -> P:
         """Return the teacher, which is a policy of the same form as the given one."""
         if self._policy is None:
@@ -52,7 +60,7 @@ class LwF(Algorithm):
     are not augmented in this term.
     """
 
-    state_form = {"weights": Weights(), "languages": {int: Tensor}}
+    state_form = {"teacher": Weights(), "languages": {int: Tensor}}
     tuned = {"strength": (0.03, 0.1, 0.3, 1.0, 3.0)}
     plain_start = True
 
@@ -67,14 +75,14 @@ class LwF(Algorithm):
         """
         self.strength = strength
         self.teacher = Teacher()
-        self._languages: dict[int, Tensor] = {}  # position of each learned task -> (L,)
+        self.languages: dict[int, Tensor] = {}  # position of each learned task -> (L,)
         self.distilled: Batch | None = None  # made by `mix`, used by `penalty`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch unchanged; earlier instructions are drawn for a copy of it."""
-        if self._languages:
-            drawn = torch.randint(len(self._languages), (len(batch),), generator=generator)
-            languages = torch.stack(list(self._languages.values()))
+        if self.languages:
+            drawn = torch.randint(len(self.languages), (len(batch),), generator=generator)
+            languages = torch.stack(list(self.languages.values()))
             language = languages[to_device(drawn, languages.device)].to(batch.observation.language)
             self.distilled = replace(batch, observation=replace(batch.observation, language=language))
         return batch
@@ -93,12 +101,4 @@ class LwF(Algorithm):
     ) -> None:
         """Make the present weights the teacher's, and add the task's instruction to the earlier ones."""
         self.teacher.become(copy_weights(policy))
-        self._languages[task_index] = dataset.batch(torch.tensor([0])).observation.language[0].clone()
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the teacher's weights and the learned instructions."""
-        return {"weights": dict(self.teacher.weights), "languages": dict(self._languages)}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        self.teacher.become(state["weights"])
-        self._languages = dict(state["languages"])
+        self.languages[task_index] = dataset.batch(torch.tensor([0])).observation.language[0].clone()

@@ -1,8 +1,5 @@
 """Replay with distillation of every modality's features and of the action distribution."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
@@ -37,7 +34,7 @@ class M2Distill(Rehearsal):
     text at hand stated neither the paper's weights nor on which windows it distils: these are this package's choices.
     """
 
-    state_form = {"memory": MEMORY_FORM, "weights": Weights()}
+    state_form = {"memory": MEMORY_FORM, "teacher": Weights()}
     tuned = {"policy": (0.03, 0.1, 0.3, 1.0), "image": (0.001, 0.003, 0.01, 0.1)}
 
     def __init__(
@@ -96,15 +93,6 @@ class M2Distill(Rehearsal):
         """Make the present weights the teacher's, and add the task's windows to the memory."""
         super().end_task(task_index, dataset, policy, generator)
         self.teacher.become(copy_weights(policy))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return which windows are kept, and the teacher's weights."""
-        return {**super().state_dict(), "weights": dict(self.teacher.weights)}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned; the frames come from the datasets."""
-        super().load_state_dict(state, datasets)
-        self.teacher.become(state["weights"])
 
 
 def distances(student: HistoryPolicy, teacher: HistoryPolicy, observation: Observation) -> dict[str, Tensor]:

@@ -82,25 +82,25 @@ class MLR(Algorithm):
         self.keep, self.adjustment, self.margin = keep, adjustment, margin
         self.ratio = ratio
         self.memory = LatentMemory(budget)
-        self._base_left = base_tasks
+        self.base_left = base_tasks
         self.frozen: list[str] = []  # parameters that features depend on; empty while the base is learned
-        self._instructions = torch.zeros(0, 0)  # (K, F) directions of the features of all instructions so far
-        self._images = torch.zeros(0, 0)  # (K, G) mean directions of the first camera's features
+        self.instructions = torch.zeros(0, 0)  # (K, F) directions of the features of all instructions so far
+        self.images = torch.zeros(0, 0)  # (K, G) mean directions of the first camera's features
         self.near = torch.zeros(0, 0)  # (J, F) of earlier instructions that are similar to the present ones
         self._present: Observation | None = None  # set by `mix`, used by `penalty`
         self._replayed: tuple[Tensor, Tensor] | None = (
-            None  # latents (B, T, ...), actions (B, T, A), likewise
+            None  # latents (B, T, ...), actions (B, T, A); likewise
         )
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Freeze the encoders once the base is learned, and find the earlier tasks that are similar."""
         policy = with_features(policy)
-        if self._base_left:
-            self._base_left -= 1
+        if self.base_left:
+            self.base_left -= 1
             return
         if not self.frozen:
             self.frozen = feature_parameters(policy, dataset.batch(torch.tensor([0])))
-        if self.adjustment and len(self._instructions):
+        if self.adjustment and len(self.instructions):
             self.near = self._similar(*describe(policy, dataset))
 
     def trained(self, policy: Policy) -> list[nn.Parameter]:
@@ -152,46 +152,32 @@ class MLR(Algorithm):
 
     def _similar(self, instructions: Tensor, images: Tensor) -> Tensor:
         """Return the directions (J, F) of earlier instructions that are similar to a task's, see `similar_pairs`."""
-        count = len(self._instructions)
-        every = torch.cat([self._instructions, instructions]), torch.cat([self._images, images])
+        count = len(self.instructions)
+        every = torch.cat([self.instructions, instructions]), torch.cat([self.images, images])
         pairs = similar_pairs(*every)
-        return self._instructions[sorted({i for i, j in pairs if i < count <= j})]
+        return self.instructions[sorted({i for i, j in pairs if i < count <= j})]
 
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Store latents of the task; none before the last base task, as features still change."""
-        if self._base_left:
+        if self.base_left:
             return
         policy = with_features(policy)
         count = min(max(1, round(self.keep * len(dataset))), self.memory.budget)
         kept = torch.randperm(len(dataset), generator=generator)[:count]
         self.memory.add(task_index, encoded(policy, dataset, kept), _actions(dataset, kept))
-        known = [x for x in (self._instructions, self._images) if len(x)]
+        known = [x for x in (self.instructions, self.images) if len(x)]
         described = describe(policy, dataset)
-        self._instructions, self._images = (
+        self.instructions, self.images = (
             described if not known else map(torch.cat, zip(known, described, strict=True))
         )
         self.near = self.near[:0]
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return latents, what is frozen, and directions of the tasks' features."""
-        return {
-            "base_left": self._base_left,
-            "frozen": list(self.frozen),
-            "memory": self.memory.state_dict(),
-            "instructions": self._instructions,
-            "images": self._images,
-            "near": self.near,
-        }
-
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned; no dataset is read."""
-        self.memory.load_state_dict(state["memory"])
-        self._base_left, self.frozen = int(state["base_left"]), list(state["frozen"])
-        self._instructions, self._images, self.near = (
-            state[name].cpu() for name in ("instructions", "images", "near")
-        )
+        on_host = {name: state[name].cpu() for name in ("instructions", "images", "near")}
+        super().load_state_dict({**state, **on_host}, datasets)
 
 
 def feature_parameters(policy: HistoryPolicy, batch: Batch) -> list[str]:

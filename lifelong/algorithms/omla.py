@@ -6,7 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.lora import LoRA, check_pairs, put_weights
+from lifelong.algorithms.base import put_weights
+from lifelong.algorithms.lora import LoRA, check_pairs
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
@@ -66,7 +67,7 @@ class OMLA(LoRA):
         """
         super().__init__(rank=rank, alpha=alpha, adapted=adapted, own=own, base_tasks=base_tasks)
         self.prior_rate = prior_rate
-        self._prior: Prior | None = None  # None before the first adapter, and without a prior
+        self.prior: Prior | None = None  # None before the first adapter, and without a prior
 
     @torch.no_grad()
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
@@ -75,15 +76,15 @@ class OMLA(LoRA):
         pairs = self.library.get(task_index)
         if pairs is None or not self.prior_rate:
             return
-        if self._prior is None:
+        if self.prior is None:
             start = {name: {k: t.detach().clone() for k, t in pair.items()} for name, pair in pairs.items()}
             own = {name: value.clone() for name, value in self.base.items() if name not in pairs}
-            self._prior = {"pairs": start, "own": own}
+            self.prior = {"pairs": start, "own": own}
             return
         for name, pair in pairs.items():
             for factor, value in pair.items():
-                value.copy_(self._prior["pairs"][name][factor])
-        put_weights(policy, self._prior["own"])
+                value.copy_(self.prior["pairs"][name][factor])
+        put_weights(policy, self.prior["own"])
         self.after_step(policy)  # the adapted weights
 
     @torch.no_grad()
@@ -92,20 +93,16 @@ class OMLA(LoRA):
     ) -> None:
         """Store the task's own copies, and move the prior towards its adapter."""
         super().end_task(task_index, dataset, policy, generator)
-        if self._prior is None:
+        if self.prior is None:
             return
-        learned, kept = self.library[task_index], self._kept[task_index]
-        self._prior = {
+        learned, kept = self.library[task_index], self.kept[task_index]
+        self.prior = {
             "pairs": {
                 name: {k: torch.lerp(t, learned[name][k].detach(), self.prior_rate) for k, t in pair.items()}
-                for name, pair in self._prior["pairs"].items()
+                for name, pair in self.prior["pairs"].items()
             },
-            "own": {n: torch.lerp(t, kept[n], self.prior_rate) for n, t in self._prior["own"].items()},
+            "own": {n: torch.lerp(t, kept[n], self.prior_rate) for n, t in self.prior["own"].items()},
         }
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what LoRA keeps, and the prior."""
-        return {**super().state_dict(), "prior": self._prior}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -114,9 +111,7 @@ class OMLA(LoRA):
             CheckpointError: An adapter or the prior does not fit its weight.
         """
         super().load_state_dict(state, datasets)
-        prior = state["prior"]
-        if prior is not None:
-            check_pairs(prior["pairs"], self.base)
-            if prior["pairs"].keys() ^ prior["own"].keys() != self.base.keys():
+        if self.prior is not None:
+            check_pairs(self.prior["pairs"], self.base)
+            if self.prior["pairs"].keys() ^ self.prior["own"].keys() != self.base.keys():
                 raise CheckpointError("the prior is not that of the weights which the tasks change")
-        self._prior = prior

@@ -9,7 +9,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from lifelong.algorithms.base import Algorithm, Phase
+from lifelong.algorithms.base import Algorithm, Phase, acting_with
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
@@ -58,8 +58,8 @@ class PackNet(Algorithm):
         """
         self.masks_only, self.prune_perc, self.post_prune_share = masks_only, prune_perc, post_prune_share
         self.task_index = 0
-        self._pruned = False
-        self._owner: dict[str, Tensor] = {}  # name -> uint8: 0 free, k + 1 owned by task k
+        self.pruned = False
+        self.owner: dict[str, Tensor] = {}  # name -> uint8: 0 free, k + 1 owned by task k
         self._fixed: dict[str, Tensor] = {}  # name -> value that `after_step` restores
         self._movable: dict[str, Tensor] = {}  # name -> bool mask of the weights that may change
 
@@ -70,20 +70,20 @@ class PackNet(Algorithm):
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Give the free weights to the new task."""
         self.task_index = task_index
-        self._pruned = False
+        self.pruned = False
         divided = _layers(policy, _DIVIDED, "weight") if self.masks_only else None
         for name, p in policy.named_parameters():
             chosen = p.dim() >= 2 if divided is None else name in divided
-            if p.requires_grad and chosen and name not in self._owner:
-                self._owner[name] = torch.zeros(p.shape, dtype=torch.uint8, device=p.device)
-        full = [name for name, owner in self._owner.items() if not bool((owner == 0).any())]
+            if p.requires_grad and chosen and name not in self.owner:
+                self.owner[name] = torch.zeros(p.shape, dtype=torch.uint8, device=p.device)
+        full = [name for name, owner in self.owner.items() if not bool((owner == 0).any())]
         if full:
             _log.warning(
                 "PackNet: task %d has no free weight in %d of %d tensors (such as %s), whose weights earlier tasks "
                 "own; a larger algo.prune_perc leaves more for later tasks",
                 task_index + 1,
                 len(full),
-                len(self._owner),
+                len(self.owner),
                 full[0],
             )
 
@@ -141,41 +141,29 @@ class PackNet(Algorithm):
     @torch.no_grad()
     def end_phase(self, phase: Phase, policy: Policy) -> None:
         """After the first phase, give the largest free weights to the task and set the others to zero."""
-        if self._pruned:
+        if self.pruned:
             return
         for name, p in policy.named_parameters():
-            if name in self._owner:
-                self._prune(p, self._owner[name])
-        self._pruned = True
+            if name in self.owner:
+                self._prune(p, self.owner[name])
+        self.pruned = True
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
         """Yield the policy with only the weights of the tasks up to `task_index`, as it was when that task ended."""
-        if task_index > self.task_index or (task_index == self.task_index and not self._pruned):
+        if task_index > self.task_index or (task_index == self.task_index and not self.pruned):
             yield policy
             return
-        whole = {n: p.detach().clone() for n, p in policy.named_parameters() if n in self._owner}
-        with torch.no_grad():
-            for name, p in policy.named_parameters():
-                if name in whole:
-                    owner = self._owner[name]
-                    p.masked_fill_((owner == 0) | (owner > task_index + 1), 0)
-        try:
+        acting = {
+            name: p.detach().masked_fill((owner == 0) | (owner > task_index + 1), 0)
+            for name, p in policy.named_parameters()
+            if (owner := self.owner.get(name)) is not None
+        }
+        with acting_with(policy, acting):
             yield policy
-        finally:
-            with torch.no_grad():
-                for name, p in policy.named_parameters():
-                    if name in whole:
-                        p.copy_(whole[name])
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the owners of all weights, and the position in the task."""
-        return {"task_index": self.task_index, "pruned": self._pruned, "owner": dict(self._owner)}
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        self.task_index = int(state["task_index"])
-        self._pruned = bool(state["pruned"])
-        self._owner = dict(state["owner"])
+        super().load_state_dict(state, datasets)
         self._fixed, self._movable = {}, {}
 
     def _prune(self, weight: Tensor, owner: Tensor) -> None:
@@ -192,16 +180,16 @@ class PackNet(Algorithm):
     def _freeze(self, policy: Policy) -> None:
         """Store the frozen values, which are those of the policy now: none has changed since the phase began."""
         self._fixed, self._movable = {}, {}
-        target = self.task_index + 1 if self._pruned else 0
+        target = self.task_index + 1 if self.pruned else 0
         untrained = _layers(policy, _DIVIDED, "bias") | _layers(policy, _UNTRAINED, "weight", "bias")
         for name, tensor in _tensors(policy).items():
-            if name in self._owner:
-                if self._owner[name].shape != tensor.shape:
+            if name in self.owner:
+                if self.owner[name].shape != tensor.shape:
                     raise CheckpointError(
-                        f"PackNet's owners of {name} have shape {tuple(self._owner[name].shape)}, the "
+                        f"PackNet's owners of {name} have shape {tuple(self.owner[name].shape)}, the "
                         f"policy's {tuple(tensor.shape)}: the state belongs to another policy"
                     )
-                self._movable[name] = self._owner[name] == target
+                self._movable[name] = self.owner[name] == target
                 self._fixed[name] = tensor.detach().clone()
             elif name in untrained if self.masks_only else self.task_index > 0:
                 self._fixed[name] = tensor.detach().clone()

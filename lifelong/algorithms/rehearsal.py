@@ -1,8 +1,5 @@
 """What methods share that keep windows of earlier tasks in a memory."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 
 from lifelong.algorithms.base import Algorithm
@@ -41,11 +38,3 @@ class Rehearsal(Algorithm):
     ) -> None:
         """Add the task's windows to the memory."""
         self.memory.add(dataset, generator)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what the memory keeps."""
-        return {"memory": self.memory.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        """Restore what `state_dict` returned; frames that the memory does not keep come from the datasets."""
-        self.memory.load_state_dict(state["memory"], datasets)

@@ -1,12 +1,9 @@
 """Synaptic intelligence."""
 
-from collections.abc import Mapping
-from typing import Any
-
 import torch
 from torch import Tensor
 
-from lifelong.algorithms.anchor import ANCHOR_FORM, Anchored
+from lifelong.algorithms.anchor import Anchored
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy
@@ -27,7 +24,7 @@ class SI(Anchored):
     path, so that omega and Delta are of the same path.
     """
 
-    state_form = {"anchor": ANCHOR_FORM, "omega": Weights(), "way": Weights()}
+    state_form = {**Anchored.state_form, "omega": Weights(), "displacement": Weights()}
     tuned = {"strength": (0.01, 0.1, 1.0, 10.0, 100.0)}
 
     def __init__(self, *, strength: NonNegative = 0.1, damping: Positive = 1e-3):
@@ -41,13 +38,13 @@ class SI(Anchored):
         """
         super().__init__(strength)
         self.damping = damping
-        self._omega: dict[str, Tensor] = {}
-        self._displacement: dict[str, Tensor] = {}  # Delta
+        self.omega: dict[str, Tensor] = {}
+        self.displacement: dict[str, Tensor] = {}  # Delta
         self._step: dict[str, tuple[Tensor, Tensor]] = {}  # of one step: gradient, weights before it
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Start a new path."""
-        self._omega, self._displacement = {}, {}
+        self.omega, self.displacement = {}, {}
 
     @torch.no_grad()
     def after_backward(self, policy: Policy) -> None:
@@ -68,8 +65,8 @@ class SI(Anchored):
                 continue
             grad, before = self._step[name]
             moved = p - before
-            self._omega[name] = self._omega.get(name, torch.zeros_like(p)) - grad * moved
-            self._displacement[name] = self._displacement.get(name, torch.zeros_like(p)) + moved
+            self.omega[name] = self.omega.get(name, torch.zeros_like(p)) - grad * moved
+            self.displacement[name] = self.displacement.get(name, torch.zeros_like(p)) + moved
         self._step = {}
 
     def end_task(
@@ -77,15 +74,7 @@ class SI(Anchored):
     ) -> None:
         """Turn the path into importance and move the anchor to the present weights."""
         added = {n: torch.zeros_like(v) for n, v in self.importance.items()}
-        for name, omega in self._omega.items():
-            added[name] = omega.clamp_min(0) / (self._displacement[name].square() + self.damping)
+        for name, omega in self.omega.items():
+            added[name] = omega.clamp_min(0) / (self.displacement[name].square() + self.damping)
         self.move_anchor(policy, added)
-        self._omega, self._displacement = {}, {}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return importance and anchor, and the path of the task being learned."""
-        return {"anchor": super().state_dict(), "omega": dict(self._omega), "way": dict(self._displacement)}
-
-    def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
-        super().load_state_dict(state["anchor"], datasets)
-        self._omega, self._displacement = dict(state["omega"]), dict(state["way"])
+        self.omega, self.displacement = {}, {}

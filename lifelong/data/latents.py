@@ -117,7 +117,7 @@ class LatentMemory(TaskMemory[LatentWindows]):
             actions.append(windows.actions[rows])
         return torch.cat(latents), torch.cat(actions)
 
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+    def load_state_dict(self, state: Mapping[str, Any], datasets: object = None) -> None:
         """Restore what `state_dict` returned.
 
         Raises:

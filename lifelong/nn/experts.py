@@ -28,7 +28,7 @@ class ExpertLibrary(dict[int, dict[str, dict[str, nn.Parameter]]]):
     """Task -> name of the layer or weight -> a low-rank pair `a` (r, inputs) and `b` (out, r), both trainable.
 
     Attributes:
-        form: Form of `state`, see `lifelong.checkpoints.check`.
+        form: Form of the state, see `lifelong.checkpoints.check`.
     """
 
     form: ClassVar[Any] = {int: {str: {"a": Tensor, "b": Tensor}}}
@@ -73,15 +73,15 @@ class ExpertLibrary(dict[int, dict[str, dict[str, nn.Parameter]]]):
         """Return a task's A and B."""
         return [p for pair in self[task].values() for p in pair.values()]
 
-    def state(self) -> dict[int, dict[str, dict[str, Tensor]]]:
+    def state_dict(self) -> dict[int, dict[str, dict[str, Tensor]]]:
         """Return all pairs as tensors."""
         return {
             task: {name: {k: p.detach() for k, p in pair.items()} for name, pair in of_task.items()}
             for task, of_task in self.items()
         }
 
-    def load(self, state: Mapping[int, Mapping[str, Pair]]) -> None:
-        """Restore what `state` returned.
+    def load_state_dict(self, state: Mapping[int, Mapping[str, Pair]], datasets: object = None) -> None:
+        """Restore what `state_dict` returned; no windows are needed.
 
         Raises:
             CheckpointError: A and B of a pair have no common rank.

@@ -151,7 +151,7 @@ def test_lora_covers_every_kind_of_layer_and_running_statistics():
         for old, value in kept.items():
             assert torch.equal(outputs(algorithm, policy, old), value)
         kept[task] = outputs(algorithm, policy, task)
-    adapted = set(algorithm.state_dict()["pairs"][1])
+    adapted = set(algorithm.state_dict()["library"][1])
     assert adapted == {n for n, p in policy.named_parameters() if p.dim() > 1}
 
 

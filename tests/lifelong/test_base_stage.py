@@ -65,7 +65,7 @@ def test_adapters_have_the_base_stage_as_their_base(tmp_path) -> None:
     learner = LoRA(base_tasks=1)
     sequences.sequence(context(tmp_path, learner)).run()
     state = learner.state_dict()
-    assert state["base_last"] == 1 and set(state["pairs"]) == {2, 3}
+    assert state["base_last"] == 1 and set(state["library"]) == {2, 3}
     results = ResultLog(tmp_path / "results.jsonl").read()
     for task in (0, 1):
         first, *later = (results.evaluation("matrix", row, task) for row in (1, 2, 3))

@@ -22,8 +22,8 @@ def policy() -> DeepPolicy:
 def adapter(algorithm: OMLA, task: int) -> dict[str, torch.Tensor]:
     """Return A, B and own copies of a learned task as one flat table."""
     state = algorithm.state_dict()
-    pairs = {f"{n}.{k}": t for n, pair in state["pairs"][task].items() for k, t in pair.items()}
-    return {name: value.clone() for name, value in {**pairs, **state["own"][task]}.items()}
+    pairs = {f"{n}.{k}": t for n, pair in state["library"][task].items() for k, t in pair.items()}
+    return {name: value.clone() for name, value in {**pairs, **state["kept"][task]}.items()}
 
 
 def prior(algorithm: OMLA) -> dict[str, torch.Tensor]:
@@ -127,5 +127,5 @@ def test_the_prior_costs_the_storage_of_one_adapter() -> None:
             learn(learner, acting, task)
         states.append(learner)
     lora, omla = states
-    learned = [*lora.library.parameters(1), *lora.state_dict()["own"][1].values()]
+    learned = [*lora.library.parameters(1), *lora.state_dict()["kept"][1].values()]
     assert sum(value.numel() for value in prior(omla).values()) == sum(p.numel() for p in learned)
