@@ -298,6 +298,24 @@ def test_another_place_is_found_for_what_is_in_the_hand(view_of):
 
 
 @pytest.mark.sim
+def test_a_bowl_stands_on_the_floor_of_a_drawer_and_one_in_a_stretched_hand_goes_where_the_arm_reaches(view_of):
+    view = view_of("libero_10/3")
+    shapes, atom = Shapes(view.scene), get_task("libero_10/3").problem.goal.parts[1]
+    (box,) = region_boxes(view, atom.args[1])
+    bottom = np.ptp([view.body_pos(atom.args[0])[2], shapes.height_range(view, atom.args[0])[0]])
+    place = plan_pick(view, shapes, atom).place
+    assert place.pos[2] + bottom < box.centre[2] - 0.015  # the drawer closes over it
+    state = view.simulations.physics_state(0)
+    state[1:8] = stretched = [0.28, 1.14, -0.05, -0.49, -0.15, 1.37, 2.27]
+    address = 1 + view.scene.model.jnt_qposadr[view.scene.model.body("akita_black_bowl_1_main").jntadr[0]]
+    state[address : address + 7] = 0.02, 0.141, 1.107, 0.83, 0.0, 0.0, -0.56
+    view.simulations.set_physics_state(0, state)
+    plan = plan_place(view, shapes, atom)
+    pose = Pose(plan.release_pos, plan.release_mat)
+    assert shapes.arm.follow(np.array(stretched), [pose])[1] < SEARCH.reach_tolerance
+
+
+@pytest.mark.sim
 def test_a_book_goes_down_between_walls_only_from_their_middle(view_of):
     """Held beside its place, the next move is level or up; over it, down."""
     view = view_of("libero_90/73")
@@ -437,7 +455,8 @@ def attempt_of(closing):
 @pytest.mark.slow
 @pytest.mark.parametrize("task_id, start", [
     ("libero_goal/3", 0), ("libero_spatial/4", 16), ("libero_90/5", 4), ("libero_90/13", 12), ("libero_90/19", 4),
-    ("libero_90/42", 7), ("libero_90/62", 6), ("libero_90/83", 3), ("libero_90/86", 2), ("libero_90/89", 3)
+    ("libero_90/42", 7), ("libero_90/62", 6), ("libero_90/83", 3), ("libero_90/86", 2), ("libero_90/89", 3),
+    ("libero_10/3", 0),
 ])  # fmt: skip
 def test_narrow_places_leaning_hands_and_small_knobs(attempt_of, task_id, start):
     style, _ = np.random.SeedSequence([get_task(task_id).index, start]).spawn(2)

@@ -86,7 +86,7 @@ def test_demonstrations_that_do_not_fit_are_refused_by_name(kwargs, words, tmp_p
 
 
 def test_what_the_expert_recorded_otherwise_is_told_and_recorded_again(tmp_path, recorded, capsys):
-    own(tmp_path / "expert.hdf5", size=16, generator="scripted-expert-14", robot="libero")
+    own(tmp_path / "expert.hdf5", size=16, generator="scripted-expert-15", robot="libero")
     demonstrations.find_demos(TASKS[1:2], [2], settings(str(tmp_path)), False)
     assert recorded == [TASKS[1].name] and "not used" in capsys.readouterr().err
     demonstrations.find_demos(TASKS[:1], [2], settings(str(tmp_path)), False)

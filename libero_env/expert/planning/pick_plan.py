@@ -122,14 +122,14 @@ SEARCH = PickSearch()
 
 
 def first_reachable(
-    view: StateView, shapes: Shapes, plans: list[PickPlan], flip: bool = True
+    view: StateView, shapes: Shapes, plans: list[PickPlan], held: bool = False
 ) -> tuple[PickPlan, float]:
     """Return the first plan that the arm reaches, or the one with the smallest error; and the error.
 
     Args:
         shapes: Shapes of the scene, with the arm's kinematics.
         plans: Plans, best first.
-        flip: Whether the hand may also be rotated by half a turn.
+        held: Whether the hand holds the object already; else it may also be rotated by half a turn.
     """
     start = joint_angles(view)
     best: tuple[float, PickPlan] | None = None
@@ -137,10 +137,12 @@ def first_reachable(
     unreachable: set[tuple] = set()
     trials = 0
     for candidate in plans:
-        for side, signs in enumerate(FLIPS[: 1 + flip]):
+        for side, signs in enumerate(FLIPS[: 1 if held else 2]):
             grasp = replace(candidate.grasp, mat=candidate.grasp.mat * signs)
             key = id(candidate.grasp), side
-            if key not in grasped:
+            if held:
+                grasped[key] = start, 0.0
+            elif key not in grasped:
                 pregrasp = Pose(grasp.pos_world - _PREGRASP_DISTANCE * grasp.mat[:, 2], grasp.mat)
                 grasped[key] = shapes.arm.follow(start, [pregrasp, Pose(grasp.pos_world, grasp.mat)])
             angles, grasp_error = grasped[key]
@@ -150,7 +152,7 @@ def first_reachable(
             if similar in unreachable:
                 continue
             plan, trials = replace(candidate, grasp=grasp), trials + 1
-            error = max(grasp_error, shapes.arm.follow(angles, _place_path(plan))[1])
+            error = max(grasp_error, shapes.arm.follow(angles, _place_path(plan)[held:])[1])
             if error > SEARCH.unreachable_error:
                 unreachable.add(similar)
             if best is None or error < best[0]:

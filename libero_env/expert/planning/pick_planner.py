@@ -70,7 +70,7 @@ def plan_place(
     placement = Placement.from_view(view, shapes, atom, slot)
     places = _candidate_places(placement, failures)
     held = Grasp(view.eef_pos, view.eef_mat, float(np.abs(view.finger_pos).sum()), 0.0)
-    return first_reachable(view, shapes, _rank_pairs(placement, [held], places), flip=False)[0]
+    return first_reachable(view, shapes, _rank_pairs(placement, [held], places), held=True)[0]
 
 
 def is_graspable(view: StateView, shapes: Shapes, name: str) -> bool:

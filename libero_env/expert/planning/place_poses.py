@@ -25,7 +25,8 @@ _MAX_OVERHANG = 0.15  # share of an object's columns that may reach into an over
 _MIN_ENTRY_OVERLAP = 0.03  # share of points that is tolerated on the way in
 _UNSUPPORTED_COST = 2.0  # of a leaning object with nothing under its middle
 _NUM_TESTED = 80  # points of an object that are tested
-_GRID = 7  # spots along each side of a region
+_GRID, _FINE_GRID = 7, 21  # spots along each side of a region
+_FLOOR = 0.015  # [m] above the lowest point of a region, up to which an object stands on its floor
 _OFFSETS = np.array([(0, 0), (0.01, 0), (-0.01, 0), (0, 0.01), (0, -0.01)])  # [m] of spots on an object
 _MAX_STACK_OFFSET = 0.024  # [m] between the origins of stacked objects
 _EDGE_COST, _EDGE_MARGIN = 40.0, 0.02  # cost for each [m] closer to the edge of a region than the margin
@@ -132,8 +133,8 @@ class Spots:
     holds: Callable[[np.ndarray], bool]
 
 
-def target_spots(placement: Placement) -> Iterator[Spots]:
-    """Yield the spots of each part of the target."""
+def target_spots(placement: Placement, grid: int = _GRID) -> Iterator[Spots]:
+    """Yield the spots of each part of the target, `grid` along each side of a region."""
     view, target = placement.view, placement.target
     if view.is_entity(target):
         xy = view.body_pos(target)[:2]
@@ -149,7 +150,7 @@ def target_spots(placement: Placement) -> Iterator[Spots]:
     for box in region_boxes(view, target):
         centre, mat, size = box
         half = np.abs(mat @ size)
-        u, v = (np.linspace(-0.9, 0.9, _GRID) * h for h in half[:2])
+        u, v = (np.linspace(-0.9, 0.9, grid) * h for h in half[:2])
         offsets = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
         costs = 4.0 * np.linalg.norm(offsets - _slot_offset(half, placement.slot), axis=1)
         room = (half[:2] - np.abs(offsets)).min(axis=1)
@@ -192,7 +193,10 @@ def find_place_poses(placement: Placement) -> list[PlacePose]:
     even = [_Rotation.about_vertical(yaw) for yaw in _even_yaws(_NUM_YAWS)]
     parallel_yaws = _parallel_yaws(placement.cloud, placement.sides[0])
     parallel = [_Rotation.about_vertical(yaw) for yaw in parallel_yaws]
-    places = _search(placement, even, overlap) or _search(placement, parallel, overlap)
+    places = _search(placement, even, overlap)
+    if places and not _on_floor(placement, places):  # a drawer does not close over what stands on its rim
+        places = _on_floor(placement, _search(placement, even, overlap, _FINE_GRID)) or places
+    places = places or _search(placement, parallel, overlap)
     if not places and not placement.target_is_flat:
         yaws = [*parallel_yaws, *_even_yaws(_NUM_YAWS // 2)]
         for lean in _LEANS:
@@ -226,12 +230,24 @@ class _Rotation:
         return cls(tilt @ rotation_about_z(yaw), 0.1 * abs(yaw), entry)
 
 
-def _search(placement: Placement, rotations: list[_Rotation], max_overlap: float) -> list[PlacePose]:
+def _on_floor(placement: Placement, places: list[PlacePose]) -> list[PlacePose]:
+    """Return the places, of an upright object, on the floor of what it goes into; all where it goes onto something."""
+    if placement.atom.predicate != "In" or placement.target_is_flat:
+        return places
+    boxes = region_boxes(placement.view, placement.target)
+    floor = min(centre[2] - np.abs(mat @ size)[2] for centre, mat, size in boxes)
+    bottom = placement.cloud[:, 2].min() - placement.object_pose.pos[2]
+    return [place for place in places if place.pos[2] + bottom < floor + _FLOOR]
+
+
+def _search(
+    placement: Placement, rotations: list[_Rotation], max_overlap: float, grid: int = _GRID
+) -> list[PlacePose]:
     """Return places of an object with some rotations, of whose points at most a share is in occupied cells."""
     places: list[PlacePose] = []
     for rotation in rotations:
         body = (placement.cloud - placement.object_pose.pos) @ rotation.mat.T
-        for spots in target_spots(placement):
+        for spots in target_spots(placement, grid):
             places += _search_spots(placement, body, rotation, spots, max_overlap)
     return places
 
