@@ -207,7 +207,7 @@ def config_folders(config_dir: Path | None = None) -> list[Path]:
     """Return the folder of the package's configuration files, and that of `--config-dir`.
 
     Raises:
-        ConfigError: The latter is not a folder.
+        ConfigError: The latter is not a folder, or has a file of the package's, which goes first.
     """
     if config_dir is None:
         return [config_folder()]
@@ -217,4 +217,12 @@ def config_folders(config_dir: Path | None = None) -> list[Path]:
         raise ConfigError(
             f"--config-dir: {config_dir} is not a folder.{hint} Give one that has files such as algo/NAME.yaml"
         )
-    return [config_folder(), config_dir]
+    package = config_folder()
+    if package.resolve() != config_dir.resolve():
+        for path in package.rglob("*.yaml"):
+            if (own := config_dir / path.relative_to(package)).is_file():
+                raise ConfigError(
+                    f"--config-dir: {own} would not be read: the package has a file of this name; give it another, "
+                    f"such as {path.stem}_own.yaml"
+                )
+    return [package, config_dir]

@@ -56,7 +56,8 @@ class TuneRequest:
         beside: Algorithms to compare with.
         out: Folder of table, picture and measurements.
         config_dir: A folder of configuration files to be added.
-        write: Folder of configuration files in which tuned/HEAD/ALGO.yaml gets the chosen value.
+        write: Folder of configuration files in which tuned/HEAD/ALGO.yaml gets the chosen value (ALGO_own.yaml where
+            the package has such a file).
     """
 
     overrides: Positional[Annotated[tuple[str, ...], Field(min_length=1)]]
@@ -89,7 +90,7 @@ def tune(request: TuneRequest) -> None:
     """Measure all values and write table, picture, JSON file and the chosen value."""
     import torch
 
-    from lifelong.composition import compose_run
+    from lifelong.composition import compose_run, config_folder
     from lifelong.settings import Configuration, plain_data
     from lifelong.tuning.frontier import draw_frontier, render, write_frontier, write_tuned
     from lifelong.tuning.proxy import ProxySettings, measure_frontier
@@ -122,9 +123,12 @@ def tune(request: TuneRequest) -> None:
     draw_frontier(frontier, f"{algo}: {keys}", stem)
     print(f"picture: {stem}.png")
     if request.write:
-        path = request.write / "tuned" / head / f"{algo}.yaml"
+        name, package = f"{head}/{algo}", config_folder()
+        if (package / f"tuned/{name}.yaml").is_file() and package.resolve() != request.write.resolve():
+            name += "_own"  # the package's goes before a file of the same name
+        path = request.write / "tuned" / f"{name}.yaml"
         write_tuned(best, path, _comment(about, best.score.value))
-        print(f"written: {path}")
+        print(f"written: {path}, for libero train --config-dir {request.write} algo={algo} tuned@algo={name}")
 
 
 def _candidates(

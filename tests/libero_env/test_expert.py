@@ -298,7 +298,9 @@ def test_another_place_is_found_for_what_is_in_the_hand(view_of):
 
 
 @pytest.mark.sim
-def test_a_bowl_stands_on_the_floor_of_a_drawer_and_one_in_a_stretched_hand_goes_where_the_arm_reaches(view_of):
+def test_a_bowl_stands_on_the_floor_of_a_drawer_and_one_in_a_stretched_hand_goes_where_the_arm_reaches(
+    view_of,
+):
     view = view_of("libero_10/3")
     shapes, atom = Shapes(view.scene), get_task("libero_10/3").problem.goal.parts[1]
     (box,) = region_boxes(view, atom.args[1])

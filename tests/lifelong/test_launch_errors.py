@@ -33,6 +33,9 @@ def own(here) -> Path:
     """The folder of a user, with a configuration file in `own`."""
     (here / "own" / "algo").mkdir(parents=True)
     (here / "own" / "algo" / "l2.yaml").write_text("_target_: my_package.L2\nstrength: 10.0\n")
+    shadow = here / "shadow" / "tuned" / "gmm_small" / "derpp.yaml"
+    shadow.parent.mkdir(parents=True)
+    shadow.write_text("alpha: 0.7\n")
     (here / "own" / "policy").mkdir()
     (here / "own" / "policy" / "mine.yaml").write_text("_target_: my_policy.Mine\n")
     return here
@@ -79,6 +82,7 @@ MISTAKES = {
     "--cfg jobs": ("--cfg", "'jobs'", "'job'"),
     "--config-dir owm": ("owm", "Did you mean 'own'?"),
     "--config-dir own algo=l2 algo.strenght=3": ("algo.strenght", "Did you mean 'algo.strength'?"),
+    "--config-dir shadow": ("shadow/tuned/gmm_small/derpp.yaml would not be read", "derpp_own.yaml"),
     "-m algo=ewc, er": ("error",),
     "-m algo=er,ewc --cfg job": ("cannot be composed", "--multirun", "--cfg"),
     "-m algo=er,ewk": ("ewk", "Did you mean 'ewc'?"),

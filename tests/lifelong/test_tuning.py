@@ -133,14 +133,20 @@ def test_a_sweep_is_measured_once_and_its_choice_is_what_a_run_reads(tmp_path, f
     assert (out / "ewc-deterministic_small-strength.png").stat().st_size > 1000
     tuned = own / "tuned" / "deterministic_small" / "ewc.yaml"
     assert yaml.safe_load(tuned.read_text()) == {"strength": record["chosen"]["algo.strength"]}
-    (own / "tuned" / "mine.yaml").write_text(tuned.read_text())
-    config, _ = compose_run(["algo=ewc", "tuned@algo=mine"], own)
+    config, _ = compose_run(["algo=ewc", said.split()[-1]], own)
     assert config.algo.strength == record["chosen"]["algo.strength"]
 
     assert fake_streams == [2]
     assert tune(*words) == 0, "everything is read back"
     assert fake_streams == [2]
     assert json.loads((out / "ewc-deterministic_small-strength.json").read_text()) == record
+
+    other = [word for word in words if not word.startswith("algo=ewc") and "estimator" not in word]
+    words = ["algo=mas", *other]  # of which the package has a tuned value for this head
+    assert tune(*words) == 0
+    choice = capsys.readouterr().out.split()[-1]
+    assert choice == "tuned@algo=deterministic_small/mas_own"
+    assert compose_run(["algo=mas", choice], own)[0].algo.strength in (10, 1000)
 
 
 def test_a_sweep_that_is_stopped_goes_on_to_the_same_result(tmp_path, fake_streams, monkeypatch) -> None:
