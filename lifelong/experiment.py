@@ -14,7 +14,7 @@ import torch
 from omegaconf import DictConfig
 
 from libero_env.assets.pack import select_pack
-from libero_env.assets.robot import robosuite_assets
+from libero_env.assets.robot import robot_assets
 from libero_env.demos.read import demo_origin
 from libero_env.envs.batch import BatchEnv
 from libero_env.memory import memory_limit
@@ -249,7 +249,7 @@ class _Parts:
 
 def _checked_parts(config: Configuration, device: torch.device) -> _Parts:
     """Build what a run is made of; refuse what cannot fit into memory, or needs a package that is not there."""
-    robosuite_assets()
+    robot_assets()
     plan, data = plan_tasks(config), config.build("data")
     check_folder(data)
     fit, evaluation, algorithm = config.build("train"), config.build("eval"), config.build("algo")

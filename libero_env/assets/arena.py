@@ -15,7 +15,7 @@ from libero_env.assets.furnishing import (
     solid_mesh,
     styles_of,
 )
-from libero_env.assets.robot import load_robosuite, robosuite_assets
+from libero_env.assets.robot import load_robosuite
 from libero_env.errors import UnknownNameError
 from libero_env.mujoco_compat import delete, mujoco
 from libero_env.objects.builtin.mesh import Mesh, merge
@@ -183,11 +183,11 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace, detailed: bool = False)
         detailed: Whether it has robosuite's visual mesh of 33,000 triangles.
 
     Raises:
-        MissingPackageError: robosuite, which supplies the model, is not installed.
+        MissingPackageError: See `libero_env.assets.robot.robot_assets`.
     """
     if workspace.mount is None:
         return
-    mount = load_robosuite(robosuite_assets() / f"mounts/{workspace.mount}_mount.xml")
+    mount = load_robosuite(f"mounts/{workspace.mount}_mount.xml")
     mount.body("base").pos = [0.0, 0.0, 0.0]
     if detailed:
         mount.geom("pedestal_vis").mass = 0.0

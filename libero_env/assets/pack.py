@@ -19,7 +19,7 @@ from libero_env.assets.published import (
     require_published,
     require_undamaged,
 )
-from libero_env.assets.robot import robosuite_assets
+from libero_env.assets.robot import robot_assets
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects import ObjectModel, get_object, object_names
@@ -200,7 +200,7 @@ def problems(pack: Pack) -> list[str]:
     """Return a line for each object or room that does not compile and each file that is missing or has changed."""
     lines = []
     try:
-        robosuite_assets()
+        robot_assets()
     except MissingPackageError as error:
         lines.append(f"robot: {error}")
 

@@ -1,16 +1,28 @@
 """`libero assets`: install or download the original's models, report which models are used, check them."""
 
 from pathlib import Path
+from typing import Literal
 
 from libero_env.cli.options import FilePath, Positional
+from libero_env.errors import LiberoError
 
 
-def install(*, dest: FilePath | None = None) -> None:
-    """Install the original's models (340 MB) with pip, the pinned version, and verify them.
+def install(
+    what: Positional[Literal["original", "robot"]] = "original", *, dest: FilePath | None = None
+) -> None:
+    """Install the original's models (340 MB) with pip, the pinned version, and verify them; or fetch the robot's.
 
     Args:
-        dest: Folder (default: the running environment).
+        what: original, or robot: the arm's files (190 MB, of which 42 are kept in the cache), unless they are there.
+        dest: Folder of the original's models (default: the running environment).
     """
+    if what == "robot":
+        from libero_env.assets.robot import robot_assets
+
+        if dest is not None:
+            raise LiberoError("the robot's files are kept in the cache; set LIBERO_CACHE in place of --dest")
+        print(f"{robot_assets()}: complete")
+        return
     from libero_env.assets.pack import ORIGINAL
     from libero_env.assets.published import install as install_models
 

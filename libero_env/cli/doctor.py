@@ -16,8 +16,8 @@ from pathlib import Path
 
 from libero_env.assets.pack import BUILTIN, VARIABLE, chosen_assets, facade_assets, pack_of
 from libero_env.assets.published import find_distribution
-from libero_env.assets.robot import ROBOSUITE_REMEDY, ROBOSUITE_VERSION, robosuite_assets, robosuite_version
-from libero_env.errors import LiberoError, MissingPackageError
+from libero_env.assets.robot import ROBOSUITE_VERSION, installed_robot, robot_cache
+from libero_env.errors import LiberoError
 from libero_env.paths import cache_dir, config_file, demos_dir, read_config
 from libero_env.storage import check_trusted
 from libero_env.text import show_bytes
@@ -142,14 +142,12 @@ def check_package(name: str, remedy: str = "make setup", essential: bool = True)
 
 
 def check_robot_models() -> Finding:
-    """Check that robosuite's MJCF files of the arm are installed, without importing robosuite."""
-    title = "robot models (robosuite)"
-    try:
-        robosuite_assets()
-        version = robosuite_version()
-    except MissingPackageError as error:
-        return Finding(title, error.reason, False, error.remedy)
-    return Finding(title, version, version == ROBOSUITE_VERSION, ROBOSUITE_REMEDY, essential=False)
+    """Check that the robot's model files are there: an installed robosuite's, or those fetched into the cache."""
+    title, fetched = "robot models", robot_cache()
+    if folder := installed_robot() or (fetched if fetched.is_dir() else None):
+        return Finding(title, str(folder))
+    absent = f"not there; the first scene fetches them (robosuite {ROBOSUITE_VERSION}, 190 MB, once) into {fetched}"
+    return Finding(title, absent, False, "libero assets install robot", essential=False)
 
 
 def check_models() -> Finding:

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field, PlainValidator
 
 from libero_env.assets.pack import select_pack
-from libero_env.assets.robot import DEFAULT_ROBOT, robosuite_version
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.contents import Pairing
 from libero_env.demos.write import make_header
 from libero_env.envs.config import Drawing, Names, Robot, Size
@@ -216,7 +216,7 @@ class DemoConfig:
             robot=self.robot,
             model_digest=model_digest(scene.model),
             models=json.dumps({"pack": pack.name, "digest": pack.digest}),
-            versions=json.dumps({**versions, "robosuite": robosuite_version()}),
+            versions=json.dumps(versions),
             **extra,
         )
 

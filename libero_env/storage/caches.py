@@ -130,7 +130,10 @@ def cached_folder(directory: Path, make: Callable[[], object]) -> None:
                 _log.warning("%s has other files than when it was made; it is made again", directory)
                 shutil.rmtree(directory)
             make()
-            write_record(record, {file.name: _file_digest(file) for file in directory.iterdir()})
+            files = sorted(file for file in directory.rglob("*") if file.is_file())
+            write_record(
+                record, {file.relative_to(directory).as_posix(): _file_digest(file) for file in files}
+            )
     except Timeout:
         raise LiberoError(
             f"{directory}: another process makes it and does not end; end that process"

@@ -1,85 +1,175 @@
-"""Without robosuite's model files, every entry point ends with one line that states what to type."""
+"""The robot's model files: of an installed robosuite, or fetched once from a package index, or one line."""
 
 import importlib.util
 import os
 import pickle
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
+import mujoco
 import pytest
 
+from libero_env.assets import robot
 from libero_env.assets.pack import BuiltinPack, problems
-from libero_env.assets.robot import robosuite_assets, robosuite_version
 from libero_env.cli import doctor
-from libero_env.errors import LiberoError, MissingPackageError
-from libero_env.sim import scene
-from libero_env.tasks import get_task
+from libero_env.cli.main import main
+from libero_env.errors import MissingPackageError
 
 ROOT = Path(__file__).parents[2]
-REMEDY = "pip install --no-deps robosuite==1.4.1"
-MESSAGE = f"the robot's model files are missing: the package robosuite is not installed; type {REMEDY}"
+MESSAGE = "error: the robot's model files are missing, and cannot be fetched ("
 # Python runs `sitecustomize.py` at start, in this process and in the workers that it spawns.
 SITE = """
-import importlib.metadata, importlib.util
-find_spec, version = importlib.util.find_spec, importlib.metadata.version
-def absent(name):
-    if name == "robosuite":
-        raise importlib.metadata.PackageNotFoundError(name)
-    return version(name)
+import importlib.util
+find_spec = importlib.util.find_spec
 importlib.util.find_spec = lambda name, package=None: None if name == "robosuite" else find_spec(name, package)
-importlib.metadata.version = absent
 """
 
 
+def compiled() -> list[bytes]:
+    spec = mujoco.MjSpec()
+    robot.add_panda(spec, (0.0, 0.0, 0.0), detailed=True)
+    spec.attach(
+        robot.load_robosuite("mounts/rethink_mount.xml"), prefix="mount0_", frame=spec.worldbody.add_frame()
+    )
+    model = spec.compile()
+    fields = (
+        "geom_type",
+        "geom_pos",
+        "geom_size",
+        "mesh_vert",
+        "mesh_face",
+        "body_mass",
+        "site_pos",
+        "names",
+    )
+    return [
+        getattr(model, field) if field == "names" else getattr(model, field).tobytes() for field in fields
+    ]
+
+
+@pytest.fixture(scope="module")
+def published():
+    """Files of the robot by their names in robosuite 1.4, and the arm that they make."""
+    found = {name: path.read_bytes() for name, path in robot._files(robot.robot_assets()).items()}
+    return found, compiled()
+
+
 @pytest.fixture
-def no_robosuite(tmp_path):
-    """Environment variables of a process that finds no robosuite."""
-    (tmp_path / "site").mkdir()
-    (tmp_path / "site" / "sitecustomize.py").write_text(SITE)
-    path = os.pathsep.join([str(tmp_path / "site"), str(ROOT)])
-    return {**os.environ, "PYTHONPATH": path, "LIBERO_CACHE": str(tmp_path / "cache"), "OMP_NUM_THREADS": "1"}
+def index(published, tmp_path, monkeypatch):
+    """Make a package index that has one wheel, in place of the network's, for a process without robosuite."""
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "robosuite" else find(name))
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("PIP_FIND_LINKS", str(tmp_path))
+    robot.robot_assets.cache_clear()
 
+    def make(change=lambda name, content: (name, content)):
+        with zipfile.ZipFile(tmp_path / "robosuite-1.4.1-py3-none-any.whl", "w") as wheel:
+            for name, content in map(change, *zip(*published[0].items(), strict=True)):
+                wheel.writestr(f"robosuite/models/assets/{name}", content)
+            info = "robosuite-1.4.1.dist-info"
+            wheel.writestr(f"{info}/METADATA", "Metadata-Version: 2.1\nName: robosuite\nVersion: 1.4.1\n")
+            wheel.writestr(
+                f"{info}/WHEEL",
+                "Wheel-Version: 1.0\nGenerator: t\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+            )
+            wheel.writestr(f"{info}/RECORD", "")
+        return tmp_path / "robosuite-1.4.1-py3-none-any.whl"
 
-def test_a_scene_asks_for_the_package(monkeypatch):
-    scene._build_scene.cache_clear()
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    for call in (robosuite_assets, lambda: scene.build_scene(get_task("libero_goal/0").problem)):
-        with pytest.raises(MissingPackageError) as raised:
-            call()
-        assert str(raised.value) == MESSAGE
-        assert isinstance(raised.value, LiberoError)
-
-
-def test_an_installation_without_its_files_is_replaced(tmp_path, monkeypatch):
-    (tmp_path / "robosuite").mkdir()
-    (tmp_path / "robosuite" / "__init__.py").touch()
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "robosuite", raising=False)
-    with pytest.raises(
-        MissingPackageError, match=r"robot.xml does not exist; type pip install .*--force-reinstall"
-    ):
-        robosuite_assets()
-
-
-def test_the_error_can_be_sent_by_a_worker():
-    error = MissingPackageError("files are missing", REMEDY)
-    again = pickle.loads(pickle.dumps(error))  # noqa: S301
-    assert str(again) == str(error) and again.remedy == REMEDY
-
-
-def test_doctor_names_the_remedy(monkeypatch):
-    assert doctor.check_robot_models().ok and robosuite_version() == "1.4.1"
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    finding = doctor.check_robot_models()
-    assert not finding.ok and finding.essential and finding.remedy == REMEDY
+    yield make
+    robot.robot_assets.cache_clear()
 
 
 @pytest.mark.sim
-def test_the_check_of_assets_reports_it(monkeypatch):
-    assert problems(BuiltinPack()) == []
+def test_the_files_are_fetched_once(index, published, capsys):
+    wheel = index()
+    assert main(["assets", "install", "robot"]) == 0
+    folder = robot.robot_cache()
+    assert capsys.readouterr().out == f"{folder}: complete\n"
+    assert {path.relative_to(folder).as_posix() for path in folder.rglob("*.*")} == set(published[0])
+    assert compiled() == published[1] and doctor.check_robot_models().detail == str(folder)
+    wheel.unlink()
+    robot.robot_assets.cache_clear()
+    assert robot.robot_assets() == folder
+    (folder / "robots/panda/robot.xml").write_text("<mujoco/>")  # then it is not used
+    robot.robot_assets.cache_clear()
+    with pytest.raises(MissingPackageError, match="cannot be fetched"):
+        robot.robot_assets()
+
+
+@pytest.mark.sim
+def test_the_files_of_robosuite_1_5_make_the_same_arm(published, tmp_path, monkeypatch):
+    link, name = b'<body name="link0" pos="0 0 0">', "robots/panda/robot.xml"
+    assert link in published[0][name]
+    later = (
+        published[0][name]
+        .replace(link, link + b'<site name="right_center" size="0.01"/>')
+        .replace(b"\r", b"")
+    )
+    for file, content in {**published[0], name: later}.items():
+        target = tmp_path / "robosuite/models/assets" / file.replace("mounts", "bases", 1)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(content)
+    (tmp_path / "robosuite/__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "robosuite", raising=False)
+    assert robot.installed_robot() is None  # a model that no release has
+    monkeypatch.setattr(robot, "_MODELS", dict.fromkeys(robot._MODELS, _Anything()))
+    robot.robot_assets.cache_clear()
+    assert robot.robot_assets().is_relative_to(tmp_path) and compiled() == published[1]
+    robot.robot_assets.cache_clear()
+
+
+class _Anything:
+    def __contains__(self, digest: str) -> bool:
+        return True
+
+
+def half(wheel: Path) -> None:
+    wheel.write_bytes(wheel.read_bytes()[: wheel.stat().st_size // 2])
+
+
+@pytest.mark.parametrize(("change", "after", "message"), [
+    (lambda name, content: (name, content), half, "cannot be fetched (ERROR: "),
+    (lambda name, content: (name, content), Path.unlink, "cannot be fetched (ERROR: No matching distribution found"),
+    (lambda name, content: (name, content + b" "), lambda wheel: None, "package index has other ones"),
+])  # fmt: skip
+def test_what_cannot_be_fetched_leaves_nothing(change, after, message, index, capsys):
+    after(index(change))
+    assert main(["assets", "install", "robot"]) == 2
+    err = capsys.readouterr().err.strip()
+    assert (
+        message in err and "\n" not in err and not list(robot.robot_cache().parent.glob("*robosuite-1.4.1/"))
+    )
+    finding = doctor.check_robot_models()
+    assert not finding.ok and finding.remedy == "libero assets install robot"
+
+
+def test_the_folder_of_the_cache_is_no_option(capsys):
+    assert main(["assets", "install", "robot", "--dest", "folder"]) == 2
+    assert "set LIBERO_CACHE" in capsys.readouterr().err
+
+
+def test_without_pip_and_uv_the_line_names_them(index, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    assert problems(BuiltinPack()) == [f"robot: {MESSAGE}"]
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(MissingPackageError, match="neither pip nor uv"):
+        robot.robot_assets()
+
+
+def test_the_error_can_be_sent_by_a_worker():
+    error = MissingPackageError("files are missing", "pip install robosuite")
+    again = pickle.loads(pickle.dumps(error))  # noqa: S301
+    assert str(again) == str(error) and again.remedy == "pip install robosuite"
+
+
+@pytest.mark.sim
+def test_the_check_of_assets_reports_it(index):
+    (line,) = problems(BuiltinPack())
+    assert line.startswith("robot: the robot's model files are missing")
 
 
 @pytest.mark.sim
@@ -93,11 +183,26 @@ def test_the_check_of_assets_reports_it(monkeypatch):
     "-m libero_env.cli demos generate --benchmark libero_object --n 1 --workers 2",
     "train.py preset=smoke runs_dir={out}",
 ])  # fmt: skip
-def test_commands_end_with_one_line(command, no_robosuite, tmp_path):
+def test_commands_end_with_one_line(command, tmp_path):
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(SITE)
+    path = os.pathsep.join([str(tmp_path / "site"), str(ROOT)])
+    environment = {
+        "PYTHONPATH": path,
+        "LIBERO_CACHE": str(tmp_path / "cache"),
+        "OMP_NUM_THREADS": "1",
+        "PIP_NO_INDEX": "1",
+    }
     words = [word.format(out=tmp_path / "out") for word in command.split()]
     done = subprocess.run(
-        [sys.executable, *words], cwd=ROOT, env=no_robosuite, capture_output=True, text=True, check=False
+        [sys.executable, *words],
+        cwd=ROOT,
+        env=os.environ | environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode != 0
     assert "Traceback" not in done.stderr
-    assert done.stderr.splitlines()[-1].endswith(f"error: {MESSAGE}")
+    assert MESSAGE in done.stderr.splitlines()[-1]
+    assert not (tmp_path / "out").exists()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from libero_env.assets import robot as robots
-from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS, add_panda, robosuite_assets
+from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS, add_panda, robot_assets
 from libero_env.envs import BatchEnv, LiberoEnv
 from libero_env.errors import UnknownNameError
 from libero_env.sim.osc import rotate
@@ -44,7 +44,7 @@ def test_only_the_wrist_differs():
 @pytest.mark.sim
 @pytest.mark.parametrize("name", ROBOTS)
 def test_either_version_of_the_package_supplies_both(name, tmp_path, monkeypatch):
-    folder, expected = robosuite_assets(), arm(name)
+    folder, expected = robot_assets(), arm(name)
     text = (folder / "robots/panda/robot.xml").read_text()
     # an own folder with the file of the version that is not installed
     hand = '<body name="right_hand"'
@@ -56,7 +56,7 @@ def test_either_version_of_the_package_supplies_both(name, tmp_path, monkeypatch
             (tmp_path / part / item.name).symlink_to(item)
     (tmp_path / "robots/panda/robot.xml").unlink()
     (tmp_path / "robots/panda/robot.xml").write_text(other)
-    monkeypatch.setattr(robots, "robosuite_assets", lambda: Path(tmp_path))
+    monkeypatch.setattr(robots, "robot_assets", lambda: Path(tmp_path))
     model = arm(name)
     assert shapes(model) == shapes(expected) and colliders(model) == colliders(expected)
     assert ("robot0_link7_collision" in colliders(model)) == (name != DEFAULT_ROBOT)

@@ -10,6 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import libero_env.parallel as parallel
+from libero_env.assets.robot import robot_assets
 from libero_env.cli.main import main
 from libero_env.errors import LiberoError
 from libero_env.tasks import get_task
@@ -158,13 +159,18 @@ def test_classes_of_a_module_in_the_current_folder_are_found(own, monkeypatch, c
         assert (status, capsys.readouterr().err) == (0, "")
 
 
-@pytest.mark.parametrize("package", ["wandb", "robosuite"])
-def test_a_package_that_is_not_installed_leaves_no_directory(package, here, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("package", "message"), [("wandb", "wandb is not installed"), ("robosuite", "cannot be fetched")]
+)
+def test_a_package_that_is_not_installed_leaves_no_directory(package, message, here, monkeypatch, capsys):
     find = importlib.util.find_spec
     for place in ("importlib.util.find_spec", "lifelong.errors.find_spec"):
         monkeypatch.setattr(place, lambda name, *more: None if name == package else find(name, *more))
+    monkeypatch.setenv("PIP_NO_INDEX", "1")
+    monkeypatch.setenv("LIBERO_CACHE", str(here / "cache"))
+    robot_assets.cache_clear()
     assert main(["train", "preset=smoke", "wandb=offline"]) == 2
-    assert f"{package} is not installed" in capsys.readouterr().err and not (here / "runs").exists()
+    assert message in capsys.readouterr().err and not (here / "runs").exists()
 
 
 def test_lines_of_the_jobs_of_a_sweep_have_their_names(here, monkeypatch, capsys):

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from libero._adapters.models import assets_folder
-from libero_env.assets.robot import robosuite_assets
+from libero_env.assets.robot import robot_file
 from libero_env.objects.xml_file import parse_xml_text
 
 DIR = os.path.dirname(__file__)
@@ -21,7 +21,7 @@ def postprocess_model_xml(xml_str: str, cameras_dict: Mapping[str, Mapping[str, 
     for element in root.iterfind("asset/*[@file]"):
         file = element.get("file", "")
         if _ROBOSUITE in file:
-            element.set("file", str(robosuite_assets() / file.split(_ROBOSUITE)[-1]))
+            element.set("file", str(robot_file(file.split(_ROBOSUITE)[-1])))
         elif _ASSETS in file and (folder := assets_folder()):
             element.set("file", str(folder / file.split(_ASSETS)[-1]))
     for camera in root.iter("camera"):
