@@ -3,6 +3,7 @@
 # make assets  set everything up, and the original's models (340 MB), with which tests compare pictures
 # make fuzz    the property tests with tens of thousands of hostile inputs, see experiments/fuzz
 # make lerobot an environment of its own, .venv-lerobot, in which policies of LeRobot are trained, and its tests
+# make release set everything up, then what a release has, checked: wheel in a fresh environment, documentation
 # make docs    set everything up, then the documentation: build/site/index.html
 PYTHON ?= python3
 ARGS ?=
@@ -17,7 +18,7 @@ EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl assets train test lint audit fuzz lerobot docs clean
+.PHONY: help setup gl assets train test lint audit fuzz lerobot docs release clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -89,7 +90,18 @@ audit: $(STAMP)
 	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
 
 docs: $(STAMP)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+TRY := build/release/try/bin
+release: docs
+	rm -rf dist build/release
+	$(PYTHON) -m venv build/release/tools && build/release/tools/bin/pip install --quiet build twine
+	build/release/tools/bin/python -m build
+	build/release/tools/bin/twine check --strict dist/*
+	$(PYTHON) -m venv build/release/try
+	$(TRY)/pip install --constraint constraints.txt "$$(ls dist/*.whl)[train]"
+	cd build/release && try/bin/libero train preset=smoke
+	cd build/release && try/bin/libero eval expert --suite libero_goal/7 --episodes 3
 
 clean:
 	rm -rf $(VENV) $(VENV)-lerobot build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache

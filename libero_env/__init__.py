@@ -5,4 +5,5 @@ The names below are loaded when they are first used; importing this package load
 
 import lazy_loader
 
+__version__ = "0.1.0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -29,3 +29,5 @@ __all__ = [
     "register_object",
     "register_predicate",
 ]
+
+__version__: str

@@ -15,3 +15,5 @@ __all__ = [
     "evaluate",
     "load_protocol",
 ]
+
+__version__: str

@@ -22,3 +22,5 @@ __all__ = [
     "rollout",
     "write_report",
 ]
+
+__version__: str

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+from libero_env import __version__
 from libero_env.cli import ending
 from libero_env.errors import InvalidInputError, MissingPackageError, UnknownNameError
 from libero_env.storage import read_yaml
@@ -116,6 +117,9 @@ def load(command: Command) -> Callable[..., Any]:
 
 def _overview(words: Sequence[str]) -> int:
     """Print the commands; return 0 where they were asked for, otherwise the status of a mistake."""
+    if "--version" in words[:1]:
+        print(f"libero-lifelong {__version__}")
+        return 0
     topics = dict.fromkeys(name.partition(" ")[0] for name in ALL)
     topic = words[0] if words and words[0] in topics else ""
     asked = bool({"-h", "--help"} & set(words[:2]))
@@ -139,4 +143,4 @@ def _lines(topic: str) -> Iterator[str]:
             yield f"  {name:18} {command.help}"
         if rows:
             yield ""
-    yield "libero COMMAND --help explains one; --debug shows the traceback of every error"
+    yield "libero COMMAND --help explains one; --debug shows the traceback of every error; --version"
