@@ -14,6 +14,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+import libero
+import libero_env
+import libero_eval
+import lifelong
 from libero_env import paths
 from libero_env.cli import doctor
 from libero_env.cli import main as cli
@@ -375,3 +379,9 @@ def test_a_package_of_learning_that_is_not_installed_is_one_line(line):
     )
     assert done.returncode == 2
     assert done.stderr == f"error: {package} is not installed; type pip install 'libero-lifelong[train]'\n"
+
+
+def test_the_version_is_that_of_all_packages(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"libero-lifelong {libero.__version__}\n"
+    assert libero.__version__ == libero_env.__version__ == libero_eval.__version__ == lifelong.__version__
