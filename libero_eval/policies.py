@@ -116,8 +116,8 @@ class RunPolicy(PolicyUnderTest):
             run.policy.spec.image_size,
             run.eval.horizon,
             run.eval.settle_steps,
-            run.robot,
-            drawing=run.drawing,
+            run.data.robot,
+            drawing=run.data.drawing,
             assets=self.request.assets,
         )
 

@@ -6,7 +6,6 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +17,8 @@ from libero_env.assets.robot import robot_assets
 from libero_env.demos.read import demo_origin
 from libero_env.envs.batch import BatchEnv
 from libero_env.memory import memory_limit
-from libero_env.perturbations import Perturbation, format_perturbations
+from libero_env.perturbations import format_perturbations
 from libero_env.sim.scene import default_drawing
-from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
@@ -29,7 +27,6 @@ from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError
 from lifelong.evaluation.environments import (
     EnvPool,
-    HeldOutShift,
     held_out_shift,
     renderer_name_or_none,
     run_environment,
@@ -58,7 +55,6 @@ from lifelong.training.distributed import Ranks
 from lifelong.training.memory import check_memory, policy_bytes, training_needs
 from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory
 from lifelong.training.settings import FitSettings
-from lifelong.types import PolicySpec
 
 PRETRAIN_KEYS = ("pretrain", "policy", "data", "augmentation", "train", "language", "seed", "init_from")
 LARGE_FOR_CPU = (
@@ -198,7 +194,14 @@ def _build_contexts(
         )
     )
     spec = data.spec(languages.shape[1])
-    make = partial(_make_env, plan.tasks, spec, evaluation, data, perturb=plan.perturb, shift=shift)
+
+    def make_env(
+        key: Any,
+    ) -> BatchEnv:  # of (task, number of simulations), with any third part under the shift
+        task, simulations, *shifted = key
+        perturb = shift.perturb if shifted and shift is not None else plan.perturb
+        return run_environment(plan.tasks[task], simulations, spec, evaluation, data, perturb[task])
+
     progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
     context = RunContext(
         tasks=plan.tasks,
@@ -212,7 +215,7 @@ def _build_contexts(
         augment=config.build("augmentation"),
         stream=plan.stream,
         group_sizes=plan.group_sizes,
-        envs=EnvPool(make, evaluation.open_environments),
+        envs=EnvPool(make_env, evaluation.open_environments),
         directory=directory,
         tracker=parts.tracker,
         seed=settings.seed,
@@ -263,30 +266,6 @@ def _checked_parts(config: Configuration, device: torch.device) -> _Parts:
     if fit.compile != "off":
         check_compiler(device)
     return _Parts(plan, data, fit, evaluation, algorithm, config.build("wandb"), demos)
-
-
-def _make_env(
-    tasks: Sequence[Task],
-    spec: PolicySpec,
-    settings: EvalSettings,
-    data: DataSettings,
-    key: Any,
-    *,
-    perturb: Sequence[Sequence[Perturbation]] = (),
-    shift: HeldOutShift | None = None,
-) -> BatchEnv:
-    """Return the environment of a key: position of the task, number of simulations, and the shift if there is one."""
-    task, simulations, *shifted = key
-    perturb = shift.perturb if shifted and shift is not None else perturb
-    return run_environment(
-        tasks[task],
-        simulations,
-        spec,
-        settings,
-        drawing=data.drawing,
-        robot=data.robot,
-        perturb=perturb[task] if perturb else (),
-    )
 
 
 def _held(context: RunContext, plain: Mapping[str, Any], resume: bool) -> AbstractContextManager[Any]:

@@ -15,8 +15,8 @@ from pathlib import Path
 import torch
 from hydra import compose, initialize_config_dir
 
+from lifelong.evaluation.environments import run_environment
 from lifelong.evaluation.rollout import rollout
-from lifelong.experiment import _make_env
 from lifelong.sequence.measuring import digest
 from lifelong.settings import build
 
@@ -65,7 +65,7 @@ def main() -> None:
     data = data if data.drawing else type(data)(**{**vars(data), "drawing": "fast"})
     spec = data.spec(language.shape[1])
     policy = build(config.policy, spec=spec).eval()
-    env, clock = _make_env(tasks, spec, settings, data, (0, settings.episodes)), Clock()
+    env, clock = run_environment(tasks[0], settings.episodes, spec, settings, data), Clock()
 
     def run() -> None:
         rollout(policy, env, range(settings.episodes), language=language[0], horizon=STEPS, settle_steps=0)

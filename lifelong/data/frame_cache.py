@@ -265,14 +265,8 @@ def _remove_stale(root: Path, made_from: dict[str, Any]) -> None:
 
 def _images_digest(path: Path) -> str:
     """Return a digest of the size of a file, and of all or 64 MiB of its bytes."""
-    size = path.stat().st_size
-    digest = hashlib.sha256(str(size).encode())
-    blocks = min(_BLOCKS, math.ceil(size / _BLOCK_BYTES))
-    with open(path, "rb") as file:
-        for k in range(blocks):
-            spread = size > _BLOCKS * _BLOCK_BYTES
-            file.seek((size - _BLOCK_BYTES) * k // (blocks - 1) if spread else k * _BLOCK_BYTES)
-            digest.update(file.read(_BLOCK_BYTES))
+    digest = hashlib.sha256(str(path.stat().st_size).encode())
+    _add_blocks(digest, path, _BLOCKS, _BLOCK_BYTES)
     return digest.hexdigest()
 
 
@@ -282,8 +276,15 @@ def _fingerprint(path: Path) -> str:
     for part in demo_files(path):
         stat = part.stat()
         digest.update(f"{part.name} {stat.st_size} {stat.st_mtime_ns}".encode())
-        with open(part, "rb") as file:
-            for k in range(_SAMPLES):
-                file.seek(max(0, stat.st_size - _SAMPLE_BYTES) * k // (_SAMPLES - 1))
-                digest.update(file.read(_SAMPLE_BYTES))
+        _add_blocks(digest, part, _SAMPLES, _SAMPLE_BYTES)
     return digest.hexdigest()
+
+
+def _add_blocks(digest: Any, path: Path, most: int, length: int) -> None:
+    """Add a file's bytes to a digest, or those of blocks that are spread evenly over it."""
+    size = path.stat().st_size
+    blocks = min(most, math.ceil(size / length))
+    with open(path, "rb") as file:
+        for k in range(blocks):
+            file.seek((size - length) * k // (blocks - 1) if size > most * length else k * length)
+            digest.update(file.read(length))

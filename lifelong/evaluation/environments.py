@@ -84,9 +84,7 @@ def run_environment(
     simulations: int,
     spec: PolicySpec,
     settings: EvalSettings,
-    *,
-    drawing: str | None,
-    robot: str,
+    data: DataSettings,
     perturb: Sequence[Perturbation] = (),
     horizon: int | None = None,
 ) -> BatchEnv:
@@ -96,8 +94,7 @@ def run_environment(
         simulations: Number of episodes that run side by side.
         spec: What the policy observes.
         settings: Back end, threads and horizon.
-        drawing: How images are drawn; None for the default of the models.
-        robot: Model of the arm.
+        data: Model of the arm, and how images are drawn.
         horizon: Maximum number of the policy's control steps; None for that of the settings.
     """
     return BatchEnv(
@@ -107,8 +104,8 @@ def run_environment(
         cameras=tuple(CAMERAS[view] for view in spec.views),
         camera_size=spec.image_size,
         horizon=(settings.horizon if horizon is None else horizon) + settings.settle_steps,
-        drawing=drawing,
-        robot=robot,
+        drawing=data.drawing,
+        robot=data.robot,
         backend=settings.backend,
         perturb=tuple(perturb),
     )

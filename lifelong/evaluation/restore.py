@@ -41,9 +41,8 @@ class LoadedRun:
         eval: Settings by which the run measured success.
         language: Encoder of instructions; see `embed`.
         instructions: Instructions that are embedded together: those of the pretraining, then those of the run.
-        robot: Model of the arm that the run was trained with.
+        data: How its demonstrations were recorded and drawn, and with which arm.
         group_sizes: Number of tasks in each group that was learned together; () for one task at a time.
-        drawing: How the images that it learned from were drawn.
         perturb: Perturbations under which each task was learned and evaluated; () for none at all.
     """
 
@@ -58,9 +57,8 @@ class LoadedRun:
     device: torch.device
     language: Any
     instructions: tuple[str, ...]
-    robot: str
+    data: DataSettings
     group_sizes: tuple[int, ...] = ()
-    drawing: str | None = None
     perturb: tuple[tuple[Perturbation, ...], ...] = ()
 
     @property
@@ -113,10 +111,9 @@ class LoadedRun:
             simulations,
             self.policy.spec,
             self.eval,
-            drawing=self.drawing,
-            robot=self.robot,
-            perturb=self.perturbations(position),
-            horizon=horizon,
+            self.data,
+            self.perturbations(position),
+            horizon,
         )
 
     @contextmanager
@@ -177,9 +174,8 @@ def restore(
         device=where,
         language=language,
         instructions=instructions,
-        robot=data.robot,
+        data=data,
         group_sizes=plan.group_sizes,
-        drawing=data.drawing,
         perturb=plan.perturb if plan.stream.perturb else (),
     )
 

@@ -215,7 +215,7 @@ def test_a_loaded_run_acts_with_the_adapter_of_the_stage(tmp_path) -> None:
         device=found.device,
         language=None,
         instructions=(),
-        robot="",
+        data=None,
         group_sizes=found.group_sizes,
     )
     for task in found.tasks:

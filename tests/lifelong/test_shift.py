@@ -199,13 +199,20 @@ def test_who_needs_a_file_that_is_being_rendered_waits_for_it(folder, monkeypatc
     assert len(calls) == 1 and found == [job.path]
 
 
+def made_environments(monkeypatch) -> list:
+    """Return a list that gets the key and the environment of each that a run makes."""
+    seen, pool = [], experiment.EnvPool
+    monkeypatch.setattr(
+        experiment,
+        "EnvPool",
+        lambda make, size: pool(lambda key: seen.append((key, make(key))) or seen[-1][1], size),
+    )
+    return seen
+
+
 @pytest.mark.sim
 def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, tmp_path, quick, monkeypatch):
-    seen, read = [], []
-    make = experiment._make_env
-    monkeypatch.setattr(
-        experiment, "_make_env", lambda *a, **k: seen.append((a[4], make(*a, **k))) or seen[-1][1]
-    )
+    seen, read = made_environments(monkeypatch), []
     opened = experiment.DemoDatasets.__getitem__
     monkeypatch.setattr(
         experiment.DemoDatasets,
@@ -257,10 +264,7 @@ def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, 
 @pytest.mark.sim
 def test_held_out_shifts_are_measured_besides(folder, tmp_path, quick, monkeypatch, capsys):
     """Also when a finished run is asked for them, to the same bits."""
-    seen, make = [], experiment._make_env
-    monkeypatch.setattr(
-        experiment, "_make_env", lambda *a, **k: seen.append((a[4], make(*a, **k))) or seen[-1][1]
-    )
+    seen = made_environments(monkeypatch)
     stream, shift = ("stream=shift", f"stream.perturb='{LOOKS}'"), "eval.shift={robot:0.3,light:0.4}"
     plain = run(folder, tmp_path, *stream)
     before = outcomes(plain)
