@@ -135,25 +135,7 @@ def load_weights(module: torch.nn.Module, state: dict[str, Tensor], source: Path
         CheckpointError: Names, shapes or kinds of numbers differ, or weights are not finite; the message names the
             first difference. The module is unchanged.
     """
-    own = module.state_dict()
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise CheckpointError(f"{source} holds no weights of a policy by name")
-    for name, tensor in own.items():
-        if name not in state:
-            raise CheckpointError(f"{source} has no {name}: it was written with another policy configuration")
-        if state[name].shape != tensor.shape:
-            raise CheckpointError(
-                f"{source}: {name} has shape {tuple(state[name].shape)}; the policy expects {tuple(tensor.shape)}"
-            )
-        if state[name].is_floating_point() != tensor.is_floating_point():
-            raise CheckpointError(
-                f"{source}: {name} is of {state[name].dtype}; the policy's is {tensor.dtype}"
-            )
-        if not _is_finite(state[name]) and _is_finite(tensor):
-            raise CheckpointError(f"{source}: {name} has values that are not finite; training had diverged")
-    extra = sorted(set(state) - set(own))
-    if extra:
-        raise CheckpointError(f"{source} has {extra[0]}, which the policy does not have")
+    check(state, Weights(complete=True), source, module)
     module.load_state_dict(state)
 
 
@@ -286,12 +268,16 @@ def _weights_difference(value: Any, form: Weights, own: Mapping[str, Tensor], pa
     for name, tensor in value.items():
         if name not in own:
             return f"{path}/{name} is no weight of the policy"
-        if not isinstance(tensor, Tensor) or (not _is_finite(tensor) and _is_finite(own[name])):
-            return f"{path}/{name} is no tensor of finite values"
+        if not isinstance(tensor, Tensor):
+            return f"{path}/{name} is no tensor"
         if tensor.shape != own[name].shape:
             return f"{path}/{name} has shape {tuple(tensor.shape)}; the policy's has {tuple(own[name].shape)}"
+        if form.complete and tensor.is_floating_point() != own[name].is_floating_point():
+            return f"{path}/{name} is of {tensor.dtype}; the policy's is of {own[name].dtype}"
+        if not _is_finite(tensor) and _is_finite(own[name]):
+            return f"{path}/{name} has values that are not finite: training had diverged"
     if form.complete and (missing := sorted(own.keys() - value.keys())):
-        return f"{path or 'it'} lacks {missing[0]}"
+        return f"{path or 'it'} lacks {missing[0]}: it is of another configuration of the policy"
     return None
 
 

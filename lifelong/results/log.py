@@ -77,7 +77,9 @@ class ResultLog:
             with open(self.path, "rb", opener=_open_own) as file:
                 for number, line in _lines(file):
                     try:
-                        record = from_line(_whole(line))
+                        if len(line) > MAX_LINE:
+                            raise ValueError(f"longer than {MAX_LINE >> 20} MiB, which no record is")
+                        record = from_line(line)
                         first = lines.setdefault(
                             hashlib.blake2b(line.strip(), digest_size=16).digest(), number
                         )
@@ -116,12 +118,6 @@ def _lines(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
             line += b"\n"
         if line.strip():
             yield number, line
-
-
-def _whole(line: bytes) -> bytes:
-    if len(line) > MAX_LINE:
-        raise ValueError(f"longer than {MAX_LINE >> 20} MiB, which no record is")
-    return line
 
 
 def _of_one_run(records: Sequence[tuple[int, Record]]) -> tuple[list[Record], list[tuple[int, str]]]:

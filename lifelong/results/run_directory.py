@@ -111,11 +111,6 @@ class CheckpointFolder:
         os.replace(path, target)
         return target
 
-    def clear_unfinished(self) -> None:
-        """Remove what processes left that were killed while they wrote a checkpoint."""
-        for file in self.path.glob(f".*{PART_SUFFIX}"):
-            file.unlink(missing_ok=True)
-
     def _checked(self, state: dict[str, Any], form: Any, path: Path) -> dict[str, Any]:
         checkpoints.check(state, form, path)
         known = self._run()
@@ -158,7 +153,6 @@ class RunDirectory:
             self._digest = None
             for part in self.path.rglob(f".*{PART_SUFFIX}"):  # left by a process that was killed
                 part.unlink(missing_ok=True)
-            self.checkpoints.clear_unfinished()
             self._check_config(dict(config))
             yield self
 

@@ -71,18 +71,15 @@ def write_summary(path: Path | str, results: Results, config: Mapping[str, Any])
     return summary
 
 
-def _other_conventions(results: Results) -> dict[str, float]:
-    """Return forgetting by other conventions; the one that is not linear is unknown from a sample of the cells."""
-    scores = results.scores()
-    return other_conventions(scores.matrix) | ({"forgetting": math.nan} if scores.sampled else {})
-
-
 def summarize(results: Results) -> dict[str, Any]:
     """Return the summary as plain data: the run, its success, metrics, costs and times."""
     run, size = results.run, results.learned_tasks()
     rates, episodes = results.success_matrix()
     low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
     unseen = np.isnan(rates)
+    others = other_conventions(results.scores().matrix) if size else None
+    if others and run.cells == "sampled":  # the best of the cells that happen to be measured means nothing
+        others["forgetting"] = math.nan
     ends = {r.task: r.best_epoch for r in results.of(TaskEndRecord)}
     return {
         "run": _without_kind(run),
@@ -99,7 +96,7 @@ def summarize(results: Results) -> dict[str, Any]:
         "metrics_diagonal_from_curve": (
             _as_data(lifelong_metrics(results.scores("curve", "published"))) if size else None
         ),
-        "metrics_of_other_conventions": _other_conventions(results) if size else None,
+        "metrics_of_other_conventions": others,
         "success_matrix": {
             "rates": rates.tolist(),
             "episodes": episodes.tolist(),
