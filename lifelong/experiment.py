@@ -57,9 +57,8 @@ from lifelong.training.precision import check_compiler, deterministic, keep_free
 from lifelong.training.settings import FitSettings
 
 PRETRAIN_KEYS = ("pretrain", "policy", "data", "augmentation", "train", "language", "seed", "init_from")
-LARGE_FOR_CPU = (
-    4_000_000  # pixels of a batch; the published protocol has 10 million, the laptop's less than one
-)
+# pixels of a batch; the published protocol has 10 million, the laptop's less than one
+LARGE_FOR_CPU = 4_000_000
 EXAMPLE_DIM = 384  # of instructions' embeddings, by which a policy is measured before they are computed
 
 
@@ -228,10 +227,10 @@ def _build_contexts(
     if not first:
         return context, None
     pretrain = config.build("pretrain")
-    folder = Path(settings.runs_dir) / "pretrain" / str(pretrain.suite)
-    folder /= config_digest(
+    digest = config_digest(
         {key: config.values[key] for key in PRETRAIN_KEYS}
     )  # equal ones are shared by runs
+    folder = Path(settings.runs_dir) / "pretrain" / str(pretrain.suite) / digest
     return context, pretraining_context(
         context, plan.before, languages[:first], pretrain, RunDirectory(folder)
     )

@@ -43,22 +43,18 @@ from lifelong.sweeps import (
 )
 from lifelong.training.distributed import Ranks, process_group, rank
 
-# of Hydra's options: those without a value, and those with one, of which some have a choice
-FLAGS = ("--multirun", "--resolve", "--help", "--hydra-help", "--version")
-VALUED = {
-    "--config-dir": None,
-    "--cfg": ("job", "hydra", "all"),
-    "--info": ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath"),
-    "--package": None,
-}
-_SHORT = {
-    "--multirun": "-m",
-    "--config-dir": "-cd",
-    "--cfg": "-c",
-    "--info": "-i",
-    "--package": "-p",
-    "--help": "-h",
-}
+# of Hydra, by which names and how they are given
+OPTIONS: Sequence[tuple[tuple[str, ...], dict[str, Any]]] = (
+    (("--multirun", "-m"), {"action": "store_true"}),
+    (("--resolve",), {"action": "store_true"}),
+    (("--help", "-h"), {"action": "store_true"}),
+    (("--hydra-help",), {"action": "store_true"}),
+    (("--version",), {"action": "store_true"}),
+    (("--config-dir", "-cd"), {}),
+    (("--cfg", "-c"), {"choices": ("job", "hydra", "all")}),
+    (("--info", "-i"), {"choices": ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")}),
+    (("--package", "-p"), {}),
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -88,19 +84,15 @@ def read_options(words: Sequence[str]) -> argparse.Namespace:
         ConfigError: A word is not an option.
     """
     parser = argparse.ArgumentParser(add_help=False, exit_on_error=False, allow_abbrev=False)
-    for name in (*FLAGS, *VALUED):
-        names = [name, _SHORT[name]] if name in _SHORT else [name]
-        if name in FLAGS:
-            parser.add_argument(*names, action="store_true")
-        else:
-            parser.add_argument(*names, choices=VALUED[name])
+    for names, how in OPTIONS:
+        parser.add_argument(*names, **how)
     parser.add_argument("overrides", nargs="*")
     try:
         options, unknown = parser.parse_known_intermixed_args(list(words))
     except argparse.ArgumentError as error:
         raise ConfigError(f"{error}") from error
     if unknown:
-        valid = [*FLAGS, *VALUED]
+        valid = [name for (name, *_), _ in OPTIONS]
         raise ConfigError(
             f"{unknown[0]} is not an option.{suggest(unknown[0], valid)} Valid: {', '.join(valid)}; "
             "an override has no dashes, as in algo=ewc"
@@ -122,17 +114,14 @@ def _launch(options: argparse.Namespace, ranks: Ranks) -> int:
             )
         sweep = Path(compose_first(words, folders).hydra.sweep.dir).resolve()
         jobs = math.prod(len(values) for values in swept(words, folders).values())
-        chooses = (
-            "BasicSweeper" not in config.hydra.sweeper._target_
-        )  # as it goes, so their number is not known
+        # another sweeper chooses as it goes, so that their number is not known
+        chooses = "BasicSweeper" not in config.hydra.sweeper._target_
         if ranks.first and not (options.cfg or options.info):
             begin_sweep(sweep, job.words, None if chooses else jobs)
             print(f"a sweep, in {sweep}: libero sweep status {sweep} says how far it is", flush=True)
-    with_value = [
-        f"{name}={value}" for name in VALUED if (value := getattr(options, name[2:].replace("-", "_")))
-    ]
-    flags = [name for name in FLAGS if getattr(options, name[2:].replace("-", "_"))]
-    sys.argv[1:] = [*flags, *with_value, *words]  # where Hydra reads them; overrides stand at the end
+    given = {name: getattr(options, name[2:].replace("-", "_")) for (name, *_), _ in OPTIONS}
+    chosen = [name if value is True else f"{name}={value}" for name, value in given.items() if value]
+    sys.argv[1:] = [*chosen, *words]  # where Hydra reads them; overrides stand at the end
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors reach the caller, which prints a line
     try:
         hydra.main(version_base="1.3", config_path=str(folders[0]), config_name="config")(job)()

@@ -87,10 +87,9 @@ class MLR(Algorithm):
         self.instructions = torch.zeros(0, 0)  # (K, F) directions of the features of all instructions so far
         self.images = torch.zeros(0, 0)  # (K, G) mean directions of the first camera's features
         self.near = torch.zeros(0, 0)  # (J, F) of earlier instructions that are similar to the present ones
-        self._present: Observation | None = None  # set by `mix`, used by `penalty`
-        self._replayed: tuple[Tensor, Tensor] | None = (
-            None  # latents (B, T, ...), actions (B, T, A); likewise
-        )
+        # set by `mix`, used by `penalty`: what is observed; latents (B, T, ...) and actions (B, T, A)
+        self._present: Observation | None = None
+        self._replayed: tuple[Tensor, Tensor] | None = None
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
         """Freeze the encoders once the base is learned, and find the earlier tasks that are similar."""

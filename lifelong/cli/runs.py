@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from libero_env.cli.doctor import Finding
     from lifelong.data.settings import DataSettings
 
-RECORDS = "results.jsonl"  # in the directory of each run
 _TRAIN_HELP = """\
 usage: libero train [-m] [--config-dir DIR] [--cfg job] [OVERRIDE ...]
 
@@ -90,28 +89,10 @@ def report(
     from lifelong.report.comparison import Plan
     from lifelong.report.page import comparison_text, shift_text, write_report
 
-    for folder in run_dirs:
-        _check_run(folder)
     page = write_report(run_dirs, out, Plan(reference, all_pairs, margin, other_worlds))
     print(page)
     for line in comparison_text(page) if len(run_dirs) > 1 else shift_text(run_dirs[0]):
         print(line)
-
-
-def _check_run(folder: Path) -> None:
-    """Check that a folder is not one of runs, at some level below `runs`.
-
-    Raises:
-        ConfigError: It is; the message names its runs.
-    """
-    if (folder / RECORDS).is_file():
-        return
-    for levels in ("*", "*/*", "*/*/*"):
-        if count := len(list(folder.glob(f"{levels}/{RECORDS}"))):
-            shown = folder / levels
-            raise ConfigError(
-                f"{folder} is not a run: it holds {count}, in {shown}; write libero report {shown}"
-            )
 
 
 def examine() -> "list[Finding]":

@@ -1,4 +1,4 @@
-from .dataset import SequenceVLDataset, batches
+from .dataset import SequenceVLDataset
 from .fake import fake_batch, fake_observation
 from .loading import open_windows
 from .memory import ReplayMemory
@@ -8,7 +8,6 @@ __all__ = [
     "DemoSource",
     "ReplayMemory",
     "SequenceVLDataset",
-    "batches",
     "fake_batch",
     "fake_observation",
     "open_windows",

@@ -4,7 +4,7 @@ Shape legend: F frames of all demonstrations, W = F windows, B batch, T time, V 
 A action, L language embedding.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -197,25 +197,3 @@ class SequenceVLDataset:
     def nbytes(self) -> int:
         """Return the number of bytes of the frames."""
         return sum(x.nbytes for x in (self.images, self.actions, self.last, *self.proprio.values()))
-
-
-def batches(
-    dataset: SequenceVLDataset,
-    batch_size: int,
-    generator: torch.Generator | None = None,
-    drop_last: bool = False,
-) -> Iterator[Batch]:
-    """Yield all windows once, in batches.
-
-    Args:
-        dataset: The windows.
-        batch_size: Number of windows in a batch, B; the last batch may be smaller.
-        generator: Shuffles the windows; used once, when iteration starts. None keeps their order.
-        drop_last: Whether to leave out a smaller last batch.
-    """
-    order = (
-        torch.arange(len(dataset)) if generator is None else torch.randperm(len(dataset), generator=generator)
-    )
-    for indices in order.split(batch_size):
-        if len(indices) == batch_size or not drop_last:
-            yield dataset.batch(indices)

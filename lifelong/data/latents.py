@@ -14,11 +14,8 @@ from lifelong.data.memory import TaskMemory, even_shares
 from lifelong.errors import DataError
 
 _TENSORS = ("codes", "low", "step", "actions")
-LATENTS_FORM = {
-    "budget": int,
-    "tasks": {int: dict.fromkeys(_TENSORS, Tensor)},
-}  # see `lifelong.checkpoints.check`
-
+# see `lifelong.checkpoints.check`
+LATENTS_FORM = {"budget": int, "tasks": {int: dict.fromkeys(_TENSORS, Tensor)}}
 _LEVELS = 255  # steps between the least and the greatest value of a feature
 
 

@@ -15,10 +15,8 @@ from lifelong.data.loading import MEMORY
 from lifelong.errors import ConfigError
 from lifelong.types import Natural, PathText, PolicySpec, Width
 
-CAMERAS = {
-    "agentview_rgb": "agentview",
-    "eye_in_hand_rgb": "robot0_eye_in_hand",
-}  # view -> camera in the model
+# view -> camera in the model
+CAMERAS = {"agentview_rgb": "agentview", "eye_in_hand_rgb": "robot0_eye_in_hand"}
 # A text such as `light=1,camera=0.3`, or kinds with severities: on a command line `stream.perturb={light:1}` needs no
 # quotes within quotes, which a text with = does.
 PerturbSetting = str | Mapping[str, float | int]

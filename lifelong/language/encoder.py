@@ -253,10 +253,8 @@ def _load(name: str) -> tuple[Any, Any]:
         ) from error
     for local in (True, False):  # local files first: a request to the hub takes long without a network
         try:
-            how: dict[str, Any] = {
-                "local_files_only": local,
-                "trust_remote_code": False,
-            }  # nothing is executed
+            # nothing is executed
+            how: dict[str, Any] = {"local_files_only": local, "trust_remote_code": False}
             config = AutoConfig.from_pretrained(name, **how)
             kind = CLIPTextModelWithProjection if config.model_type.startswith("clip") else AutoModel
             tokenizer = AutoTokenizer.from_pretrained(name, **how)

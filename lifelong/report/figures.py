@@ -183,7 +183,8 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
     """
     named = any(line.label for line in lines)
     with matplotlib.rc_context(STYLE):
-        room = 0.18 * _legend_rows([line.label for line in lines])
+        labels = [line.label for line in lines]
+        room = 0.18 * math.ceil(len(labels) / _legend_columns(labels))
         figure = Figure(figsize=(5.6, 2.8 + room) if named else (3.5, 2.7), layout="constrained")
         axes = figure.subplots()
         for number, line in enumerate(lines):
@@ -356,10 +357,6 @@ def legend_below(figure: Figure) -> None:
 def _legend_columns(labels: Sequence[str]) -> int:
     longest = max((len(name) for name in labels), default=0)
     return max(1, min(4, 88 // (longest + 8)))
-
-
-def _legend_rows(labels: Sequence[str]) -> int:
-    return math.ceil(len(labels) / _legend_columns(labels))
 
 
 def hide_spines(axes: Axes) -> None:

@@ -186,6 +186,9 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
     save(heatmap_figure(panels), folder / "heatmap")
     save(forgetting_figure(lines), folder / "forgetting")
     benchmarks = sorted({r.record.benchmark for r in runs})
+    texts: dict[str, str] = {}
+    for run in (run for group in groups for run in group.runs):
+        texts |= dict(zip(run.record.tasks, short_labels(run.record.instructions), strict=True))
     return {
         "title": f"{len(groups)} methods on {', '.join(benchmarks)}" if len(groups) > 1 else groups[0].label,
         "facts": [
@@ -212,10 +215,14 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         "findings": _findings(found),
         "margin": plan.margin,
         "later_findings": _findings(later),
-        "published": _published_of(found),
+        "published": [
+            (label, group["published"])
+            for label, group in found["groups"].items()
+            if np.isfinite(group["published"]["fwt"])
+        ],
         "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[r.results.transfer] for r in runs)),
-        "forgotten_tasks": _forgotten_tasks(groups, found),
-        "forgotten_subgoals": _forgotten_subgoals(found),
+        "forgotten_tasks": _forgotten(found, "forgetting_by_task", texts),
+        "forgotten_subgoals": _forgotten(found, "subgoals"),
         "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),
         "heatmaps": heatmaps,
         "forgetting": as_svg(forgetting_figure(lines)),
@@ -306,12 +313,6 @@ def _published(run: Run) -> dict[str, float] | None:
     return values if np.isfinite(values["fwt"]) else None
 
 
-def _published_of(found: dict[str, Any]) -> list[tuple[str, dict[str, float]]]:
-    """Return FWT and AUC of each group as eq. 3 is written, where they are known."""
-    rows = [(label, group["published"]) for label, group in found["groups"].items()]
-    return [(label, values) for label, values in rows if np.isfinite(values["fwt"])]
-
-
 def _group_rows(metrics: Mapping[str, dict[str, Any]], found: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row of metrics for each group."""
     return [
@@ -320,24 +321,22 @@ def _group_rows(metrics: Mapping[str, dict[str, Any]], found: dict[str, Any]) ->
     ]
 
 
-def _forgotten_tasks(groups: Sequence[Group], found: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each task with its NBT in each group; tasks in the order of the first run."""
-    texts: dict[str, str] = {}
-    for run in (run for group in groups for run in group.runs):
-        texts |= dict(zip(run.record.tasks, short_labels(run.record.instructions), strict=True))
-    tables = [group["forgetting_by_task"] for group in found["groups"].values()]
+def _forgotten(
+    found: dict[str, Any], key: str, texts: Mapping[str, str] | None = None
+) -> list[dict[str, Any]]:
+    """Return a row for each task or predicate, with its forgetting in each group, and with a text in place of its name.
+
+    Args:
+        key: What a group has the forgetting under.
+        texts: The names in the order of the rows, each with its text; by default the names in the groups.
+    """
+    tables = [group[key] for group in found["groups"].values()]
+    rows = texts or {name: name for table in tables for name in table}
     return [
         {"label": text, "cells": [table.get(name) for table in tables]}
-        for name, text in texts.items()
+        for name, text in rows.items()
         if any(name in table for table in tables)
     ]
-
-
-def _forgotten_subgoals(found: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row for each predicate with its forgetting in each group."""
-    tables = [group["subgoals"] for group in found["groups"].values()]
-    names = dict.fromkeys(name for table in tables for name in table)
-    return [{"label": name, "cells": [table.get(name) for table in tables]} for name in names]
 
 
 def _run_row(run: Run, label: str, folder: Path) -> dict[str, Any]:

@@ -90,13 +90,14 @@ def load_run(path: Path) -> Run:
     log = path / "results.jsonl"
     if not log.is_file():
         present = ", ".join(sorted(p.name for p in path.iterdir())[:8]) or "nothing"
-        inner = next(
-            (f"{path}/{depth}" for depth in ("*", "*/*", "*/*/*") if any(path.glob(f"{depth}/{log.name}"))),
-            "",
-        )
-        advice = f"; the runs in it are {inner}" if inner else ""
+        for levels in ("*", "*/*", "*/*/*"):
+            if count := len(list(path.glob(f"{levels}/{log.name}"))):
+                inner = path / levels
+                raise LifelongError(
+                    f"{path} is not a run: it holds {count}, in {inner}; write libero report {inner}"
+                )
         raise LifelongError(
-            f"{path}: {log.name} is missing, so this is not a run directory (it contains: {present}){advice}"
+            f"{path}: {log.name} is missing, so this is not a run directory (it contains: {present})"
         )
     results = ResultLog(log).read()
     try:
@@ -256,9 +257,8 @@ def _unlike_settings(groups: Sequence[Group]) -> list[str]:
     """Return a sentence with the settings that differ between methods, and that their names do not tell."""
     known = [(group.label, dict(_identity(group.runs[0]))) for group in groups]
     shared = set[str].intersection(*(set(settings) for _, settings in known)) - set(_BASICS)
-    one_policy = (
-        len({settings["policy"] for _, settings in known}) == 1
-    )  # keys of another one mean something else
+    # keys of another policy mean something else
+    one_policy = len({settings["policy"] for _, settings in known}) == 1
     untold = []
     for key in sorted(shared):
         found: dict[Any, list[str]] = {}

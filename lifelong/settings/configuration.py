@@ -54,10 +54,8 @@ _COMPONENTS = (
     "torch.nn.Module",
 )
 _PACKAGE = "lifelong"
-_STRICT = (
-    "algo",
-    "policy",
-)  # a user's own class must be derived from ours there; elsewhere it may resemble it
+# where a user's own class must be derived from ours; elsewhere it may resemble it
+_STRICT = ("algo", "policy")
 _SPECIAL = ("_target_", "_partial_")  # keys of a node that are not arguments
 
 
@@ -176,9 +174,8 @@ def _build(
         raise ConfigError(
             f"{name}._partial_ is {shown(is_partial)}; expected {'true' if completed else 'true or false'}"
         )
-    if (
-        hasattr(target, "__pydantic_validator__") and not is_partial
-    ):  # a class that checks what it is built with
+    # a class that checks what it is built with
+    if hasattr(target, "__pydantic_validator__") and not is_partial:
         try:
             return validate(target, {**values, **more}, prefix=at, error=ConfigError)
         except ConfigError as error:

@@ -164,9 +164,7 @@ class Stopping:
     power: float
 
 
-def sequential_stopping(
-    question: Question, limit: int, *, simulations: int = 2000, seed: int = 2023
-) -> Stopping:
+def sequential_stopping(question: Question, limit: int, *, simulations: int = 2000) -> Stopping:
     """Simulate the sequential test of a true difference.
 
     Args:
@@ -174,7 +172,7 @@ def sequential_stopping(
         limit: Number of pairs after which the evaluation is given up.
         simulations: Number of simulated evaluations.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(2023)
     won = (question.differing + abs(question.difference)) / 2
     found = np.full(simulations, np.inf)
     better = np.zeros(simulations, dtype=bool)

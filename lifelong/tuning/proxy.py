@@ -126,16 +126,13 @@ class Trial:
         return hashlib.sha256(json.dumps([groups, rest], sort_keys=True).encode()).hexdigest()[:16]
 
 
-def open_stream(
-    config: Mapping[str, Any], tasks: Sequence[Task], held_out: float, progress: bool | None = None
-) -> StreamData:
+def open_stream(config: Mapping[str, Any], tasks: Sequence[Task], held_out: float) -> StreamData:
     """Read the demonstrations of a stream; missing ones are recorded.
 
     Args:
         config: Configuration of a run, as plain data.
         tasks: Tasks in learning order.
         held_out: Share of each task's demonstrations, the last ones, that is measured on.
-        progress: Whether to show a progress bar of recordings.
 
     Raises:
         ConfigError: Too few demonstrations to learn from some and measure on others.
@@ -150,7 +147,7 @@ def open_stream(
         )
     languages = checked.build("language").embed([task.language for task in tasks])
     spec = data.spec(languages.shape[1])
-    paths = find_demos(tasks, [data.demos] * len(tasks), data, progress)
+    paths = find_demos(tasks, [data.demos] * len(tasks), data, None)
     device = torch.device("cpu")
     training, everything = (
         DemoDatasets(paths, [count] * len(tasks), spec, languages, data, device)
@@ -267,7 +264,6 @@ def measure_frontier(
     fine_tuning: Candidate,
     proxy: ProxySettings,
     folder: Path,
-    report: Callable[[str], None] = print,
 ) -> Frontier:
     """Measure candidates on all streams and with all seeds.
 
@@ -277,7 +273,6 @@ def measure_frontier(
         fine_tuning: Sequential fine-tuning, whose errors are the unit.
         proxy: Streams, seeds and length of training.
         folder: Folder of what is measured.
-        report: Function that is given a line after each trial.
 
     Raises:
         ConfigError: A stream is too short to forget anything.
@@ -298,7 +293,7 @@ def measure_frontier(
             errors[one.label].append(found)
             done += 1
             shown = ", ".join(f"{error:.3f}" for error in found[-1])
-            report(
+            print(
                 f"{done}/{total} {one.label}, {stream[0].name} and {len(stream) - 1} more, seed {seed}: "
                 f"errors at the end {shown} ({time.perf_counter() - began:.0f} s)"
             )

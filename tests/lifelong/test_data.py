@@ -9,7 +9,7 @@ import torch
 
 from libero_env.demos.read import Episode
 from libero_env.errors import DemoError
-from lifelong.data import ReplayMemory, SequenceVLDataset, batches, fake_batch
+from lifelong.data import ReplayMemory, SequenceVLDataset, fake_batch
 from lifelong.errors import DataError
 from lifelong.types import PolicySpec
 
@@ -95,22 +95,6 @@ def test_a_batch_keeps_the_requested_order_and_is_a_copy() -> None:
 def test_window_indices_out_of_range_are_refused(index: int) -> None:
     with pytest.raises(DataError, match="must lie in"):
         make_dataset().batch(torch.tensor([0, index]))
-
-
-@pytest.mark.parametrize("drop_last", [True, False])
-def test_a_pass_has_each_window_once_in_an_order_that_only_the_generator_decides(drop_last: bool) -> None:
-    dataset = make_dataset()
-    global_state = torch.random.get_rng_state()
-    run = lambda seed: [  # noqa: E731
-        b.window_ids for b in batches(dataset, 5, torch.Generator().manual_seed(seed), drop_last=drop_last)
-    ]
-    one, again, other = run(1), run(1), run(2)
-    seen = torch.cat(one)
-    assert len(seen) == (len(dataset) // 5 * 5 if drop_last else len(dataset))
-    assert len(seen.unique()) == len(seen)
-    assert torch.equal(seen, torch.cat(again))
-    assert not torch.equal(seen, torch.cat(other))
-    assert torch.equal(global_state, torch.random.get_rng_state())
 
 
 def test_a_file_reads_upright_and_aligned(tmp_path: Path) -> None:
