@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
-from libero_env.text import closest
+from libero_env.text import suggest
 
 DEBUG_VARIABLE = "LIBERO_DEBUG"  # environment variable that asks for every traceback
 MAX_LISTED = 64  # valid names in a message; all categories of objects fit
@@ -33,8 +33,7 @@ class UnknownNameError(LiberoError, LookupError):
             super().__init__(f"unknown {kind} {name!r}. Valid: {ends}")
             return
         names = sorted(map(str, valid))
-        near = closest(str(name), [*names, *map(str, unlisted)])
-        hint = f" Did you mean {near!r}?" if near is not None else ""
+        hint = suggest(name, [*names, *unlisted])
         more = f", ... ({len(names)} in all)" if len(names) > MAX_LISTED else ""
         super().__init__(f"unknown {kind} {name!r}.{hint} Valid: {', '.join(names[:MAX_LISTED])}{more}")
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from libero_env.errors import LiberoError
+from libero_env.text import show_bytes
 
 _PROC, _GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 _NAMES = {  # version of control groups -> files with the limit and with what is used
@@ -43,7 +44,7 @@ def memory_limit() -> int:
     return min(limits if soft == resource.RLIM_INFINITY else [*limits, soft])
 
 
-def require_memory(needed: float, what: str, remedy: str) -> None:
+def require_memory(needed: float, what: str, remedy: str, error: type[LiberoError] = LiberoError) -> None:
     """Check that memory is available before it is asked for; a process that takes too much is killed.
 
     Args:
@@ -52,12 +53,12 @@ def require_memory(needed: float, what: str, remedy: str) -> None:
         remedy: What to change.
 
     Raises:
-        LiberoError: There is less; the message has both figures.
+        LiberoError: There is less; the message has both figures. Or `error`.
     """
-    there = available_memory()
-    if there is not None and needed > there:
-        raise LiberoError(
-            f"{what} needs about {needed / 1e9:.1f} GB of memory; {there / 1e9:.1f} GB are free: {remedy}"
+    there, _ = host_memory()
+    if needed > there:
+        raise error(
+            f"{what} needs about {show_bytes(needed)} of memory; {show_bytes(there)} are free: {remedy}"
         )
 
 

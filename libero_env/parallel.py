@@ -60,7 +60,11 @@ def user_entries() -> bytes:
     changes: dict[str, tuple[dict[Any, Any], list[Any]]] = {}
     for address, own in _tables.items():
         table = _table(address)
-        added = {k: v for k, v in table.items() if not (k in own and (own[k] is v or _same(own[k], v)))}
+        added = {
+            key: value
+            for key, value in table.items()
+            if key not in own or not (own[key] is value or (isinstance(value, dict) and own[key] == value))
+        }
         removed = [key for key in own if key not in table]
         if added or removed:
             changes[address] = added, removed
@@ -99,10 +103,6 @@ def with_entries(content: bytes, function: Callable[..., T], *args: Any) -> T:
 def _table(address: str) -> dict[Any, Any]:
     module, _, name = address.partition(":")
     return getattr(importlib.import_module(module), name)
-
-
-def _same(own: Any, value: Any) -> bool:
-    return isinstance(own, dict) and own == value
 
 
 def spawn_context() -> SpawnContext:

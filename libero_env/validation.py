@@ -4,6 +4,7 @@ Types are those of pydantic (`Annotated[float, Field(gt=0)]`, `Literal`, datacla
 number, a bool is not a whole number, numbers are finite, unknown keys are errors.
 """
 
+import contextlib
 import dataclasses
 import functools
 import inspect
@@ -189,26 +190,21 @@ class OneOf:
         return core_schema.literal_schema(list(self.names))
 
 
-@functools.lru_cache(maxsize=512)
-def _has_schema(kind: Any) -> bool:
+def is_plain(kind: Any) -> bool:
+    """Return whether values of a type are plain data: a function or a tensor is not."""
     from pydantic import PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError
     from pydantic_core import SchemaError  # of a protocol
 
     no_schema = (PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError, SchemaError)
     try:
         _adapter(kind).json_schema()
-    except (*no_schema, NameError, TypeError):  # names that exist for type checkers only
+    except (
+        *no_schema,
+        NameError,
+        TypeError,
+    ):  # names that exist for type checkers only; annotations with lists
         return False
     return True
-
-
-def is_plain(kind: Any) -> bool:
-    """Return whether values of a type are plain data: a function or a tensor is not."""
-    try:
-        hash(kind)
-    except TypeError:  # of annotations with lists
-        return False
-    return _has_schema(kind)
 
 
 def _json(value: Any, error: type[LiberoError], depth: int = 0) -> Any:
@@ -309,9 +305,9 @@ def _real_path(error: "ErrorDetails", value: Any, skip: bool = False) -> tuple[K
 def _describe(path: tuple[Key, ...], group: Sequence["ErrorDetails"], kind: Any) -> str:
     first = group[0]
     if first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        fields = _fields(_type_at(kind, path[:-1]))
-        listed = "" if fields is None else f" Valid: {', '.join(fields) or 'none'}"
-        return f"is an unknown key.{suggest(path[-1], fields or ())}{listed}"
+        fields = _annotations(_type_at(kind, path[:-1]))
+        listed = f" Valid: {', '.join(fields)}" if fields else ""
+        return f"is an unknown key.{suggest(path[-1], fields)}{listed}"
     if first["type"].startswith("missing"):
         return "is missing"
     if first["type"] == "value_error":
@@ -376,29 +372,23 @@ def _number(value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:g}"
 
 
-def _fields(kind: Any) -> list[str] | None:
-    """Return the names of the fields of a class; None where it has no annotations."""
-    kind = next((one for one in (kind, *get_args(kind)) if _annotations(one)), None)
-    return None if kind is None else list(_annotations(kind))
-
-
 def _annotations(kind: Any) -> Mapping[str, Any]:
-    if not isinstance(kind, type):
-        return {}
-    if (fields := getattr(kind, "model_fields", None)) is not None:
-        return {name: info.annotation for name, info in fields.items()}
-    if not hasattr(kind, "__annotations__"):
-        return {}
-    try:
-        return get_type_hints(kind)
-    except (NameError, TypeError):
-        return {}
+    """Return the annotations of a class, or of the first of a union that has some; empty where none has."""
+    for one in (kind, *get_args(kind)):
+        if not isinstance(one, type):
+            continue
+        if (fields := getattr(one, "model_fields", None)) is not None:
+            return {name: info.annotation for name, info in fields.items()}
+        with contextlib.suppress(NameError, TypeError):
+            if hints := get_type_hints(one):
+                return hints
+    return {}
 
 
 def _type_at(kind: Any, path: Sequence[Key]) -> Any:
     """Return the annotation at a path of a type; None where it is not known."""
     for key in path:
-        fields = _annotations(next((one for one in (kind, *get_args(kind)) if _annotations(one)), None))
+        fields = _annotations(kind)
         if fields and isinstance(key, str):
             kind = fields.get(key)
         else:  # of a list or mapping: the type of its values

@@ -3,18 +3,20 @@
 A worker answers requests in order: `send` starts one and `recv` waits for its answer, so several workers run at once.
 """
 
+import contextlib
 import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from multiprocessing import connection
+from multiprocessing.shared_memory import SharedMemory
 from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.vector import utils
 
-from libero_env.envs.worker import CallHost, Shared, Worker, shut_down, wait_for
+from libero_env.envs.worker import Host, Worker, shut_down, wait_for
 from libero_env.errors import ClosedEnvironmentError, LiberoError
 
 CALL_TIMEOUT = 600.0  # [s] for a call, unless told otherwise; making an environment may take minutes
@@ -27,8 +29,49 @@ class Layout(NamedTuple):
     dtype: np.dtype
 
 
-class VectorHost(CallHost):
+class Shared:
+    """The observation of one environment in shared memory.
+
+    Args:
+        layout: Space or array, with `shape` and `dtype`, of each entry.
+        name: Name of the block to attach to; by default a new block is made.
+
+    Attributes:
+        name: Name of the block.
+        views: Array of each entry.
+    """
+
+    def __init__(self, layout: Mapping[str, Any], name: str | None = None):
+        boxes = [(key, tuple(box.shape or ()), np.dtype(box.dtype)) for key, box in layout.items()]
+        sizes = [int(np.prod(shape)) * dtype.itemsize for _, shape, dtype in boxes]
+        starts = np.cumsum([0, *(-(-size // 64) * 64 for size in sizes)])  # aligned
+        self._memory = SharedMemory(name, create=name is None, size=max(int(starts[-1]), 1))
+        self.name = self._memory.name
+        self._owner = name is None
+        self.views = {
+            key: np.ndarray(shape, dtype, self._memory.buf, int(start))
+            for (key, shape, dtype), start in zip(boxes, starts, strict=False)
+        }
+
+    def write(self, observation: Mapping[str, np.ndarray]) -> None:
+        """Copy an observation to the shared memory."""
+        for key, view in self.views.items():
+            view[...] = observation[key]
+
+    def close(self) -> None:
+        """Close the block; the process that made it also frees it."""
+        self.views = {}
+        with contextlib.suppress(BufferError):  # a view is still in use; the memory is closed with it
+            self._memory.close()
+        if self._owner:
+            self._owner = False
+            self._memory.unlink()
+
+
+class VectorHost(Host):
     """The commands of a worker, with observations in shared memory."""
+
+    shared: Shared | None = None
 
     def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Call a method; None stands for arrays of an observation that are in shared memory."""
@@ -51,15 +94,22 @@ class VectorHost(CallHost):
         return getattr(self.env if hasattr(self.env, key) else getattr(self.env, "unwrapped", self.env), key)
 
     def set(self, key: str, value: Any) -> None:
-        """Set an attribute of the environment: of Gymnasium's interface of the one in the wrappers."""
+        """Set an attribute of the environment; where only the one in it, or in its wrappers, has it, of that."""
         if hasattr(self.env, "unwrapped"):
             setattr(self.env.unwrapped, key, value)
         else:
-            super().set(key, value)
+            inner = getattr(self.env, "env", None)
+            setattr(inner if inner is not None and not hasattr(self.env, key) else self.env, key, value)
 
     def attach(self, name: str, layout: Mapping[str, Layout]) -> None:
         """Write observations to shared memory, where they fit its layout."""
         self.shared = Shared(layout, name)
+
+    def close(self) -> None:
+        super().close()
+        if self.shared is not None:
+            self.shared.close()
+            self.shared = None
 
 
 def observation_of(result: Any) -> dict[str, Any] | None:
@@ -276,6 +326,7 @@ class SubprocEnvWorker(_HostWorker):
         super().__init__(env_fn)
         self.share_memory, self._timeout = share_memory, CALL_TIMEOUT if timeout is None else timeout
         self._worker = Worker("", env_fn, host=VectorHost, run_main=False)
+        self._shared: Shared | None = None
         self._opening: int | None = self._worker.requests  # until its answer has come
         self._request, self._since, self._lost = "open", time.monotonic(), ""
         self.process, self.parent_remote = self._worker.process, self._worker.pipe
@@ -333,18 +384,20 @@ class SubprocEnvWorker(_HostWorker):
 
     def _unshare(self, observation: dict[str, Any]) -> None:
         """Fill in the arrays that came through shared memory, which the first observation sets up."""
-        shared = self._worker.shared
-        if shared is not None:
+        if (shared := self._shared) is not None:
             absent = [key for key in shared.views if observation.get(key, 0) is None]
             observation.update({key: shared.views[key].copy() for key in absent})
         elif arrays := arrays_of(observation):
             layout = {key: Layout(array.shape, array.dtype) for key, array in arrays.items()}
-            self._worker.shared = shared = Shared(layout)
+            self._shared = shared = Shared(layout)
             self._answer("attach", self._worker.send("attach", shared.name, layout))
 
     def close_env(self) -> None:
         """End the process, by force where it does not answer."""
         shut_down([self._worker])
+        if self._shared is not None:
+            self._shared.close()
+            self._shared = None
 
     @staticmethod
     def wait(workers: "list[EnvWorker]", wait_num: int, timeout: float | None = None) -> "list[EnvWorker]":

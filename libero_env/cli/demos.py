@@ -426,8 +426,8 @@ def export(
         print(f"{out}: {episodes} episodes, {frames} frames")
         return
     config = Regeneration(settle_steps=settle, labels=labels, assets=assets, drawing=drawing)
-    written = export_published(found, out, published, config, task=task_of(bddl))
-    print(f"{out}: {written.episodes} episodes, {written.frames} frames, as {published}")
+    episodes, frames, failed = export_published(found, out, published, config, task=task_of(bddl))
+    print(f"{out}: {episodes} episodes, {frames} frames, as {published}")
     print(f"models: {config.pack().name}, drawing: {config.drawing}")
-    for where in written.failed:
+    for where in failed:
         print(f"left out, does not reach the goal when it is run again: {where}")

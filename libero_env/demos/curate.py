@@ -19,7 +19,7 @@ from libero_env.demos.contents import (
 from libero_env.demos.hdf5 import open_demo_file
 from libero_env.demos.observe import recorded_task, task_header
 from libero_env.demos.read import NOOP_THRESHOLD, Episode, noop_steps, read_episodes
-from libero_env.demos.write import DemoWriter
+from libero_env.demos.write import DemoWriter, require_absent
 from libero_env.errors import DemoError
 from libero_env.paths import demos_dir
 from libero_env.tasks import Task
@@ -129,8 +129,7 @@ def filter_demos(
     Raises:
         DemoError: The file is broken, nothing of it is left, or the target exists.
     """
-    if target.exists():
-        raise DemoError(f"{target} exists; choose another name or remove it")
+    require_absent(target)
     dropped = [key for key, on in (("failures", success_only), ("no-ops", without_noops)) if on]
     dropped_text = f"without {' and '.join(dropped) or 'nothing'}"
     writer = DemoWriter(target, task_header(file, task) | {"filter": dropped_text})

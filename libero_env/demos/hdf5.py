@@ -19,7 +19,6 @@ import numpy as np
 from h5py import h5a, h5d, h5g, h5l, h5o, h5t, h5z
 
 from libero_env.errors import DemoError
-from libero_env.memory import host_memory
 from libero_env.text import show_bytes
 
 MAX_LINKS = 300_000  # of a file; 20,000 demonstrations have them
@@ -115,21 +114,6 @@ def check_dataset(dataset: h5py.Dataset, where: str) -> int:
             f"{where} is stored in chunks of {show_bytes(chunk)}; at most {show_bytes(MAX_CHUNK_BYTES)} are read"
         )
     return size + chunk
-
-
-def check_memory(needed: int, what: str, remedy: str) -> None:
-    """Raise DemoError if a number of bytes does not fit into the memory that is free now.
-
-    Args:
-        needed: Number of bytes.
-        what: What needs them, for the message.
-        remedy: What to do instead.
-    """
-    free, _ = host_memory()
-    if needed > max(free, FREE_BYTES):
-        raise DemoError(
-            f"{what} needs {show_bytes(needed)} of memory and {show_bytes(free)} are free; {remedy}"
-        )
 
 
 def read_attributes(item: h5py.Group, where: str) -> dict[str, Any]:

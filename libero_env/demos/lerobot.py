@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from libero_env.demos.contents import EXPORTED_STATE, json_attribute, read_header
 from libero_env.demos.hdf5 import BrokenDemoError
@@ -22,6 +22,7 @@ from libero_env.demos.lerobot_writers import ImageDatasetWriter, VideoDatasetWri
 from libero_env.demos.observe import recorded_robot, recorded_task
 from libero_env.demos.read import Episode, Labels, read_episodes
 from libero_env.demos.replay import Regeneration, regenerate
+from libero_env.demos.write import require_absent
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_folder
@@ -29,18 +30,6 @@ from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ
 
 ORIGIN = "meta/libero.json"  # how a data set was made
-
-
-class PublishedExport(NamedTuple):
-    """Size of an export in the layout of a published set.
-
-    Attributes:
-        failed: Demonstrations that did not reach the goal when they were run again, and were left out.
-    """
-
-    episodes: int
-    frames: int
-    failed: tuple[str, ...]
 
 
 def export_lerobot(
@@ -69,7 +58,7 @@ def export_lerobot(
         DemoError: A file is broken or has other images than the first, or the folder exists.
         LiberoError: PyArrow or PyAV is not installed.
     """
-    _check_absent(root)
+    require_absent(root)
     with atomic_folder(root) as folder, closing(VideoDatasetWriter(folder, OWN, video_mb)) as dataset:
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
             language = _language(file, task)
@@ -90,7 +79,7 @@ def export_published(
     *,
     task: Task | None = None,
     progress: bool | None = None,
-) -> PublishedExport:
+) -> tuple[int, int, list[str]]:
     """Run demonstrations again and write them as one data set in the layout of a published one.
 
     Args:
@@ -101,6 +90,10 @@ def export_published(
         task: Task that all files recorded; None for those that they state.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.
 
+    Returns:
+        Number of episodes, number of frames, and the demonstrations that were left out, since they did not reach the
+        goal when they were run again.
+
     Raises:
         UnknownNameError: No such set is known.
         DemoError: A file is broken, no demonstration reaches its goal, or the folder exists.
@@ -108,7 +101,7 @@ def export_published(
     """
     if name not in PUBLISHED:
         raise UnknownNameError("published data set", name, PUBLISHED)
-    _check_absent(root)
+    require_absent(root)
     layout, config = PUBLISHED[name], config or Regeneration()
     writer = ImageDatasetWriter if layout.codec is None else VideoDatasetWriter
     exported, failed = 0, []
@@ -129,12 +122,7 @@ def export_published(
         robots = ", ".join(sorted(set(map(recorded_robot, files))))
         how = {"robot": robots, "as": name, "left_out": len(failed)}
         _write_origin(folder, layout, config.record() | how)
-    return PublishedExport(episodes, frames, tuple(failed))
-
-
-def _check_absent(root: Path) -> None:
-    if root.exists():
-        raise DemoError(f"{root} exists; choose another folder or remove it")
+    return episodes, frames, failed
 
 
 def _language(file: Path, task: Task | None) -> str:

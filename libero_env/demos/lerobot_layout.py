@@ -8,7 +8,7 @@ which keeps the features and replaces those of the indices by LeRobot's default 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
@@ -115,29 +115,25 @@ OWN = Layout(
     mirrored=False,
     outcome=True,
 )
-LEROBOT_LIBERO = Layout(
-    version="v3.0",
+LEROBOT_LIBERO = replace(
+    OWN,
     fps=10,
-    state="observation.state",
-    action="action",
     state_names=("state",),
     action_names=("actions",),
-    cameras=OWN.cameras,
     codec=AV1,
     mirrored=True,
+    outcome=False,
     states_fps=True,
     video_mb=500,
 )
-OPENPI_LIBERO = Layout(
+OPENPI_LIBERO = replace(
+    LEROBOT_LIBERO,
     version="v2.0",
-    fps=10,
     state="state",
     action="actions",
-    state_names=("state",),
-    action_names=("actions",),
     cameras=MappingProxyType({"agentview": "image", "eye_in_hand": "wrist_image"}),
     codec=None,
-    mirrored=True,
+    states_fps=False,
 )
 PUBLISHED: Mapping[str, Layout] = MappingProxyType(
     {"lerobot/libero": LEROBOT_LIBERO, "physical-intelligence/libero": OPENPI_LIBERO}

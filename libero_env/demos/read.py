@@ -41,14 +41,16 @@ from libero_env.demos.contents import (
     read_pairing,
     read_values,
 )
-from libero_env.demos.hdf5 import BrokenDemoError, check_memory, open_demo_file, read_attribute
+from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file, read_attribute
 from libero_env.errors import DemoError
+from libero_env.memory import require_memory
 
 Labels = Literal["expert", "executed"]
 NOOP_THRESHOLD = 1e-3  # [action units] largest entry of a motion that counts as none
 PUBLISHED_NOOP_NORM = (
     1e-4  # [action units] Euclidean norm below which the published sets count a motion as none
 )
+_SMALLER = "record shorter ones or smaller images"
 _DERIVED = ("num_samples", "init_state", "success", "fixtures")  # attributes that follow from the fields
 
 
@@ -169,9 +171,8 @@ def read_demos(
             message names file, demonstration, key and what was expected.
     """
     plan = _plan(path, obs_keys, limit)
-    check_memory(
-        sum(plan.sizes), f"{path} with {len(plan.sizes)} demonstrations", "read fewer, or one at a time"
-    )
+    what = f"{path} with {len(plan.sizes)} demonstrations"
+    require_memory(sum(plan.sizes), what, "read fewer, or one at a time", DemoError)
     return list(_read(plan, labels, pairing))
 
 
@@ -190,9 +191,8 @@ def iter_demos(
             array is read is found later.
     """
     plan = _plan(path, obs_keys, limit)
-    check_memory(
-        max(plan.sizes), f"the longest demonstration of {path}", "record shorter ones or smaller images"
-    )
+    what = f"the longest demonstration of {path}"
+    require_memory(max(plan.sizes), what, _SMALLER, DemoError)
     yield from _read(plan, labels, pairing)
 
 
@@ -213,7 +213,7 @@ def read_episodes(file: Path, *, check_values: bool = True) -> Iterator[Episode]
             stored = obs if isinstance(obs, h5py.Group) else ()
             keys = [key for key in stored if is_image(key) or key in LOW_DIM_KEYS]
             size = check_demo(group, where, keys)
-            check_memory(size, where, "record shorter ones or smaller images")
+            require_memory(size, where, _SMALLER, DemoError)
             if "states" not in group:
                 raise BrokenDemoError(f"{where}/states is missing; expected (T, 1 + nq + nv)")
             attrs = demo_attributes(group, where)
@@ -347,17 +347,9 @@ def _load(
 
 
 def demo_files(path: str | Path) -> list[Path]:
-    """Return the file itself, or the complete parts in a folder of them.
-
-    Raises:
-        DemoError: There is nothing at the path.
-    """
+    """Return the file itself, or the complete parts in a folder of them."""
     path = Path(path)
-    if path.is_dir():
-        return sorted(path.glob("demo_*.hdf5"))
-    if not path.is_file():
-        raise DemoError(f"{path}: no such file; record it with `libero demos generate`")
-    return [path]
+    return sorted(path.glob("demo_*.hdf5")) if path.is_dir() else [path]
 
 
 def _stored_keys(group: h5py.Group, where: str) -> list[str]:

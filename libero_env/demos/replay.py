@@ -23,7 +23,7 @@ from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import EXPORTED_STATE, demo_number, read_header
 from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import PUBLISHED_NOOP_NORM, Episode, Labels, published_noop_steps, read_episodes
-from libero_env.demos.write import DemoWriter
+from libero_env.demos.write import DemoWriter, require_absent
 from libero_env.envs.config import Assets, Drawing, Size
 from libero_env.errors import DemoError
 from libero_env.mujoco_compat import mujoco
@@ -140,8 +140,7 @@ def rerun_actions(file: Path, target: Path) -> Path:
     Raises:
         DemoError: The file is broken or does not fit its task's scene, or the target exists.
     """
-    if target.exists():
-        raise DemoError(f"{target} exists; choose another name or remove it")
+    require_absent(target)
     renderer = StateRenderer.of_file(file, RenderConfig(()))
     writer, env = DemoWriter(target, read_header(file)), renderer.env.batch
     writer.discard_parts()  # of an interrupted call, perhaps with another file

@@ -48,6 +48,12 @@ _CONFIG_KEYS = (  # attributes in which all demonstrations of a file agree
 REMEDY = "choose another file or remove this one"
 
 
+def require_absent(target: Path) -> None:
+    """Raise a DemoError where a file or folder that is to be written exists."""
+    if target.exists():
+        raise DemoError(f"{target} exists; choose another name or remove it")
+
+
 class OtherRecordingError(DemoError):
     """A file that was recorded with another configuration."""
 

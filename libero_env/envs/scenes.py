@@ -65,12 +65,16 @@ def open_scenes(task: Task | str, config: EnvConfig, num: int) -> TaskScenes:
         spare_materials=needs_materials(changes),
     )
     base_scene = compiled(base.problem)
+    # In LIBERO-Plus the controller pulls towards the joints of the variant in its null space, and its first goals are
+    # relative to them, whether the arm starts there or not.
+    variant = base.variant if isinstance(base, PublishedTask) else None
+    rest = joint_pose(0 if variant is None else variant.pose)
     if not changes:
-        return TaskScenes(base, base_scene, base, base_scene, _rest_of(base))
+        return TaskScenes(base, base_scene, base, base_scene, rest)
     changed = perturb_task(base, (one for one in changes if isinstance(one, Perturbation)), base_scene)
     scene = compiled(scene_problem(changed, base))
     perturbed = PerturbedEpisodes(changes, base, base_scene, scene, num)
-    return TaskScenes(changed, scene, base, base_scene, _rest_of(base), perturbed)
+    return TaskScenes(changed, scene, base, base_scene, rest, perturbed)
 
 
 def published_changes(task: Task) -> tuple[Change, ...]:
@@ -90,13 +94,3 @@ def published_changes(task: Task) -> tuple[Change, ...]:
     if variant.noise is not None:
         changes.append(Corruption(variant.noise.kind, variant.noise.severity))
     return tuple(changes)
-
-
-def _rest_of(task: Task) -> np.ndarray:
-    """Return the joints that the controller takes for the arm's rest pose, (7,) [rad].
-
-    In LIBERO-Plus they are those of the variant, whether the arm starts there or not: its controller pulls towards
-    them in its null space, and its first goals are relative to them.
-    """
-    variant = task.variant if isinstance(task, PublishedTask) else None
-    return joint_pose(0 if variant is None else variant.pose)

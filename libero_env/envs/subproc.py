@@ -1,7 +1,7 @@
 """Environments in worker processes, as one `gymnasium.vector.VectorEnv`: for different tasks side by side.
 
 Workers are spawned, so that no OpenGL context and no lock is inherited; each makes its environment and its context
-itself. Observations are passed in shared memory. A worker that dies, or does not answer in time, is replaced.
+itself. A worker that dies, or does not answer in time, is replaced.
 """
 
 import weakref
@@ -18,7 +18,8 @@ from pydantic import Field
 from libero_env.envs.batch import LiberoVectorEnv
 from libero_env.envs.checks import ResetRequest, checked_actions, checked_index, checked_indices
 from libero_env.envs.config import EnvConfig, show_options
-from libero_env.envs.worker import Failure, Worker, open_libero, shut_down, wait_for
+from libero_env.envs.env import LiberoEnv
+from libero_env.envs.worker import Failure, Worker, shut_down, wait_for
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.text import shown
 from libero_env.validation import validate
@@ -120,7 +121,7 @@ class SubprocEnv(LiberoVectorEnv):
             variables = {"MUJOCO_EGL_DEVICE_ID": str(devices[i % len(devices)])} if devices else {}
             self._workers.append(Worker(self.tasks[i], factory, variables))
         try:
-            self._spaces = self._open()
+            self._open()
         except LiberoError:
             self.close()
             raise
@@ -154,11 +155,12 @@ class SubprocEnv(LiberoVectorEnv):
         ids = [i for i in ids if i not in failed]
         for i in ids:
             start = {} if request.init_states is None else {"init_state": int(request.init_states[i])}
-            self._workers[i].send("reset", request.seeds[i], {**others, **start})
+            how = {"seed": request.seeds[i], "options": {**others, **start}}
+            self._workers[i].send("call", "reset", (), how)
         answers, more = self._collect(ids, self.timeout)
-        for i, info in answers.items():
+        for i, (observation, info) in answers.items():
+            self._note(i, observation, info)
             self._running[i], self._success[i] = True, bool(info.get("success", False))
-            self._progress[i] = info.get("progress", {})
         return self._result((self._observe(), self._info()), failed | more)
 
     def step(self, actions: np.ndarray) -> Outcome:
@@ -175,14 +177,14 @@ class SubprocEnv(LiberoVectorEnv):
         actions = checked_actions(actions, self.action_space.shape)
         ids = [int(i) for i in np.flatnonzero(self._running)]
         for i in ids:
-            self._workers[i].send("step", actions[i])
+            self._workers[i].send("call", "step", (actions[i],), {})
         answers, failed = self._collect(ids, self.timeout)
         rewards = np.zeros(self.num_envs)
         terminated, truncated = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, bool)
-        for i, (reward, end, cut, info) in answers.items():
+        for i, (observation, reward, end, cut, info) in answers.items():
+            self._note(i, observation, info)
             rewards[i], terminated[i], truncated[i] = reward, end, cut
             self._success[i] |= bool(info.get("success", end))
-            self._progress[i] = info.get("progress", {})
             self._running[i] = not (end or cut)
         truncated[list(failed)] = True
         return self._result((self._observe(), rewards, terminated, truncated, self._info()), failed)
@@ -204,7 +206,7 @@ class SubprocEnv(LiberoVectorEnv):
         failed = self._reopen([i for i in indices if not self._workers[i].opened])
         called = [i for i in indices if i not in failed]
         for i in called:
-            self._workers[i].send("call", name, args, kwargs)
+            self._workers[i].send("look", name, args, kwargs)
         answers, more = self._collect(called, self.timeout, keep_running=True)
         return self._result([answers.get(i) for i in indices], failed | more)
 
@@ -219,11 +221,11 @@ class SubprocEnv(LiberoVectorEnv):
         self._running[i], self._success[i] = True, False
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End the workers and free their memory."""
+        """End the workers."""
         self._finalizer()
 
-    def _open(self) -> list[spaces.Dict]:
-        """Wait for all environments, and determine the common spaces; returns the observation space of each."""
+    def _open(self) -> None:
+        """Wait for all environments, and determine the common spaces."""
         answers, failures = wait_for(dict(enumerate(self._workers)), self.start_timeout)
         if failures:
             raise WorkerError({i: f.reason for i, f in failures.items()}, self.tasks)
@@ -238,31 +240,21 @@ class SubprocEnv(LiberoVectorEnv):
             raise LiberoError(
                 f"the action spaces of {', '.join(different)} differ from {first} of {self.tasks[0]}"
             )
-        for worker, space in zip(self._workers, observed, strict=True):
-            worker.share(space)
-        self._attached(range(self.num_envs))
+        for worker in self._workers:
+            worker.opened = True
+        self._rows = [{k: np.zeros(box.shape, box.dtype) for k, box in o.items()} for o in observed]
         self._common = [k for k, box in observed[0].items() if all(o.spaces.get(k) == box for o in observed)]
         self.single_observation_space = spaces.Dict({key: observed[0][key] for key in self._common})
         self.single_action_space = first
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(first, self.num_envs)
-        return observed
-
-    def _attached(self, ids: Sequence[int]) -> dict[int, str]:
-        """Wait until workers have attached the shared memory, and return the reasons of those that failed."""
-        answers, failed = self._collect(ids, self.timeout)
-        for i in answers:
-            self._workers[i].opened = True
-        return failed
 
     def _reopen(self, ids: Sequence[int]) -> dict[int, str]:
         """Wait for workers that were replaced, and return the reasons of those that failed."""
-        if not ids:
-            return {}
         answers, failed = self._collect(ids, self.start_timeout)
         for i in answers:
-            self._workers[i].share(self._spaces[i])
-        return failed | self._attached(list(answers))
+            self._workers[i].opened = True
+        return failed
 
     def _collect(
         self, ids: Sequence[int], timeout: float, keep_running: bool = False
@@ -286,15 +278,17 @@ class SubprocEnv(LiberoVectorEnv):
             worker.restart()
         if failure.lost or not keep_running:
             self._running[i] = False
-            for view in worker.shared.views.values() if worker.shared else ():
-                view[...] = 0
+            for row in self._rows[i].values():
+                row[...] = 0
+
+    def _note(self, i: int, observation: Mapping[str, np.ndarray], info: Mapping[str, Any]) -> None:
+        """Keep the observation of an environment, and which atoms of its goal hold."""
+        for key, row in self._rows[i].items():
+            row[...] = observation[key]
+        self._progress[i] = info.get("progress", {})
 
     def _observe(self) -> dict[str, np.ndarray]:
-        views = self._views()
-        return {key: np.stack([v[key] for v in views]) for key in self._common}
-
-    def _views(self) -> list[dict[str, np.ndarray]]:
-        return [worker.shared.views if worker.shared else {} for worker in self._workers]
+        return {key: np.stack([rows[key] for rows in self._rows]) for key in self._common}
 
     def _info(self) -> dict[str, Any]:
         info: dict[str, Any] = {
@@ -302,8 +296,7 @@ class SubprocEnv(LiberoVectorEnv):
             "progress": [dict(p) for p in self._progress],
         }
         own = [
-            {key: view.copy() for key, view in views.items() if key not in self._common}
-            for views in self._views()
+            {key: row.copy() for key, row in rows.items() if key not in self._common} for rows in self._rows
         ]
         return {**info, "own": own} if any(own) else info
 
@@ -321,7 +314,7 @@ def _factory(arguments: Mapping[str, Any]) -> Callable[[], gymnasium.Env]:
         raise LiberoError(f"each environment needs a 'task'; got the keys {given}")
     other = ("task", "config", "render_mode")
     EnvConfig.from_options(arguments["config"], {k: v for k, v in arguments.items() if k not in other})
-    return partial(open_libero, dict(arguments))
+    return partial(LiberoEnv, **arguments)
 
 
 def _task_name(spec: EnvSpec) -> str:

@@ -1,7 +1,7 @@
 """One environment in a worker process.
 
-`Host` and `serve` are the end in the worker: an environment, the commands on it, and shared memory for observations.
-`Worker` and `wait_for` are the parent's end.
+`Host` and `serve` are the end in the worker: an environment, and the commands on it. `Worker` and `wait_for` are the
+parent's end.
 """
 
 import contextlib
@@ -18,11 +18,8 @@ from functools import partial
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
-from multiprocessing.shared_memory import SharedMemory
 from typing import Any
 
-import gymnasium
-import numpy as np
 from gymnasium import spaces
 from gymnasium.vector.utils import CloudpickleWrapper
 
@@ -33,73 +30,44 @@ _JOIN_TIMEOUT = 5.0  # [s] for a worker to end by itself
 _PIPE_TIMEOUT = 60.0  # [s] for a message that has begun to go on, in either direction
 
 
-class Shared:
-    """The observation of one environment in shared memory.
-
-    Args:
-        layout: Space or array, with `shape` and `dtype`, of each entry.
-        name: Name of the block to attach to; by default a new block is made.
-
-    Attributes:
-        name: Name of the block.
-        views: Array of each entry.
-    """
-
-    def __init__(self, layout: Mapping[str, Any], name: str | None = None):
-        boxes = [(key, tuple(box.shape or ()), np.dtype(box.dtype)) for key, box in layout.items()]
-        sizes = [int(np.prod(shape)) * dtype.itemsize for _, shape, dtype in boxes]
-        starts = np.cumsum([0, *(-(-size // 64) * 64 for size in sizes)])  # aligned
-        self._memory = SharedMemory(name, create=name is None, size=max(int(starts[-1]), 1))
-        self.name = self._memory.name
-        self._owner = name is None
-        self.views = {
-            key: np.ndarray(shape, dtype, self._memory.buf, int(start))
-            for (key, shape, dtype), start in zip(boxes, starts, strict=False)
-        }
-
-    def write(self, observation: Mapping[str, np.ndarray]) -> None:
-        """Copy an observation to the shared memory."""
-        for key, view in self.views.items():
-            view[...] = observation[key]
-
-    def close(self) -> None:
-        """Close the block; the process that made it also frees it."""
-        self.views = {}
-        with contextlib.suppress(BufferError):  # a view is still in use; the memory is closed with it
-            self._memory.close()
-        if self._owner:
-            self._owner = False
-            self._memory.unlink()
-
-
 class Host:
-    """An environment in a worker; each method of a subclass is a command.
+    """An environment in a worker; each method is a command.
 
     Attributes:
         env: The environment, which the command `open` makes with `make`.
-        shared: Shared memory for observations.
     """
 
     def __init__(self, make: Callable[[], Any]):
         self.make = make
         self.env: Any = None
-        self.shared: Shared | None = None
+
+    def open(self) -> Any:
+        """Make the environment."""
+        self.env = self.make()
+
+    def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        """Call a method of the environment and return its result."""
+        return getattr(self.env, method)(*args, **kwargs)
 
     def close(self) -> None:
-        """Close the environment and the shared memory. Idempotent."""
+        """Close the environment. Idempotent."""
         if self.env is not None:
             self.env.close()
             self.env = None
-        if self.shared is not None:
-            self.shared.close()
-            self.shared = None
 
 
-def open_libero(spec: Mapping[str, Any]) -> gymnasium.Env:
-    """Make a `LiberoEnv` from its arguments; it is imported here, in the worker."""
-    from libero_env.envs.env import LiberoEnv
+class GymHost(Host):
+    """A Gymnasium environment in a worker."""
 
-    return LiberoEnv(**spec)
+    def open(self) -> tuple[spaces.Space, spaces.Space]:
+        """Make the environment and return its observation and action space."""
+        super().open()
+        return self.env.observation_space, self.env.action_space
+
+    def look(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        """Return an attribute of the environment without its wrappers, or the result of calling it."""
+        value = getattr(self.env.unwrapped, name)
+        return value(*args, **kwargs) if callable(value) else value
 
 
 def serve(
@@ -131,61 +99,6 @@ def serve(
         host.close()
 
 
-class GymHost(Host):
-    """A Gymnasium environment in a worker."""
-
-    def open(self) -> tuple[spaces.Space, spaces.Space]:
-        """Make the environment and return its observation and action space."""
-        self.env = self.make()
-        return self.env.observation_space, self.env.action_space
-
-    def attach(self, name: str) -> None:
-        """Attach the shared memory for observations."""
-        self.shared = Shared(self.env.observation_space, name)
-
-    def reset(self, seed: int | None, options: dict[str, Any]) -> dict[str, Any]:
-        """Reset the environment, write its observation and return its info."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._write(observation)
-        return info
-
-    def step(self, action: np.ndarray) -> tuple[float, bool, bool, dict[str, Any]]:
-        """Step the environment, write its observation and return reward, terminated, truncated and info."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._write(observation)
-        return reward, terminated, truncated, info
-
-    def call(self, name: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
-        """Return an attribute of the environment, or the result of calling it."""
-        value = getattr(self.env.unwrapped, name)
-        return value(*args, **kwargs) if callable(value) else value
-
-    def _write(self, observation: Mapping[str, np.ndarray]) -> None:
-        assert self.shared is not None, "the shared memory is attached before the first reset"
-        self.shared.write(observation)
-
-
-class CallHost(Host):
-    """Any environment in a worker: its methods and attributes."""
-
-    def open(self) -> None:
-        """Make the environment."""
-        self.env = self.make()
-
-    def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
-        """Call a method of the environment and return its result."""
-        return getattr(self.env, method)(*args, **kwargs)
-
-    def get(self, key: str) -> Any:
-        """Return an attribute of the environment."""
-        return getattr(self.env, key)
-
-    def set(self, key: str, value: Any) -> None:
-        """Set an attribute of the environment, or of its inner environment where only that has it."""
-        inner = getattr(self.env, "env", None)
-        setattr(inner if inner is not None and not hasattr(self.env, key) else self.env, key, value)
-
-
 @dataclass
 class Worker:
     """The parent's end of one worker.
@@ -209,7 +122,6 @@ class Worker:
     run_main: bool = True
 
     def __post_init__(self) -> None:
-        self.shared: Shared | None = None
         self.opened = False
         self.start()
 
@@ -279,18 +191,6 @@ class Worker:
         if self.process.exitcode is None:
             return f"it stopped within an answer, for {_PIPE_TIMEOUT:g} s"
         return f"its process ended (exit code {self.process.exitcode})"
-
-    def share(self, space: spaces.Dict) -> None:
-        """Have observations written to shared memory, the same as before a restart."""
-        if self.shared is None:
-            self.shared = Shared(space)
-        self.send("attach", self.shared.name)
-
-    def free(self) -> None:
-        """Free the shared memory."""
-        if self.shared is not None:
-            self.shared.close()
-            self.shared = None
 
 
 def _limit_waiting(pipe: connection.Connection) -> None:
@@ -375,7 +275,7 @@ def wait_for(
 
 
 def shut_down(workers: Sequence[Worker]) -> None:
-    """Close environments, end processes and free memory; those that do not answer are killed."""
+    """Close environments and end processes; those that do not answer are killed."""
     for worker in workers:
         if not worker.pipe.closed and worker.process.is_alive():
             worker.send("close")
@@ -384,4 +284,3 @@ def shut_down(workers: Sequence[Worker]) -> None:
         worker.process.join(max(0.0, end - time.monotonic()))
         if not worker.pipe.closed:
             worker.kill()
-        worker.free()

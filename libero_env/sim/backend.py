@@ -63,7 +63,10 @@ class Backend:
             )
         if found.get("device") == "":
             raise InvalidInputError(f"backend={value}: device is a device of Warp, such as cpu or cuda:0")
-        return cls(name, found.get("device"), _contacts(found.get("contacts"), value))
+        contacts = found.get("contacts", str(DEFAULT_CONTACTS))
+        if not (contacts.isascii() and contacts.isdigit() and 1 <= int(contacts[:9]) <= MOST_CONTACTS):
+            raise InvalidInputError(f"backend={value}: contacts is a whole number from 1 to {MOST_CONTACTS}")
+        return cls(name, found.get("device"), int(contacts))
 
     def __str__(self) -> str:
         parts = [self.name, *([f"device={self.device}"] if self.device else [])]
@@ -82,11 +85,3 @@ class Backend:
         """
         if self.is_warp and any(importlib.util.find_spec(name) is None for name in ("warp", "mujoco_warp")):
             raise LiberoError(MISSING)
-
-
-def _contacts(text: str | None, value: str) -> int:
-    if text is None:
-        return DEFAULT_CONTACTS
-    if not (text.isascii() and text.isdigit() and 1 <= int(text[:9]) <= MOST_CONTACTS):
-        raise InvalidInputError(f"backend={value}: contacts is a whole number from 1 to {MOST_CONTACTS}")
-    return int(text)

@@ -174,6 +174,7 @@ class Renderer:
             )
         return index
 
+    @first_picture()
     def render(
         self,
         data: mujoco.MjData,
@@ -192,16 +193,6 @@ class Renderer:
         Raises:
             RenderError: No OpenGL backend works here, or the context belongs to another thread or process.
         """
-        with first_picture():
-            self._render(data, targets, glowing_sites, appearance)
-
-    def _render(
-        self,
-        data: mujoco.MjData,
-        targets: Sequence[RenderTarget],
-        glowing_sites: Iterable[int],
-        appearance: SceneAppearance | None,
-    ) -> None:
         if self._gl is None:
             self._gl, self._owner = self._open(), (os.getpid(), threading.current_thread())
             _watch_forks()

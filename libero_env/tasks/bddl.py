@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 from libero_env.errors import BDDLError, InvalidInputError
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, ProblemError, Region
-from libero_env.tasks.sexpr import MAX_CHARACTERS, List, Word, fail, number, parse_tree, show, text_of
+from libero_env.tasks.sexpr import MAX_CHARACTERS, List, Word, number, parse_tree, show, text_of
 
 SECTIONS = (
     ":domain",
@@ -76,7 +76,8 @@ def read_text(path: str | Path) -> str:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = content.count(b"\n", 0, error.start) + 1
-        fail(str(path), line, f"the byte 0x{content[error.start]:02x}", "UTF-8 text")
+        what = f"the byte 0x{content[error.start]:02x}"
+        raise BDDLError(what, "UTF-8 text", str(path), line) from None
 
 
 def parse_expression(text: str, file: str = "<string>", line: int = 1) -> Expression:
@@ -178,7 +179,7 @@ class Reader:
 
     def fail(self, line: int, what: str, expected: str) -> NoReturn:
         """Raise the error of a line in this file."""
-        fail(self.file, line, what, expected)
+        raise BDDLError(what, expected, self.file, line)
 
     def problem(self, root: List) -> Problem:
         """Return the problem of the tree of a text.

@@ -3,7 +3,6 @@
 import math
 import re
 from dataclasses import dataclass
-from typing import NoReturn
 
 from libero_env.errors import BDDLError
 from libero_env.tasks.problem import MAX_DEPTH
@@ -36,11 +35,6 @@ class List:
         return self.items[0].text.casefold() if self.items and isinstance(self.items[0], Word) else ""
 
 
-def fail(file: str, line: int, what: str, expected: str) -> NoReturn:
-    """Raise the error of a task file, in the common format."""
-    raise BDDLError(what, expected, file, line)
-
-
 def show(node: Word | List) -> str:
     """Return a node as text on one line, truncated where it is long."""
     return shorten(text_of(node))
@@ -63,10 +57,10 @@ def parse_tree(text: str, file: str, first: int = 1) -> List:
             are not text.
     """
     if len(text) > MAX_CHARACTERS:
-        fail(file, 1, f"{len(text)} characters", f"a task file of at most {MAX_CHARACTERS}")
+        raise BDDLError(f"{len(text)} characters", f"a task file of at most {MAX_CHARACTERS}", file, 1)
     if bad := _UNREADABLE.search(text):
         line = text.count("\n", 0, bad.start()) + first
-        fail(file, line, f"the character {bad[0]!a}", "text; is this a complete task file?")
+        raise BDDLError(f"the character {bad[0]!a}", "text; is this a complete task file?", file, line)
     stack: list[tuple[list, int]] = [([], first)]
     line = first
     for token in _TOKEN.findall(text):
@@ -74,21 +68,21 @@ def parse_tree(text: str, file: str, first: int = 1) -> List:
             line += 1
         elif token == "(":
             if len(stack) > MAX_DEPTH:
-                fail(file, line, f"more than {MAX_DEPTH} nested brackets", "a flatter expression")
+                raise BDDLError(f"more than {MAX_DEPTH} nested brackets", "a flatter expression", file, line)
             stack.append(([], line))
         elif token == ")":
             if len(stack) == 1:
-                fail(file, line, "a ) closes nothing", "as many ( as )")
+                raise BDDLError("a ) closes nothing", "as many ( as )", file, line)
             items, start = stack.pop()
             stack[-1][0].append(List(tuple(items), start))
         elif not token.startswith(";"):
             stack[-1][0].append(Word(token, line))
     if len(stack) > 1:
-        fail(file, stack[-1][1], "this ( is never closed", "as many ( as )")
+        raise BDDLError("this ( is never closed", "as many ( as )", file, stack[-1][1])
     roots = stack[0][0]
     if len(roots) != 1 or not isinstance(roots[0], List):
         line = roots[1].line if len(roots) > 1 else first
-        fail(file, line, f"{len(roots)} expressions at the top", "one (define (problem NAME) ...)")
+        raise BDDLError(f"{len(roots)} expressions at the top", "one (define (problem NAME) ...)", file, line)
     return roots[0]
 
 

@@ -7,6 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env import memory
 from libero_env.demos import hdf5
 from libero_env.demos.contents import read_header
 from libero_env.demos.curate import describe, examine, filter_demos
@@ -302,8 +303,7 @@ def test_a_heap_within_data_is_no_heap(path):
 
 
 def test_more_than_the_free_memory_is_refused(path, monkeypatch):
-    monkeypatch.setattr(hdf5, "host_memory", lambda: (3000, 10_000))
-    monkeypatch.setattr(hdf5, "FREE_BYTES", 0)
+    monkeypatch.setattr(memory, "host_memory", lambda: (3000, 10_000))
     refused(path, "2 demonstrations", "3.0 kB are free")
     refused(path, "longest demonstration", "are free", read=iter_demos)
     refused(path, "demo_0", "are free", read=read_episodes)

@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from libero_env.demos.contents import check_demo, demo_names, file_attributes, read_values, subset_names
-from libero_env.demos.hdf5 import check_memory, open_demo_file
+from libero_env.demos.hdf5 import open_demo_file
 from libero_env.errors import DemoError
+from libero_env.memory import require_memory
 
 
 def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, verbose: bool = True) -> dict:
@@ -31,9 +32,8 @@ def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, ve
             names = subset_names(file, path, filter_key)
         if not names:
             raise DemoError(f"{path}: no demonstrations; expected at least data/demo_0")
-        check_memory(
-            sum(check_demo(data[name], f"{path}: {name}", ()) for name in names), str(path), "choose a subset"
-        )
+        size = sum(check_demo(data[name], f"{path}: {name}", ()) for name in names)
+        require_memory(size, str(path), "choose a subset", DemoError)
         rows = [
             np.asarray(read_values(data[name], "actions", f"{path}: {name}", check=False)) for name in names
         ]

@@ -63,6 +63,8 @@ class WarpSimulations(Simulations):
         self.device = choose_device(self.backend.device)
         self.model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_SENSOR)  # nothing reads them
         contacts = self.backend.contacts
+        # constraints that are not contacts, at most: friction and limits of joints
+        other_rows = int((self.model.dof_frictionloss > 0).sum() + self.model.jnt_limited.sum())
         with wp.ScopedDevice(self.device):
             try:
                 self.device_model = mjw.put_model(self.model, {"body_pos": num, "body_quat": num})
@@ -76,7 +78,7 @@ class WarpSimulations(Simulations):
                     self.model,
                     nworld=num,
                     nconmax=contacts,
-                    njmax=_ROWS_PER_CONTACT * contacts + self._other_rows,
+                    njmax=_ROWS_PER_CONTACT * contacts + other_rows,
                 )
                 self._control: Any = allocate(self.model, self.arm, num, self.fixture_bodies)
         self._copies: Any = DeviceFields(self.device_data, self._control.arm)
@@ -85,11 +87,6 @@ class WarpSimulations(Simulations):
         self.limits_reached = Counter[str]()
         self._actions_seen = np.zeros(num)
         self._unplaced = np.ones(num, bool)  # not started yet: all things at one place
-
-    @property
-    def _other_rows(self) -> int:
-        """Number of constraints that are not contacts, at most: friction and limits of joints."""
-        return int((self.model.dof_frictionloss > 0).sum() + self.model.jnt_limited.sum())
 
     def record(self) -> dict[str, str]:
         versions = {name: metadata.version(name) for name in ("mujoco-warp", "warp-lang")}
@@ -109,14 +106,14 @@ class WarpSimulations(Simulations):
 
     @property
     def contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._copies.derived("contacts", self._download_contacts)
+        def download() -> tuple[np.ndarray, np.ndarray]:
+            data = self.device_data
+            count = int(data.nacon.numpy()[0])
+            worlds = data.contact.worldid.numpy()[:count]
+            order = np.argsort(worlds, kind="stable")
+            return data.contact.geom.numpy()[:count][order], worlds[order]
 
-    def _download_contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        data = self.device_data
-        count = int(data.nacon.numpy()[0])
-        worlds = data.contact.worldid.numpy()[:count]
-        order = np.argsort(worlds, kind="stable")
-        return data.contact.geom.numpy()[:count][order], worlds[order]
+        return self._copies.derived("contacts", download)
 
     def time(self, i: int) -> float:
         return float(self.device_data.time.numpy()[i])
@@ -206,8 +203,9 @@ class WarpSimulations(Simulations):
                 (control.qpos, control.qvel, control.warm_start, control.time), self._moved, strict=True
             ):
                 wp.copy(kept, present)
-            if self.uses_graphs and not self._graphs:
-                self._load_kernels()
+            if self.uses_graphs and not self._graphs:  # nothing is compiled while a graph is captured
+                control.active.zero_()
+                self._substep()
             control.active.assign(np.isin(np.arange(self.num), ids))
             data.overflow.zero_()
 
@@ -237,11 +235,6 @@ class WarpSimulations(Simulations):
                     gc.enable()
             self._graphs[substeps] = capture.graph
         wp.capture_launch(self._graphs[substeps])
-
-    def _load_kernels(self) -> None:
-        """Run a substep in which every simulation is held: nothing is compiled while a graph is captured."""
-        self._control.active.zero_()
-        self._substep()
 
     def _substep(self) -> None:
         data, names = (
