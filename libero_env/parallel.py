@@ -131,6 +131,13 @@ def spawn_pool(
     return _Pool(workers, mp_context=spawn_context(), initializer=_start_worker, initargs=arguments)
 
 
+@lru_cache
+def after_forks(function: Callable[[], None]) -> None:
+    """Call a function first in all processes that are forked from this one from now on."""
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=function)
+
+
 def check_main_guard() -> None:
     """Check that this process is not a worker of `spawn_pool` that still imports the main script.
 

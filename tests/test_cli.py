@@ -178,7 +178,7 @@ def test_doctor_renders_a_frame(monkeypatch):
 def test_doctor_survives_a_machine_without_gl(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "vulkan")
     finding = doctor.check_gl()
-    assert not finding.ok and "egl, osmesa, glfw" in finding.remedy
+    assert not finding.ok and "MUJOCO_GL=vulkan is not a backend; valid: egl, osmesa, glfw" in finding.detail
     monkeypatch.delenv("MUJOCO_GL")
     for probe in ("import os; os.abort()", "raise SystemExit(3)", "raise OSError('no libGL')"):
         monkeypatch.setattr(doctor, "_PROBE", probe)
@@ -216,9 +216,12 @@ def test_renderers_that_fail_or_draw_on_the_processor_are_told(monkeypatch):
         found = json.dumps({"device": device, "milliseconds": 1.0})
         monkeypatch.setattr(doctor, "_PROBE", f"print({found!r})")
         assert re.match(detail, doctor.check_renderers(2).detail)
-    monkeypatch.setattr(doctor, "_PROBE", "import os; os.abort()")
-    finding = doctor.check_renderers(2)
-    assert finding.detail.startswith("2 failed") and not finding.ok and "MUJOCO_GL=osmesa" in finding.remedy
+    for probe in ("import os; os.abort()", "print('{\"error\": 1}')"):
+        monkeypatch.setattr(doctor, "_PROBE", probe)
+        finding = doctor.check_renderers(2)
+        assert (
+            finding.detail.startswith("2 failed") and not finding.ok and "MUJOCO_GL=osmesa" in finding.remedy
+        )
 
 
 def test_doctor_says_in_one_line_that_there_is_no_gpu(monkeypatch, capsys):
@@ -351,21 +354,6 @@ def test_training_warns_where_a_batch_is_too_large_for_a_cpu(capsys):
     )
     _warn_of_cpu(data(64, 1), FitSettings(batch_size=64))
     assert not capsys.readouterr().err
-
-
-def test_doctor_checks_the_gpu(monkeypatch, capsys):
-    monkeypatch.setattr(doctor, "gpu_name", lambda: "")
-    assert cli.main(["doctor", "--gpu"]) == 1
-    assert capsys.readouterr().out.startswith("FAIL  GPU: ")
-    probes = {
-        "print('{\"milliseconds\": 1}')": True,
-        "print('{\"error\": 1}')": False,
-        "import time; time.sleep(99)": False,
-    }
-    monkeypatch.setattr(doctor, "PROBE_SECONDS", 2)
-    for probe, ok in probes.items():
-        monkeypatch.setattr(doctor, "_PROBE", probe)
-        assert doctor.check_renderers(2).ok is ok
 
 
 @pytest.mark.parametrize(

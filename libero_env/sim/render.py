@@ -11,14 +11,14 @@ import threading
 import weakref
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, Protocol
 
 import numpy as np
 
 from libero_env.errors import RenderError, UnknownNameError
 from libero_env.mujoco_compat import forget_opengl, mujoco
-from libero_env.parallel import first_picture
+from libero_env.parallel import after_forks, first_picture
 from libero_env.sim.appearance import SceneAppearance
 from libero_env.sim.culling import Culling
 
@@ -195,7 +195,7 @@ class Renderer:
         """
         if self._gl is None:
             self._gl, self._owner = self._open(), (os.getpid(), threading.current_thread())
-            _watch_forks()
+            after_forks(_keep_contexts)
             _renderers.add(self)
         elif self._owner[1] is not threading.current_thread() or self._owner[0] != os.getpid():
             raise RenderError(self._owner_text())
@@ -343,12 +343,6 @@ class Renderer:
 _renderers: "weakref.WeakSet[Renderer]" = weakref.WeakSet()  # that have had a context
 
 
-@cache
-def _watch_forks() -> None:
-    """Keep the contexts of this process in its forks, where freeing them would hang."""
-    if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=_keep_contexts)
-
-
 def _keep_contexts() -> None:
+    """Keep the contexts of the parent in a forked process, where freeing them would hang."""
     _unreachable.extend((renderer._gl, renderer._context) for renderer in _renderers)

@@ -6,18 +6,18 @@ then the kinematics. `LoopSimulations` steps one MjData after another (one simul
 single precision.
 """
 
-import os
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from libero_env.errors import ClosedEnvironmentError, LiberoError, SimulationError
 from libero_env.mujoco_compat import FORWARD_WARM_STARTS, MASS_FIELD, log_warnings, mujoco
+from libero_env.parallel import after_forks
 from libero_env.sim.backend import Backend
 from libero_env.sim.controller import ControllerState, get_controller
 from libero_env.sim.osc import REST, ArmIndex
@@ -242,7 +242,7 @@ class Simulations(ABC):
         """Return the fields that the controller sees, (num, ...): those of the rest pose where it is outdated."""
         if not self._outdated[ids].any():
             return self.fields
-        fields = dict(self.fields)
+        fields = {name: self.fields[name] for name in FIELDS}
         for name in _CONTROLLED:
             fields[name] = self.fields[name].copy()
             fields[name][self._outdated] = self._rest_fields[name]
@@ -434,7 +434,7 @@ class BatchSimulations(Simulations):
     def __init__(self, model: mujoco.MjModel, num: int, threads: int = 0, fixture_bodies: Indices = ()):
         super().__init__(model, num, fixture_bodies)
         self._batch: Any = Batch(model, num, nthread=threads, persistent=True)
-        _watch_forks()
+        after_forks(_leave_batches)
         _batches.add(self)
         fields = {name: self._batch.bind(name) for name in FIELDS}
         self.fields = {**fields, "site_xmat": fields["site_xmat"].reshape(num, model.nsite, 9)}
@@ -484,14 +484,8 @@ _batches: "weakref.WeakSet[BatchSimulations]" = weakref.WeakSet()
 _inherited: list[Any] = []  # never freed: their threads are not in this process
 
 
-@cache
-def _watch_forks() -> None:
-    """Let a forked process raise where it uses a batch of its parent, whose threads it would wait for without end."""
-    if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=_leave_batches)
-
-
 def _leave_batches() -> None:
+    """Let a forked process raise where it uses a batch of its parent, whose threads it would wait for without end."""
     for simulations in list(_batches):
         _inherited.append(simulations._batch)
         simulations._batch = Unusable(LiberoError(FORKED))

@@ -58,10 +58,10 @@ def _run(python, home, *arguments):
 def test_lerobot_merges_ours_with_the_published_metadata(file, tmp_path):
     python = _lerobot()
     ours = tmp_path / "ours"
-    written = export_published([file], ours, "lerobot/libero", HOW, progress=False)
+    _, frames, _ = export_published([file], ours, "lerobot/libero", HOW, progress=False)
     found = _run(python, tmp_path / "hf", "merge", ours, tmp_path)
     assert (found["fps"], found["robot_type"]) == (10, "panda")
-    assert (found["episodes"], found["frames"]) == (2 + 1, 2 * 5 + written.frames)
+    assert (found["episodes"], found["frames"]) == (2 + 1, 2 * 5 + frames)
     assert found["tasks"] == ["put the bowl on the plate", LANGUAGE]
     features = json.loads((ours / "meta/info.json").read_text())["features"]
     for key, feature in found["converted"].items():  # `info` is worded otherwise by newer versions
@@ -82,9 +82,11 @@ def test_lerobot_refuses_to_merge_the_unturned_export(file, tmp_path):
 
 def test_lerobot_reads_the_set_of_version_2(file, tmp_path):
     python = _named("LIBERO_LEROBOT_V2")
-    written = export_published([file], tmp_path / "ours", "physical-intelligence/libero", HOW, progress=False)
+    _, frames, _ = export_published(
+        [file], tmp_path / "ours", "physical-intelligence/libero", HOW, progress=False
+    )
     found = _run(python, tmp_path / "hf", "read", tmp_path / "ours")
-    assert (found["episodes"], found["frames"], found["task"]) == (1, written.frames, LANGUAGE)
+    assert (found["episodes"], found["frames"], found["task"]) == (1, frames, LANGUAGE)
     shapes = {"image": [3, 256, 256], "wrist_image": [3, 256, 256], "state": [8], "actions": [7]}
     assert shapes.items() <= found["shapes"].items() and 0.5 < found["largest"] <= 1.0
     table = parquet.read_table(tmp_path / "ours/data/chunk-000/episode_000000.parquet")

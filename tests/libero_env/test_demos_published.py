@@ -84,8 +84,8 @@ def exported(file, tmp_path_factory):
     folder, found = tmp_path_factory.mktemp("sets"), {}
     for name in FEATURES:
         found[name] = folder / name
-        written = export_published([file], found[name], name, HOW, progress=False)
-        assert (written.episodes, written.failed) == (1, ())
+        episodes, _, failed = export_published([file], found[name], name, HOW, progress=False)
+        assert (episodes, failed) == (1, [])
     return found
 
 
@@ -178,8 +178,8 @@ def test_steps_that_do_nothing_are_left_out(file, episode, exported, tmp_path):
     paused = _rewrite(file, tmp_path / file.name, pause)
     name = "physical-intelligence/libero"
     small = replace(HOW, size=(16, 16))
-    written = export_published([paused], tmp_path / "set", name, small, progress=False)
-    assert written.frames == len(episode)
+    _, frames, _ = export_published([paused], tmp_path / "set", name, small, progress=False)
+    assert frames == len(episode)
     tables = [
         parquet.read_table(r / "data/chunk-000/episode_000000.parquet")
         for r in (exported[name], tmp_path / "set")
@@ -202,8 +202,8 @@ def test_failures_are_left_out_and_named(file, tmp_path):
     lost = _rewrite(file, tmp_path / f"lost_{file.name}", lambda one: replace(one, actions=one.actions * 0.5))
     small = replace(HOW, size=(16, 16))
     name = "physical-intelligence/libero"
-    written = export_published([lost, file], tmp_path / "set", name, small, progress=False)
-    assert written.episodes == 1 and written.failed == (f"{lost}: demo_0",)
+    episodes, _, failed = export_published([lost, file], tmp_path / "set", name, small, progress=False)
+    assert episodes == 1 and failed == [f"{lost}: demo_0"]
     assert json.loads((tmp_path / "set" / ORIGIN).read_text())["left_out"] == 1
     with pytest.raises(DemoError, match=r"lost_.*demo_0: neither this demonstration nor any other"):
         export_published([lost], tmp_path / "none", name, small, progress=False)

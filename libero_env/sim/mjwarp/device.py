@@ -1,7 +1,7 @@
 """What MuJoCo Warp's simulations have on the device, and how the host reads it."""
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -103,35 +103,18 @@ def room_for(num: int, backend: Backend) -> Iterator[None]:
         ) from error
 
 
-class DeviceFields(Mapping[str, np.ndarray]):
+class DeviceFields(dict[str, Any]):
     """Fields of all simulations on the host, in double precision; each is copied when it is first read after a step."""
 
     def __init__(self, data: Any, arm: Any):
-        self._data, self._arm, self._found = data, arm, dict[str, Any]()
+        super().__init__()
+        self._data, self._arm = data, arm
 
-    def forget(self) -> None:
-        """Drop what was copied: the simulations have moved."""
-        self._found = {}
-
-    def derived(self, name: str, compute: Callable[[], Any]) -> Any:
-        """Return a value that is computed once after each step."""
-        if name not in self._found:
-            self._found[name] = compute()
-        return self._found[name]
-
-    def __getitem__(self, name: str) -> np.ndarray:
+    def __missing__(self, name: str) -> np.ndarray:
         if name not in FIELDS:
             raise KeyError(name)
-        return self.derived(name, lambda: self._download(name))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(FIELDS)
-
-    def __len__(self) -> int:
-        return len(FIELDS)
-
-    def _download(self, name: str) -> np.ndarray:
         values = getattr(self._data, "M" if name == MASS_FIELD else name).numpy().astype(np.float64)
         if name == "qpos":
             values[:, :7] = self._arm.numpy()
-        return values.reshape(*values.shape[:2], 9) if name == "site_xmat" else values
+        self[name] = values.reshape(*values.shape[:2], 9) if name == "site_xmat" else values
+        return self[name]

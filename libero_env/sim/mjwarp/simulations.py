@@ -106,14 +106,13 @@ class WarpSimulations(Simulations):
 
     @property
     def contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        def download() -> tuple[np.ndarray, np.ndarray]:
+        if "contacts" not in self._copies:
             data = self.device_data
             count = int(data.nacon.numpy()[0])
             worlds = data.contact.worldid.numpy()[:count]
             order = np.argsort(worlds, kind="stable")
-            return data.contact.geom.numpy()[:count][order], worlds[order]
-
-        return self._copies.derived("contacts", download)
+            self._copies["contacts"] = data.contact.geom.numpy()[:count][order], worlds[order]
+        return self._copies["contacts"]
 
     def time(self, i: int) -> float:
         return float(self.device_data.time.numpy()[i])
@@ -162,7 +161,7 @@ class WarpSimulations(Simulations):
                 )
             data.overflow.zero_()
             mjw.step1(model, data)
-        self._copies.forget()
+        self._copies.clear()
         lost = data.nacon.numpy()[0] > data.naconmax  # of which simulation is not known, and no flag is set
         if failed := {int(i): self._no_room(mjw.OverflowType.NARROWPHASE) for i in started if lost}:
             raise SimulationError(failed)
@@ -181,7 +180,7 @@ class WarpSimulations(Simulations):
                 if until > done:
                     self._run(until - done)
                     done = until
-                    self._copies.forget()
+                    self._copies.clear()
                     if watch is not None and done in WATCHED:
                         watch(done, ids)
         self.controller_state.gripper[:] = self._control.gripper.numpy()
@@ -294,7 +293,7 @@ class WarpSimulations(Simulations):
             (self.device_data.qacc_warmstart, self.device_data.ctrl), values, strict=True
         ):
             _write(array, i, value)
-        self._copies.forget()
+        self._copies.clear()
 
 
 def _write(array: Any, where: Any, values: Any) -> None:
