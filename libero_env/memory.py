@@ -20,19 +20,17 @@ def physical_memory() -> int:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
-def available_memory() -> int | None:
-    """Return how much memory a new process could use, [bytes]; None where the system does not say it."""
-    meminfo = _meminfo()
-    found = [meminfo["MemAvailable"]] if "MemAvailable" in meminfo else []
-    found += [free for _, free in _groups() if free is not None]
-    return max(0, min(found)) if found else None
-
-
 def host_memory() -> tuple[int, int]:
-    """Return the available and the total bytes of host memory, or of the container if it has a limit."""
-    total = min([physical_memory(), *(limit for limit, _ in _groups())])
-    free = available_memory()
-    return total // 2 if free is None else min(free, total), total
+    """Return the available and the total bytes of host memory, or of the container if it has a limit.
+
+    Where the system does not say what is available, it is half of the total.
+    """
+    groups, meminfo = list(_groups()), _meminfo()
+    total = min([physical_memory(), *(limit for limit, _ in groups)])
+    free = [amount for _, amount in groups if amount is not None]
+    if "MemAvailable" in meminfo:
+        free.append(meminfo["MemAvailable"])
+    return max(0, min([*free, total])) if free else total // 2, total
 
 
 def memory_limit() -> int:

@@ -30,9 +30,8 @@ _DAMAGED = (EOFError, pickle.UnpicklingError, ValueError, LookupError, TypeError
 T = TypeVar("T")
 LONGEST_SILENCE = 4 * 3600.0  # [s] for one piece of work of a pool; the longest take minutes
 LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
-PICTURE_SECONDS = (
-    120.0  # [s] for the first picture of one of several processes; seconds where cores are shared
-)
+# [s] for the first picture of one of several processes; seconds where cores are shared
+PICTURE_SECONDS = 120.0
 NO_PICTURE = 76  # exit status of a worker that did not draw it in time
 NO_PICTURE_TEXT = (
     "no first picture: in some drivers several processes that draw by EGL on one GPU hang for ever (mujoco#3444). Give "

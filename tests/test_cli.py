@@ -309,18 +309,6 @@ def test_doctor_checks_folders(tmp_path, monkeypatch):
     assert "meshes is writable by every user: chmod" in doctor.check_cache().detail
 
 
-def test_folders_follow_the_environment(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
-    monkeypatch.delenv("LIBERO_DEMOS", raising=False)
-    assert paths.demos_dir() == tmp_path / "demos"
-    monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path / "elsewhere"))
-    assert paths.demos_dir() == tmp_path / "elsewhere"
-    monkeypatch.delenv("LIBERO_CACHE")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert paths.cache_dir() == tmp_path / "xdg" / "libero"
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_doctor_knows_the_device():
     assert check_torch().ok and "threads" in check_torch().detail
 

@@ -248,10 +248,8 @@ def run_probe(words: Sequence[str], seconds: float = PROBE_SECONDS) -> tuple[boo
 
 def check_renderers(count: int) -> Finding:
     """Draw with several processes at once: some drivers hang in that for ever."""
-    title, remedy = (
-        f"{count} renderers at once",
-        "record and evaluate with fewer --workers, or MUJOCO_GL=osmesa",
-    )
+    title = f"{count} renderers at once"
+    remedy = "record and evaluate with fewer --workers, or MUJOCO_GL=osmesa"
     with ThreadPoolExecutor(count) as pool:
         answers = list(pool.map(run_probe, [["-c", _PROBE]] * count))
     failed = [text for _, text in answers if '"milliseconds"' not in text]

@@ -95,9 +95,8 @@ def debugging(words: Sequence[str]) -> Iterator[list[str]]:
     """
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         if getattr(sys, name) is None:
-            os.set_inheritable(
-                os.open(os.devnull, os.O_RDWR), True
-            )  # the lowest free number, which is this one
+            # the lowest free number, which is this one
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
             setattr(sys, name, open(number, mode))  # noqa: SIM115 - until the process ends
     rest = [word for word in words if word != DEBUG]
     before = os.environ.get(DEBUG_VARIABLE)

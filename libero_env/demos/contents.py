@@ -168,6 +168,18 @@ def demo_number(name: str) -> int:
     return int(name.removeprefix("demo_"))
 
 
+def picture_size(handle: h5py.File, file: Path) -> tuple[int, int] | None:
+    """Return height and width of the first colour images of a file; None where it has none."""
+    for name in demo_names(handle, file)[:1]:
+        group = handle["data"][name]
+        obs = group.get("obs") if isinstance(group, h5py.Group) else None
+        for key in obs if isinstance(obs, h5py.Group) else ():
+            if key.endswith("_rgb"):
+                check_demo(group, f"{file}: {name}", [key])
+                return int(obs[key].shape[1]), int(obs[key].shape[2])
+    return None
+
+
 def read_pairing(handle: h5py.File, file: Path) -> Pairing:
     """Return which observation stands with an action; the original's files, which do not state it, have "libero".
 

@@ -4,16 +4,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from libero_env.demos.contents import (
     IMAGE_KEYS,
-    check_demo,
     count_steps,
     demo_names,
     file_attributes,
     json_attribute,
+    picture_size,
     value_fault,
 )
 from libero_env.demos.hdf5 import open_demo_file
@@ -184,12 +183,8 @@ def describe(file: Path) -> str:
     with open_demo_file(file) as handle:
         names, header = demo_names(handle, file), file_attributes(handle, file)
         steps = sum(count_steps(handle["data"][name], f"{file}: {name}") for name in names)
-        obs = handle["data"][names[0]].get("obs") if names else None
-        colours = [key for key in obs if key.endswith("_rgb")] if isinstance(obs, h5py.Group) else []
-        images = "no images"
-        if colours and isinstance(obs, h5py.Group):
-            check_demo(handle["data"][names[0]], f"{file}: {names[0]}", colours)
-            images = "{}x{} pixels".format(*obs[colours[0]].shape[1:3])
+        size = picture_size(handle, file)
+    images = "no images" if size is None else f"{size[0]}x{size[1]} pixels"
     models = json_attribute(header, "models", file).get("pack", "unknown")
     failed = header.get("num_failed_attempts", "unknown")
     parts = (f"{len(names)} demonstrations", f"{steps} steps", images, f"failed attempts: {failed}")

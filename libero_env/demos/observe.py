@@ -7,13 +7,12 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
-import h5py
 import numpy as np
 
 from libero_env.assets.pack import Pack
 from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.config import RenderConfig
-from libero_env.demos.contents import demo_names, read_header
+from libero_env.demos.contents import picture_size, read_header
 from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
 from libero_env.demos.read import Episode
 from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
@@ -100,13 +99,10 @@ def recorded_rendering(file: Path) -> RenderConfig:
     """
     header, default = read_header(file), RenderConfig()
     with open_demo_file(file) as handle:
-        names = demo_names(handle, file)
-        obs = handle["data"][names[0]].get("obs") if names else None
-        views = [key for key in obs if key.endswith("_rgb")] if isinstance(obs, h5py.Group) else []
-        size = tuple(map(int, obs[views[0]].shape[1:3])) if views and obs is not None else default.size
+        size = picture_size(handle, file) or default.size
     return RenderConfig(
         tuple(map(str, header.get("cameras", default.cameras))),
-        (size[0], size[1]),
+        size,
         tuple(map(str, header.get("pictures", default.modalities))),
         header.get("drawing", FAST if "generator" in header else None),
     )

@@ -47,9 +47,8 @@ from libero_env.memory import require_memory
 
 Labels = Literal["expert", "executed"]
 NOOP_THRESHOLD = 1e-3  # [action units] largest entry of a motion that counts as none
-PUBLISHED_NOOP_NORM = (
-    1e-4  # [action units] Euclidean norm below which the published sets count a motion as none
-)
+# [action units] Euclidean norm below which the published sets count a motion as none
+PUBLISHED_NOOP_NORM = 1e-4
 _SMALLER = "record shorter ones or smaller images"
 _DERIVED = ("num_samples", "init_state", "success", "fixtures")  # attributes that follow from the fields
 

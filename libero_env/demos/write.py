@@ -33,17 +33,8 @@ from libero_env.storage import atomic_path, require_own_folders
 TAG = "libero-v1"
 FRAMES_PER_CHUNK = 8
 _CONFIG_KEYS = (  # attributes in which all demonstrations of a file agree
-    *(
-        "bddl_file_name",
-        "bddl_file_content",
-        "seed",
-        "camera_size",
-        "cameras",
-        "pictures",
-        "drawing",
-        "pairing",
-    ),
-    *("generator", "disturbed", "variation", "model_digest", "filter", "perturb", "perturb_draws"),
+    *("bddl_file_name", "bddl_file_content", "seed", "camera_size", "cameras", "pictures", "drawing"),
+    *("pairing", "generator", "disturbed", "variation", "model_digest", "filter", "perturb", "perturb_draws"),
 )
 REMEDY = "choose another file or remove this one"
 

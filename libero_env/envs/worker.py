@@ -197,9 +197,7 @@ def _limit_waiting(pipe: connection.Connection) -> None:
     """Let reads and writes of a pipe fail where the other end stops in the middle of a message."""
     if os.name == "posix":  # where pipes for both directions are sockets
         limit = struct.pack("ll", int(_PIPE_TIMEOUT), 0)
-        with socket.socket(
-            fileno=os.dup(pipe.fileno())
-        ) as end:  # the limits hold for all handles of the socket
+        with socket.socket(fileno=os.dup(pipe.fileno())) as end:  # they hold for all handles of the socket
             end.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
             end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
 

@@ -37,13 +37,11 @@ _JOINT_LOW = (-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973)  # 
 _JOINT_HIGH = (2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973)  # [rad]
 
 VELOCITY_WINDOW = 5  # substeps over which the derivative is averaged
-VELOCITY_MEMORY = (
-    7 * VELOCITY_WINDOW + 7 + 2
-)  # errors of the window, their sum, saturated, number of substeps
+# errors of the window, their sum, whether a torque saturated, number of substeps
+VELOCITY_MEMORY = 7 * VELOCITY_WINDOW + 7 + 2
 _JOINT_GAINS = np.array([[50.0] * 7, [2.0 * np.sqrt(50.0)] * 7])
-_VELOCITY_GAINS = np.full(
-    (2, 7), 3.0
-)  # of the width of the torque range, per rad/s; the second row is not used
+# of the width of the torque range, per rad/s; the second row is not used
+_VELOCITY_GAINS = np.full((2, 7), 3.0)
 _INTEGRAL, _DERIVATIVE = 0.005, 0.001  # of the proportional gain
 
 SetGoals = Callable[..., None]

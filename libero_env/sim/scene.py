@@ -12,6 +12,7 @@ from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from threading import RLock
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +27,8 @@ from libero_env.tasks.problem import Atom, Problem, ProblemError, Region, Violat
 from libero_env.text import suggest
 from libero_env.timing import TIMESTEP
 
-InitialStates = (
-    np.ndarray
-)  # (k, state_size) rows [time, qpos, qvel, position and quaternion (wxyz) of each fixture]
+# (k, state_size) rows [time, qpos, qvel, position and quaternion (wxyz) of each fixture]
+InitialStates = np.ndarray
 FAST, FAITHFUL = DRAWINGS = ("fast", "faithful")
 ROBOT = "robot"  # name of arm and gripper in contacts
 _MAX_IMAGE = 1024  # [pixels] largest edge of an image; size of the offscreen buffer
@@ -125,10 +125,8 @@ class Scene:
         if not self.fixtures:
             return self.model
         model = copy(self.model)
-        model.body_pos[self.fixture_bodies], model.body_quat[self.fixture_bodies] = (
-            fixtures[:, :3],
-            fixtures[:, 3:],
-        )
+        model.body_pos[self.fixture_bodies] = fixtures[:, :3]
+        model.body_quat[self.fixture_bodies] = fixtures[:, 3:]
         return model
 
     @cached_property
@@ -227,7 +225,9 @@ def default_drawing(pack: Pack) -> str:
     return FAITHFUL if isinstance(pack, OriginalPack) and pack.lod is None else FAST
 
 
-def _compile_scene(problem: Problem, pack: Pack, drawing: str, robot: str, spare_materials: bool) -> Scene:
+def _compile_scene(
+    problem: Problem, pack: Pack, drawing: str, robot: str, spare_materials: bool = False
+) -> Scene:
     name, workspace = workspace_of(problem)
     entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
     spec = scene_spec(problem, pack, entities, drawing=drawing, robot=robot)
@@ -289,11 +289,8 @@ class _SceneCache:
         self._scenes: OrderedDict[Hashable, Scene] = OrderedDict()
         self._lock = RLock()
 
-    def __call__(
-        self, problem: Problem, pack: Pack, drawing: str, robot: str, spare_materials: bool = False
-    ) -> Scene:
-        """Return the scene of these arguments; it is compiled if it is not there."""
-        key = (problem, pack, drawing, robot, spare_materials)
+    def __call__(self, *key: Any) -> Scene:
+        """Return the scene of arguments of `_compile_scene`; it is compiled if it is not there."""
         with self._lock:
             if key not in self._scenes:
                 self._scenes[key] = scene = _compile_scene(*key)

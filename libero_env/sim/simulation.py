@@ -33,15 +33,8 @@ FIELDS = (
     *("qpos", "qvel", "ctrl", "xpos", "xquat", "xanchor", "xaxis", "site_xpos", "site_xmat"),
     *(MASS_FIELD, "qfrc_bias"),
 )
-_CONTROLLED = (
-    "qpos",
-    "qvel",
-    "xanchor",
-    "xaxis",
-    "site_xpos",
-    "site_xmat",
-    MASS_FIELD,
-)  # of the arm, not of contacts
+# Those that the controller sees of the arm, not of contacts.
+_CONTROLLED = ("qpos", "qvel", "xanchor", "xaxis", "site_xpos", "site_xmat", MASS_FIELD)
 
 # Substeps after which the original observes: kinematics of the first, positions of the second.
 WATCHED = (SUBSTEPS - 2, SUBSTEPS - 1)
@@ -169,10 +162,8 @@ class Simulations(ABC):
             control_delta: Whether actions are relative.
             rest: Joints that the controller takes for the arm's rest pose, (7,) [rad].
         """
-        self.controller_state, self.rest = (
-            ControllerState(self.num, get_controller(name, control_delta)),
-            rest,
-        )
+        self.controller_state = ControllerState(self.num, get_controller(name, control_delta))
+        self.rest = rest
 
     def close(self) -> None:
         """Free the simulations. Idempotent."""

@@ -160,16 +160,3 @@ FIELDS = list(EnvConfig.__dataclass_fields__)
 @examples(short=60, long=3000)
 def test_any_options_make_a_configuration_or_are_refused(options):
     survive("environment options", lambda: EnvConfig(**options))
-
-
-@given(data=st.data())
-@examples(short=3, long=40)
-def test_after_close_every_call_is_refused(data):
-    many = data.draw(st.booleans())
-    env = BatchEnv(TASK, NUM, cameras=()) if many else LiberoEnv(TASK, cameras=())
-    state = env.get_state(0) if many else env.get_state()
-    env.close()
-    for _ in range(8):
-        name, given_ = data.draw(arguments(many, state))
-        with pytest.raises(gymnasium.error.ClosedEnvironmentError):
-            call(env, name, given_)

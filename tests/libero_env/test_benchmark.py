@@ -48,10 +48,6 @@ def moved(view: StateView, before: dict[str, np.ndarray]) -> dict[str, float]:
     return {name: float(np.linalg.norm(view.body_pos(name) - pos)) for name, pos in before.items()}
 
 
-def test_there_are_130_tasks():
-    assert len(TASKS) == 130
-
-
 @pytest.mark.parametrize("key", TASKS)
 def test_init_states_are_at_rest_in_the_regions_of_the_task(key):
     task = get_task(key)

@@ -241,11 +241,17 @@ def test_a_result_about_models_that_is_damaged_is_found_again(tmp_path, monkeypa
 def test_paths_of_the_cache(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("LIBERO_DEMOS", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", "relative")  # which its specification says to ignore
     for value, expected in (("", "home/.cache/libero"), ("~/x", "home/x"), ("x", "x"), (str(tmp_path), ".")):
         monkeypatch.setenv("LIBERO_CACHE", value)
         assert cache_dir() == tmp_path / expected
         assert demos_dir() == tmp_path / expected / "demos"
+    monkeypatch.setenv("LIBERO_DEMOS", "elsewhere")
+    monkeypatch.setenv("LIBERO_CACHE", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert (demos_dir(), cache_dir()) == (tmp_path / "elsewhere", tmp_path / "xdg" / "libero")
+    assert list(tmp_path.iterdir()) == []
     monkeypatch.setenv("LIBERO_CACHE", "~nobody-of-this-name/x")
     with pytest.raises(LiberoError, match="set LIBERO_CACHE"):
         cache_dir()

@@ -99,41 +99,6 @@ def test_files_of_the_original_are_read(tmp_path):
     assert read_demos(path, pairing="aligned")[0].pairing == "aligned"
 
 
-def _delete(key):
-    def damage(handle):
-        del handle[key]
-
-    return damage
-
-
-def _replace(key, values):
-    def damage(handle):
-        del handle[key]
-        handle[key] = values
-
-    return damage
-
-
-@pytest.mark.parametrize(("damage", "words"), [
-    (_delete("data"), ("data", "missing")),
-    (_delete("data/demo_1/actions"), ("demo_1/actions", "missing")),
-    (_delete("data/demo_1/obs/agentview_rgb"), ("demo_1/obs/agentview_rgb", "missing", "eye_in_hand_rgb")),
-    (_delete("data/demo_0/obs"), ("demo_0/obs", "missing")),
-    (_replace("data/demo_2/actions", np.zeros((11, 6))), ("demo_2/actions", "(11, 6)", "(11, 7)")),
-    (_replace("data/demo_1/states", np.zeros((10, 30))), ("demo_1/states", "(10, 30)", "(11, any)")),
-    (_replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 16, 16, 3))), ("eye_in_hand_rgb", "float64", "un")),
-    (_replace("data/demo_1/obs/eye_in_hand_rgb", np.zeros((11, 8, 8, 3), np.uint8)), ("demo_1", "(16, 16, 3)")),
-    (_replace("data/demo_1/expert_actions", np.full((11, 7), np.nan)), ("demo_1", "not finite")),
-    (lambda handle: [handle.__delitem__(f"data/demo_{i}") for i in range(3)], ("no demonstrations",)),
-])  # fmt: skip
-def test_broken_files_are_named(path, damage, words):
-    with h5py.File(path, "r+") as handle:
-        damage(handle)
-    with pytest.raises(DemoError) as caught:
-        read_demos(path)
-    assert all(word in str(caught.value) for word in (path.name, *words)), caught.value
-
-
 def test_truncated_and_absent_files_are_named(path):
     whole = path.read_bytes()
     for size in (0, 100, len(whole) // 2, len(whole) - 1):

@@ -61,6 +61,10 @@ def put(key, value, **options):
     return change
 
 
+def without(*keys):
+    return lambda handle: [handle.__delitem__(key) for key in keys]
+
+
 def attribute(key, value, group="data"):
     def change(handle):
         handle[group].attrs[key] = value
@@ -148,6 +152,15 @@ def ragged(handle):
     (put("data/demo_0/actions", h5py.Empty("f8")), ("demo_0/actions", "empty")),
     (put("data/demo_0/obs/agentview_rgb", np.zeros((4, 8, 8, 3), np.uint16)), ("agentview_rgb", "8 bits")),
     (put("data/demo_01", h5py.Empty("f8")), ("demo_01", "demo_1", "same number")),
+    (without("data"), ("data", "missing")),
+    (without("data/demo_1/actions"), ("demo_1/actions", "missing")),
+    (without("data/demo_1/obs/agentview_rgb"), ("demo_1/obs/agentview_rgb", "missing", "eye_in_hand_rgb")),
+    (without("data/demo_0/obs"), ("demo_0/obs", "missing")),
+    (without("data/demo_0", "data/demo_1"), ("no demonstrations",)),
+    (put("data/demo_1/actions", np.zeros((4, 6))), ("demo_1/actions", "(4, 6)", "(4, 7)")),
+    (put("data/demo_1/states", np.zeros((3, 30))), ("demo_1/states", "(3, 30)", "(4, any)")),
+    (put("data/demo_1/obs/eye_in_hand_rgb", np.zeros((4, 8, 8, 3))), ("eye_in_hand_rgb", "float64", "un")),
+    (put("data/demo_1/obs/eye_in_hand_rgb", np.zeros((4, 4, 4, 3), np.uint8)), ("demo_1", "(8, 8, 3)")),
 ])  # fmt: skip
 def test_shapes_types_and_sizes_are_checked_before_memory_is_asked_for(path, change, words):
     damaged(path, change)

@@ -2,14 +2,13 @@
 
 import dataclasses
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import LiberoEnv
-from libero_env.errors import ActionError, LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states.store import generate_init_states, load_init_states
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite
@@ -35,15 +34,6 @@ def same(a, b):
 def test_gymnasium_checks_pass(closing):
     env = closing(LiberoEnv(TASK, **SMALL, render_mode="rgb_array"))
     check_env(env, skip_render_check=True)
-
-
-def test_observations_are_in_their_space(closing):
-    env = closing(LiberoEnv(TASK, **SMALL))
-    observation, info = env.reset(options={"init_state": 0})
-    assert env.observation_space.contains(observation)
-    assert observation["agentview_rgb"].shape == (32, 48, 3)
-    assert not info["success"]
-    assert env.observation_space.contains(env.step(np.zeros(7))[0])
 
 
 def test_the_same_seed_gives_the_same_episode(env):
@@ -86,15 +76,6 @@ def test_states_of_the_original_are_accepted(env, shared):
     np.testing.assert_array_equal(env0.simulations.physics_state(0), state)
     with pytest.raises(LiberoError, match="finite numbers"):
         env0.set_state(state[:-1])
-
-
-def test_the_horizon_truncates(closing):
-    env = closing(LiberoEnv(TASK, cameras=(), horizon=3))
-    env.reset(options={"init_state": 0})
-    outcomes = [env.step(np.zeros(7))[2:4] for _ in range(3)]
-    assert outcomes == [(False, False), (False, False), (False, True)]
-    with pytest.raises(LiberoError, match="reset"):
-        env.step(np.zeros(7))
 
 
 def test_reaching_the_goal_terminates(env):
@@ -157,15 +138,6 @@ def test_a_reset_of_no_simulation_changes_nothing(closing):
     for start in ({}, {"init_state": 0}):
         batch.reset(options={"reset_mask": [False, False], **start})
     np.testing.assert_array_equal((batch.get_state(0), batch.get_state(1)), before)
-
-
-def test_a_batch_is_a_gymnasium_vector_environment(closing):
-    batch = closing(BatchEnv(TASK, 2, **SMALL))
-    assert isinstance(batch, gymnasium.vector.VectorEnv)
-    observation, _ = batch.reset(options={"init_state": 0})
-    assert batch.observation_space.contains(observation)
-    with pytest.raises(ActionError):
-        batch.step(np.zeros((3, 7)))
 
 
 def test_stored_initial_states_are_reproducible():

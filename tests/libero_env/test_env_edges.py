@@ -53,6 +53,9 @@ def test_options_of_numpy_and_whole_floats_are_made_plain():
         EnvConfig(camera_size=size).camera_size == (64, 64) for size in (64, 64.0, np.int64(64), [64, 64])
     )
     assert EnvConfig(cameras=iter(["agentview"])).cameras == ("agentview",)
+    assert EnvConfig(observations=["rgb"]).observations == ("rgb",)
+    with pytest.raises(UnknownNameError, match="strict"):
+        EnvConfig(semantics="stric")
     assert type(EnvConfig(horizon=7.0).horizon) is int
 
 

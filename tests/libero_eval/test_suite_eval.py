@@ -318,7 +318,7 @@ def test_several_workers_of_the_command_line_have_the_result_of_one(module, tmp_
     assert (one.environment["robot"], one.environment["models"]) == ("robosuite-1.4.1", "builtin")
     assert cli.main([*command, "--out", "two", "--unit-starts", "5"]) == 2
     assert "unit_starts is 2 there and 5 here" in capsys.readouterr().err
-    monkeypatch.setattr(memory, "available_memory", lambda: 10**9)
+    monkeypatch.setattr(memory, "host_memory", lambda: (10**9, 10**10))
     assert cli.main([*command, "--out", "three", "--workers", "3"]) == 2
     assert "by 3 processes needs about 1.8 GB" in capsys.readouterr().err and not Path("three").exists()
 

@@ -10,9 +10,8 @@ import warp as wp
 
 from libero_env.sim import osc
 
-wp.set_module_options(
-    {"enable_backward": False, "max_unroll": 1}
-)  # loops stay loops: they compile in a second
+# loops stay loops: they compile in a second
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 vec6 = wp.types.vector(6, wp.float64)
 vec7 = wp.types.vector(7, wp.float64)

@@ -134,9 +134,8 @@ class WarpSimulations(Simulations):
             return
         started = ids
         self._unplaced[ids] = False
-        unplaced = np.flatnonzero(
-            self._unplaced
-        )  # they take the first state: their contacts would fill all memory
+        # the others take the first state: their contacts would fill all memory
+        unplaced = np.flatnonzero(self._unplaced)
         source = np.append(np.arange(len(ids)), np.zeros(len(unplaced), np.int64))
         poses = self.fixtures[ids[source]]
         ids, qpos, qvel = np.append(ids, unplaced), qpos[source], qvel[source]
@@ -236,10 +235,8 @@ class WarpSimulations(Simulations):
         wp.capture_launch(self._graphs[substeps])
 
     def _substep(self) -> None:
-        data, names = (
-            self.device_data,
-            ("qpos", "qvel", "xanchor", "xaxis", "site_xpos", "site_xmat", "M", "qfrc_bias"),
-        )
+        data = self.device_data
+        names = ("qpos", "qvel", "xanchor", "xaxis", "site_xpos", "site_xmat", "M", "qfrc_bias")
         seen = [getattr(data, name) for name in names]
         wp.launch(kernels.osc_substep, self.num, inputs=[self._control, *seen], outputs=[data.ctrl])
         self._physics()

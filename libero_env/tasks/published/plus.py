@@ -202,11 +202,8 @@ def _noise(name: str, number: int) -> Noise | None:
 _PIVOT = np.array([0.0, 0.0, 0.8])  # [m]
 _DECIMALS = 4
 _Y, _Z = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
-_POSE_SEED, _POSES_PER_STEP, _STEP = (
-    42,
-    100,
-    0.1,
-)  # [rad] poses 1 to 100 are one step from rest, 101 to 200 two, ...
+_POSE_SEED, _POSES_PER_STEP = 42, 100
+_STEP = 0.1  # [rad] poses 1 to 100 are one step from rest, 101 to 200 two, ...
 
 
 class CameraPose(NamedTuple):
