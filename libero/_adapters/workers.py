@@ -342,7 +342,7 @@ class SubprocEnvWorker(_HostWorker):
         request = self._worker.requests
         if self._opening is not None:
             self._answer("making the environment", self._opening)
-            self._opening, self._worker.opened, self._since = None, True, time.monotonic()
+            self._opening, self._since = None, time.monotonic()
         result = self._answer(self._request, request)
         if self.share_memory and (observation := observation_of(result)):
             self._unshare(observation)

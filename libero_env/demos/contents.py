@@ -173,10 +173,10 @@ def picture_size(handle: h5py.File, file: Path) -> tuple[int, int] | None:
     for name in demo_names(handle, file)[:1]:
         group = handle["data"][name]
         obs = group.get("obs") if isinstance(group, h5py.Group) else None
-        for key in obs if isinstance(obs, h5py.Group) else ():
-            if key.endswith("_rgb"):
-                check_demo(group, f"{file}: {name}", [key])
-                return int(obs[key].shape[1]), int(obs[key].shape[2])
+        colours = [key for key in obs if key.endswith("_rgb")] if isinstance(obs, h5py.Group) else []
+        if colours and isinstance(obs, h5py.Group):
+            check_demo(group, f"{file}: {name}", colours)
+            return int(obs[colours[0]].shape[1]), int(obs[colours[0]].shape[2])
     return None
 
 

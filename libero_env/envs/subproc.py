@@ -151,7 +151,7 @@ class SubprocEnv(LiberoVectorEnv):
             key: value for key, value in (options or {}).items() if key not in ("reset_mask", "init_state")
         }
         ids = [int(i) for i in request.ids]
-        failed = self._reopen([i for i in ids if not self._workers[i].opened])
+        _, failed = self._collect([i for i in ids if not self._workers[i].opened], self.start_timeout)
         ids = [i for i in ids if i not in failed]
         for i in ids:
             start = {} if request.init_states is None else {"init_state": int(request.init_states[i])}
@@ -203,7 +203,8 @@ class SubprocEnv(LiberoVectorEnv):
         """
         self.require_open()
         indices = [int(i) for i in checked_indices(indices, self.num_envs)]
-        failed = self._reopen([i for i in indices if not self._workers[i].opened])
+        closed = [i for i in indices if not self._workers[i].opened]
+        _, failed = self._collect(closed, self.start_timeout)
         called = [i for i in indices if i not in failed]
         for i in called:
             self._workers[i].send("look", name, args, kwargs)
@@ -249,13 +250,6 @@ class SubprocEnv(LiberoVectorEnv):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(first, self.num_envs)
 
-    def _reopen(self, ids: Sequence[int]) -> dict[int, str]:
-        """Wait for workers that were replaced, and return the reasons of those that failed."""
-        answers, failed = self._collect(ids, self.start_timeout)
-        for i in answers:
-            self._workers[i].opened = True
-        return failed
-
     def _collect(
         self, ids: Sequence[int], timeout: float, keep_running: bool = False
     ) -> tuple[dict[int, Any], dict[int, str]]:
@@ -267,6 +261,8 @@ class SubprocEnv(LiberoVectorEnv):
             for worker in workers.values():  # or their answers would be taken for those to the next command
                 worker.process.kill()
             raise
+        for i in answers:
+            self._workers[i].opened = True
         for i, failure in failures.items():
             self._handle_failure(i, failure, keep_running)
         return answers, {i: failure.reason for i, failure in failures.items()}
@@ -275,7 +271,8 @@ class SubprocEnv(LiberoVectorEnv):
         """Replace a worker whose process is lost; end its episode and clear its observation."""
         worker = self._workers[i]
         if failure.lost or not worker.opened:
-            worker.restart()
+            worker.kill()
+            worker.start()
         if failure.lost or not keep_running:
             self._running[i] = False
             for row in self._rows[i].values():

@@ -174,11 +174,6 @@ class Worker:
                 return done, value
         return None
 
-    def restart(self) -> None:
-        """Replace the process by a new one."""
-        self.kill()
-        self.start()
-
     def kill(self) -> None:
         """End the process at once."""
         self.process.kill()

@@ -140,24 +140,6 @@ def test_a_glowing_site_is_visible_only_while_turned_on(kitchen):
     np.testing.assert_array_equal(again["agentview_rgb"], off["agentview_rgb"])
 
 
-def test_one_simulation_and_many_have_the_same_observations(closing):
-    kwargs = {"camera_size": (24, 32), "observations": EVERYTHING, "reward": "staged"}
-    batch, env = closing(BatchEnv(STOVE, 2, num_threads=2, **kwargs)), closing(LiberoEnv(STOVE, **kwargs))
-    moves = np.random.default_rng(1).uniform(-1, 1, (3, 2, 7))
-    rows = [batch.reset(seed=3)[0]]
-    steps = [batch.step(move) for move in moves]
-    assert batch.observation_space.contains(rows[0])
-    for i in range(2):
-        singles = [env.reset(seed=3 + i)[0]]
-        for t, move in enumerate(moves[:, i]):
-            observation, reward, *_ = env.step(move)
-            singles.append(observation)
-            assert reward == steps[t][1][i]
-        for many, one in zip([*rows, *(step[0] for step in steps)], singles, strict=True):
-            for key in one:
-                np.testing.assert_array_equal(many[key][i], one[key], err_msg=key)
-
-
 @pytest.mark.parametrize("make", [LiberoEnv, lambda *args, **kwargs: BatchEnv(*args, 2, **kwargs)])
 def test_images_are_rendered_only_on_request(make, monkeypatch):
     env = make(TASK, camera_size=(16, 16))
