@@ -3,6 +3,7 @@ from .errors import LifelongError
 from .evaluation.rollout import rollout
 from .evaluation.settings import EvalSettings
 from .policies.base import Policy
+from .report.export import load_runs
 from .report.page import write_report
 from .stats.metrics import lifelong_metrics
 from .training.fit import fit
@@ -19,6 +20,7 @@ __all__ = [
     "PolicySpec",
     "fit",
     "lifelong_metrics",
+    "load_runs",
     "rollout",
     "write_report",
 ]

@@ -17,7 +17,7 @@ OFFERED = {
      "UnknownNameError"), *("ensure_demos", "get_suite", "get_task", "make_task", "read_demos", "read_task"),
      *("register_object", "register_predicate")},
     "lifelong": {*("Algorithm", "Batch", "EvalSettings", "FitSettings", "LifelongError", "Policy", "PolicySpec"),
-     *("fit", "lifelong_metrics", "rollout", "write_report")},
+     *("fit", "lifelong_metrics", "load_runs", "rollout", "write_report")},
     "libero_eval": {*("Comparison", "EvalProtocol", "EvalRequest", "EvaluationResult", "TaskResult"),
      *("compare_groups", "evaluate", "load_protocol")},
 }  # fmt: skip

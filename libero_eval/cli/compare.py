@@ -99,22 +99,32 @@ def power(options: PowerOptions) -> None:
 
 
 def export(
-    result: Positional[str],
+    results: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
     *,
-    format: Annotated[Literal["vla-eval", "lerobot"], arg(name="as")],
+    format: Annotated[Literal["vla-eval", "lerobot", "csv", "latex", "parquet"], arg(name="as")],
     out: FilePath | None = None,
 ) -> None:
-    """Write a result as another tool's result file, and print the files.
+    """Write an evaluation as another tool's result file, or runs as a table, and print the files.
 
     Args:
-        result: A file eval.json or its folder.
-        format: vla-eval: SUITE_aggregate.json for each suite; lerobot: eval_info.json.
-        out: Folder of the files (default: the result's).
+        results: A file eval.json or its folder; for a table runs, folders of runs, or patterns.
+        format: vla-eval: SUITE_aggregate.json for each suite; lerobot: eval_info.json; csv, parquet: a row a run, with
+            metrics, costs and configuration; latex: a row a method, means over seeds with 95 % intervals.
+        out: Folder of the files (default: the evaluation's, or the working directory).
     """
     from libero_eval.evaluation_file import EvaluationResult
     from libero_eval.exports import export_lerobot, export_vla_eval
 
-    content, path = EvaluationResult.read(result), Path(result)
+    if format in ("csv", "latex", "parquet"):
+        from lifelong.report.export import export_runs
+
+        print(
+            export_runs(results, format, (out or Path()) / f"runs.{'tex' if format == 'latex' else format}")
+        )
+        return
+    if len(results) > 1:
+        raise ConfigError(f"--as {format} takes one evaluation, not {len(results)}")
+    content, path = EvaluationResult.read(results[0]), Path(results[0])
     write = {"vla-eval": export_vla_eval, "lerobot": export_lerobot}[format]
     print(*write(content, out or (path if path.is_dir() else path.parent)), sep="\n")
 

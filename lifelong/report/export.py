@@ -1,0 +1,128 @@
+"""Runs as a table for other programs: a pandas DataFrame, CSV, Parquet, and LaTeX for a paper."""
+
+import math
+from collections.abc import Mapping, Sequence
+from glob import glob
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from libero_env.errors import UnknownNameError
+from libero_env.storage import atomic_path
+from libero_env.text import flatten
+from lifelong.errors import LifelongError
+from lifelong.report.comparison import compare, costs_of
+from lifelong.report.runs import Run, group_runs, load_run
+from lifelong.results.summary import summarize
+from lifelong.stats.metrics import METRIC_NAMES
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMATS = ("csv", "latex", "parquet")
+_TITLES = {"final_success": "final", "just_learned": "just learned"}
+
+
+def load_runs(*patterns: str | Path) -> "pd.DataFrame":
+    """Return a table of runs, a row each.
+
+    Columns: `path`, `method` (the label of the reports), `algo`, `benchmark`, `policy`, `preset`, `seed`, `finished`,
+    `tasks`, `tasks_learned`; the metrics `fwt`, `nbt`, `auc`, `final_success`, `just_learned`, each with `_low` and
+    `_high` of its interval, and those of other conventions; `cost.NAME`, the costs of the reports (bytes, seconds,
+    parameters, FLOPs); `config.KEY` for every key of the configuration.
+
+    Args:
+        patterns: Run directories, folders that hold some at any depth, or patterns such as `runs/*/er/*`.
+
+    Raises:
+        LifelongError: A pattern holds no run, or a run cannot be read.
+    """
+    import pandas as pd
+
+    runs = find_runs(patterns)
+    labels = {run.path: group.label for group in group_runs(runs) for run in (*group.runs, *group.repeats)}
+    return pd.DataFrame([_row(run, labels[run.path]) for run in runs])
+
+
+def find_runs(patterns: Sequence[str | Path]) -> list[Run]:
+    """Return the runs that patterns name, in the order of their paths; see `load_runs`."""
+    found: dict[Path, None] = {}
+    for pattern in map(str, patterns):
+        folders = [Path(name) for name in sorted(glob(pattern))] or [Path(pattern)]
+        inside = [log.parent for folder in folders for log in sorted(folder.rglob("results.jsonl"))]
+        if not inside:
+            raise LifelongError(f"{pattern}: no run directory is there (with a file results.jsonl)")
+        found |= dict.fromkeys(inside)
+    return [load_run(path) for path in found]
+
+
+def export_runs(patterns: Sequence[str | Path], form: str, target: Path) -> Path:
+    """Write runs as `csv` or `parquet`, a row each (`load_runs`), or as `latex`, a row a method over its seeds.
+
+    The LaTeX table is of the package booktabs: the mean over seeds and its 95 % interval, in percent.
+
+    Raises:
+        LifelongError: The runs cannot be read or compared, or the file cannot be written.
+    """
+    if form not in FORMATS:
+        raise UnknownNameError("format", form, FORMATS)
+    content = _latex(find_runs(patterns)) if form == "latex" else load_runs(*patterns)
+    try:
+        with atomic_path(target) as part:
+            if isinstance(content, str):
+                part.write_text(content, encoding="utf-8")
+            elif form == "csv":
+                content.to_csv(part, index=False)
+            else:
+                content.to_parquet(part, index=False)
+    except (OSError, ImportError) as error:
+        reason = "pip install 'libero-lifelong[export]'" if isinstance(error, ImportError) else str(error)
+        raise LifelongError(f"{target}: the table cannot be written: {reason}") from error
+    return target
+
+
+def _row(run: Run, label: str) -> dict[str, object]:
+    record = run.record
+    row: dict[str, object] = {
+        "path": str(run.path),
+        "method": label,
+        **{name: getattr(record, name) for name in ("algo", "benchmark", "policy", "preset", "seed")},
+        "finished": run.results.finished,
+        "tasks": len(record.tasks),
+        "tasks_learned": run.learned,
+    }
+    if run.metrics is not None:
+        for name in METRIC_NAMES:
+            estimate = getattr(run.metrics, name)
+            row |= {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
+        row |= summarize(run.results)["metrics_of_other_conventions"]
+    costs = costs_of([run])
+    return (
+        row
+        | {f"cost.{k}": v for k, v in costs.items()}
+        | {f"config.{k}": v for k, v in flatten(run.config).items()}
+    )
+
+
+def _latex(runs: Sequence[Run]) -> str:
+    found = compare(group_runs(runs))
+    lines = [rf"\begin{{tabular}}{{l{'r' * (1 + len(METRIC_NAMES))}}}", r"\toprule"]
+    lines.append(
+        " & ".join(["method", "seeds", *(_TITLES.get(name, name.upper()) for name in METRIC_NAMES)]) + r" \\"
+    )
+    lines.append(r"\midrule")
+    for label, group in found["groups"].items():
+        cells = [_cell(group["metrics"][name]) for name in METRIC_NAMES]
+        lines.append(" & ".join([_escaped(label), str(group["measured"]), *cells]) + r" \\")
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def _cell(metric: Mapping[str, float]) -> str:
+    mean, low, high = (100 * metric[name] for name in ("mean", "low", "high"))
+    if math.isnan(mean):
+        return "--"
+    return f"${mean:.1f}$" + ("" if math.isnan(low) else f" $[{low:.1f}, {high:.1f}]$")
+
+
+def _escaped(text: str) -> str:
+    special = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    return "".join(special.get(c, f"\\{c}" if c in "&%$#_{}" else c) for c in text)

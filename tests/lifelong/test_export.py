@@ -1,0 +1,61 @@
+"""Runs as tables: values are those of results.json and of the reports."""
+
+from pathlib import Path
+
+import pandas
+import pytest
+
+import lifelong
+from libero_env.cli.main import main
+from libero_env.text import json_safe
+from lifelong.errors import LifelongError
+from lifelong.report.export import _escaped
+from lifelong.report.runs import load_run
+from lifelong.results.summary import summarize
+
+RUNS = Path(__file__).parent / "data/saved_runs"
+
+
+def test_a_row_has_what_the_summary_of_the_run_has():
+    table = lifelong.load_runs(RUNS)
+    assert sorted(table.algo) == sorted(path.name for path in RUNS.iterdir())
+    for row in table.to_dict("records"):
+        run = load_run(Path(row["path"]))
+        summary = json_safe(summarize(run.results))
+        assert (row["seed"], row["finished"]) == (summary["run"]["seed"], summary["finished"])
+        for name in ("fwt", "nbt", "auc"):
+            assert row[name] == pytest.approx(summary["metrics"][name]["value"])
+        assert row["config.train.lr"] == run.config["train"]["lr"]
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_files_hold_the_same_table(form, tmp_path, capsys):
+    assert main(["results", "export", f"{RUNS}/e*", "--as", form, "--out", str(tmp_path)]) == 0
+    file = tmp_path / f"runs.{form}"
+    assert capsys.readouterr().out == f"{file}\n"
+    table = pandas.read_csv(file) if form == "csv" else pandas.read_parquet(file)
+    assert list(table.columns) == list(lifelong.load_runs(f"{RUNS}/e*").columns) and sorted(table.algo) == [
+        "er",
+        "ewc",
+    ]
+
+
+def test_latex_has_a_row_for_each_method(tmp_path, capsys):
+    assert main(["results", "export", str(RUNS), "--as", "latex", "--out", str(tmp_path)]) == 0
+    lines = (tmp_path / "runs.tex").read_text().splitlines()
+    (row,) = [line for line in lines if line.startswith("packnet")]
+    assert row.endswith(r"& $0.0$ & $0.0$ & $0.0$ & $0.0$ $[0.0, 49.0]$ & $0.0$ $[0.0, 49.0]$ \\")
+    assert len({line.count(" & ") for line in lines if " & " in line}) == 1
+
+
+def test_text_of_a_label_is_never_markup():
+    assert _escaped(r"50% a_b \x{}") == r"50\% a\_b \textbackslash{}x\{\}"
+
+
+def test_a_pattern_without_runs_is_named(tmp_path, capsys):
+    with pytest.raises(LifelongError, match="nothing/\\*: no run directory"):
+        lifelong.load_runs("nothing/*")
+    assert main(["results", "export", "a", "b", "--as", "lerobot"]) == 2
+    assert "takes one evaluation, not 2" in capsys.readouterr().err
+    assert main(["results", "export", str(RUNS), "--as", "csv", "--out", "/proc/none"]) == 2
+    assert "cannot be written" in capsys.readouterr().err
