@@ -110,7 +110,6 @@ _NAMES: dict[str, Callable[[Any], Any]] = {  # m, rad, N m
     "goal_ori": lambda c: c._state.memory[0].reshape(3, 3),
     "initial_ee_pos": lambda c: _at_rest(c)[0],
     "initial_ee_ori_mat": lambda c: _at_rest(c)[1],
-    "actuator_max": lambda c: c._env.simulations.arm.torque_limit.copy(),
     "actuator_min": lambda c: -c.actuator_max,
     "control_limits": lambda c: (c.input_min, c.input_max),
     "actuator_limits": lambda c: (c.actuator_min, c.actuator_max),
@@ -138,6 +137,7 @@ class Controller(Named, names=_NAMES):
         name: Name of the controller, such as `OSC_POSE`.
         control_dim: Length of an action without the gripper.
         input_min, input_max, output_min, output_max: Ranges of an action, and what they mean, (control_dim,).
+        actuator_max: Largest torques of the joints at the last reset, (7,), N m.
         position_limits, velocity_limits, torque_limits: Bounds of goals, (2, n): m, rad, rad/s or N m; None for none.
     """
 
@@ -146,6 +146,8 @@ class Controller(Named, names=_NAMES):
 
     def __init__(self, env: Domain, config: Mapping[str, Any]):
         self._env, self.name = env, config["type"]
+        self._take_torque_limits()
+        self.actuator_max = env.simulations.arm.torque_limit.copy()
         self.use_delta = bool(config.get("control_delta", True))
         self.control_dim = self._law.action_dim - 1
         for name in ("kp", "damping_ratio"):
@@ -163,6 +165,11 @@ class Controller(Named, names=_NAMES):
         env.simulations.controller_state = ControllerState(1, law)
         self.reset_goal()
 
+    def _take_torque_limits(self) -> None:
+        """Clip torques at what the model allows now; it does so itself where that is less on one side."""
+        simulations = self._env.simulations
+        np.abs(simulations.model.actuator_ctrlrange[:7]).max(axis=1, out=simulations.arm.torque_limit)
+
     def _gains(self, config: Mapping[str, Any]) -> np.ndarray:
         gains = self._law.gains.copy()
         if "kp" in config:
@@ -170,7 +177,7 @@ class Controller(Named, names=_NAMES):
         if "damping_ratio" in config:
             gains[1] = 2 * np.sqrt(gains[0]) * self._numbers(config, "damping_ratio", gains.shape[1])
         if self.name == "JOINT_VELOCITY" and np.ndim(config["kp"]):  # a list is not of the torque range
-            gains[0] /= 2 * self._env.simulations.arm.torque_limit
+            gains[0] /= 2 * self.actuator_max
         return gains
 
     def _numbers(self, config: Mapping[str, Any], key: str, count: int) -> np.ndarray:
@@ -205,6 +212,8 @@ class Controller(Named, names=_NAMES):
 
     def _set_goals(self, ids, actions, qpos, site_pos, site_mat, goal, memory):
         """See `libero_env.sim.controller.Controller`."""
+        if self.name != "JOINT_VELOCITY":  # robosuite's clips at those of the last reset
+            self._take_torque_limits()
         move, limits = actions[0, : self.control_dim], self.position_limits
         absolute = np.clip(move, self._law.low[:-1], self._law.high[:-1])
         wanted = self.scale_action(move) if self.use_delta else absolute
@@ -218,8 +227,7 @@ class Controller(Named, names=_NAMES):
         if self.name == "JOINT_VELOCITY":
             limits = self.velocity_limits
         elif self.name == "JOINT_TORQUE":
-            most = self._env.simulations.arm.torque_limit
-            limits = (-most, most) if self.torque_limits is None else self.torque_limits
+            limits = self.actuator_limits if self.torque_limits is None else self.torque_limits
         elif self.use_delta:
             start = site_pos[0] if self.name.startswith("OSC") else qpos[0, :7]
         goal[0] = start + wanted[: goal.shape[1]]
@@ -245,7 +253,7 @@ class Controller(Named, names=_NAMES):
     def kp(self) -> np.ndarray:
         """Gains on errors, (6,) of poses or (7,) of joints."""
         kp = self._state.controller.gains[0]
-        return kp * 2 * self._env.simulations.arm.torque_limit if self.name == "JOINT_VELOCITY" else kp
+        return kp * 2 * self.actuator_max if self.name == "JOINT_VELOCITY" else kp
 
     @kp.setter
     def kp(self, value: Any) -> None:

@@ -156,6 +156,26 @@ def test_a_hard_reset_undoes_what_was_changed_and_another_keeps_it(make_env, har
     assert DEFAULTS["OSC_POSE"]["output_max"][0] == 0.05
 
 
+@pytest.mark.parametrize("name", DEFAULTS)
+def test_torques_are_clipped_at_the_limits_of_the_model(make_env, name):
+    """As in robosuite: at once, but by the controller of joint velocities at those of the last reset."""
+    config = {"type": name, "output_max": 500.0, "output_min": -500.0}
+    env = make_env(controller=config, **BLIND, hard_reset=False)
+    env.reset()
+    for limit in (0.1, 400.0):
+        env.sim.model.actuator_ctrlrange[0] = -limit, limit
+        assert env.robots[0].torque_limits[1][0] == limit
+        assert env.robots[0].controller.actuator_max[0] == 80.0
+        env.step([1.0] * env.env.action_dim)
+        force = env.sim.data.actuator_force[0]
+        if limit > 80.0 and name == "JOINT_TORQUE":
+            assert 80.0 < force < 100.0  # its goal is clipped at that of the last reset, and gravity balanced
+        else:
+            assert force == (min(limit, 80.0) if name == "JOINT_VELOCITY" else limit)
+    env.reset()
+    assert env.robots[0].controller.actuator_max[0] == 400.0
+
+
 def test_a_hard_reset_returns_from_a_model_of_text_and_observables_are_kept(make_env):
     env = make_env(**BLIND)
     env.reset()
