@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from contextlib import closing, contextmanager
+from typing import Any
 
 import msgpack
 import numpy as np
@@ -16,12 +17,15 @@ from PIL import Image
 from libero_env.errors import MissingPackageError
 from libero_env.tasks import get_suite
 from libero_eval.protocols.adapter import PolicyInput
+from libero_eval.protocols.files import load_protocol
+from libero_eval.requests import EvalRequest
 from libero_eval.servers.actors import RemoteActor, checked_actions
 from libero_eval.servers.groot import ACTION, GROOT, GrootClient
 from libero_eval.servers.openpi import OPENPI, OpenpiClient
+from libero_eval.servers.policy import ServerPolicy
 from libero_eval.servers.transport import Connection, EpisodeStart, Limits, need
 from libero_eval.servers.vla_eval import VLA_EVAL, VlaEvalClient
-from lifelong.errors import CodecError, ConnectionLost, ServerError
+from lifelong.errors import CodecError, ConfigError, ConnectionLost, ProtocolMismatchError, ServerError
 from lifelong.evaluation.rollout import run_episodes
 from tests.harness import policy_servers
 
@@ -344,6 +348,27 @@ def test_a_server_that_changes_its_policy_is_refused():
         pytest.raises(ServerError, match="'version': 1.*at first.*'version': 0"),
     ):
         ask(address)
+
+
+def test_what_openpi_announces_identifies_the_policy_and_is_compared_with_the_protocol():
+    base = load_protocol("openpi")
+    replan = base.action.replan
+
+    def policy(metadata: Any, **changes: Any) -> ServerPolicy:
+        with policy_servers.openpi(lambda seen: {}, metadata) as address:
+            return ServerPolicy(EvalRequest(policy=address, **changes))
+
+    about = {"checkpoint": "pi0_1", "action.replan": replan}
+    found = policy(about)
+    assert found.identity == {"server": found.given, "announced": about}
+    assert found.protocol(base) is base
+    with pytest.raises(ProtocolMismatchError, match=rf"action.replan.*{replan + 1}"):
+        policy({**about, "action.replan": replan + 1}).protocol(base)
+    with pytest.raises(ConfigError, match="does not say which policy it serves.*--name"):
+        policy({"action.replan": replan})
+    assert policy({"action.replan": replan}, name="pi0_1").protocol(base) is base
+    with pytest.raises(ServerError, match="metadata"):
+        policy([1])
 
 
 def deep(count: int) -> bytes:
