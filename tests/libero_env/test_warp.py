@@ -252,6 +252,23 @@ def test_too_many_contacts_are_an_error_of_that_simulation_that_says_what_to_set
     assert env.simulations.limits_reached == {"ITERATIONS": 1}
 
 
+def test_a_start_with_too_many_contacts_is_an_error_of_that_simulation_and_leaves_the_others_theirs():
+    env = BatchEnv(TASK, 2, cameras=(), backend="warp,device=cpu,contacts=4")
+    simulations, model = env.simulations, env.scene.model
+    states = np.tile(env.init_states[0], (2, 1))
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        states[0, 1 + model.jnt_qposadr[joint] + 2] += 0.5  # nothing touches anything
+    env.reset(options={"start": states})
+    assert len(simulations.contact_geoms(0)) == 0
+    np.testing.assert_allclose(simulations.fields["qpos"][0], states[0, 1 : 1 + model.nq], atol=1e-6)
+    info = env.step(np.zeros((2, 7)))[4]
+    assert list(info["errors"]) == [1] and "contacts=8" in info["errors"][1]
+    assert env.running.tolist() == [True, False]
+    env.reset(options={"start": states[[0, 0]]})
+    assert "errors" not in env.step(np.zeros((2, 7)))[4] and env.running.all()
+    env.close()
+
+
 def test_a_simulation_that_diverges_ends_its_episode_with_an_error(pair):
     env = pair[1]
     reset(pair)

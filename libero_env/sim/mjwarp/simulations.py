@@ -87,6 +87,7 @@ class WarpSimulations(Simulations):
         self.limits_reached = Counter[str]()
         self._actions_seen = np.zeros(num)
         self._unplaced = np.ones(num, bool)  # not started yet: all things at one place
+        self._no_start = dict[int, str]()  # why a start was not possible, which the next step tells
 
     def record(self) -> dict[str, str]:
         versions = {name: metadata.version(name) for name in ("mujoco-warp", "warp-lang")}
@@ -132,8 +133,9 @@ class WarpSimulations(Simulations):
         model, data, control = self.device_model, self.device_data, self._control
         if not len(ids):
             return
-        started = ids
+        started, starts, speeds = ids, qpos, qvel
         self._unplaced[ids] = False
+        self._no_start = {i: why for i, why in self._no_start.items() if i not in ids}
         # the others take the first state: their contacts would fill all memory
         unplaced = np.flatnonzero(self._unplaced)
         source = np.append(np.arange(len(ids)), np.zeros(len(unplaced), np.int64))
@@ -161,9 +163,18 @@ class WarpSimulations(Simulations):
             data.overflow.zero_()
             mjw.step1(model, data)
         self._copies.clear()
-        lost = data.nacon.numpy()[0] > data.naconmax  # of which simulation is not known, and no flag is set
-        if failed := {int(i): self._no_room(mjw.OverflowType.NARROWPHASE) for i in started if lost}:
+        if data.nacon.numpy()[0] <= data.naconmax:
+            return
+        # some contacts are lost, of which simulations is not known; those that fill their share do not start
+        shares = np.bincount(data.contact.worldid.numpy(), minlength=self.num)
+        fits = shares[started] < self.backend.contacts
+        full = started if fits.all() else started[~fits]
+        failed = {int(i): self._no_room(mjw.OverflowType.NARROWPHASE) for i in full}
+        if len(full) == len(started):
             raise SimulationError(failed)
+        self._unplaced[full] = True
+        self._start(started[fits], starts[fits], speeds[fits], time)
+        self._no_start |= failed
 
     def _substeps(
         self, ids: np.ndarray, actions: np.ndarray, first: Inputs | None, watch: Watch | None
@@ -279,7 +290,7 @@ class WarpSimulations(Simulations):
 
     def _failures(self, before: Mapping[int, float]) -> dict[int, str]:
         finite = np.isfinite(self.fields["qpos"]).all(axis=1) & np.isfinite(self.fields["qvel"]).all(axis=1)
-        failed = {i: DIVERGED for i in before if not finite[i]} | self._overflows()
+        failed = {i: DIVERGED for i in before if not finite[i]} | self._overflows() | self._no_start
         return {i: reason for i, reason in failed.items() if i in before}
 
     def _warm_start(self, i: int) -> list[np.ndarray]:
