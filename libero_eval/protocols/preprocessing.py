@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from PIL import Image
 
-from libero_env.errors import MissingPackageError
+from lifelong.errors import require_package
 
 Size = tuple[int, int]
 
@@ -79,13 +79,9 @@ def jpeg_round_trip(image: np.ndarray) -> np.ndarray:
     Raises:
         MissingPackageError: simplejpeg is not installed.
     """
-    try:
-        import simplejpeg
-    except ModuleNotFoundError as error:
-        raise MissingPackageError(
-            "the chain jpeg_lanczos3 needs the package simplejpeg, which is not installed",
-            "pip install 'libero-lifelong[servers]'",
-        ) from error
+    require_package("simplejpeg", "servers")
+    import simplejpeg
+
     file = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(image)).save(file, "JPEG", quality=95, subsampling=2)
     return simplejpeg.decode_jpeg(file.getvalue(), fastdct=True, fastupsample=False)
@@ -195,12 +191,9 @@ def torch_bilinear(image: np.ndarray, size: Size) -> np.ndarray:
         image: (H, W, 3) uint8.
         size: Height and width of the result.
     """
-    try:
-        import torch
-    except ModuleNotFoundError as error:
-        raise MissingPackageError(
-            "the chain torch_bilinear needs PyTorch, which is not installed", "pip install torch"
-        ) from error
+    require_package("torch", "train")
+    import torch
+
     tensor = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
     resized = torch.nn.functional.interpolate(
         tensor, size, mode="bilinear", antialias=True, align_corners=False

@@ -44,12 +44,12 @@ class OpenpiClient(WebSocketClient):
         """Return the metadata; names of protocols, such as `action.replan`, are taken as they are."""
         return dict(announced)
 
-    async def greet(self, connection: Connection) -> Mapping[str, Any]:
+    def greet(self, connection: Connection) -> Mapping[str, Any]:
         """Return the metadata that the server sends first."""
-        return await connection.receive_map("metadata")
+        return connection.receive_map("metadata")
 
-    async def infer(self, connection: Connection, given: PolicyInput) -> Mapping[str, Any]:
-        """Return the server's answer to an observation under openpi's names for LIBERO."""
+    def send(self, connection: Connection, given: PolicyInput) -> None:
+        """Send an observation under openpi's names for LIBERO."""
         observation: dict[str, Any] = {
             "observation/image": self.image(given, "agentview"),
             "prompt": given.prompt,
@@ -58,7 +58,11 @@ class OpenpiClient(WebSocketClient):
             observation["observation/state"] = given.state
         if "robot0_eye_in_hand" in given.images:
             observation["observation/wrist_image"] = given.images["robot0_eye_in_hand"]
-        return await self._request(connection, observation)
+        connection.send(observation)
+
+    def receive(self, connection: Connection) -> Mapping[str, Any]:
+        """Return the server's answer to an observation."""
+        return connection.receive_map("actions")
 
     def request(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the server's answer to an observation of the first simulation, as it is.
@@ -67,8 +71,6 @@ class OpenpiClient(WebSocketClient):
             ServerError: The server fails, is too late, or answers something else than a map.
             ConnectionLost: The connection breaks.
         """
-        return self.run(self._request(self._connections[0], observation))
-
-    async def _request(self, connection: Connection, observation: Mapping[str, Any]) -> Mapping[str, Any]:
-        await connection.send(observation)
-        return await connection.receive_map("actions")
+        connection = self._connections[0]
+        connection.send(observation)
+        return self.receive(connection)

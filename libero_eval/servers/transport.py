@@ -3,7 +3,6 @@
 Errors name the server. `libero_eval.servers` has one module for each kind of server.
 """
 
-import asyncio
 import importlib
 import itertools
 import math
@@ -11,44 +10,37 @@ import os
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from socket import SHUT_RDWR
+from typing import Any, ClassVar
 
 import numpy as np
 
-from libero_env.errors import MissingPackageError
 from libero_env.tasks import Task
 from libero_env.text import json_safe, shorten
 from libero_eval.protocols.adapter import PolicyInput
-from lifelong.errors import CodecError, ConnectionLost, ServerError
-
-T = TypeVar("T")
+from lifelong.errors import CodecError, ConnectionLost, ServerError, require_package
 
 API_KEY = "LIBERO_API_KEY"  # environment variable with the key that servers ask for
 MAX_MESSAGE_BYTES = 4 << 20  # of an answer; chunks of actions have some kB
 MAX_PARTS = 10_000  # lists and maps of a message
 MAX_DEPTH = 30  # lists and maps within each other
 MAX_TEXT = 2000  # characters of a server's error that are shown, its last ones
-_END_SECONDS = 10.0  # for the thread of connections to end
+_CLOSE_SECONDS = 1.0  # for a server to take note that a connection is closed
 _FIRST_DELAY, _LONGEST_DELAY = 0.1, 5.0  # between attempts to connect, [s]
-_DISTRIBUTIONS = {"websockets": "websockets", "msgpack": "msgpack", "zmq": "pyzmq"}
 
 
 def need(module: str) -> Any:
-    """Return a module of the extra `servers`, such as `websockets.asyncio.client`.
+    """Return a module of the extra `servers`, such as `websockets.sync.client`.
 
     Raises:
         MissingPackageError: Its package is not installed.
     """
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        package = _DISTRIBUTIONS[module.partition(".")[0]]
-        raise MissingPackageError(
-            f"policy servers need the package {package}, which is not installed",
-            "pip install 'libero-lifelong[servers]'",
-        ) from error
+    require_package(module.partition(".")[0], "servers")
+    return importlib.import_module(module)
 
 
 @dataclass(frozen=True)
@@ -233,34 +225,11 @@ class PolicyClient(ABC):
         return given.images[camera]
 
 
-class LoopThread:
-    """An event loop in a thread of its own, so that a server's pings are answered while simulations step."""
-
-    def __init__(self) -> None:
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, name="policy server", daemon=True)
-        self._thread.start()
-
-    def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """Return what a coroutine returns; an interruption cancels it."""
-        future = asyncio.run_coroutine_threadsafe(work, self._loop)
-        try:
-            return future.result()
-        except BaseException:
-            future.cancel()
-            raise
-
-    def close(self) -> None:
-        """End the thread; what still runs is cancelled."""
-        if not self._loop.is_closed():
-            self.run(_cancel_others())
-            self._loop.call_soon_threadsafe(self._loop.stop)
-            self._thread.join(_END_SECONDS)
-            self._loop.close()
-
-
 class Connection:
-    """An open connection.
+    """An open connection, whose pings are answered while simulations step.
+
+    Args:
+        stack: What closes it.
 
     Attributes:
         address: URL of the server, for error messages.
@@ -269,23 +238,21 @@ class Connection:
         sent: Number of messages that were sent.
     """
 
-    def __init__(self, socket: Any, address: str, codec: Codec, limits: Limits):
-        self._socket = socket
-        self._next: asyncio.Task[Any] | None = None  # the message that is waited for
+    def __init__(self, socket: Any, stack: ExitStack, address: str, codec: Codec, limits: Limits):
+        self._socket, self._stack = socket, stack
         self.address, self.codec, self.limits, self.sent = address, codec, limits, 0
 
-    async def check_quiet(self) -> None:
+    def check_quiet(self) -> None:
         """Check that no message is there that nobody has asked for; it would be taken for an answer to a later request.
 
         Raises:
             ServerError: There is one.
         """
-        self._next = self._next or asyncio.ensure_future(self._socket.recv())
-        await asyncio.sleep(0)
-        if self._next.done() and not self._next.exception():
+        with suppress(TimeoutError, need("websockets").exceptions.ConnectionClosed):
+            self._socket.recv(timeout=0)
             raise ServerError(f"{self.address} sent a message before it was asked; nothing of it is used")
 
-    async def send(self, message: Any) -> None:
+    def send(self, message: Any) -> None:
         """Send a message.
 
         Raises:
@@ -294,11 +261,25 @@ class Connection:
             ConnectionLost: The connection is broken.
         """
         data = self.codec.pack(message)
-        await self.check_quiet()
-        await self._in_time(self._socket.send(data), "took no request", "")
+        self.check_quiet()
+        late = threading.Event()
+
+        def give_up() -> None:
+            late.set()
+            self._socket.socket.shutdown(SHUT_RDWR)
+
+        timer = threading.Timer(self.limits.answer, give_up)
+        timer.daemon = True
+        timer.start()
+        try:
+            self._socket.send(data)
+        except need("websockets").exceptions.ConnectionClosed as error:
+            raise (self._late("took no request") if late.is_set() else self._lost(error)) from error
+        finally:
+            timer.cancel()
         self.sent += 1
 
-    async def receive(self, what: str) -> Any:
+    def receive(self, what: str) -> Any:
         """Return the next message: text as it is, bytes decoded.
 
         Args:
@@ -308,30 +289,28 @@ class Connection:
             ServerError: Nothing comes in time, or bytes that are not a message.
             ConnectionLost: The connection is broken.
         """
-        waiting, self._next = self._next or self._socket.recv(), None
-        data = await self._in_time(waiting, "sent nothing", f" ({what})")
-        if isinstance(data, str):
-            return data
         try:
-            return self.codec.unpack(data)
+            data = self._socket.recv(timeout=self.limits.answer)
+            return data if isinstance(data, str) else self.codec.unpack(data)
+        except TimeoutError as error:
+            raise self._late("sent nothing", f" ({what})") from error
+        except need("websockets").exceptions.ConnectionClosed as error:
+            raise self._lost(error) from error
         except CodecError as error:
             raise ServerError(f"{self.address} sent {error} ({what})") from error
 
-    async def _in_time(self, work: Awaitable[T], failed: str, what: str) -> T:
-        try:
-            return await asyncio.wait_for(work, self.limits.answer)
-        except TimeoutError as error:
-            raise ServerError(
-                f"{self.address} {failed} within {self.limits.answer:g} s{what}; --timeout sets the limit"
-            ) from error
-        except need("websockets").exceptions.ConnectionClosed as error:
-            closing = error.rcvd or error.sent
-            why = f"closed with {closing.code} {closing.reason}".strip() if closing else "broken off"
-            raise ConnectionLost(f"the connection to {self.address} was {why}") from error
+    def _late(self, failed: str, what: str = "") -> ServerError:
+        seconds = f"{self.limits.answer:g} s{what}"
+        return ServerError(f"{self.address} {failed} within {seconds}; --timeout sets the limit")
 
-    async def receive_map(self, what: str) -> Mapping[str, Any]:
+    def _lost(self, error: Any) -> ConnectionLost:
+        closing = error.rcvd or error.sent
+        why = f"closed with {closing.code} {closing.reason}".strip() if closing else "broken off"
+        return ConnectionLost(f"the connection to {self.address} was {why}")
+
+    def receive_map(self, what: str) -> Mapping[str, Any]:
         """Return the next message, which must be a map; text is a traceback. See `receive`."""
-        return self.as_map(await self.receive(what), what)
+        return self.as_map(self.receive(what), what)
 
     def as_map(self, message: Any, what: str) -> Mapping[str, Any]:
         """Return a message that must be a map.
@@ -345,15 +324,12 @@ class Connection:
             raise ServerError(f"{self.address} sent a {type(message).__name__} as {what}; expected a map")
         return message
 
-    async def close(self) -> None:
+    def close(self) -> None:
         """Close the connection; one that is broken is closed already."""
-        if self._next is not None:
-            self._next.cancel()
-            await asyncio.gather(self._next, return_exceptions=True)
-        await self._socket.close()
+        self._stack.close()
 
 
-async def connect(address: str, codec: Codec, limits: Limits) -> Connection:
+def connect(address: str, codec: Codec, limits: Limits) -> Connection:
     """Open a connection; a server that is not there yet is waited for, with growing pauses between attempts.
 
     The environment variable `LIBERO_API_KEY` is sent as openpi's client does: `Authorization: Api-Key KEY`.
@@ -361,7 +337,7 @@ async def connect(address: str, codec: Codec, limits: Limits) -> Connection:
     Raises:
         ServerError: The server refuses, or is not there in time.
     """
-    client, exceptions = need("websockets.asyncio.client"), need("websockets.exceptions")
+    client, exceptions = need("websockets.sync.client"), need("websockets.exceptions")
     key = os.environ.get(API_KEY)
     options = {
         "additional_headers": {"Authorization": f"Api-Key {key}"} if key else None,
@@ -369,12 +345,14 @@ async def connect(address: str, codec: Codec, limits: Limits) -> Connection:
         "max_size": MAX_MESSAGE_BYTES,
         "ping_interval": None,  # a server that computes may not answer pings; the time limits decide
         "open_timeout": limits.connect,
+        "close_timeout": _CLOSE_SECONDS,
     }
-    clock, delay = asyncio.get_running_loop().time, _FIRST_DELAY
-    deadline = clock() + limits.connect
+    deadline, delay = time.monotonic() + limits.connect, _FIRST_DELAY
     while True:
         try:
-            return Connection(await client.connect(address, **options), address, codec, limits)
+            with ExitStack() as stack:
+                socket = stack.enter_context(client.connect(address, **options))
+                return Connection(socket, stack.pop_all(), address, codec, limits)
         except exceptions.InvalidStatus as error:
             if error.response.status_code < 500:
                 raise ServerError(
@@ -385,19 +363,12 @@ async def connect(address: str, codec: Codec, limits: Limits) -> Connection:
             raise ServerError(f"{address} is not an address; write ws://host:port") from error
         except (OSError, TimeoutError, exceptions.InvalidHandshake) as error:
             last = error
-        if clock() + delay > deadline:
+        if time.monotonic() + delay > deadline:
             raise ServerError(
                 f"no policy server at {address} within {limits.connect:g} s ({type(last).__name__}: {last})"
             ) from last
-        await asyncio.sleep(delay)
+        time.sleep(delay)
         delay = min(2 * delay, _LONGEST_DELAY)
-
-
-async def _cancel_others() -> None:
-    others = asyncio.all_tasks() - {asyncio.current_task()}
-    for task in others:
-        task.cancel()
-    await asyncio.gather(*others, return_exceptions=True)
 
 
 class WebSocketClient(PolicyClient):
@@ -415,27 +386,27 @@ class WebSocketClient(PolicyClient):
         for package in ("websockets", "msgpack"):  # before anything is connected
             need(package)
         self.address, self.limits = address, limits
-        self._loop: LoopThread | None = LoopThread()
         self._connections: list[Connection] = []
-        self._started: list[float] = []
-        try:
-            self.announced = json_safe(self._loop.run(self._first()))
-        except BaseException:
-            self.close()
-            raise
+        self._started = 0.0
+        with closing(connect(address, self.codec, limits)) as connection:
+            self.announced = json_safe(self.greet(connection))
 
     @abstractmethod
-    async def greet(self, connection: Connection) -> Mapping[str, Any]:
+    def greet(self, connection: Connection) -> Mapping[str, Any]:
         """Return what the server says about itself."""
 
-    async def begin(self, connection: Connection, episode: EpisodeStart) -> None:
+    def begin(self, connection: Connection, episode: EpisodeStart) -> None:
         """Tell the server that an episode begins."""
 
     @abstractmethod
-    async def infer(self, connection: Connection, given: PolicyInput) -> Mapping[str, Any]:
-        """Return the server's answer, a map with `actions`."""
+    def send(self, connection: Connection, given: PolicyInput) -> None:
+        """Send an observation."""
 
-    async def end(self, connection: Connection, outcome: Mapping[str, Any]) -> None:
+    @abstractmethod
+    def receive(self, connection: Connection) -> Mapping[str, Any]:
+        """Return the server's answer to an observation, a map with `actions`."""
+
+    def end(self, connection: Connection, outcome: Mapping[str, Any]) -> None:
         """Tell the server that an episode is over."""
 
     def open(self, episodes: Sequence[EpisodeStart]) -> None:
@@ -444,70 +415,46 @@ class WebSocketClient(PolicyClient):
         Raises:
             ServerError: The server is not there, or announces something else than at first.
         """
-        self._loop = self._loop or LoopThread()
-        self._loop.run(self._close_connections())
-        self._started = [time.monotonic()] * len(episodes)
-        self._loop.run(self._open(episodes))
+        self.close()
+        self._started = time.monotonic()
+        for episode in episodes:
+            connection = connect(self.address, self.codec, self.limits)
+            self._connections.append(connection)  # what is open is closed, also after an error
+            self.check_same(json_safe(self.greet(connection)), self.announced)
+            self.begin(connection, episode)
 
     def ask(self, inputs: Mapping[int, PolicyInput]) -> dict[int, Any]:
         """Return the predicted actions, unchecked; see `PolicyClient`."""
-        return self.run(self._ask(inputs))
+        actions: dict[int, Any] = {}
+        waiting: deque[int] = deque()
+        for i, given in inputs.items():
+            if len(waiting) == self.limits.in_flight:
+                self._take(waiting, actions)
+            self.send(self._connections[i], given)
+            waiting.append(i)
+        while waiting:
+            self._take(waiting, actions)
+        return actions
+
+    def _take(self, waiting: deque[int], actions: dict[int, Any]) -> None:
+        """Add the answer of the simulation that waits longest."""
+        answer = self.receive(self._connections[waiting[0]])
+        if "actions" not in answer:
+            raise ServerError(
+                f"{self.address} answered a map with {shorten(str(sorted(map(str, answer)) or 'nothing'))} "
+                f"and without `actions`, in {self.codec.name}'s protocol"
+            )
+        actions[waiting.popleft()] = answer["actions"]
 
     def finish(self, simulation: int, success: bool) -> None:
         """Tell the server that an episode is over, and close its connection; see `PolicyClient`."""
-        seconds = time.monotonic() - self._started[simulation]
-        outcome = {"metrics": {"success": success}, "elapsed_sec": round(seconds, 3)}
+        seconds = time.monotonic() - self._started
         connection = self._connections[simulation]
-        self.run(self.end(connection, outcome))
-        self.run(connection.check_quiet())
-        self.run(connection.close())
+        self.end(connection, {"metrics": {"success": success}, "elapsed_sec": round(seconds, 3)})
+        connection.check_quiet()
+        connection.close()
 
     def close(self) -> None:
-        """Close all connections and end the thread."""
-        if self._loop is not None:
-            self._loop.run(self._close_connections())
-            self._loop.close()
-            self._loop = None
-
-    def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """Return what a coroutine returns in the thread of the connections."""
-        assert self._loop is not None, "open was called"
-        return self._loop.run(work)
-
-    async def _first(self) -> Mapping[str, Any]:
-        connection = await connect(self.address, self.codec, self.limits)
-        try:
-            return await self.greet(connection)
-        finally:
-            await connection.close()
-
-    async def _open(self, episodes: Sequence[EpisodeStart]) -> None:
-        for episode in episodes:
-            connection = await connect(self.address, self.codec, self.limits)
-            self._connections.append(connection)  # what is open is closed, also after an error
-            self.check_same(json_safe(await self.greet(connection)), self.announced)
-            await self.begin(connection, episode)
-
-    async def _ask(self, inputs: Mapping[int, PolicyInput]) -> dict[int, Any]:
-        slots = asyncio.Semaphore(self.limits.in_flight or len(inputs) or 1)
-
-        async def one(simulation: int, given: PolicyInput) -> Any:
-            async with slots:
-                answer = await self.infer(self._connections[simulation], given)
-            if "actions" not in answer:
-                raise ServerError(
-                    f"{self.address} answered a map with {shorten(str(sorted(map(str, answer)) or 'nothing'))} "
-                    f"and without `actions`, in {self.codec.name}'s protocol"
-                )
-            return answer["actions"]
-
-        try:
-            async with asyncio.TaskGroup() as group:
-                tasks = {i: group.create_task(one(i, given)) for i, given in inputs.items()}
-        except BaseExceptionGroup as group_error:  # the other tasks are cancelled
-            raise group_error.exceptions[0] from None
-        return {i: task.result() for i, task in tasks.items()}
-
-    async def _close_connections(self) -> None:
-        connections, self._connections = self._connections, []
-        await asyncio.gather(*(c.close() for c in connections), return_exceptions=True)
+        """Close all connections."""
+        while self._connections:
+            self._connections.pop().close()

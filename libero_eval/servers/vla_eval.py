@@ -128,14 +128,14 @@ class VlaEvalClient(WebSocketClient):
             values["proprioception.rotation"] = rotation
         return values
 
-    async def greet(self, connection: Connection) -> Mapping[str, Any]:
+    def greet(self, connection: Connection) -> Mapping[str, Any]:
         """Exchange hellos and return the server's."""
         hello = {"harness_version": VERSION, "protocol_version": 1, "benchmark": "libero"}
-        await self._send(connection, "hello", hello)
-        said = plain(await self._receive(connection, "hello"))
+        self._send(connection, "hello", hello)
+        said = plain(self._receive(connection, "hello"))
         return validate(_Hello, said, source=f"{connection.address}'s hello", error=ServerError)
 
-    async def begin(self, connection: Connection, episode: EpisodeStart) -> None:
+    def begin(self, connection: Connection, episode: EpisodeStart) -> None:
         """Send the start of an episode with the task, as the harness does; the server does not answer."""
         task = episode.task
         about = {
@@ -144,10 +144,10 @@ class VlaEvalClient(WebSocketClient):
             "task_id": task.index,
             "episode_idx": episode.init_state,
         }
-        await self._send(connection, "episode_start", {"task": about})
+        self._send(connection, "episode_start", {"task": about})
 
-    async def infer(self, connection: Connection, given: PolicyInput) -> Mapping[str, Any]:
-        """Return the server's answer to an observation with what its hello asks for."""
+    def send(self, connection: Connection, given: PolicyInput) -> None:
+        """Send an observation with what the server's hello asks for."""
         wanted = self.announced.get("observation_params") or {}
         images = {"agentview": self.image(given, "agentview")}
         if wanted.get("send_wrist_image"):
@@ -155,25 +155,28 @@ class VlaEvalClient(WebSocketClient):
         observation: dict[str, Any] = {"images": images, "task_description": given.prompt}
         if wanted.get("send_state") and given.state.size:
             observation |= {"states": given.state, **given.extra}
-        await self._send(connection, "observation", observation)
-        answer = await self._receive(connection, "action")
+        self._send(connection, "observation", observation)
+
+    def receive(self, connection: Connection) -> Mapping[str, Any]:
+        """Return the server's answer to an observation."""
+        answer = self._receive(connection, "action")
         return {"actions": answer["action"]} if "action" in answer and "actions" not in answer else answer
 
-    async def end(self, connection: Connection, outcome: Mapping[str, Any]) -> None:
+    def end(self, connection: Connection, outcome: Mapping[str, Any]) -> None:
         """Send the outcome of the episode."""
-        await self._send(connection, "episode_end", dict(outcome))
+        self._send(connection, "episode_end", dict(outcome))
 
-    async def _send(self, connection: Connection, kind: str, payload: dict[str, Any]) -> None:
+    def _send(self, connection: Connection, kind: str, payload: dict[str, Any]) -> None:
         message = {"type": kind, "payload": payload, "seq": connection.sent + 1, "timestamp": time.time()}
-        await connection.send(message)
+        connection.send(message)
 
-    async def _receive(self, connection: Connection, kind: str) -> Mapping[str, Any]:
+    def _receive(self, connection: Connection, kind: str) -> Mapping[str, Any]:
         """Return the payload of the answer to the last message.
 
         Raises:
             ServerError: The server failed, or sent something else.
         """
-        message = await connection.receive_map(kind)
+        message = connection.receive_map(kind)
         lacking = [key for key in ("type", "payload", "seq") if key not in message]
         if lacking:
             raise ServerError(f"{connection.address} sent a message without {', '.join(lacking)}")
