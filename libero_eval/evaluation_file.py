@@ -16,16 +16,18 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from libero_env.sim.backend import MUJOCO
 from libero_env.storage import read_json, write_json
 from libero_env.text import json_safe
 from libero_env.validation import validate
-from lifelong.errors import EvaluationFileError, ResultsError
+from lifelong.errors import EvaluationFileError, writing
 from lifelong.results.records import Count, Episodes
 from lifelong.results.subgoals import predicate_of
 from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
+UNMEASURED = ("actions", "limits_reached")  # columns that are not part of `outcomes`
 
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
 _Id = Annotated[
@@ -158,9 +160,15 @@ class EvaluationResult:
         return {name: overall([task for task in self.tasks if task.suite == name]) for name in names}
 
     @property
+    def backend(self) -> str:
+        """Backend that simulated it; results that name none are of `mujoco`."""
+        world = self.protocol.get("world")
+        return str(world.get("backend", MUJOCO)) if isinstance(world, Mapping) else MUJOCO
+
+    @property
     def outcomes(self) -> str:
         """Digest of everything that was measured, without actions, times, versions and the environment."""
-        rows = [_measured(r) for r in self.tasks]
+        rows = [{k: v for k, v in asdict(r).items() if k not in UNMEASURED} for r in self.tasks]
         return _digest(sorted(rows, key=lambda row: row["task"]))
 
     @property
@@ -207,10 +215,8 @@ class EvaluationResult:
             ResultsError: The file cannot be written.
         """
         path = Path(path)
-        try:
+        with writing(path, "the result"):
             write_json(path, self.to_plain(), fsync=True)
-        except OSError as error:
-            raise ResultsError(f"{path}: the result cannot be written ({error})") from error
         return path
 
     def to_plain(self) -> dict[str, Any]:
@@ -255,11 +261,6 @@ def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
                 float(np.mean([row[i] for row in result.atoms_ever]))
             )
     return {name: float(np.mean(values)) for name, values in rates.items()}
-
-
-def _measured(result: TaskResult) -> dict[str, Any]:
-    """Return what was measured, as plain data."""
-    return {k: v for k, v in asdict(result).items() if k not in ("actions", "limits_reached")}
 
 
 def _digest(rows: Any) -> str:

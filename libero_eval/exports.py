@@ -8,7 +8,7 @@ import numpy as np
 
 from libero_env.storage import write_json
 from libero_eval.evaluation_file import EvaluationResult, TaskResult
-from lifelong.errors import ResultsError
+from lifelong.errors import writing
 
 
 def export_vla_eval(result: EvaluationResult, folder: Path) -> list[Path]:
@@ -120,8 +120,6 @@ def _by_suite(result: EvaluationResult) -> dict[str, list[TaskResult]]:
 
 
 def _write(path: Path, values: Mapping[str, Any]) -> Path:
-    try:
+    with writing(path, "the result"):
         write_json(path, values)
-    except OSError as error:
-        raise ResultsError(f"{path}: the result cannot be written ({error})") from error
     return path

@@ -16,7 +16,7 @@ from libero_env.cli import ending
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.memory import require_memory
 from libero_env.perturbations import format_perturbations, parse_perturbations
-from libero_env.sim.backend import MUJOCO, Backend
+from libero_env.sim.backend import Backend
 from libero_env.tasks import Task
 from libero_env.tasks.published import require_available
 from libero_env.validation import validate
@@ -85,33 +85,32 @@ def run(
         print(f"note: {store.path}: finished {when}, nothing was run; --again repeats it", file=sys.stderr)
     try:
         with policy_threads(evaluation), Workers(count - 1, _help, replace(request, again=False)) as workers:
-            return Worker(
-                evaluation, on_result=on_task, on_progress=on_progress, on_wait=workers.supervise
-            ).run()
+            worker = Worker(evaluation, on_result=on_task, on_progress=on_progress, on_wait=workers.supervise)
+            result = worker.run()
     except KeyboardInterrupt as error:
         error.add_note(f"{evaluation.out} keeps what is done; the same command goes on")
         raise
+    assert result is not None, "others were waited for"
+    return result
 
 
-def _help(request: EvalRequest) -> None:
-    """Work on the evaluation of another process, which prints it; errors go to the standard error."""
-
-    def work() -> None:
-        with redirect_stderr(io.StringIO()):  # the other process says the same
-            evaluation = plan_evaluation(request)
-        with policy_threads(evaluation):
-            Worker(evaluation).run()
-
-    work_quietly(work)
-
-
-def work_quietly(work: Callable[[], None]) -> None:
-    """Call a function in a further process; an error ends the process with one line."""
+@contextmanager
+def further_process() -> Iterator[None]:
+    """Let an error of the block, all that a further process does, end the process with one line."""
     with suppress(KeyboardInterrupt), ending.interruptible():
         try:
-            work()
+            yield
         except Exception as error:  # noqa: BLE001 - told by kind
             sys.exit(ending.report(error, who="a worker ended: "))
+
+
+@further_process()
+def _help(request: EvalRequest) -> None:
+    """Work on the evaluation of another process, which prints it; errors go to the standard error."""
+    with redirect_stderr(io.StringIO()):  # the other process says the same
+        evaluation = plan_evaluation(request)
+    with policy_threads(evaluation):
+        Worker(evaluation).run()
 
 
 @contextmanager
@@ -325,7 +324,13 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
     if policy is None:
         raise ResultsError(f"{path} does not say which policy it is of: {dict(result.evaluated)}")
     _check_allowed(policy, request)
-    _check_backend(request, result)
+    if request.backend is not None and (asked := Backend.read(request.backend).name) != result.backend:
+        raise ConfigError(
+            f"--backend {asked}: the result is of backend={result.backend}, which it is repeated with"
+        )
+    threads = result.environment.get("policy_threads") if result.evaluated.get("run") else None
+    if not (isinstance(threads, int) and 1 <= threads <= 1024):
+        threads = None
     return replace(
         request,
         policy=policy,
@@ -335,20 +340,13 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
         seed=evaluated.get("seed", 0),
         suite=tuple(task.task for task in result.tasks),
         unit_starts=result.unit_starts or len(result.init_states),
-        policy_threads=request.policy_threads or _threads(result),
+        policy_threads=request.policy_threads or threads,
         horizon=None,
         robot=None,
         perturb=None,
         size=None,
         out=request.out or (path if path.is_dir() else path.parent) / "again",
     )
-
-
-def _check_backend(request: EvalRequest, result: EvaluationResult) -> None:
-    world = result.protocol.get("world")
-    backend = str(world.get("backend", MUJOCO)) if isinstance(world, dict) else MUJOCO
-    if request.backend is not None and (asked := Backend.read(request.backend).name) != backend:
-        raise ConfigError(f"--backend {asked}: the result is of backend={backend}, which it is repeated with")
 
 
 def _check_allowed(policy: str, request: EvalRequest) -> None:
@@ -402,8 +400,3 @@ def check_same(
         raise ConfigError(
             f"the result cannot be repeated as it was; {'; '.join(wrong)}. To run it all the same: --despite {names}"
         )
-
-
-def _threads(result: EvaluationResult) -> int | None:
-    threads = result.environment.get("policy_threads") if result.evaluated.get("run") else None
-    return threads if isinstance(threads, int) and 1 <= threads <= 1024 else None

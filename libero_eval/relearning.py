@@ -16,19 +16,17 @@ from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import torch
-from pydantic import Field
 
 from libero_env.errors import SimulationError
-from libero_env.init_states.store import NUM_INIT_STATES
-from libero_env.validation import validate_arguments
+from libero_eval.requests import RelearnRequest
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.demonstrations import DemoDatasets, find_demos, perturb_demos
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows, WindowDataset
-from lifelong.errors import ConfigError, LifelongError
+from lifelong.errors import LifelongError
 from lifelong.evaluation.environments import VectorEnv
 from lifelong.evaluation.restore import LoadedRun, read_config, restore
 from lifelong.evaluation.rollout import rollout
@@ -43,40 +41,11 @@ from lifelong.training.fit import EpochEnd, fit
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import BatchAugmentation
 from lifelong.tuning.proxy import CHUNK, MEASURED
-from lifelong.types import Batch, Count, NonNegative
+from lifelong.types import Batch
 
 Start = Literal["final", "initial"]
 Measure = Callable[[Policy], float]  # 0 is perfect
 STARTS: tuple[Start, ...] = ("final", "initial")
-
-
-@dataclass(frozen=True)
-class RelearnSettings:
-    """Settings of the measurement.
-
-    Attributes:
-        steps: Number of optimiser steps after which a task is given up.
-        every: Number of optimiser steps between two measurements.
-        tolerance: By how much less than just after learning suffices: the share by which the error may be larger, or
-            the difference by which the success rate may be lower.
-        held_out: Number of demonstrations to measure the error on, those after the ones that the run learned from.
-        episodes: Number of rollouts from which the success rate is measured instead of the error, from the first
-            initial states. 0: the error is measured.
-    """
-
-    steps: Count = 400
-    every: Count = 20
-    tolerance: NonNegative = 0.05
-    held_out: Annotated[int, Field(ge=1, le=1000)] = 5
-    episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
-
-    def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("relearn",), error=ConfigError)
-
-    @property
-    def demos_held_out(self) -> int:
-        """Number of demonstrations to measure on; none where rollouts are measured."""
-        return 0 if self.episodes else self.held_out
 
 
 @dataclass(frozen=True)
@@ -122,27 +91,15 @@ def failure_share(policy: Policy, run: LoadedRun, task: int, env: VectorEnv, epi
     return 1 - done.rate
 
 
-def relearn(
-    source: Path,
-    initial: Policy,
-    *,
-    tasks: Sequence[int] | None = None,
-    settings: RelearnSettings = RelearnSettings(),  # noqa: B008 - frozen
-    device: str = "auto",
-    allow: Sequence[str] = (),
-) -> Path:
+def relearn(request: RelearnRequest, initial: Policy) -> Path:
     """Measure the steps until tasks of a finished run are back, and record them in its directory.
 
     What is recorded already under the same settings is not measured again, so a killed call goes on where it was. The
     run itself is not changed.
 
     Args:
-        source: Directory of the run.
+        request: Run, tasks, and how it is measured.
         initial: Policy with the weights that the run began with; it is not changed.
-        tasks: Positions of the tasks. None: all but those that the run learned last.
-        settings: Settings of the measurement.
-        device: Device of the policies: `auto`, `cpu`, `cuda`, `cuda:<number>`.
-        allow: Packages whose classes the configuration may name, too.
 
     Returns:
         The file with the records.
@@ -150,15 +107,16 @@ def relearn(
     Raises:
         LifelongError: The run is not finished, a position is not one of its tasks, or demonstrations are missing.
     """
-    run = restore(source, device=device, allow=allow)
+    device, allow = request.device, request.allow
+    run = restore(request.run, device=device, allow=allow)
     if run.learned != len(run.tasks) - 1:
         raise LifelongError(
-            f"{source} is not finished: {run.learned + 1} of {len(run.tasks)} tasks are learned"
+            f"{request.run} is not finished: {run.learned + 1} of {len(run.tasks)} tasks are learned"
         )
     config = read_config(run.path / "config.yaml", allow)
     rate, log = config.build("train").lr, ResultLog(run.path / FILE_NAME)
-    for task in _chosen(run, tasks):
-        starts = [start for start in STARTS if not _recorded(log, task, start, settings, rate)]
+    for task in _chosen(run, request.tasks):
+        starts = [start for start in STARTS if not _recorded(log, task, start, request, rate)]
         if not starts:
             continue
         before = restore(
@@ -167,15 +125,15 @@ def relearn(
             device=device,
             allow=allow,
         )
-        training, held_out = _windows(run, task, settings, config)
-        with _opened(run, task, held_out, settings.episodes) as measure:
+        training, held_out = _windows(run, task, request, config)
+        with _opened(run, task, held_out, request.episodes) as measure:
             with before.acting(run.tasks[task]) as then:
                 learned = measure(then)
-            trial = Trial(task, training, measure, back_limit(learned, settings.tolerance, settings.episodes))
+            trial = Trial(task, training, measure, back_limit(learned, request.tolerance, request.episodes))
             for start in starts:
                 acting = run.acting(run.tasks[task]) if start == "final" else nullcontext(initial)
                 with acting as policy:
-                    log.append(_relearned(run, policy, start, trial, learned, settings, config))
+                    log.append(_relearned(run, policy, start, trial, learned, request, config))
     return log.path
 
 
@@ -185,7 +143,7 @@ def _relearned(
     start: Start,
     trial: Trial,
     learned: float,
-    settings: RelearnSettings,
+    request: RelearnRequest,
     config: Configuration,
 ) -> RelearnRecord:
     """Fine-tune a copy of a policy until a task is back; return the record."""
@@ -194,7 +152,7 @@ def _relearned(
     steps, errors = steps_until(
         copy.deepcopy(policy).to(run.device),
         trial,
-        settings=settings,
+        request=request,
         fit_settings=fit_settings,
         seed=(run.seed, RELEARN, trial.task),
         augment=config.build("augmentation") if "augmentation" in config.values else None,
@@ -203,9 +161,9 @@ def _relearned(
         task=trial.task,
         start=start,
         learned_error=learned,
-        tolerance=settings.tolerance,
-        held_out=settings.demos_held_out,
-        episodes=settings.episodes,
+        tolerance=request.tolerance,
+        held_out=request.demos_held_out,
+        episodes=request.episodes,
         rate=fit_settings.lr,
         steps=tuple(steps),
         errors=tuple(errors),
@@ -217,7 +175,7 @@ def steps_until(
     policy: Policy,
     trial: Trial,
     *,
-    settings: RelearnSettings,
+    request: RelearnRequest,
     fit_settings: FitSettings,
     seed: Sequence[int],
     augment: BatchAugmentation | None = None,
@@ -227,7 +185,7 @@ def steps_until(
     Args:
         policy: Policy to be trained, all weights of it.
         trial: The task.
-        settings: Settings of the measurement.
+        request: How it is measured.
         fit_settings: Batch size and optimiser; the rate stays what it is after the warm-up.
         seed: Integers that all draws derive from.
         augment: Augmentation of training batches.
@@ -239,14 +197,14 @@ def steps_until(
     errors: list[float] = []
 
     def measure(end: EpochEnd) -> None:
-        steps.append(end.epoch * settings.every)
+        steps.append(end.epoch * request.every)
         errors.append(trial.measure(policy))
         if errors[-1] <= trial.limit:
             raise _Back
 
-    epochs = -(-settings.steps // settings.every)
+    epochs = -(-request.steps // request.every)
     constant = replace(
-        fit_settings, epochs=epochs, steps_per_epoch=settings.every, lr_min=fit_settings.lr, compile="off"
+        fit_settings, epochs=epochs, steps_per_epoch=request.every, lr_min=fit_settings.lr, compile="off"
     )
     with suppress(_Back):
         fit(
@@ -280,35 +238,35 @@ class _Back(Exception):  # noqa: N818 - ends training that has done what it is f
     """The task is back."""
 
 
-def _chosen(run: LoadedRun, tasks: Sequence[int] | None) -> list[int]:
+def _chosen(run: LoadedRun, tasks: Sequence[int]) -> list[int]:
     """Return the positions of the tasks to measure, ascending."""
     last = run.stages[-1][0]
-    if tasks is None:
+    if not tasks:
         return list(range(last))
     if odd := [task for task in tasks if task not in range(len(run.tasks))]:
         raise LifelongError(f"{run.path} has tasks 0 to {len(run.tasks) - 1}; there is no task {odd[0]}")
     return sorted(set(tasks))
 
 
-def _recorded(log: ResultLog, task: int, start: str, settings: RelearnSettings, rate: float) -> bool:
+def _recorded(log: ResultLog, task: int, start: str, request: RelearnRequest, rate: float) -> bool:
     """Return whether a measurement is recorded that these settings would repeat."""
-    wanted = task, start, settings.tolerance, settings.demos_held_out, settings.episodes, rate
+    wanted = task, start, request.tolerance, request.demos_held_out, request.episodes, rate
     return any(
         (r.task, r.start, r.tolerance, r.held_out, r.episodes, r.rate) == wanted
-        and r.steps == tuple(range(0, r.steps[-1] + 1, settings.every))
-        and (r.needed is not None or r.steps[-1] >= settings.steps)
+        and r.steps == tuple(range(0, r.steps[-1] + 1, request.every))
+        and (r.needed is not None or r.steps[-1] >= request.steps)
         for r in log.read().of(RelearnRecord)
     )
 
 
 def _windows(
-    run: LoadedRun, task: int, settings: RelearnSettings, config: Configuration
+    run: LoadedRun, task: int, request: RelearnRequest, config: Configuration
 ) -> tuple[TaskWindows, Batch | None]:
     """Read the windows that the run learned from, and those to measure the error on, unless rollouts are measured."""
     data: DataSettings = config.build("data")
     stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
     learned_from = stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])[task]
-    tasks, counts = [run.tasks[task]], [learned_from + settings.demos_held_out]
+    tasks, counts = [run.tasks[task]], [learned_from + request.demos_held_out]
     recorded = find_demos(tasks, counts, data, None)
     (path,) = perturb_demos(recorded, tasks, counts, [run.perturbations(task)], data, None)
     languages, read = run.embed(run.learned_task(task))[None], replace(data, memory="host")
@@ -317,7 +275,7 @@ def _windows(
         return DemoDatasets([path], [count], run.policy.spec, languages, read, run.device)[0]
 
     training = windows(learned_from)
-    if not settings.demos_held_out:
+    if not request.demos_held_out:
         return training, None
     everything = windows(sum(counts))
     rest = torch.arange(len(training), len(everything))  # windows are in the order of the demonstrations

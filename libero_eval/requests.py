@@ -18,6 +18,7 @@ from libero_env.cli.options import (
     Seed,
     Side,
 )
+from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.parallel import cpu_count
 from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
@@ -153,3 +154,76 @@ class RobustnessRequest(Request):
         """Return the evaluation under some perturbations, in a folder of its own."""
         shared = {f.name: getattr(self, f.name) for f in fields(Request)}
         return EvalRequest(**{**shared, "perturb": perturb, "out": out})
+
+
+@dataclass(frozen=True, kw_only=True)
+class RelearnRequest:
+    """Measure how many steps a forgotten task of a run takes until it is back, and write the run's report again.
+
+    Attributes:
+        run: The directory of a finished run.
+        tasks: Positions in the run's sequence, from 0 (default: all but the last).
+        steps: Steps until it is given up.
+        every: Steps between measurements.
+        tolerance: Share by which the error may exceed that just after learning, or the difference by which success may
+            fall short of it.
+        held_out: Demonstrations to measure the error on, after those that were learned from.
+        episodes: Rollouts to measure success by, instead of the error; 0: the error.
+        initial: The pretrained weights that the run began with: a finished run, or one of its checkpoints.
+        device: auto, cpu, cuda, cuda:1.
+        allow: Packages of others whose classes the run's configuration may name (default: none; their code is
+            executed).
+
+    Raises:
+        ConfigError: A value is of another kind or outside of its range.
+    """
+
+    run: Positional[FilePath]
+    tasks: tuple[Natural, ...] = ()
+    steps: Positive = 400
+    every: Positive = 20
+    tolerance: Annotated[float, Field(ge=0, le=10)] = 0.05
+    held_out: Annotated[int, Field(ge=1, le=1000)] = 5
+    episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
+    initial: FilePath | None = None
+    device: Device = "auto"
+    allow: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        validate_arguments(type(self), vars(self), prefix=("relearn",), error=ConfigError)
+
+    @property
+    def demos_held_out(self) -> int:
+        """Number of demonstrations to measure on; none where rollouts are measured."""
+        return 0 if self.episodes else self.held_out
+
+
+@dataclass(frozen=True, kw_only=True)
+class SaliencyRequest:
+    """Draw where a policy looks during a rollout, and write the run's report again.
+
+    Attributes:
+        run: A run's directory, or one of its checkpoints.
+        task: Position in the run's sequence.
+        after: The policy after this task, from 0 (default: the last).
+        start: Initial state of the rollout.
+        moments: Number of images.
+        stride: Distance of two places in pixels of a 128-pixel image.
+        horizon: Maximum number of control steps.
+        device: auto, cpu, cuda, cuda:1.
+        allow: Packages of others whose classes the run's configuration may name (default: none; their code is
+            executed).
+    """
+
+    run: Positional[FilePath]
+    task: Natural = 0
+    after: Natural | None = None
+    start: Annotated[int, Field(ge=0, lt=NUM_INIT_STATES)] = 0
+    moments: Annotated[int, Field(ge=1, le=100)] = 6
+    stride: Annotated[float, Field(ge=1, le=128)] = 8.0
+    horizon: Horizon = 200
+    device: Device = "auto"
+    allow: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        validate_arguments(type(self), vars(self), prefix=("saliency",), error=ConfigError)

@@ -26,6 +26,7 @@ from torch.nn import functional
 
 from libero_env.errors import SimulationError
 from libero_env.storage import atomic_path, atomic_write_text, require_own_folders
+from libero_eval.requests import SaliencyRequest
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import PolicyActor, observe
 from lifelong.evaluation.environments import Obs
@@ -242,47 +243,27 @@ class RecordingActor(PolicyActor):
         return super().act(obs)
 
 
-def draw_saliency(
-    source: Path,
-    *,
-    task: int,
-    after: int | None = None,
-    start: int = 0,
-    moments: int = 6,
-    horizon: int = 200,
-    settings: SaliencySettings = SaliencySettings(),  # noqa: B008 - frozen
-    device: str = "auto",
-    allow: Sequence[str] = (),
-) -> Path:
+def draw_saliency(request: SaliencyRequest) -> Path:
     """Run one episode of a run's policy, and draw where the policy looks at some moments.
 
     Args:
-        source: Directory of the run, or one of its checkpoints.
-        task: Position of the task in the run's sequence.
-        after: See `lifelong.evaluation.restore.restore`.
-        start: Index of the initial state.
-        moments: Number of columns, evenly distributed over the episode from its first step on.
-        horizon: Maximum number of control steps.
-        settings: Resolution of the saliency maps.
-        device: See `lifelong.evaluation.restore.restore`.
-        allow: See `lifelong.evaluation.restore.restore`.
+        request: Run, task and moments; these are evenly distributed over the episode from its first step on.
 
     Returns:
         The contact sheet, `saliency/task_<k>_after_<l>.png` in the run's directory, with its caption in a text file
         beside it.
 
     Raises:
-        ConfigError: The task does not exist, there are no moments, or the folder is a link that leads out of the run.
+        ConfigError: The task does not exist, or the folder is a link that leads out of the run.
         LiberoError: The run cannot be read, or its policy has no `predict`.
     """
-    run = restore(source, after=after, device=device, allow=allow)
-    if not 0 <= task < len(run.tasks) or moments < 1:
-        raise ConfigError(
-            f"task {task} and {moments} moments; valid: tasks 0 to {len(run.tasks) - 1}, and 1 moment or more"
-        )
+    run = restore(request.run, after=request.after, device=request.device, allow=request.allow)
+    task, settings = request.task, SaliencySettings(stride=request.stride)
+    if task >= len(run.tasks):
+        raise ConfigError(f"there is no task {task}; valid: tasks 0 to {len(run.tasks) - 1}")
     require_own_folders(run.path, "saliency", error=ConfigError)
-    frames, success = _run_episode(run, task, start, horizon)
-    steps = sorted({round(i) for i in np.linspace(0, len(frames) - 1, moments)})
+    frames, success = _run_episode(run, task, request.start, request.horizon)
+    steps = sorted({round(i) for i in np.linspace(0, len(frames) - 1, request.moments)})
     language = run.embed(run.learned_task(task)).to(run.device)
     with run.acting(run.tasks[task]) as policy:
         windows = [window_at(frames, step, policy.spec.seq_len) for step in steps]

@@ -1,6 +1,9 @@
 """Errors of the learning side; all derive from `LifelongError`."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
 
 from libero_env.errors import LiberoError, MissingPackageError
 
@@ -98,3 +101,17 @@ def require_package(name: str, extra: str) -> None:
         found = None
     if found is None:
         raise MissingPackageError(f"{name} is not installed", f"pip install 'libero-lifelong[{extra}]'")
+
+
+@contextmanager
+def writing(path: Path, what: str) -> Iterator[None]:
+    """Turn what the machine refuses while the block writes, an `OSError`, into a `ResultsError` that names it.
+
+    Args:
+        path: Where it is written.
+        what: What is written, such as `the page`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise ResultsError(f"{path}: {what} cannot be written ({error})") from error

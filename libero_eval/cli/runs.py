@@ -4,18 +4,9 @@ import asyncio
 import contextlib
 from typing import Annotated
 
-from libero_env.cli.options import (
-    Device,
-    Field,
-    FilePath,
-    Horizon,
-    Natural,
-    Positional,
-    Positive,
-    Processes,
-    Seed,
-)
+from libero_env.cli.options import Device, Field, FilePath, Natural, Positional, Processes, Seed
 from libero_env.text import to_json
+from libero_eval.requests import RelearnRequest, SaliencyRequest
 
 
 def serve(
@@ -59,94 +50,24 @@ def serve(
         asyncio.run(server.run(ready))
 
 
-def relearn(
-    run: Positional[FilePath],
-    *,
-    tasks: tuple[Natural, ...] = (),
-    steps: Positive = 400,
-    every: Positive = 20,
-    tolerance: Annotated[float, Field(ge=0, le=10)] = 0.05,
-    held_out: Annotated[int, Field(ge=1, le=1000)] = 5,
-    episodes: Natural = 0,
-    initial: FilePath | None = None,
-    device: Device = "auto",
-    allow: tuple[str, ...] = (),
-) -> None:
-    """Measure how many steps a forgotten task of a run takes until it is back, and write the run's report again.
-
-    Args:
-        run: The directory of a finished run.
-        tasks: Positions in the run's sequence, from 0 (default: all but the last).
-        steps: Steps until it is given up.
-        every: Steps between measurements.
-        tolerance: Share by which the error may exceed that just after learning, or the difference by which success may
-            fall short of it.
-        held_out: Demonstrations to measure the error on, after those that were learned from.
-        episodes: Rollouts to measure success by, instead of the error; 0: the error.
-        initial: The pretrained weights that the run began with: a finished run, or one of its checkpoints.
-        device: auto, cpu, cuda, cuda:1.
-        allow: Packages of others whose classes the run's configuration may name (default: none; their code is
-            executed).
-    """
-    from libero_eval.relearning import RelearnSettings
+def relearn(request: RelearnRequest) -> None:
+    """Relearn tasks of a run; print the savings, and the page."""
     from libero_eval.relearning import relearn as measure
     from lifelong.pretraining import initial_policy
     from lifelong.report.page import write_report
     from lifelong.results.relearning import read_relearning, savings_tables
 
-    measure(
-        run,
-        initial_policy(run, weights=initial, allow=allow),
-        tasks=tasks or None,
-        settings=RelearnSettings(steps, every, tolerance, held_out, episodes),
-        device=device,
-        allow=allow,
-    )
-    print(savings_tables(read_relearning(run)))
-    print(write_report([run]))
+    measure(request, initial_policy(request.run, weights=request.initial, allow=request.allow))
+    print(savings_tables(read_relearning(request.run)))
+    print(write_report([request.run]))
 
 
-def saliency(
-    run: Positional[FilePath],
-    *,
-    task: Natural = 0,
-    after: Natural | None = None,
-    start: Annotated[int, Field(ge=0, le=49)] = 0,
-    moments: Annotated[int, Field(ge=1, le=100)] = 6,
-    stride: Annotated[float, Field(ge=1, le=128)] = 8.0,
-    horizon: Horizon = 200,
-    device: Device = "auto",
-    allow: tuple[str, ...] = (),
-) -> None:
-    """Draw where a policy looks during a rollout, and write the run's report again.
-
-    Args:
-        run: A run's directory, or one of its checkpoints.
-        task: Position in the run's sequence.
-        after: The policy after this task, from 0 (default: the last).
-        start: Initial state of the rollout.
-        moments: Number of images.
-        stride: Distance of two places in pixels of a 128-pixel image.
-        horizon: Maximum number of control steps.
-        device: auto, cpu, cuda, cuda:1.
-        allow: Packages of others whose classes the run's configuration may name (default: none; their code is
-            executed).
-    """
-    from libero_eval.saliency import SaliencySettings, draw_saliency
+def saliency(request: SaliencyRequest) -> None:
+    """Draw the saliency of an episode of a run; print the sheet, and the page."""
+    from libero_eval.saliency import draw_saliency
     from lifelong.report.page import write_report
 
-    settings = SaliencySettings(stride=stride)
-    path = draw_saliency(
-        run,
-        task=task,
-        after=after,
-        start=start,
-        moments=moments,
-        horizon=horizon,
-        settings=settings,
-        device=device,
-        allow=allow,
-    )
+    path = draw_saliency(request)
     print(path)
     print(write_report([path.parents[1]]))
 

@@ -1,12 +1,11 @@
 """Which results may be compared: the same protocol, tasks and environment, and starts in common."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from libero_env.sim.backend import MUJOCO
 from libero_env.text import flatten, plain, shorten
 from libero_eval.evaluation_file import EvaluationResult
 from lifelong.errors import ComparisonError
@@ -66,7 +65,7 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
     """
     rows = [(s.label, r) for s in groups for r in s.results]
     base_label, base = rows[0]
-    check_same_back_end({label: backend_of(result) for label, result in rows})
+    check_same_back_end({label: result.backend for label, result in rows})
     expected, refused, notes = settings(base), {}, {}
     for label, result in rows[1:]:
         others = settings(result)
@@ -101,12 +100,6 @@ def settings(result: EvaluationResult) -> dict[str, Any]:
     world = {k: v for k, v in result.environment.items() if k.partition("_")[0] in WORLD and v is not None}
     tasks = {r.task: {"name": r.name, "instruction": r.instruction} for r in result.tasks}
     return flatten(plain({"protocol": result.protocol, "environment": world, "tasks": tasks}))
-
-
-def backend_of(result: EvaluationResult) -> str:
-    """Return the backend of a result; those that name none are of `mujoco`."""
-    world = result.protocol.get("world")
-    return str(world.get("backend", MUJOCO)) if isinstance(world, Mapping) else MUJOCO
 
 
 def match(first: Group, second: Group) -> Matched:

@@ -14,14 +14,13 @@ from libero_env.storage import write_json
 from libero_env.text import json_safe
 from libero_eval.judging.comparability import (
     Group,
-    backend_of,
     check_comparable,
     match,
     same_policy,
     settings,
 )
 from libero_eval.judging.group_scores import GroupScores, group_scores
-from lifelong.errors import ConfigError, ResultsError
+from lifelong.errors import ConfigError, writing
 from lifelong.stats.episodes import ALPHA, Difference, SequentialTest, difference, sequential_test
 from lifelong.stats.intervals import Estimate, holm, wilson_interval
 from lifelong.stats.power import Question, shown_difference
@@ -161,7 +160,7 @@ def compare_groups(
             "no control arm: evaluate one of the policies again with another --seed and name both results "
             "with --control, to see which differences arise by chance alone"
         )
-    backend = backend_of((groups or control)[0].results[0])  # type: ignore[index]  # there is one of them
+    backend = (groups or control)[0].results[0].backend  # type: ignore[index]  # there is one of them
     if backend != MUJOCO:
         notes.append(f"simulated by backend={backend}; not to be compared with results of others")
     return Comparison(
@@ -181,10 +180,8 @@ def write_comparison(comparison: Comparison, path: Path) -> Path:
     Raises:
         ResultsError: The file cannot be written.
     """
-    try:
+    with writing(path, "the comparison"):
         write_json(path, comparison.to_plain())
-    except OSError as error:
-        raise ResultsError(f"{path}: the comparison cannot be written ({error})") from error
     return path
 
 

@@ -13,7 +13,7 @@ from libero_env.storage import atomic_write_text
 from libero_env.text import text_table
 from libero_eval.judging.comparison import Comparison, Contrast, Row
 from libero_eval.judging.group_scores import Profile
-from lifelong.errors import ResultsError
+from lifelong.errors import writing
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below, shorten
 from lifelong.report.tables import page_template
 from lifelong.stats.episodes import Difference, SequentialTest
@@ -195,10 +195,8 @@ def write_page(comparison: Comparison, path: Path) -> Path:
         p_text=p_text,
         interval_text=interval_text,
     )
-    try:
+    with writing(path, "the page"):
         atomic_write_text(path, page)
-    except OSError as error:
-        raise ResultsError(f"{path}: the page cannot be written ({error})") from error
     return path
 
 

@@ -16,7 +16,7 @@ from libero_env.storage import atomic_write_text, write_json
 from libero_env.text import text_table
 from libero_eval.judging.page import interval_text, p_text
 from libero_eval.robustness.results import Axis, Outcomes, Robustness, name_of
-from lifelong.errors import ResultsError
+from lifelong.errors import writing
 from lifelong.report.figures import (
     INK,
     LINE_COLOURS,
@@ -125,11 +125,9 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         severity=severity_text,
         severities=_severities_text,
     )
-    try:
+    with writing(folder, "the page"):
         atomic_write_text(folder / "robustness.html", page)
         write_json(folder / "robustness.json", {"policies": [_content(policy) for policy in policies]})
-    except OSError as error:
-        raise ResultsError(f"{folder}: the page cannot be written ({error})") from error
     return folder / "robustness.html"
 
 

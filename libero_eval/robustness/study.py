@@ -10,7 +10,7 @@ from pathlib import Path
 from libero_env.perturbations import format_perturbations, get_kind, parse_perturbations
 from libero_env.storage import require_own_folders
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
-from libero_eval.plan import load_policy, plan_evaluation, policy_threads, work_quietly
+from libero_eval.plan import further_process, load_policy, plan_evaluation, policy_threads
 from libero_eval.policies import PolicyUnderTest
 from libero_eval.requests import PAIRS, RobustnessRequest
 from libero_eval.robustness.results import Outcomes, Robustness, name_of
@@ -55,15 +55,12 @@ def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_:
     return _name(policy), out
 
 
+@further_process()
 def _help(request: RobustnessRequest) -> None:
     """Work on the conditions of another process; errors go to the standard error."""
-
-    def work() -> None:
-        with redirect_stderr(io.StringIO()):  # the other process says the same
-            evaluations = _plan(request, load_policy(request), conditions_of(request))
-        _work(evaluations)
-
-    work_quietly(work)
+    with redirect_stderr(io.StringIO()):  # the other process says the same
+        evaluations = _plan(request, load_policy(request), conditions_of(request))
+    _work(evaluations)
 
 
 def _work(
@@ -83,7 +80,7 @@ def _work(
                     workers.supervise(before + done)
 
             with policy_threads(evaluation):
-                result = Worker(evaluation, on_wait=supervise).work(wait=wait)
+                result = Worker(evaluation, on_wait=supervise).run(wait=wait)
             if result is not None:
                 units[condition] = len(evaluation.units)
                 on_condition(condition, result, len(units), len(evaluations))

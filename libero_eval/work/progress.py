@@ -95,7 +95,7 @@ def describe_status(path: Path) -> str:
     store, units = WorkStore(path, plan), plan["units"]
     files = {name: path / "units" / f"{name}.json" for name in units}
     done = {name: read_unit(file)[0] for name, file in files.items() if file.exists()}
-    held = {name: one for name, one in store.held().items() if name in units}
+    held = {name: one for name, one in store.claims.held().items() if name in units}
     errors = {name: one for name, one in store.errors().items() if name in units}
     lines = [
         f"policy    {', '.join(f'{k} {shorten(str(v))}' for k, v in plan['evaluated'].items())}",
@@ -134,14 +134,15 @@ def total_rows(results: Sequence[TaskResult]) -> list[str]:
         if suite.startswith(PLUS):
             kinds.setdefault(f"  {parse_plus_id(result.name).kind}", []).append(result)
     rows = {**(suites if len(suites) > 1 else {}), **(kinds if len(kinds) > 1 else {})}
-    return [_total_row(name, tasks) for name, tasks in {**rows, "mean over tasks": results}.items()]
-
-
-def _total_row(name: str, results: Sequence[TaskResult]) -> str:
-    wins, episodes = sum(sum(r.successes) for r in results), sum(len(r.successes) for r in results)
-    failed = sum(len(r.simulation_errors) for r in results)
-    note = f"  ({failed} of {episodes + failed} ended by a simulation error, not counted)" if failed else ""
-    return f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(overall(results))}{note}"
+    lines = []
+    for name, tasks in {**rows, "mean over tasks": results}.items():
+        wins, episodes = sum(sum(r.successes) for r in tasks), sum(len(r.successes) for r in tasks)
+        failed = sum(len(r.simulation_errors) for r in tasks)
+        note = (
+            f"  ({failed} of {episodes + failed} ended by a simulation error, not counted)" if failed else ""
+        )
+        lines.append(f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(overall(tasks))}{note}")
+    return lines
 
 
 def _percent(e: Estimate) -> str:

@@ -16,8 +16,7 @@ import os
 import shutil
 import socket
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -33,8 +32,8 @@ from libero_env.text import flatten, json_safe, shorten, to_json
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, TaskResult
 from libero_eval.policies import PROBE_TOLERANCE
-from libero_eval.work.claims import LEASE, Claim, Claims, Held
-from lifelong.errors import ConfigError, LifelongError, ResultsError
+from libero_eval.work.claims import LEASE, Claim, Claims
+from lifelong.errors import ConfigError, LifelongError, writing
 from lifelong.results.provenance import utc_now
 
 PLAN_NAME = "evaluation.json"
@@ -170,7 +169,7 @@ class WorkStore:
             "units": {unit.name: len(unit.init_states) for unit in units},
         }
         require_own_folders(self.path, *FOLDERS, error=ConfigError)
-        with _named_errors(self.path, "the folder of the evaluation cannot be written"):
+        with writing(self.path, "the folder of the evaluation"):
             self.path.mkdir(parents=True, exist_ok=True)
             file = self.path / PLAN_NAME
             if not file.exists():
@@ -222,9 +221,7 @@ class WorkStore:
             ResultsError: It cannot be written; the unit counts as not done.
         """
         head = {"format": UNIT_FORMAT, "unit": unit.name, "digest": self._digest(unit)}
-        with _named_errors(
-            self._unit_path(unit), "the result of the unit cannot be written, it is not counted"
-        ):
+        with writing(self._unit_path(unit), "the result of the unit, which is not counted,"):
             create_text(self._unit_path(unit), to_json(head | asdict(result)))
         if not result.result.errors:
             (self.path / "errors" / f"{unit.name}.json").unlink(missing_ok=True)
@@ -238,7 +235,7 @@ class WorkStore:
             "when": utc_now(),
             "traceback": "".join(traceback.format_exception(error))[-MAX_ERROR:],
         }
-        with _named_errors(path, "the error of a unit cannot be written"):
+        with writing(path, "the error of a unit"):
             write_json(path, {"unit": unit.name, "errors": [*_read_errors(path), entry]})
         return self.errors()[unit.name]
 
@@ -257,7 +254,7 @@ class WorkStore:
         Raises:
             LifelongError: The folder cannot be written.
         """
-        with _named_errors(self.path, "a unit cannot be claimed"):
+        with writing(self.path, "the claim of a unit"):
             for unit in units:
                 claim = self.claims.take(unit.name)
                 if claim and self._unit_path(unit).exists():  # it was finished a moment ago
@@ -270,10 +267,6 @@ class WorkStore:
     def has_results(self) -> bool:
         """Whether any unit is done."""
         return bool(_names(self.path / "units"))
-
-    def held(self) -> dict[str, Held]:
-        """Return the units that processes work on."""
-        return self.claims.held()
 
     def _unit_path(self, unit: Unit) -> Path:
         return self.path / "units" / f"{unit.name}.json"
@@ -369,15 +362,6 @@ def describe(error: BaseException) -> str:
     """Return an error in one line."""
     text = shorten(" ".join(str(error)[:MAX_ERROR].split()), 1000)
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-@contextmanager
-def _named_errors(path: Path, what: str) -> Iterator[None]:
-    """Turn an `OSError` of the block into a `ResultsError` that names the file."""
-    try:
-        yield
-    except OSError as error:
-        raise ResultsError(f"{error.filename or path}: {what}: {error.strerror or error}") from error
 
 
 def _names(folder: Path) -> set[str]:

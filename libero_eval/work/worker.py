@@ -63,13 +63,7 @@ class Worker:
         self._succeeded, self._in_a_row, self._said = False, 0, -math.inf
         self._task: str | None = None
 
-    def run(self) -> EvaluationResult:
-        """Evaluate units until all are done, whoever does them; see `work`."""
-        result = self.work(wait=True)
-        assert result is not None
-        return result
-
-    def work(self, *, wait: bool) -> EvaluationResult | None:
+    def run(self, *, wait: bool = True) -> EvaluationResult | None:
         """Evaluate units; write `eval.json` and return its content if all are done.
 
         Args:
@@ -87,7 +81,7 @@ class Worker:
         with evaluation.pool() as self._pool:
             while len(done := self._look()) < len(evaluation.units):
                 self._on_wait(len(done))
-                errors, held = self._errors(), set(store.held())
+                errors, held = self._errors(), set(store.claims.held())
                 choice = self._order(done, errors, held)
                 if taken := store.take(choice):
                     self._work(*taken)
@@ -141,8 +135,10 @@ class Worker:
     def _work(self, unit: Unit, claim: Claim) -> None:
         self._task = unit.task.id
         with self._store.claims.keeping(claim, on_beat=self._beat):
+            done = self._store.done(self._evaluation.units)
+            label = f"{self._progress(done)} | {unit.task.id}" if self._evaluation.progress else ""
             try:
-                result: UnitResult | None = self._evaluation.evaluate(unit, self._pool, self._label(unit))
+                result: UnitResult | None = self._evaluation.evaluate(unit, self._pool, label)
             except Exception as error:  # noqa: BLE001 - policies raise errors of any type
                 self._pool.close()
                 result = self._after_error(unit, error)
@@ -194,15 +190,9 @@ class Worker:
             self._on_progress(self._progress(done))
 
     def _progress(self, done: Mapping[str, UnitResult]) -> Progress:
-        running, failed = len(self._names & self._store.held().keys()), len(self._errors())
+        running, failed = len(self._names & self._store.claims.held().keys()), len(self._errors())
         sizes = {unit.name: len(unit.init_states) for unit in self._evaluation.units}
         return measure_progress(sizes, done, running, failed)
-
-    def _label(self, unit: Unit) -> str:
-        if not self._evaluation.progress:
-            return ""
-        done = self._store.done(self._evaluation.units)
-        return f"{self._progress(done)} | {unit.task.id}"
 
 
 class Workers:

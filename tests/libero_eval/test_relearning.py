@@ -1,9 +1,8 @@
 """Steps until a forgotten task is back: the measurement, its records, and what reports say."""
 
 import copy
-import inspect
 from contextlib import nullcontext
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,8 +11,8 @@ import pytest
 import torch
 
 from libero_eval import relearning
-from libero_eval.cli import runs
-from libero_eval.relearning import RelearnSettings, Trial, error_on, failure_share, relearn, steps_until
+from libero_eval.relearning import Trial, error_on, failure_share, relearn, steps_until
+from libero_eval.requests import RelearnRequest
 from lifelong.algorithms import Sequential
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.report.page import write_report
@@ -27,7 +26,7 @@ from tests.harness.fakes import LinearPolicy, Windows
 from tests.harness.records import run_start
 
 FIT = FitSettings(epochs=1, batch_size=10, lr=0.05, warmup_steps=5, weight_decay=0.0, precision="fp32")
-SETTINGS = RelearnSettings(steps=200, every=5, tolerance=0.05, held_out=1)
+SETTINGS = RelearnRequest(run=Path("run"), steps=200, every=5, tolerance=0.05, held_out=1)
 
 
 class Linear(LinearPolicy):
@@ -54,8 +53,8 @@ def held_out(task: int = 0) -> Batch:
     return Windows(task).batch(torch.arange(20))
 
 
-def again(found: Linear, goal: Trial, settings: RelearnSettings = SETTINGS):
-    return steps_until(found, goal, settings=settings, fit_settings=FIT, seed=(1, 5, 0))
+def again(found: Linear, goal: Trial, settings: RelearnRequest = SETTINGS):
+    return steps_until(found, goal, request=settings, fit_settings=FIT, seed=(1, 5, 0))
 
 
 def test_a_task_is_back_at_the_first_measurement_within_the_tolerance() -> None:
@@ -240,7 +239,7 @@ def test_a_killed_measurement_goes_on_and_changes_nothing_else(finished, monkeyp
     before = copy.deepcopy([end.state_dict() for end in ends])
     for part in ("whole", "killed"):
         (folder / part).mkdir()
-    relearn(folder / "whole", policy(), settings=SETTINGS)
+    relearn(replace(SETTINGS, run=folder / "whole"), policy())
     assert [(r.task, r.start) for r in outcome(folder / "whole")] == [
         (task, start) for task in (0, 1) for start in ("final", "initial")
     ]
@@ -256,12 +255,12 @@ def test_a_killed_measurement_goes_on_and_changes_nothing_else(finished, monkeyp
 
             patch.setattr(ResultLog, "append", guarded)
             with pytest.raises(KeyboardInterrupt):
-                relearn(folder / "killed", policy(), settings=SETTINGS)
-    relearn(folder / "killed", policy(), settings=SETTINGS)
+                relearn(replace(SETTINGS, run=folder / "killed"), policy())
+    relearn(replace(SETTINGS, run=folder / "killed"), policy())
     assert outcome(folder / "killed") == outcome(folder / "whole")
-    relearn(folder / "killed", policy(), settings=SETTINGS)
+    relearn(replace(SETTINGS, run=folder / "killed"), policy())
     assert len(outcome(folder / "killed")) == 4, "nothing is measured twice"
-    relearn(folder / "killed", policy(), settings=replace(SETTINGS, tolerance=0.2), tasks=[0])
+    relearn(replace(SETTINGS, run=folder / "killed", tolerance=0.2, tasks=(0,)), policy())
     assert len(outcome(folder / "killed")) == 6, "under other settings it is"
     for end, state in zip(ends, before, strict=True):
         assert all(torch.equal(value, state[name]) for name, value in end.state_dict().items())
@@ -270,15 +269,10 @@ def test_a_killed_measurement_goes_on_and_changes_nothing_else(finished, monkeyp
 def test_tasks_that_do_not_exist_and_settings_that_make_no_sense_are_refused(finished) -> None:
     folder, _ = finished
     with pytest.raises(LifelongError, match="has tasks 0 to 2; there is no task 7"):
-        relearn(folder, policy(), tasks=[7], settings=SETTINGS)
+        relearn(replace(SETTINGS, run=folder, tasks=(7,)), policy())
     for change in ({"every": 0}, {"steps": 0}, {"tolerance": -0.1}, {"held_out": 0}, {"episodes": 51}):
         with pytest.raises(ConfigError, match=f"relearn.{next(iter(change))} is"):
-            RelearnSettings(**change)
-
-
-def test_the_options_of_the_command_default_to_the_settings() -> None:
-    options = inspect.signature(runs.relearn).parameters
-    assert all(options[f.name].default == f.default for f in fields(RelearnSettings))
+            RelearnRequest(run=folder, **change)
 
 
 def test_a_run_that_is_not_finished_is_refused(finished, monkeypatch) -> None:
@@ -286,4 +280,4 @@ def test_a_run_that_is_not_finished_is_refused(finished, monkeypatch) -> None:
     unfinished = SimpleNamespace(learned=0, tasks=("a", "b"))
     monkeypatch.setattr(relearning, "restore", lambda *_, **__: unfinished)
     with pytest.raises(LifelongError, match="is not finished: 1 of 2 tasks are learned"):
-        relearn(folder, policy(), settings=SETTINGS)
+        relearn(replace(SETTINGS, run=folder), policy())

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from libero_eval.policies import RunPolicy
-from libero_eval.requests import EvalRequest
+from libero_eval.requests import EvalRequest, SaliencyRequest
 from libero_eval.saliency import SaliencySettings, contact_sheet, draw_saliency, overlay, saliency, window_at
 from lifelong.data import fake_batch
 from lifelong.errors import ConfigError
@@ -123,6 +123,6 @@ def test_what_is_written_into_a_run_follows_no_link_out_of_it(tmp_path, monkeypa
     monkeypatch.setattr("libero_eval.saliency.restore", lambda *_, **__: run)
     monkeypatch.setattr("libero_eval.policies.restore", lambda *_, **__: run)
     with pytest.raises(ConfigError, match="saliency is not a folder, or is a link that leads out of"):
-        draw_saliency(run.path, task=0)
+        draw_saliency(SaliencyRequest(run=run.path))
     with pytest.raises(ConfigError, match="eval is not a folder, or is a link that leads out of"):
         RunPolicy(EvalRequest(policy=str(run.path)))

@@ -11,8 +11,8 @@ from PIL import Image
 from libero_env.tasks import get_task
 from libero_eval.policies import RunPolicy
 from libero_eval.protocols.files import load_protocol
-from libero_eval.requests import Request
-from libero_eval.saliency import SaliencySettings, draw_saliency
+from libero_eval.requests import Request, SaliencyRequest
+from libero_eval.saliency import draw_saliency
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.evaluation.restore import restore
 from tests.harness.runs import make_run
@@ -74,15 +74,15 @@ def test_paths_that_are_no_runs_are_named(tmp_path):
 @pytest.mark.sim
 def test_saliency_sheet_of_a_run(tmp_path):
     make_run(tmp_path / "run")
-    settings = SaliencySettings(stride=43, sigma=20)
-    path = draw_saliency(tmp_path / "run", task=1, moments=3, horizon=4, settings=settings)
+    request = SaliencyRequest(run=tmp_path / "run", task=1, moments=3, horizon=4, stride=43)
+    path = draw_saliency(request)
     assert path == tmp_path / "run" / "saliency" / "task_01_after_01.png"
     with Image.open(path) as sheet:
         assert sheet.size == (3 * (128 + 4), 4 * (128 + 4))
         assert np.asarray(sheet).std() > 10
     assert "failure, after learning 2 tasks; steps 0, 2, 3" in path.with_suffix(".txt").read_text()
     with pytest.raises(ConfigError, match="tasks 0 to 1"):
-        draw_saliency(tmp_path / "run", task=2)
+        draw_saliency(replace(request, task=2))
 
 
 @pytest.mark.parametrize("drawing", ["faithful", "fast"])

@@ -20,7 +20,7 @@ from libero_env.demos.rendering import RenderJob, ensure_rendered
 from libero_env.perturbations import parse_perturbations, reword_task
 from libero_env.tasks import get_suite
 from libero_eval import relearning
-from libero_eval.relearning import RelearnSettings
+from libero_eval.requests import RelearnRequest
 from lifelong import experiment
 from lifelong.data import demonstrations
 from lifelong.errors import ConfigError
@@ -242,7 +242,7 @@ def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, 
     )  # without the shift
     assert (path / "report.html").is_file()
 
-    settings, config = RelearnSettings(held_out=1), read_config(path / "config.yaml", ())
+    settings, config = RelearnRequest(run=path, held_out=1), read_config(path / "config.yaml", ())
     training, held_out = relearning._windows(loaded, 1, settings, config)
     shifted = next(folder.rglob(f"under-instruction=0.6*/{TASKS[1].name}_demo.hdf5"))
     first, other = read_episodes(shifted)  # learned from, and held out
