@@ -8,7 +8,7 @@ import pytest
 
 from libero_env.cli.main import main
 from libero_env.envs.batch import BatchEnv
-from libero_eval.judging.comparability import Group, backend_of, check_comparable, check_same_back_end
+from libero_eval.judging.comparability import Group, check_comparable, check_same_back_end
 from libero_eval.judging.comparison import compare_groups
 from libero_eval.protocols.files import load_protocol
 from lifelong.errors import ComparisonError, ConfigError, ProtocolError
@@ -42,7 +42,7 @@ def test_results_of_different_ones_are_not_compared():
         "results of different back ends are not compared: old on backend=mujoco, new on backend=warp; evaluate all on "
         "one, see --backend"
     )
-    assert [backend_of(one.results[0]) for one in sides] == ["mujoco", "warp"]
+    assert [one.results[0].backend for one in sides] == ["mujoco", "warp"]
 
 
 @pytest.mark.parametrize("backend", [None, "warp"])
