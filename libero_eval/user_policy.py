@@ -5,7 +5,6 @@ import hashlib
 import importlib
 import os
 import sys
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from libero_env.envs.checks import checked_numbers
 from libero_env.errors import code_of
 from libero_env.tasks import Task
 from libero_env.validation import validate
@@ -134,24 +134,18 @@ class _UserActor:
             with code_of(f"the policy's {self._name('reset')}"):
                 self.policy.reset(instruction, num_envs)
 
-    def _predict(self, observations: Observations) -> np.ndarray:
-        """Return what the object predicts as an array of any shape.
+    def _predict(self, observations: Observations, shape: tuple[int, ...] | str) -> np.ndarray:
+        """Return what the object predicts, finite numbers of a shape; where that is a text, the caller checks it.
 
         Raises:
-            PolicyError: It is not an array of numbers.
+            PolicyError: It predicts something else.
         """
         name = self._name("predict")
         with code_of(f"the policy's {name}"):
             answer = self.policy.predict(observations)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error", np.exceptions.ComplexWarning)
-                tensor = hasattr(answer, "detach")  # of PyTorch
-                return np.asarray(answer.detach().cpu() if tensor else answer, np.float64)
-        except (TypeError, ValueError, np.exceptions.ComplexWarning) as error:
-            raise PolicyError(
-                f"{name} returned a {type(answer).__name__} that is not an array of numbers ({error})"
-            ) from None
+        if hasattr(answer, "detach"):  # of PyTorch
+            answer = answer.detach().cpu()
+        return checked_numbers(answer, f"the actions of {name}", (shape,), PolicyError)
 
 
 @dataclass
@@ -182,15 +176,8 @@ class CallableActor(_UserActor):
             PolicyError: The actions have the wrong shape, or are not finite.
         """
         observations = as_original(obs) if self.original else obs
-        actions = self._predict(Observations(observations, instruction=self.instruction))
-        expected = (len(next(iter(obs.values()))), self.action_dim)
-        if actions.shape != expected:
-            raise PolicyError(
-                f"{self._name('predict')} returned actions of shape {actions.shape}; expected {expected}"
-            )
-        if not np.isfinite(actions).all():
-            raise PolicyError(f"{self._name('predict')} returned actions that are not finite")
-        return actions
+        shape = (len(next(iter(obs.values()))), self.action_dim)
+        return self._predict(Observations(observations, instruction=self.instruction), shape)
 
 
 @dataclass
@@ -237,12 +224,13 @@ class ProtocolActor(_UserActor):
             self._num_envs = None
         images = {name: np.stack([one.images[name] for one in inputs]) for name in inputs[0].images}
         states = np.stack([one.state for one in inputs])
-        answer = self._predict(Observations(images, state=states, instruction=inputs[0].prompt))
+        count, dim = len(inputs), self.action_dim
+        shapes = f"({count}, {dim}), or chunks ({count}, H, {dim})"
+        answer = self._predict(Observations(images, state=states, instruction=inputs[0].prompt), shapes)
         chunks = answer[:, None] if answer.ndim == 2 else answer
-        if chunks.ndim != 3 or chunks.shape[::2] != (len(inputs), self.action_dim):
+        if chunks.ndim != 3 or chunks.shape[::2] != (count, dim):
             raise PolicyError(
-                f"{self._name('predict')} returned actions of shape {answer.shape}; expected "
-                f"({len(inputs)}, {self.action_dim}), or chunks ({len(inputs)}, H, {self.action_dim})"
+                f"the actions of {self._name('predict')}: expected shape {shapes}, got {answer.shape}"
             )
         count = chunks.shape[1] if self.replan is None or answer.ndim == 2 else self.replan
         if chunks.shape[1] < count:

@@ -154,7 +154,7 @@ def test_a_policy_that_raises_shows_its_own_frames(here, capsys):
     assert DEBUG_VARIABLE not in os.environ
     command[1] = "ending_policy:texts"
     assert cli.main(command) == ending.MISTAKE
-    assert "error: Policy.predict returned a list that is not an array of numbers" in capsys.readouterr().err
+    assert "the actions of Policy.predict: expected finite numbers of shape" in capsys.readouterr().err
 
 
 def test_an_error_keeps_its_type_where_it_is_caught():

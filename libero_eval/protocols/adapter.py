@@ -9,7 +9,6 @@ import numpy as np
 from libero_env.tasks import Task
 from libero_eval.protocols.preprocessing import preprocess
 from libero_eval.protocols.protocol import EvalProtocol
-from lifelong.errors import PolicyError
 from lifelong.evaluation.environments import Obs
 
 ACTION_DIM = 7
@@ -63,16 +62,9 @@ class ProtocolAdapter:
         """Return the simulations' actions, (..., 7) float64; the gripper opens at -1 and closes at +1.
 
         Args:
-            predicted: (..., 7) actions of a policy in the protocol's convention.
-
-        Raises:
-            PolicyError: The last dimension is not 7, or a value is not finite.
+            predicted: (..., 7) finite actions of a policy in the protocol's convention.
         """
         actions = np.array(predicted, np.float64)
-        if actions.ndim == 0 or actions.shape[-1] != ACTION_DIM:
-            raise PolicyError(f"predicted actions have shape {actions.shape}; expected (..., {ACTION_DIM})")
-        if not np.isfinite(actions).all():
-            raise PolicyError("predicted actions are not finite")
         gripper = self.protocol.action.gripper or "as_predicted"
         actions[..., -1] = GRIPPERS[gripper](np.asarray(predicted)[..., -1])
         return actions

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.envs.checks import checked_numbers
 from libero_env.tasks import get_task
-from libero_env.text import shown
 from libero_eval.protocols.adapter import ACTION_DIM, ProtocolAdapter
 from libero_eval.servers.openpi import OpenpiClient
 from libero_eval.servers.serving import PREFIX
@@ -172,11 +172,5 @@ class ServedActor:
         request: dict[str, Any] = {PREFIX + name: np.asarray(obs[name]) for name in self._names}
         actions = self._client.request(request if self._begun else request | self._first).get("actions")
         self._begun = True
-        expected = (len(next(iter(obs.values()))), 1, self.action_dim)
-        address = self._client.address
-        if not isinstance(actions, np.ndarray) or actions.dtype.kind != "f" or actions.shape != expected:
-            came = f"{actions.dtype} {actions.shape}" if isinstance(actions, np.ndarray) else shown(actions)
-            raise ServerError(f"{address} sent as actions {came}; expected floats of shape {expected}")
-        if not np.isfinite(actions).all():
-            raise ServerError(f"{address} sent actions that are not finite")
-        return actions[:, 0].astype(np.float64)
+        shape = (len(next(iter(obs.values()))), 1, self.action_dim)
+        return checked_numbers(actions, f"the actions of {self._client.address}", (shape,), ServerError)[:, 0]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.envs.checks import checked_numbers
 from libero_env.errors import LiberoError, MissingPackageError, SimulationError
 from libero_env.tasks import Task, get_suite
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
@@ -185,9 +186,8 @@ class LiberoBenchmark(StepBenchmark):
             SimulationError: The simulation has diverged.
         """
         assert self._env is not None and self._adapter is not None, "reset was called"
-        predicted = np.asarray(action.get("actions", action.get("action")), np.float64)
-        if predicted.shape != (7,):
-            raise PolicyError(f"the server sent actions of shape {predicted.shape}; expected (7,)")
+        answer = action.get("actions", action.get("action"))
+        predicted = checked_numbers(answer, "the server's actions", ((7,),), PolicyError)
         executed = predicted if self.observations else self._adapter.actions(predicted)
         obs, reward, _, _, info = self._env.step(executed[None])
         if "errors" in info:

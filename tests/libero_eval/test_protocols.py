@@ -208,14 +208,6 @@ def test_gripper_maps(gripper, expected):
     np.testing.assert_array_equal(actions[:, :-1], predicted[:, :-1])
 
 
-def test_invalid_predictions_are_named():
-    adapter = ProtocolAdapter(load_protocol("openpi"), TASK)
-    with pytest.raises(PolicyError, match=r"shape \(2, 6\)"):
-        adapter.actions(np.zeros((2, 6)))
-    with pytest.raises(PolicyError, match="not finite"):
-        adapter.actions(np.full((1, 7), np.nan))
-
-
 class Chunks:
     """Predicts chunks that count up, and notes what it is given."""
 

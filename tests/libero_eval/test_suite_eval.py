@@ -225,7 +225,10 @@ def test_names_and_conventions_of_the_original():
 
 @pytest.mark.parametrize(
     ("answer", "message"),
-    [(np.zeros((3, 6)), r"\(3, 6\); expected \(3, 7\)"), (np.full((3, 7), np.nan), "not finite")],
+    [
+        (np.zeros((3, 6)), r"expected finite numbers of shape \(3, 7\), got \(3, 6\)"),
+        (np.full((3, 7), np.nan), r"must be finite; entry \[0, 0\] is nan"),
+    ],
 )
 def test_invalid_actions_are_refused(answer, message):
     policy = argparse.Namespace(predict=lambda observations: answer)

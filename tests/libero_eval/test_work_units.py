@@ -129,7 +129,7 @@ def test_a_process_begins_with_a_task_that_nobody_works_on(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         evaluate(tmp_path, env=env, **TWO)
     assert begun == [TASKS[1].id]
-    assert list(plan.store.held()) == [plan.units[0].name], "the other unit was given back"
+    assert list(plan.store.claims.held()) == [plan.units[0].name], "the other unit was given back"
 
 
 def test_a_process_that_does_not_wait_leaves_what_others_hold(tmp_path):
