@@ -135,10 +135,10 @@ def test_a_process_begins_with_a_task_that_nobody_works_on(tmp_path):
 def test_a_process_that_does_not_wait_leaves_what_others_hold(tmp_path):
     plan = evaluation(tmp_path)
     claim = plan.store.claims.take(plan.units[0].name)
-    assert Worker(plan).work(wait=False) is None
+    assert Worker(plan).run(wait=False) is None
     assert set(plan.store.done(plan.units)) == {unit.name for unit in plan.units[1:]}
     plan.store.claims.release(claim)
-    assert Worker(plan).work(wait=False) == evaluate(tmp_path / "other")
+    assert Worker(plan).run(wait=False) == evaluate(tmp_path / "other")
 
 
 def test_tasks_are_announced_once_each_and_progress_is_that_of_all(tmp_path):
