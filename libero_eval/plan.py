@@ -35,6 +35,7 @@ from lifelong.results.provenance import installed_versions, source_digest
 
 def evaluate(
     request: EvalRequest,
+    evaluation: Evaluation | None = None,
     *,
     on_task: Callable[[TaskResult], None] = lambda _: None,
     on_progress: Callable[[Progress], None] = lambda _: None,
@@ -43,6 +44,7 @@ def evaluate(
 
     Args:
         request: Policy, tasks and episodes.
+        evaluation: The evaluation that is asked for, where it is planned already, see `plan_evaluation`.
         on_task: Function called with the result of each task as soon as it is known.
         on_progress: Function called with the progress of all processes every half minute, and at the end.
 
@@ -54,17 +56,7 @@ def evaluate(
             another evaluation.
         EvaluationIncompleteError: Episodes ended with errors; the others are kept.
     """
-    return run(plan_evaluation(request), request, on_task=on_task, on_progress=on_progress)
-
-
-def run(
-    evaluation: Evaluation,
-    request: EvalRequest,
-    *,
-    on_task: Callable[[TaskResult], None] = lambda _: None,
-    on_progress: Callable[[Progress], None] = lambda _: None,
-) -> EvaluationResult:
-    """Run a planned evaluation in as many processes as the request names; see `evaluate`."""
+    evaluation = evaluation or plan_evaluation(request)
     store, units = evaluation.store, evaluation.units
     count = min(request.workers, len(units))
     remedy = "fewer --workers, --unit-starts or --videos, or a smaller --size"

@@ -107,7 +107,10 @@ def saliency(
                     0.5 * difference.square().sum(-1) if measure == "action" else difference.abs()[:, 0]
                 )
             maps.append(torch.cat(changes).view(1, 1, len(rows), len(cols)))
-    return _interpolate(torch.cat(maps, dim=1).float(), rows, cols, (height, width))[0]
+    values = torch.cat(maps, dim=1).float()  # at places that are the cell centres of a regular grid
+    if (len(rows), len(cols)) != (height, width):
+        values = functional.interpolate(values, size=(height, width), mode="bilinear", align_corners=False)
+    return values[0]
 
 
 def overlay(image: np.ndarray, heat: np.ndarray, strongest: float) -> np.ndarray:
@@ -218,13 +221,6 @@ def _perturbed(batch: Batch, blurred: Tensor, masks: Tensor, view: int) -> Batch
 def _outputs(policy: Policy, batch: Batch, measure: str) -> Tensor:
     """Return (B, A) actions at the last step, or (B, 1) losses."""
     return policy.predict(batch)[:, -1] if measure == "action" else policy.window_losses(batch)[:, None]
-
-
-def _interpolate(values: Tensor, rows: Tensor, cols: Tensor, size: tuple[int, int]) -> Tensor:
-    """Interpolate values at places (1, V, R, C), the cell centres of a regular grid, to (1, V, H, W)."""
-    if (len(rows), len(cols)) == size:
-        return values
-    return functional.interpolate(values, size=size, mode="bilinear", align_corners=False)
 
 
 @dataclass

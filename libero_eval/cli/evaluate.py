@@ -31,7 +31,8 @@ class EvalOptions(EvalRequest):
 def evaluate(options: EvalOptions) -> None:
     """Evaluate a policy; print a row for each task, the mean, and the file of the results."""
     from libero_eval.evaluation_file import FILE_NAME
-    from libero_eval.plan import plan_evaluation, run
+    from libero_eval.plan import evaluate as run
+    from libero_eval.plan import plan_evaluation
     from libero_eval.work.progress import HEADER, describe_status, table_row, total_rows
 
     if options.status:
@@ -44,7 +45,7 @@ def evaluate(options: EvalOptions) -> None:
         print(*heads, table_row(result), sep="\n", flush=True)
         heads.clear()
 
-    result = run(evaluation, options, on_task=print_row, on_progress=_print_progress)
+    result = run(options, evaluation, on_task=print_row, on_progress=_print_progress)
     print(*total_rows(result.tasks), evaluation.out / FILE_NAME, sep="\n")
     for name in ("renderer", "instruction_set"):
         if isinstance(values := result.environment.get(name), list):

@@ -154,7 +154,12 @@ def compare_groups(
         (controls if _is_control(a, b) else rivals).append((a, b))
     notes += [note for a, b in controls for note in _control_notes(a, b)]
     comparisons = _adjusted([_compare(a, b, alpha) for a, b in rivals])
-    notes += [_dropped(c) for c in comparisons if any(c.dropped)]
+    notes += [
+        f"{c.first} and {c.second}: {c.total.difference.pairs} pairs; without a partner and not counted: "
+        f"{c.dropped[0]} episodes of {c.first}, {c.dropped[1]} of {c.second}"
+        for c in comparisons
+        if any(c.dropped)
+    ]
     if not controls:
         notes.append(
             "no control arm: evaluate one of the policies again with another --seed and name both results "
@@ -293,10 +298,3 @@ def _control_notes(a: Group, b: Group) -> list[str]:
             "or other hardware to see chance"
         ]
     return []
-
-
-def _dropped(c: Contrast) -> str:
-    return (
-        f"{c.first} and {c.second}: {c.total.difference.pairs} pairs; without a partner and not counted: "
-        f"{c.dropped[0]} episodes of {c.first}, {c.dropped[1]} of {c.second}"
-    )

@@ -31,7 +31,9 @@ def render(comparison: Comparison, *, tasks: bool = False) -> str:
     """
     blocks = [_rates(comparison)]
     blocks += [_contrast_text(c, comparison.alpha, tasks) for c in comparison.comparisons]
-    blocks += [_control_text(c) for c in comparison.controls]
+    for c in comparison.controls:
+        head = f"control arm: {c.first} − {c.second}, one policy twice"
+        blocks.append("\n".join([head, chance_text(c), "", _table(c, (c.total, *c.suites))]))
     blocks += [_groups(comparison)] if comparison.groups else []
     blocks += ["\n".join(f"note: {note}" for note in comparison.notes)] if comparison.notes else []
     return "\n\n".join(blocks)
@@ -121,11 +123,6 @@ def _contrast_text(c: Contrast, alpha: float, all_tasks: bool) -> str:
         head = "every task" if all_tasks else f"tasks that differ most (of {len(c.tasks)})"
         lines += ["", f"{head}; Holm over the tasks", _table(c, shown)]
     return "\n".join(lines)
-
-
-def _control_text(c: Contrast) -> str:
-    head = f"control arm: {c.first} − {c.second}, one policy twice"
-    return "\n".join([head, chance_text(c), "", _table(c, (c.total, *c.suites))])
 
 
 def _table(c: Contrast, rows: Sequence[Row]) -> str:

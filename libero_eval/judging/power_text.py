@@ -22,7 +22,8 @@ def answer(question: Question) -> str:
     """Say how many episodes a difference needs: in the same starts, in others, and with a test that stops early."""
     paired, unpaired = paired_episodes(question), unpaired_episodes(question)
     lines = [
-        _asked(question),
+        f"success {100 * question.base:.1f} % and {100 * question.other:.1f} %, "
+        f"power {100 * question.power:.0f} %, alpha {question.alpha:g}{_tests(question)}",
         f"same starts (McNemar, exact; {100 * question.differing:.1f} % of the pairs differ"
         f"{'' if question.discordance is not None else ', as independent outcomes do'}): "
         f"{paired} episodes of each policy",
@@ -78,13 +79,6 @@ def _episodes(question: Question, gap: float, share: float | None) -> str:
         return str(paired_episodes(replace(question, difference=gap, discordance=share)))
     except ConfigError:  # with these rates, so many pairs cannot differ
         return "–"
-
-
-def _asked(question: Question) -> str:
-    return (
-        f"success {100 * question.base:.1f} % and {100 * question.other:.1f} %, power {100 * question.power:.0f} %, "
-        f"alpha {question.alpha:g}{_tests(question)}"
-    )
 
 
 def _tests(question: Question) -> str:

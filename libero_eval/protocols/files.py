@@ -34,11 +34,6 @@ def load_protocol(protocol: str | Path) -> EvalProtocol:
     return _packaged(path) if path.parent == _FOLDER else _load(path)
 
 
-@lru_cache(maxsize=64)
-def _packaged(path: Path) -> EvalProtocol:
-    return _load(path)
-
-
 def _load(path: Path) -> EvalProtocol:
     if path.suffix != ".json":
         return EvalProtocol.read({**_content(path, ()), "name": path.stem}, str(path))
@@ -46,6 +41,9 @@ def _load(path: Path) -> EvalProtocol:
         return EvalProtocol.read(EvaluationResult.read(path).protocol, str(path))
     except EvaluationFileError as error:
         raise ProtocolError(str(error)) from error
+
+
+_packaged = lru_cache(maxsize=64)(_load)
 
 
 def _path(protocol: str, folder: Path) -> Path:

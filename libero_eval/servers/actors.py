@@ -76,16 +76,14 @@ class RemoteActor:
             inputs = dict(zip(rows, self._adapter.inputs(obs, rows), strict=True))
             answers = self._client.ask(inputs)
             for i in rows:
-                predicted = checked_actions(answers[i], self._replan, self._describe(i))
+                episode = self._episodes[i]
+                where = f"{self._client.address} ({episode.task.id}, initial state {episode.init_state})"
+                predicted = checked_actions(answers[i], self._replan, where)
                 self._chunks[i].extend(self._adapter.actions(predicted))
         actions = np.zeros((len(self._chunks), self.action_dim))
         for i in running:
             actions[i] = self._chunks[i].popleft()
         return actions
-
-    def _describe(self, i: int) -> str:
-        episode = self._episodes[i]
-        return f"{self._client.address} ({episode.task.id}, initial state {episode.init_state})"
 
 
 def checked_actions(answer: Any, replan: int | None, where: str) -> np.ndarray:

@@ -14,7 +14,7 @@ import pytest
 from libero_env import memory
 from libero_env.cli import main as cli
 from libero_eval.evaluation_file import EvaluationResult, overall
-from libero_eval.plan import choose_init_states, plan_evaluation, run
+from libero_eval.plan import choose_init_states, evaluate, plan_evaluation
 from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
 from libero_eval.user_policy import ORIGINAL_NAMES, CallableActor, UserPolicy, as_original, load_callable
@@ -92,7 +92,7 @@ def test_another_source_of_the_package_is_told_and_stated(tmp_path, capsys):
     """As after another commit: what is done stays, and the result names both."""
     first = evaluation(tmp_path, unit_starts=2, tasks=TASKS[:1], versions={"mujoco": "3", "source": "aaa"})
     request = EvalRequest(policy="expert")
-    run(first, request)
+    evaluate(request, first)
     assert "another source" not in capsys.readouterr().err
     grown = run(evaluation(tmp_path, unit_starts=2, versions={"mujoco": "3", "source": "bbb"}), request)
     assert "another source of this package (aaa; here bbb)" in capsys.readouterr().err

@@ -3,7 +3,7 @@
 import re
 from collections import UserDict
 from collections.abc import Callable, Mapping, MutableMapping
-from functools import cached_property, partial, partialmethod
+from functools import cached_property, partialmethod
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -27,11 +27,7 @@ class _Objects(UserDict):
         super().__setitem__(category, made_by)
         is_builtin = isinstance(made_by, type) and issubclass(made_by, BuiltinObject)
         if not (is_builtin and category in builtin_names()):
-            register_model(category, partial(_model, made_by, category))
-
-
-def _model(made_by: Any, category: str) -> ObjectModel:
-    return model_of(made_by(name=category), category)
+            register_model(category, lambda: model_of(made_by(name=category), category))
 
 
 OBJECTS_DICT: MutableMapping[str, Any] = _Objects()
