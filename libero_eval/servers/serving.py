@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from http import HTTPStatus
 from itertools import count
 from typing import Annotated, Any, Literal
@@ -394,7 +394,6 @@ class PolicyServer:
     ):
         self._metadata, self._session = metadata, session
         self._host, self._port = host, port
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="policy")
         self._key = os.environ.get(API_KEY)
 
     async def run(self, on_ready: Callable[[int], None] = lambda port: None) -> None:
@@ -410,6 +409,8 @@ class PolicyServer:
         row = sum(8 * math.prod(one["shape"]) for one in self._metadata["observation"].values())
         most = (1 << 20) + MAX_ROWS * row  # of a request, [bytes]
         options = {"compression": None, "max_size": most, "max_queue": 1}
+        loop = asyncio.get_running_loop()
+        loop.set_default_executor(ThreadPoolExecutor(1, thread_name_prefix="policy"))  # one request at a time
         async with serve(
             self._handle, self._host, self._port, process_request=self._respond, **options
         ) as server:
@@ -425,7 +426,7 @@ class PolicyServer:
             while True:
                 data = await socket.recv()
                 began = time.perf_counter()
-                answer = await self._in_worker(partial(self._answer, session, data, last))
+                answer = await asyncio.to_thread(self._answer, session, data, last)
                 await socket.send(answer)
                 last = time.perf_counter() - began
         except closed:
@@ -433,7 +434,7 @@ class PolicyServer:
         except Exception as error:  # noqa: BLE001 - whatever went wrong ends this client only
             await self._fail(socket, error)
         finally:
-            await self._in_worker(session.close)
+            await asyncio.to_thread(session.close)
 
     def _answer(self, session: Session, data: bytes | str, last: float | None) -> bytes:
         if isinstance(data, str):
@@ -445,9 +446,6 @@ class PolicyServer:
         if last is not None:
             timing["prev_total_ms"] = 1000 * last
         return OPENPI.pack({**answer, "server_timing": timing})
-
-    async def _in_worker(self, work: Callable[[], Any]) -> Any:
-        return await asyncio.get_running_loop().run_in_executor(self._worker, work)
 
     async def _fail(self, socket: Any, error: Exception) -> None:
         """Send an error in one line, tell the operator, and close the connection; the client may be gone."""

@@ -14,7 +14,8 @@ import pytest
 from libero_env import memory
 from libero_env.cli import main as cli
 from libero_eval.evaluation_file import EvaluationResult, overall
-from libero_eval.plan import choose_init_states, evaluate, plan_evaluation
+from libero_eval.plan import choose_init_states, plan_evaluation
+from libero_eval.plan import evaluate as evaluate_request
 from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
 from libero_eval.user_policy import ORIGINAL_NAMES, CallableActor, UserPolicy, as_original, load_callable
@@ -92,9 +93,10 @@ def test_another_source_of_the_package_is_told_and_stated(tmp_path, capsys):
     """As after another commit: what is done stays, and the result names both."""
     first = evaluation(tmp_path, unit_starts=2, tasks=TASKS[:1], versions={"mujoco": "3", "source": "aaa"})
     request = EvalRequest(policy="expert")
-    evaluate(request, first)
+    evaluate_request(request, first)
     assert "another source" not in capsys.readouterr().err
-    grown = run(evaluation(tmp_path, unit_starts=2, versions={"mujoco": "3", "source": "bbb"}), request)
+    second = evaluation(tmp_path, unit_starts=2, versions={"mujoco": "3", "source": "bbb"})
+    grown = evaluate_request(request, second)
     assert "another source of this package (aaa; here bbb)" in capsys.readouterr().err
     assert grown.versions == {"mujoco": "3", "source": ["aaa", "bbb"]}
 
