@@ -502,7 +502,7 @@ def test_a_full_disk_counts_nothing_and_the_same_command_goes_on(tmp_path, monke
             return super().predict(observations)
 
     try:
-        with pytest.raises(ResultsError, match="cannot be written, it is not counted.*too large"):
+        with pytest.raises(ResultsError, match="which is not counted, cannot be written.*too large"):
             evaluate(tmp_path, Filling(), **TWO)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
