@@ -31,16 +31,9 @@ from libero_eval.servers.transport import (
 from lifelong.errors import CodecError, ServerError
 
 VIDEO = {"image": "agentview", "wrist_image": "robot0_eye_in_hand"}  # key -> camera
-STATE = {
-    "x": slice(0, 1),
-    "y": slice(1, 2),
-    "z": slice(2, 3),
-    "roll": slice(3, 4),
-    "pitch": slice(4, 5),
-    "yaw": slice(5, 6),
-    "gripper": slice(6, 8),
-}  # key -> part of the state; roll, pitch and yaw are a rotation vector, as in their environment
 ACTION = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
+# key -> part of the state; roll, pitch and yaw are a rotation vector, as in their environment
+STATE = {key: slice(i, i + 1) for i, key in enumerate(ACTION)} | {"gripper": slice(6, 8)}
 PROMPT = "annotation.human.action.task_description"
 _KEYS = {"video": tuple(VIDEO), "state": tuple(STATE), "action": ACTION, "language": (PROMPT,)}
 

@@ -48,14 +48,14 @@ def tiny(*overrides: str) -> Config:
     return load_config(*TINY, *TINY_TRANSFORMER, *overrides)
 
 
-def write_demos(path: Path, lengths: tuple[int, ...] = (5, 4), seed: int = 0) -> Path:
+def write_demos(path: Path, lengths: tuple[int, ...] = (5, 4), seed: int = 0, size: int = SIZE) -> Path:
     """Write demonstrations of noise with the given lengths."""
     rng = np.random.default_rng(seed)
     writer = DemoWriter(path, {"pairing": "aligned"})
     for index, steps in enumerate(lengths):
         obs = {
-            "agentview_rgb": rng.integers(0, 255, (steps, SIZE, SIZE, 3), np.uint8),
-            "eye_in_hand_rgb": rng.integers(0, 255, (steps, SIZE, SIZE, 3), np.uint8),
+            "agentview_rgb": rng.integers(0, 255, (steps, size, size, 3), np.uint8),
+            "eye_in_hand_rgb": rng.integers(0, 255, (steps, size, size, 3), np.uint8),
             "joint_states": rng.normal(size=(steps, 7)),
             "gripper_states": rng.normal(size=(steps, 2)),
             "ee_pos": rng.normal(size=(steps, 3)),

@@ -2,13 +2,11 @@
 
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from libero.libero.benchmark import get_benchmark
 from libero_env.demos.generate import generate
-from libero_env.demos.read import Episode
-from libero_env.demos.write import DemoWriter
+from tests.harness.facade_learning import write_demos
 from tests.walkthroughs.blocks import Block, load_blocks
 
 SIZE, STEPS = 128, 6
@@ -35,7 +33,7 @@ def demos(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("demos")
     suite = get_benchmark("libero_object")()
     for i in range(suite.n_tasks):
-        write_noise(root / suite.get_task_demonstration(i))
+        write_demos(root / suite.get_task_demonstration(i), (STEPS,), size=SIZE)
     return root
 
 
@@ -44,21 +42,6 @@ def drawer(demos) -> Path:
     """A demonstration by the expert of the task that is looked into and replayed."""
     path = demos / get_benchmark("libero_goal")().get_task_demonstration(0)
     return generate("libero_goal/0", 1, path=path, camera_size=(64, 64), workers=1, progress=False)
-
-
-def write_noise(path: Path) -> None:
-    rng = np.random.default_rng(0)
-    pictures = {
-        k: rng.integers(0, 255, (STEPS, SIZE, SIZE, 3), np.uint8)
-        for k in ("agentview_rgb", "eye_in_hand_rgb")
-    }
-    sizes = {"joint_states": 7, "gripper_states": 2, "ee_pos": 3, "ee_ori": 3}
-    readings = {key: rng.normal(size=(STEPS, size)) for key, size in sizes.items()}
-    writer = DemoWriter(path, {"pairing": "aligned"})
-    writer.write(
-        0, Episode(rng.uniform(-1, 1, (STEPS, 7)), np.zeros((STEPS, 5)), None, {**pictures, **readings})
-    )
-    writer.finish()
 
 
 @pytest.fixture
