@@ -132,14 +132,10 @@ def export(
 def _question(options: PowerOptions) -> "Question":
     from lifelong.stats.power import Question, discordance_of
 
-    base, gap, discordance = options.base, options.difference, options.discordance
-    if options.results:
-        observed = _observed(options.results)
-        base = observed[0] if base is None else base
-        gap = observed[1] if gap is None else gap
-        discordance = observed[2] if discordance is None and options.correlation is None else discordance
-    base = 0.9 if base is None else base
-    gap = 0.03 if gap is None else gap
+    usual = _observed(options.results) if options.results else (0.9, 0.03, None)
+    base = usual[0] if options.base is None else options.base
+    gap = usual[1] if options.difference is None else options.difference
+    discordance = usual[2] if options.discordance is None else options.discordance
     if gap > 0 and base + gap > 1:
         raise ConfigError(
             f"--base {base:g} and --difference {gap:g} give a success of {base + gap:g}, above 1"
