@@ -15,7 +15,7 @@ pytestmark = pytest.mark.sim
 ARTICULATED = tuple(
     name
     for name in object_names()
-    if name != "target_zone" and any(part.joint for part in load_physics(name).parts.values())
+    if name != "target_zone" and any("joint" in part for part in load_physics(name).bodies.values())
 )
 STOPPED = {  # category -> how far its parts get, m: to the frame, the shelf, the back
     "short_cabinet": (-0.0015, 0.16),

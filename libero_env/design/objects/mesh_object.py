@@ -13,7 +13,7 @@ from libero_env.assets.simplify import decimate
 from libero_env.design.objects.collision import Pieces, collision_pieces, is_closed
 from libero_env.design.objects.mesh_file import MAX_FACES, Notify, Surface, bounds, read_mesh
 from libero_env.errors import InvalidInputError, LiberoError
-from libero_env.objects.builtin.physics import FRICTION, SOLIMP, SOLREF
+from libero_env.objects.builtin.physics import CONTACT
 from libero_env.objects.folder import MODEL
 from libero_env.objects.model import ROOT_BODY
 from libero_env.validation import checked
@@ -158,9 +158,7 @@ def _add_collision(category: str, pieces: Pieces, assets: ET.Element, main: ET.E
         "group": "0",
         "condim": "3",
         "rgba": "0.8 0.8 0.8 0.3",
-        "friction": _text(FRICTION),
-        "solref": _text(SOLREF),
-        "solimp": _text((*SOLIMP, 0.5, 2.0)),
+        **{key: _text(values) for key, values in CONTACT.items()},
         "mass": "0",
     }
     for number, points in enumerate(pieces.meshes):

@@ -83,10 +83,11 @@ def _in_body(drawn: Mesh, category: str, body: str, *, at_rest: bool) -> Mesh:
         return drawn.rotated(rest_quat(physics.rotation) * _CONJUGATE)
     chain = []
     while body != ROOT_BODY:
-        chain.append(physics.parts[body])
-        body = chain[-1].parent
+        chain.append(physics.bodies[body])
+        body = chain[-1]["parent"]
     for part in reversed(chain):
-        drawn = drawn.moved(np.negative(part.pos)).rotated(np.multiply(part.quat, _CONJUGATE))
+        drawn = drawn.moved(np.negative(part.get("pos", (0.0, 0.0, 0.0))))
+        drawn = drawn.rotated(np.multiply(part.get("quat", (1.0, 0.0, 0.0, 0.0)), _CONJUGATE))
     return drawn
 
 

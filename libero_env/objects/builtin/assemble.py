@@ -1,16 +1,20 @@
 """The models of the builtin objects, from their physics (`parameters/`) and their appearance (`appearance/`)."""
 
-from collections.abc import Iterator
+from collections.abc import Mapping
 from itertools import count
+from typing import Any
 
 from libero_env.mujoco_compat import mujoco, set_damping
 from libero_env.objects.builtin.appearance import Appearance, appearance_of
-from libero_env.objects.builtin.physics import Part, Physics, categories, load_physics
+from libero_env.objects.builtin.physics import categories, load_physics
 from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, VISUAL_GEOM, ObjectModel
 
 HIDDEN_GROUP = 3
 GLOWING_SITES = ("burner",)
 TARGET_ZONE = "target_zone"
+_SOLID: Mapping[str, Any] = {"group": 0, "condim": 3, "rgba": (0.8, 0.8, 0.8, 0.3)}
+_HIDDEN: Mapping[str, Any] = {"group": HIDDEN_GROUP, "rgba": (0.0, 0.0, 0.0, 0.0)}
+_GLOWING: Mapping[str, Any] = {"group": GLOW_GROUP, "rgba": (0.9, 0.05, 0.05, 1.0)}
 
 
 def builtin_names() -> frozenset[str]:
@@ -30,55 +34,41 @@ def build(category: str) -> ObjectModel:
     spec = mujoco.MjSpec()
     spec.modelname = category
     spec.compiler.degree = False
-    bodies = {ROOT_BODY: spec.worldbody.add_body(name=ROOT_BODY)}
-    for name, part in physics.parts.items():
-        bodies[name] = bodies[part.parent].add_body(name=name, pos=part.pos, quat=part.quat)
+    bodies: dict[str, mujoco.MjsBody] = {}
     numbers = count()
-    for name, part in {ROOT_BODY: physics.root, **physics.parts}.items():
-        _add_mass(bodies[name], part)
-        _add_joint(bodies[name], part)
-        _add_collision(bodies[name], part, physics, numbers)
-        _add_sites(bodies[name], part, name == ROOT_BODY)
+    for name, part in physics.bodies.items():
+        parent = bodies[part["parent"]] if "parent" in part else spec.worldbody
+        body = bodies[name] = parent.add_body(
+            name=name, pos=part.get("pos", (0.0, 0.0, 0.0)), quat=part.get("quat", (1.0, 0.0, 0.0, 0.0))
+        )
+        body.explicitinertial = True
+        body.mass, body.ipos = part.get("mass", 0.0), part.get("com", (0.0, 0.0, 0.0))
+        if body.mass:
+            body.fullinertia = part["inertia"]
+        else:
+            body.inertia = (0.0, 0.0, 0.0)
+        if "joint" in part:
+            joint = dict(part["joint"])
+            damping, kind = joint.pop("damping", 0.0), f"mjJNT_{joint.pop('type').upper()}"
+            set_damping(body.add_joint(type=getattr(mujoco.mjtJoint, kind), **joint), damping)
+        for box in part.get("boxes", ()):
+            options = {**_SOLID, **physics.contact, **_shape(box)}
+            body.add_geom(name=f"g{next(numbers)}", **options)
+        if name == ROOT_BODY:
+            sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+            body.add_site(name="default_site", type=sphere, size=(0.002,) * 3, **_HIDDEN)
+        for site in part.get("sites", ()):
+            body.add_site(**_shape(site), **(_GLOWING if site["name"] in GLOWING_SITES else _HIDDEN))
     for name, several in appearance_of(category).items():
         for index, appearance in enumerate(several):
             _add_visual(spec, bodies[name], category, appearance, suffix=f"_{index}" if index else "")
     return ObjectModel(category, spec, **physics.of_model)
 
 
-def _add_mass(body: mujoco.MjsBody, part: Part) -> None:
-    body.explicitinertial = True
-    body.mass, body.ipos = part.mass, part.com
-    if part.mass:
-        body.fullinertia = part.inertia
-    else:
-        body.inertia = (0.0, 0.0, 0.0)
-
-
-def _add_joint(body: mujoco.MjsBody, part: Part) -> None:
-    if part.joint is None:
-        return
-    kind = getattr(mujoco.mjtJoint, f"mjJNT_{part.joint.type.upper()}")
-    joint = body.add_joint(
-        name=part.joint.name, type=kind, axis=part.joint.axis, pos=part.joint.pos, range=part.joint.range
-    )
-    set_damping(joint, part.joint.damping)
-
-
-def _add_collision(body: mujoco.MjsBody, part: Part, physics: Physics, numbers: Iterator[int]) -> None:
-    for shape in part.boxes:
-        body.add_geom(
-            name=f"g{next(numbers)}",
-            type=getattr(mujoco.mjtGeom, f"mjGEOM_{shape.type.upper()}"),
-            pos=shape.pos,
-            size=_padded(shape.size),
-            quat=shape.quat,
-            friction=shape.friction or physics.friction,
-            condim=3,
-            solref=shape.solref or physics.solref,
-            solimp=(*(shape.solimp or physics.solimp), 0.5, 2.0),
-            group=0,
-            rgba=(0.8, 0.8, 0.8, 0.3),
-        )
+def _shape(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the keys of a shape as MuJoCo takes them: a box unless it has a type, a size of three numbers."""
+    kind = getattr(mujoco.mjtGeom, f"mjGEOM_{keys.get('type', 'box').upper()}")
+    return {**keys, "type": kind, "size": (*keys["size"], 0.0, 0.0)[:3]}
 
 
 def _add_visual(
@@ -117,31 +107,12 @@ def _add_visual(
     )
 
 
-def _add_sites(body: mujoco.MjsBody, part: Part, root: bool) -> None:
-    hidden = {"rgba": (0.0, 0.0, 0.0, 0.0), "group": HIDDEN_GROUP}
-    glowing = {"rgba": (0.9, 0.05, 0.05, 1.0), "group": GLOW_GROUP}
-    if root:
-        sphere = mujoco.mjtGeom.mjGEOM_SPHERE
-        body.add_site(name="default_site", type=sphere, pos=(0.0, 0.0, 0.0), size=(0.002,) * 3, **hidden)
-    for site in part.sites:
-        kind = getattr(mujoco.mjtGeom, f"mjGEOM_{site.type.upper()}")
-        style = glowing if site.name in GLOWING_SITES else hidden
-        body.add_site(
-            name=site.name, type=kind, pos=site.pos, size=_padded(site.size), quat=site.quat, **style
-        )
-
-
-def _padded(size: tuple[float, ...]) -> tuple[float, ...]:
-    return (*size, 0.0, 0.0, 0.0)[:3]
-
-
 def _target_zone() -> ObjectModel:
     """Return a flat translucent rectangle that marks a place; its site `default_site` is slightly above it."""
     spec, box, half = mujoco.MjSpec(), mujoco.mjtGeom.mjGEOM_BOX, (0.05, 0.05, 0.001)
     spec.modelname = TARGET_ZONE
     spec.compiler.degree = False
     body = spec.worldbody.add_body(name=ROOT_BODY, explicitinertial=True, mass=0.0, inertia=(0.0, 0.0, 0.0))
-    color, clear = (0.85, 0.15, 0.15, 0.5), (0.0, 0.0, 0.0, 0.0)
-    body.add_geom(name="visual", type=box, size=half, rgba=color, **VISUAL_GEOM)
-    body.add_site(name="default_site", type=box, size=(*half[:2], 0.007), rgba=clear, group=HIDDEN_GROUP)
+    body.add_geom(name="visual", type=box, size=half, rgba=(0.85, 0.15, 0.15, 0.5), **VISUAL_GEOM)
+    body.add_site(name="default_site", type=box, size=(*half[:2], 0.007), **_HIDDEN)
     return ObjectModel(category=TARGET_ZONE, spec=spec, horizontal_radius=half[0])
