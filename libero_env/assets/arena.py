@@ -6,14 +6,12 @@ from functools import cache
 from typing import Any
 
 from libero_env.assets.furnishing import (
-    add_furniture,
     add_material,
     add_visual_mesh,
+    chosen_styles,
     furniture,
-    furniture_of,
     load_styles,
     solid_mesh,
-    styles_of,
 )
 from libero_env.assets.robot import load_robosuite
 from libero_env.errors import UnknownNameError
@@ -21,15 +19,8 @@ from libero_env.mujoco_compat import delete, mujoco
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.storage import read_yaml
 
-# Fixture category of a workspace -> its file in `libero_env/assets/workspaces`.
-WORKSPACES: Mapping[str, str] = {
-    "table": "table",
-    "kitchen_table": "kitchen_table",
-    "living_room_table": "living_room_table",
-    "study_table": "study_table",
-    "coffee_table": "coffee_table",
-    "floor": "floor",
-}
+# Fixture categories of workspaces, each with a file in `libero_env/assets/workspaces`.
+WORKSPACES = ("table", "kitchen_table", "living_room_table", "study_table", "coffee_table", "floor")
 SPARE = "spare_"  # prefix of materials that nothing has
 _ROOM = "room"  # file with the parameters that all workspaces share
 _MOUNT_LIFT = 0.01  # [m] height of the mount's origin above the arm's
@@ -76,8 +67,11 @@ def load_workspace(category: str) -> Workspace:
     """
     if category not in WORKSPACES:
         raise UnknownNameError("workspace", category, WORKSPACES)
-    room, specific = _read(_ROOM), _read(WORKSPACES[category])
-    parameters = {**specific, **{key: _merged(room[key], specific.get(key, {})) for key in _SHARED}}
+    room, specific = _read(_ROOM), _read(category)
+    parameters = dict(specific)
+    for key in _SHARED:  # entries that are null in the specific file are left out
+        both = {**room[key], **specific.get(key, {})}
+        parameters[key] = {name: value for name, value in both.items() if value is not None}
     return Workspace(
         name=category,
         problem=parameters["problem"],
@@ -96,11 +90,11 @@ def workspace_of_problem(problem: str) -> Workspace:
     Raises:
         UnknownNameError: The problem class does not exist; the message lists the valid ones.
     """
-    categories = {load_workspace(category).problem: category for category in WORKSPACES}
-    for name, category in categories.items():
+    workspaces = {load_workspace(category).problem: load_workspace(category) for category in WORKSPACES}
+    for name, workspace in workspaces.items():
         if name.casefold() == problem.casefold():
-            return load_workspace(category)
-    raise UnknownNameError("problem", problem, categories)
+            return workspace
+    raise UnknownNameError("problem", problem, workspaces)
 
 
 def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]) -> None:
@@ -114,13 +108,21 @@ def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mappi
     Raises:
         UnknownNameError: A property or a style does not exist; the message lists the valid ones.
     """
-    parameters = workspace.parameters
-    styles = styles_of(parameters["styles"], scene_properties)
+    parameters, valid, world = workspace.parameters, load_styles(), spec.worldbody
+    styles = chosen_styles(parameters["styles"], scene_properties)
     add_cameras_and_lights(spec, workspace)
-    _add_room(spec, parameters, styles)
+    ground = world.add_body(name=parameters["floor_body"]) if parameters["floor_body"] else world
+    add_material(spec, "floor", valid["floor"][styles["floor"]])
+    plane, size = mujoco.mjtGeom.mjGEOM_PLANE, parameters["floor"]["size"]
+    ground.add_geom(name="floor", type=plane, size=size, material="floor", group=1, condim=3)
+    add_material(spec, "wall", valid["wall"][styles["wall"]], *parameters["wall_gloss"])
+    for name, wall in parameters["walls"].items():
+        world.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, material="wall", **_SEEN, **wall)
     if "table" in parameters:
         _add_table(spec, parameters["table"])
-    add_furniture(spec, furniture_of(parameters.get("furniture", ()), scene_properties))
+    more = valid["scene"][styles["scene"]].get("furniture", ())
+    if sets := tuple(dict.fromkeys([*parameters.get("furniture", ()), *more])):
+        add_visual_mesh(spec, world, "furniture", furniture(sets))
 
 
 def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
@@ -202,25 +204,6 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace, detailed: bool = False)
     spec.attach(mount, prefix="mount0_", frame=frame)
 
 
-def _add_room(
-    spec: mujoco.MjSpec, parameters: Mapping[str, Any], styles: Mapping[str, Mapping[str, Any]]
-) -> None:
-    world = spec.worldbody
-    ground = world.add_body(name=parameters["floor_body"]) if parameters["floor_body"] else world
-    add_material(spec, "floor", styles["floor"])
-    ground.add_geom(
-        name="floor",
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=parameters["floor"]["size"],
-        material="floor",
-        group=1,
-        condim=3,
-    )
-    add_material(spec, "wall", styles["wall"], *parameters["wall_gloss"])
-    for name, wall in parameters["walls"].items():
-        world.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, material="wall", **_SEEN, **wall)
-
-
 def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
     body = spec.worldbody
     for name, pos in table["bodies"].items():
@@ -250,8 +233,3 @@ def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
 @cache
 def _read(name: str) -> Mapping[str, Any]:
     return read_yaml(f"assets/workspaces/{name}.yaml")
-
-
-def _merged(common: Mapping[str, Any], specific: Mapping[str, Any]) -> dict[str, Any]:
-    """Return both, where entries of `specific` take precedence; those that are null there are left out."""
-    return {key: value for key, value in {**common, **specific}.items() if value is not None}

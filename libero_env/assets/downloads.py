@@ -28,7 +28,6 @@ MANIFEST = "libero-assets.json"  # written when all files are complete and verif
 _MAX_FILES = 100_000  # of a listing or an archive
 _MAX_NAME = 500  # characters
 _MAX_SIZE = 1 << 42  # [bytes]
-_BLOCK = 1 << 20  # [bytes] read at a time
 _SPARE_BYTES = 64 << 20  # [bytes] to leave free on the disk
 
 
@@ -52,21 +51,17 @@ class Remote:
         """Return whether a file exists and has this size and digest."""
         if not path.is_file() or path.stat().st_size != self.size:
             return False
-        return (
-            git_digest(path) if len(self.digest) == 40 else _update(hashlib.sha256(), path)
-        ) == self.digest
+        if len(self.digest) == 40:
+            return git_digest(path) == self.digest
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest() == self.digest
 
 
 def git_digest(path: Path) -> str:
     """Return the id that a file has as a git blob, 40 hexadecimal digits."""
-    return _update(hashlib.sha1(f"blob {path.stat().st_size}\0".encode(), usedforsecurity=False), path)
-
-
-def _update(digest: Any, path: Path) -> str:
+    digest = hashlib.sha1(f"blob {path.stat().st_size}\0".encode(), usedforsecurity=False)
     with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
+        return hashlib.file_digest(file, lambda: digest).hexdigest()
 
 
 def broken_files(folder: Path, remote: Mapping[str, Remote]) -> list[str]:

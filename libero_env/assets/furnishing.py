@@ -19,7 +19,6 @@ from libero_env.storage import read_yaml
 _SIZE = 128  # [pixels] default side of a texture
 _CELLS = 8  # colours along a side of the palette
 _CELL_PIXELS = 8  # side of a colour's square
-_FACES = ("front", "back", "left", "right", "top", "bottom")
 _COVERS = ("red", "navy", "teal", "cream", "yellow", "black", "orange", "white", "walnut")  # colours of books
 
 
@@ -29,10 +28,8 @@ def load_styles() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
     return read_yaml("assets/workspaces/styles.yaml")
 
 
-def styles_of(
-    defaults: Mapping[str, str], scene_properties: Mapping[str, str]
-) -> dict[str, Mapping[str, Any]]:
-    """Return the parameters of the styles of `floor` and `wall`.
+def chosen_styles(defaults: Mapping[str, str], scene_properties: Mapping[str, str]) -> dict[str, str]:
+    """Return the names of the styles of `floor`, `wall` and the whole `scene`.
 
     Args:
         defaults: Styles of the workspace.
@@ -48,15 +45,8 @@ def styles_of(
             raise UnknownNameError("scene property", kind, valid)
         if name not in valid[kind]:
             raise UnknownNameError(f"{kind} style", name, valid[kind])
-    scene = valid["scene"][chosen.pop("scene", "base")]
-    styles = {**defaults, **scene, **chosen}
-    return {kind: valid[kind][styles[kind]] for kind in ("floor", "wall")}
-
-
-def furniture_of(defaults: Sequence[str], scene_properties: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the names of the sets of furniture: those of the workspace, and those that the scene's style adds."""
-    scene = scene_properties.get("scene", scene_properties.get("scene_style", "base"))
-    return tuple(dict.fromkeys([*defaults, *load_styles()["scene"][scene].get("furniture", ())]))
+    scene = chosen.setdefault("scene", "base")
+    return {**defaults, **valid["scene"][scene], **chosen}
 
 
 def add_material(
@@ -92,7 +82,10 @@ def make_texture(style: Mapping[str, Any]) -> np.ndarray:
     size, rng = style.get("size", _SIZE), np.random.default_rng(0)
     image = np.empty((size, size, 3))
     image[:] = style["colours"][0]
-    image = _PATTERNS[style["pattern"]](image, style, rng)
+    return _as_pixels(_PATTERNS[style["pattern"]](image, style, rng))
+
+
+def _as_pixels(image: np.ndarray) -> np.ndarray:
     return np.clip(image * 255, 0, 255).astype(np.uint8)
 
 
@@ -172,12 +165,6 @@ _PATTERNS = {
 }
 
 
-def add_furniture(spec: mujoco.MjSpec, sets: tuple[str, ...]) -> None:
-    """Add sets of furniture, such as `kitchen`, as one geom without collisions."""
-    if sets:
-        add_visual_mesh(spec, spec.worldbody, "furniture", furniture(sets))
-
-
 def add_visual_mesh(
     spec: mujoco.MjSpec, body: mujoco.MjsBody, name: str, mesh: Mesh, material: str | None = None
 ) -> None:
@@ -192,7 +179,10 @@ def add_visual_mesh(
     if material is None:
         material = f"{name}_colours"
         added = spec.add_material(name=material, specular=0.1, shininess=0.1)
-        add_texture(spec, added, palette_texture())
+        cells, colours = np.zeros((_CELLS * _CELLS, 3)), list(_read_furniture()["palette"].values())
+        cells[: len(colours)] = colours
+        palette = cells.reshape(_CELLS, _CELLS, 3).repeat(_CELL_PIXELS, 0).repeat(_CELL_PIXELS, 1)
+        add_texture(spec, added, _as_pixels(palette))
     added = spec.add_mesh(
         name=name,
         uservert=mesh.vertices.ravel(),
@@ -209,35 +199,23 @@ def furniture(sets: tuple[str, ...]) -> Mesh:
     return merge([shape for name in sets for piece in _read_furniture()[name] for shape in _shapes(piece)])
 
 
-def palette_texture() -> np.ndarray:
-    """Return the palette texture, one square for each colour, (64, 64, 3) uint8."""
-    cells = np.zeros((_CELLS * _CELLS, 3))
-    colours = list(_read_furniture()["palette"].values())
-    cells[: len(colours)] = colours
-    image = cells.reshape(_CELLS, _CELLS, 3).repeat(_CELL_PIXELS, 0).repeat(_CELL_PIXELS, 1)
-    return np.clip(image * 255, 0, 255).astype(np.uint8)
-
-
 def _shapes(piece: Mapping[str, Any]) -> Iterator[Mesh]:
+    if "books" in piece:
+        shapes = _books(piece["books"], piece["count"])
+    elif "leaves" in piece:
+        shapes = _leaves(piece)
+    else:
+        shapes = [_painted(solid_mesh(piece), piece["in"])]
     times, *step = piece.get("repeat", [1, 0.0, 0.0, 0.0])
     for i in range(times):
-        for shape in _shape(piece):
-            yield Mesh(shape.vertices + np.multiply(step, i), shape.faces, shape.texcoords)
-
-
-def _shape(piece: Mapping[str, Any]) -> list[Mesh]:
-    if "books" in piece:
-        return _books(piece["books"], piece["count"])
-    if "leaves" in piece:
-        return _leaves(piece)
-    return [_painted(solid_mesh(piece), piece["in"])]
+        yield from (shape.moved(np.multiply(step, i)) for shape in shapes)
 
 
 def solid_mesh(piece: Mapping[str, Any]) -> Mesh:
     """Return the mesh of a `box` between two corners, or of a `round`: a stack of ellipses or rounded rectangles."""
     if "box" in piece:
         low, high = np.array(piece["box"][:3]), np.array(piece["box"][3:])
-        return box((high - low) / 2, (high + low) / 2, dict.fromkeys(_FACES, (0.0, 0.0, 1.0, 1.0)))
+        return box((high - low) / 2, (high + low) / 2, (0.0, 0.0, 1.0, 1.0))
     corner = piece.get("corner", 2.0)
     rings = [Ring(z, rx, ry, z, corner, crease=True) for z, rx, ry in piece["round"]]
     return loft(rings, piece.get("sides", 16), tuple(piece["at"]))

@@ -11,7 +11,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 from libero_env.assets.arena import Workspace, add_light
-from libero_env.assets.furnishing import load_styles, styles_of
+from libero_env.assets.furnishing import chosen_styles
 from libero_env.assets.original_mjcf import read_file, read_spec, to_xml, used_assets
 from libero_env.mujoco_compat import delete, mujoco
 from libero_env.storage import read_yaml
@@ -41,17 +41,13 @@ def arena_spec(root: Path, workspace: Workspace, scene_properties: Mapping[str, 
         UnknownNameError: A property or a style does not exist.
         LiberoError: Files are missing.
     """
-    defaults = workspace.parameters["styles"]
-    styles_of(defaults, scene_properties)  # raises where a name is wrong
-    chosen = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
-    scene = chosen.pop("scene", "base")
-    textures = {**defaults, **load_styles()["scene"][scene], **chosen}
-    file = scene_file(root, workspace.name, scene)
+    styles = chosen_styles(workspace.parameters["styles"], scene_properties)
+    file = scene_file(root, workspace.name, styles["scene"])
     assets, world = read_file(file, root)
     for element in assets:
         for kind, name in _TEXTURE_NAMES.items():
             if element.tag == "texture" and element.get("name") == name:
-                element.set("file", str(root / "textures" / TEXTURES[kind][textures[kind]]))
+                element.set("file", str(root / "textures" / TEXTURES[kind][styles[kind]]))
     for element in list(world):
         if element.tag in _EXCLUDED:
             world.remove(element)

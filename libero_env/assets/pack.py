@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from libero_env.assets.arena import WORKSPACES, Workspace, add_arena, load_workspace
 from libero_env.assets.downloads import broken_files, default_folder, read_manifest
@@ -31,20 +31,19 @@ VARIABLE = "LIBERO_ASSETS"
 _SOURCES = ("objects", "assets/arena.py", "assets/furnishing.py")
 
 
-class Pack(Protocol):
-    """Source of the models of objects and rooms. It is hashable: scenes are cached by it."""
-
-    def __hash__(self) -> int: ...
+@dataclass(frozen=True)
+class BuiltinPack:
+    """The pack that is generated in code: nothing to download. Packs are hashable: scenes are cached by them."""
 
     @property
     def name(self) -> str:
-        """Name of the pack in results and messages."""
-        ...
+        """Name of the pack in results and messages: `builtin`."""
+        return BUILTIN
 
     @property
     def digest(self) -> str:
-        """Text that changes with the files of the models, for results: they say which models they were made with."""
-        ...
+        """16 hexadecimal digits that change with the code and the parameters that models are generated from."""
+        return _builtin_digest()
 
     def build(self, category: str) -> ObjectModel:
         """Return a new model of a category at each call: the caller may change its spec.
@@ -53,11 +52,16 @@ class Pack(Protocol):
             UnknownNameError: No object has this name.
             LiberoError: This pack has no model of it.
         """
-        ...
+        if category in LIBERO_PRO and category not in object_names():
+            raise LiberoError(
+                f"the builtin pack has no model of {category}, which LIBERO-PRO adds; the original's distributions do: "
+                "`libero assets install`, then --assets original"
+            )
+        return get_object(category)
 
     def categories(self) -> tuple[str, ...]:
         """Return all categories that `build` knows, sorted."""
-        ...
+        return object_names()
 
     def add_arena(
         self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
@@ -67,41 +71,11 @@ class Pack(Protocol):
         Raises:
             UnknownNameError: A property names a style that does not exist.
         """
-        ...
-
-
-@dataclass(frozen=True)
-class BuiltinPack:
-    """The pack that is generated in code: nothing to download."""
-
-    @property
-    def name(self) -> str:
-        """Name of the pack: `builtin`."""
-        return BUILTIN
-
-    @property
-    def digest(self) -> str:
-        """16 hexadecimal digits that change with the code and the parameters that models are generated from."""
-        return _builtin_digest()
-
-    def build(self, category: str) -> ObjectModel:
-        """Return a new model of a category; see `Pack`."""
-        if category in LIBERO_PRO and category not in object_names():
-            raise LiberoError(
-                f"the builtin pack has no model of {category}, which LIBERO-PRO adds; the original's distributions do: "
-                "`libero assets install`, then --assets original"
-            )
-        return get_object(category)
-
-    def categories(self) -> tuple[str, ...]:
-        """Return all categories; see `Pack`."""
-        return object_names()
-
-    def add_arena(
-        self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
-    ) -> None:
-        """Add the arena of a workspace; see `Pack`."""
         add_arena(spec, workspace, scene_properties)
+
+
+Pack = BuiltinPack | OriginalPack
+"""Source of the models of objects and rooms."""
 
 
 class Choice(NamedTuple):

@@ -76,12 +76,9 @@ class FolderCheck:
     @property
     def differences(self) -> tuple[str, ...]:
         """A line for each file that is not the published one."""
-        kinds = {
-            "missing": self.missing,
-            "of another size than the published file": self.replaced,
-            "of the published size, but with other bytes": self.damaged,
-        }
-        return tuple(f"{name}: {kind}" for kind, names in kinds.items() for name in names)
+        replaced = (f"{name}: of another size than the published file" for name in self.replaced)
+        damaged = (f"{name}: of the published size, but with other bytes" for name in self.damaged)
+        return (*(f"{name}: missing" for name in self.missing), *replaced, *damaged)
 
     @property
     def summary(self) -> str:
@@ -140,7 +137,11 @@ def require_undamaged(root: Path) -> None:
 @lru_cache(maxsize=16)
 def check_folder(root: Path) -> FolderCheck:
     """Compare a folder with the published files, once in a process, and with the result in the cache if it is there."""
-    stamps = {name: (stat.st_size, stat.st_mtime_ns) for name, stat in _walk(root)}
+    stamps: dict[str, tuple[int, int]] = {}  # size and time of modification
+    for folder, _, names in os.walk(root, followlinks=True):
+        for path in (Path(folder, name) for name in names):
+            with suppress(OSError):  # a link that leads nowhere
+                stamps[path.relative_to(root).as_posix()] = path.stat().st_size, path.stat().st_mtime_ns
     content = repr(([(n, *stamps[n]) for n in sorted(stamps)], published_digest()))
     stamp = hashlib.sha256(content.encode()).hexdigest()
     sizes = {name: size for name, (size, _) in stamps.items()}
@@ -175,16 +176,6 @@ def _digests(root: Path, names: list[str]) -> dict[str, str]:
 def _digest(digests: Mapping[str, str]) -> str:
     text = "".join(f"{digests[name]} {name}\n" for name in sorted(digests))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _walk(root: Path) -> list[tuple[str, os.stat_result]]:
-    stats = []
-    for folder, _, names in os.walk(root, followlinks=True):
-        for name in names:
-            path = Path(folder, name)
-            with suppress(OSError):  # a link that leads nowhere
-                stats.append((path.relative_to(root).as_posix(), path.stat()))
-    return stats
 
 
 def _some(names: tuple[str, ...]) -> str:

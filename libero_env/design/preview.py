@@ -40,14 +40,11 @@ def contact_sheet(
         UnknownNameError: A camera does not exist.
     """
     check_picture(path)
-    env = LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size))
-    try:
+    with LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size)) as env:
         rows = [
             np.concatenate([_reset(env, i)[image_name(c, "rgb")] for c in cameras], axis=1)
             for i in range(starts)
         ]
-    finally:
-        env.close()
     sheet = Image.fromarray(np.concatenate(rows))
     draw = ImageDraw.Draw(sheet)
     for i in range(starts):
@@ -85,13 +82,10 @@ def compare_starts(
     check_picture(path)
     columns = []
     for perturb in ((), tuple(perturbations)):
-        env = LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size), perturb=perturb)
-        try:
+        with LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size), perturb=perturb) as env:
             obs = _reset(env, start)
             columns.append(np.concatenate([obs[image_name(c, "rgb")] for c in cameras]))
             changed = env.task
-        finally:
-            env.close()
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.concatenate(columns, axis=1)).save(path)
     return changed
@@ -124,22 +118,16 @@ def expert_video(
     Raises:
         UnsupportedGoalError: The goal needs a skill that the expert does not have.
     """
-    env = LiberoEnv(task, cameras=(camera,), camera_size=(size, size), horizon=MAX_STEPS)
-    try:
-        frames = [_reset(env, start)[image_name(camera, "rgb")]]
+    name = image_name(camera, "rgb")
+    with LiberoEnv(task, cameras=(camera,), camera_size=(size, size), horizon=MAX_STEPS) as env:
+        frames = [_reset(env, start)[name]]
         expert, terminated, truncated, step = Expert(task, np.random.default_rng(start)), False, False, 0
         while not (terminated or truncated or expert.failure_reason):
             env.render_images = step % _EVERY == _EVERY - 1
             obs, _, terminated, truncated, _ = env.step(expert.act(env.view))
             if env.render_images or terminated:
-                frames.append(
-                    env.render_cameras()[image_name(camera, "rgb")]
-                    if terminated
-                    else obs[image_name(camera, "rgb")]
-                )
+                frames.append(env.render_cameras()[name] if terminated else obs[name])
             step += 1
-    finally:
-        env.close()
     write_video(path, np.stack(frames), CONTROL_HZ // _EVERY)
     reason = expert.failure_reason or f"in phase {expert.phase} after {step} steps"
     return terminated, "" if terminated else reason

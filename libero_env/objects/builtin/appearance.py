@@ -59,22 +59,18 @@ def appearance_of(category: str) -> Mapping[str, Sequence[Appearance]]:
         recipe = read_section("appearance", recipe["like"]) | recipe
     seen: dict[str, list[Appearance]] = {}
     for look in (recipe, recipe["more"]) if "more" in recipe else (recipe,):
-        image, cells = _texture(look)
+        if "tiles" in look:
+            pixels, cells = _make_tiles(look["tiles"])
+        else:
+            picture, cells = look["picture"], look.get("cells", {})
+            pixels = weave(*picture["weave"]) if "weave" in picture else Canvas(**picture).pixels()
+        image = png(pixels)
         surface = {key: look[key] for key in ("specular", "shininess", "alpha") if key in look}
         bodies = look["bodies"] if "bodies" in look else {look.get("body", ROOT_BODY): look["mesh"]}
         for body, shapes in bodies.items():
             drawn = _in_body(merge(_shapes(shapes, cells)), category, body, at_rest="picture" in look)
             seen.setdefault(body, []).append(Appearance(drawn, image, **surface))
     return seen
-
-
-def _texture(look: Mapping[str, Any]) -> tuple[bytes, Mapping[str, Cell]]:
-    if "tiles" in look:
-        pixels, cells = _make_tiles(look["tiles"])
-        return png(pixels), cells
-    picture = look["picture"]
-    pixels = weave(*picture["weave"]) if "weave" in picture else Canvas(**picture).pixels()
-    return png(pixels), look.get("cells", {})
 
 
 def _in_body(drawn: Mesh, category: str, body: str, *, at_rest: bool) -> Mesh:
@@ -138,22 +134,12 @@ def _loft(
     return loft(rings, segments, center)
 
 
-def _box(half: Sequence[float], center: Sequence[float], cells: Any) -> Mesh:
-    """Return a box whose faces show cells of their own, or all the same one."""
-    faces = ("front", "back", "left", "right", "top", "bottom")
-    return mesh.box(half, center, cells if isinstance(cells, dict) else dict.fromkeys(faces, cells))
-
-
-def _triangles(corners: Any, faces: Any, texcoords: Any) -> Mesh:
-    return Mesh(np.array(corners, float), np.array(faces), np.array(texcoords, float))
-
-
 SHAPES: dict[str, Callable[..., Mesh]] = {
     "arch": solids.arch,
     "bar": solids.bar,
     "block": solids.block,
     "bottle": mesh.bottle,
-    "box": _box,
+    "box": mesh.box,
     "capsule": solids.capsule,
     "loft": _loft,
     "packet": mesh.packet,
@@ -161,7 +147,7 @@ SHAPES: dict[str, Callable[..., Mesh]] = {
     "quad": mesh.quad,
     "sweep": mesh.sweep,
     "tin": mesh.tin,
-    "triangles": _triangles,
+    "triangles": lambda *arrays: Mesh(*map(np.array, arrays)),
     "turned": solids.turned,
     "vessel": mesh.vessel,
 }

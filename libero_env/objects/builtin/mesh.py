@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from libero_env.geometry import quat_to_mat
+from libero_env.objects.builtin.paint import Cell
 
 CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
 SPARE = (0.0, 0.94, 1.0, 0.99)  # part of a vessel's texture that only its handle shows
@@ -84,8 +85,8 @@ def loft(rings: Sequence[Ring], segments: int, center: Sequence[float] = (0.0, 0
     return Mesh(vertices, _without_degenerate(vertices, faces), np.concatenate(coords))
 
 
-def box(half: Sequence[float], center: Sequence[float], cells: Mapping[str, Sequence[float]]) -> Mesh:
-    """Return a box whose faces show rectangles of the texture.
+def box(half: Sequence[float], center: Sequence[float], cells: Mapping[str, Cell] | Cell) -> Mesh:
+    """Return a box whose faces show rectangles of the texture, or all the same one.
 
     Args:
         half: Half extents (x, y, z), [m].
@@ -104,11 +105,12 @@ def box(half: Sequence[float], center: Sequence[float], cells: Mapping[str, Sequ
     quads = []
     for face, (normal, right, up) in frames.items():
         corners = [np.add(normal, np.add(np.multiply(s, right), np.multiply(t, up))) for s, t in CORNERS]
-        quads.append(quad([np.add(center, np.multiply(half, corner)) for corner in corners], cells[face]))
+        cell = cells[face] if isinstance(cells, Mapping) else cells
+        quads.append(quad([np.add(center, np.multiply(half, corner)) for corner in corners], cell))
     return merge(quads)
 
 
-def quad(corners: Sequence[Sequence[float] | np.ndarray], cell: Sequence[float]) -> Mesh:
+def quad(corners: Sequence[Sequence[float] | np.ndarray], cell: Cell) -> Mesh:
     """Return a quadrilateral, corners counter-clockwise from the lower left, with (u0, v0, u1, v1) of the texture."""
     u0, v0, u1, v1 = cell
     texcoords = np.array([(u0, v0), (u1, v0), (u1, v1), (u0, v1)], float)
@@ -117,7 +119,7 @@ def quad(corners: Sequence[Sequence[float] | np.ndarray], cell: Sequence[float])
 
 def sweep(
     *points: Sequence[float],
-    cell: Sequence[float] = SPARE,
+    cell: Cell = SPARE,
     segments: int = 8,
     round: float = 2.0,
     x: float = 0.0,
@@ -135,7 +137,7 @@ def sweep(
     normal, (u0, v0, u1, v1) = np.array([1.0, 0.0, 0.0]), cell
     along = np.gradient(path, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
-    length = _lengths(path)
+    length = path_lengths(path)
     rows, coords = [], []
     last = len(path) - 1
     for index, size in [(0, 0.0), (0, 1.0), *((i, 1.0) for i in range(last + 1)), (last, 1.0), (last, 0.0)]:
@@ -170,7 +172,7 @@ def vessel(
         segments: Number of vertices around the axis.
         center: Position (x, y) of the axis, [m].
     """
-    points, out, back = np.array([*outside, *inside], float), _lengths(outside), _lengths(inside)
+    points, out, back = np.array([*outside, *inside], float), path_lengths(outside), path_lengths(inside)
     v = np.concatenate([0.44 * out / out[-1], 0.46 + (0.90 - 0.46) * back / back[-1]])
     steps = np.diff(points, axis=0)
     turn = np.abs(np.diff(np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))))
@@ -242,7 +244,7 @@ def merge(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _lengths(points: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+def path_lengths(points: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
     """Return the length of a path up to each of its points."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
 

@@ -6,7 +6,7 @@ from itertools import combinations, product
 import numpy as np
 
 from libero_env.mujoco_compat import mujoco
-from libero_env.objects.builtin.mesh import CORNERS, Mesh, Ring, loft, merge
+from libero_env.objects.builtin.mesh import CORNERS, Mesh, Ring, loft, merge, path_lengths
 from libero_env.objects.builtin.paint import Cell
 
 _FACES = {  # face -> (to the right, upwards), seen from outside
@@ -47,8 +47,7 @@ def block(
     for corners in _chamfers(half, inner) if bevel else ():
         # A chamfer continues the texture of the face that is nearest in orientation.
         pieces.append(_facet(corners, half, _face_of(corners, half), cell))
-    mesh = merge(pieces)
-    return mesh.moved(center)
+    return merge(pieces).moved(center)
 
 
 def prism(outline: Sequence[Sequence[float]], low: float, high: float, cell: Cell) -> Mesh:
@@ -63,8 +62,7 @@ def prism(outline: Sequence[Sequence[float]], low: float, high: float, cell: Cel
         side = [near[one], far[one], far[two], near[two]]
         along = np.abs(points[two] - points[one])
         pieces.append(_facet(side, half, "z+" if along[0] > along[1] else "x+", cell))
-    mesh = merge(pieces)
-    return mesh.moved(center)
+    return merge(pieces).moved(center)
 
 
 def turned(
@@ -109,7 +107,7 @@ def arch(length: float, height: float, thickness: float, half_width: float, cell
 def outline_of(profile: Sequence[Sequence[float]]) -> tuple[np.ndarray, np.ndarray]:
     """Return a profile closed at the axis, (n, 2), and the share of its length at each point, (n,) in [0, 1]."""
     points = np.array([(profile[0][0], 0.0), *profile, (profile[-1][0], 0.0)])
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    way = path_lengths(points)
     return points, way / way[-1]
 
 
