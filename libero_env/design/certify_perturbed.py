@@ -8,6 +8,7 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -153,14 +154,12 @@ def _outcomes(
     }
     try:
         with trying(attempts):
-            env = BatchEnv(task, len(starts), num_threads=1, cameras=(), horizon=NO_HORIZON, perturb=[one])
-            try:
+            options: dict[str, Any] = {"num_threads": 1, "cameras": (), "horizon": NO_HORIZON}
+            with BatchEnv(task, len(starts), perturb=[one], **options) as env:
                 env.reset(options={"init_state": list(starts)})
                 seeds = [np.random.default_rng([task.index, start]) for start in starts]
                 shapes = Shapes(env.scene)
                 found = run_experts(env, [Expert(env.task, seed, shapes=shapes) for seed in seeds])
-            finally:
-                env.close()
     except InvalidInputError:
         raise
     except PlacementError as error:

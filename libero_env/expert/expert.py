@@ -192,12 +192,10 @@ def run_experts(
             retries=expert.retries,
             reason=""
             if success[i]
-            else expert.failure_reason or errors.get(i) or _last_phase(expert, len(executed[i])),
+            else expert.failure_reason
+            or errors.get(i)
+            or f"in phase {expert.phase} after {len(executed[i])} steps, {expert.retries} retries",
             fixtures=env.simulations.fixtures[i].copy(),
         )
         for i, expert in enumerate(experts)
     ]
-
-
-def _last_phase(expert: Expert, steps: int) -> str:
-    return f"in phase {expert.phase} after {steps} steps, {expert.retries} retries"

@@ -1,10 +1,11 @@
 """Objects and fixtures of a scene as points on their surfaces."""
 
-from functools import cached_property
+from functools import cache, cached_property, partial
 
 import numpy as np
 
 from libero_env.expert.arm import ArmKinematics
+from libero_env.expert.clearance import obstacle_height
 from libero_env.geometry import Pose, body_points, quat_to_mat, surface_points
 from libero_env.sim.scene import Scene
 from libero_env.sim.state import StateView
@@ -18,7 +19,7 @@ class Shapes:
 
     def __init__(self, scene: Scene):
         self._scene = scene
-        self._body_points: dict[tuple[int, float], np.ndarray] = {}
+        self._points_of_body = cache(partial(body_points, scene.model))
 
     @cached_property
     def arm(self) -> ArmKinematics:
@@ -45,6 +46,16 @@ class Shapes:
         clouds = [self.points(view, other, spacing) for other in self._scene.entities if other != name]
         return np.concatenate([*clouds, np.zeros((0, 3))])
 
+    def highest(self, view: StateView, name: str, *paths: tuple[np.ndarray, np.ndarray, float]) -> float:
+        """Return the height of the highest obstacle near the first 10 cm of paths, [m]; see `obstacle_height`.
+
+        Args:
+            name: Object that is no obstacle.
+            paths: Start (3,), end (3,) and radius of each, [m].
+        """
+        obstacles, surface = self.obstacles(view, name), view.scene.workspace.surface_height
+        return max(obstacle_height(obstacles, *path, surface) for path in paths)
+
     def points(self, view: StateView, name: str, spacing: float) -> np.ndarray:
         """Return points on an object or fixture with its parts where they are now, world frame, (N, 3)."""
         pos, quat = (view.simulations.fields[key][view.index] for key in ("xpos", "xquat"))
@@ -54,11 +65,6 @@ class Shapes:
             if len(local):
                 clouds.append(Pose(pos[body], quat_to_mat(quat[body])).apply(local))
         return np.concatenate([*clouds, np.zeros((0, 3))])
-
-    def _points_of_body(self, body: int, spacing: float) -> np.ndarray:
-        if (body, spacing) not in self._body_points:
-            self._body_points[body, spacing] = body_points(self._scene.model, body, spacing)
-        return self._body_points[body, spacing]
 
 
 def pose_of(view: StateView, name: str) -> Pose:

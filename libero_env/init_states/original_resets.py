@@ -44,7 +44,10 @@ class OriginalResets:
         self._rng = np.random.RandomState(seed)  # the generator behind `np.random.seed`
         self._loads = loads
         self._joints = [
-            (atom.args[0], _joint_range(scene, atom))
+            (
+                atom.args[0],
+                scene.entities[scene.owner(atom.args[0]) or ""].articulation[atom.predicate.lower()],
+            )
             for atom in scene.problem.init
             if atom.predicate.lower() in OPPOSITE_STATES
         ]
@@ -221,12 +224,6 @@ def _item(scene: Scene, atom: Atom, filled: Container[str]) -> _Item:
         inside=inside,
         on_object=atom.predicate == "On" and target in scene.objects,
     )
-
-
-def _joint_range(scene: Scene, atom: Atom) -> tuple[float, float]:
-    owner = scene.owner(atom.args[0])
-    assert owner is not None
-    return scene.entities[owner].articulation[atom.predicate.lower()]
 
 
 def drawn_fixtures(scene: Scene, seed: int, resets: int, loads: int = 1) -> Iterator[np.ndarray]:

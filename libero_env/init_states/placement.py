@@ -4,6 +4,7 @@ They are checked against the task: its init atoms hold, its goal does not.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,7 +59,10 @@ def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | 
     """
     places, qpos = _places(scene), initial_qpos(scene)
     qpos[:7] += ARM_NOISE * rng.standard_normal(7)
-    fixtures = _sample_fixtures(scene, rng) if fixtures is None else fixtures
+    if fixtures is None:
+        problem, name, workspace = scene.problem, scene.workspace_name, scene.workspace
+        poses = [fixture_pose(problem, name, workspace, *item, rng) for item in scene.fixtures.items()]
+        fixtures = np.array(poses).reshape(-1, 7)
     model = scene.model_with(fixtures)
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
@@ -166,15 +170,6 @@ def _place_of(scene: Scene, atom: Atom) -> Place:
     )
 
 
-def _sample_fixtures(scene: Scene, rng: np.random.Generator) -> np.ndarray:
-    """Sample the poses of all fixtures, (nfixtures, 7)."""
-    poses = [
-        fixture_pose(scene.problem, scene.workspace_name, scene.workspace, name, item, rng)
-        for name, item in scene.fixtures.items()
-    ]
-    return np.array(poses).reshape(-1, 7)
-
-
 def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) -> None:
     """Sample the joints that init atoms require to be open, closed, turned on or off."""
     for atom in scene.problem.init:
@@ -198,7 +193,10 @@ def _place(scene: Scene, data: mujoco.MjData, name: str, place: Place, rng: np.r
     if place.flat:
         assert place.region is not None
         x0, y0, x1, y1 = place.region.ranges[rng.integers(len(place.region.ranges))]
-        quat = _rotate_about_vertical(scene.objects[name].rest_quat(rng), place.region, rng)
+        quat = scene.objects[name].rest_quat(rng)
+        if place.region.yaw:
+            yaw = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), rng.uniform(*place.region.yaw[0]))
+            mujoco.mju_mulQuat(quat, yaw, quat.copy())
         ox, oy, _ = scene.workspace.offset
         surface = scene.workspace.surface_height
         x, y = rng.uniform(x0, x1) + ox, rng.uniform(y0, y1) + oy
@@ -208,15 +206,6 @@ def _place(scene: Scene, data: mujoco.MjData, name: str, place: Place, rng: np.r
     height = surface - lowest_point(scene, name, quat) + _CLEARANCE
     address = scene.pose_address(name)
     data.qpos[address : address + 7] = (x, y, height, *quat)
-
-
-def _rotate_about_vertical(quat: np.ndarray, region: Region, rng: np.random.Generator) -> np.ndarray:
-    """Rotate an orientation (4,), wxyz, by an angle in the yaw range of a region."""
-    if not region.yaw:
-        return quat
-    yaw, rotated = quat_from_axis_angle(np.array([0.0, 0.0, 1.0]), rng.uniform(*region.yaw[0])), np.zeros(4)
-    mujoco.mju_mulQuat(rotated, yaw, quat)
-    return rotated
 
 
 def _sample_on_carrier(
@@ -343,11 +332,9 @@ def sample_states(scene: Scene, generators: Sequence[np.random.Generator]) -> In
     Raises:
         PlacementError: The objects do not fit, or do not come to rest.
     """
-    simulations, speed = LoopSimulations(scene.model, 1, scene.fixture_bodies), np.zeros(scene.model.nv)
-    try:
+    speed = np.zeros(scene.model.nv)
+    with closing(LoopSimulations(scene.model, 1, scene.fixture_bodies)) as simulations:
         starts = [sample_settled(scene, simulations, 0, rng) for rng in generators]
-    finally:
-        simulations.close()
     return np.stack([np.concatenate([[0.0], s.qpos, speed, s.fixtures.ravel()]) for s in starts])
 
 

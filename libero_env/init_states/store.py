@@ -101,17 +101,14 @@ def load_original_states(task: Task, scene: Scene | None = None) -> np.ndarray |
         return None
     if not path.is_file():
         return None
-    states = _read_npz(path) if path.suffix == ".npz" else read_states(path)
+    if path.suffix == ".npz":  # of LIBERO-PRO's distribution
+        states = read_npz(path).get("states", np.zeros(0))
+        if states.ndim != 2 or states.dtype != np.float64 or not np.isfinite(states).all():
+            raise StateFileError(f"{path}: expected an array `states` (n, size) of finite numbers")
+    else:
+        states = read_states(path)
     if scene is not None:
         scene.check_states(states, path)
-    return states
-
-
-def _read_npz(path: Path) -> np.ndarray:
-    """Return the states of a file of LIBERO-PRO's distribution, rows [time, qpos, qvel]."""
-    states = read_npz(path).get("states", np.zeros(0))
-    if states.ndim != 2 or states.dtype != np.float64 or not np.isfinite(states).all():
-        raise StateFileError(f"{path}: expected an array `states` (n, size) of finite numbers")
     return states
 
 

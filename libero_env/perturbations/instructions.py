@@ -6,7 +6,7 @@ it knows are replaced, and the frame.
 """
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -102,21 +102,18 @@ def _own_way(match: re.Match[str]) -> str:
 
 def _rename(text: str, boldness: float, rng: np.random.Generator) -> str:
     """Return a text in which things have other names."""
-    return " ".join(_renamed(text, boldness, rng))
-
-
-def _renamed(text: str, boldness: float, rng: np.random.Generator) -> Iterator[str]:
     names: Mapping[str, Sequence[str]] = _wording()["names"]
-    words, i = text.split(), 0
+    words, said, i = text.split(), [], 0
     while i < len(words):
         for end in range(len(words), i, -1):
             if (phrase := " ".join(words[i:end])) in names:
-                yield _pick([phrase, *names[phrase]], boldness, rng)
+                said.append(_pick([phrase, *names[phrase]], boldness, rng))
                 i = end
                 break
         else:
-            yield words[i]
+            said.append(words[i])
             i += 1
+    return " ".join(said)
 
 
 def _pick(ways: Sequence[str], boldness: float, rng: np.random.Generator) -> str:

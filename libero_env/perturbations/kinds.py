@@ -7,7 +7,7 @@ A change belongs to one of five layers, which are applied in the order of `LAYER
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from libero_env.sim.appearance import Appearance
 from libero_env.sim.scene import Scene
 
 Layer = Literal["problem", "appearance", "start", "observation", "action"]
-LAYERS: tuple[Layer, ...] = ("problem", "appearance", "start", "observation", "action")
+LAYERS: tuple[Layer, ...] = get_args(Layer)
 
 
 @dataclass

@@ -85,18 +85,23 @@ class MouseReader:
             self.mouse.report(bytes(data))
 
 
-class _Clock:
-    """Makes a control step last as long as it does on the robot."""
+class _Timed(Screen):
+    """What screens share: the devices, and a control step that lasts as long as on the robot."""
 
-    def __init__(self) -> None:
-        self.next = time.monotonic()
+    def __init__(self, keyboard: Keyboard, camera: str, reader: MouseReader | None):
+        self.keyboard, self.camera, self.reader = keyboard, camera, reader
+        self._next = time.monotonic()
 
-    def wait(self) -> None:
-        self.next = max(self.next + 1.0 / CONTROL_HZ, time.monotonic())
-        time.sleep(max(self.next - time.monotonic(), 0.0))
+    def poll(self, env: BatchEnv) -> None:
+        if self.reader is not None:
+            self.reader.poll()
+
+    def _wait(self) -> None:
+        self._next = max(self._next + 1.0 / CONTROL_HZ, time.monotonic())
+        time.sleep(max(self._next - time.monotonic(), 0.0))
 
 
-class Window:
+class Window(_Timed):
     """A GLFW window into which MuJoCo renders.
 
     Args:
@@ -124,15 +129,14 @@ class Window:
         if not self.window:
             self.glfw.terminate()
             raise RenderError("no window: GLFW cannot open a window with OpenGL")
-        self.keyboard, self.reader, self.camera, self.clock = keyboard, reader, camera, _Clock()
+        super().__init__(keyboard, camera, reader)
         self.glfw.set_key_callback(self.window, self._on_key)
         self.context: mujoco.MjrContext | None = None
 
     def poll(self, env: BatchEnv) -> None:
         """See `Screen`."""
         self.glfw.poll_events()
-        if self.reader is not None:
-            self.reader.poll()
+        super().poll(env)
         if self.glfw.window_should_close(self.window):
             self.keyboard.press(QUIT)
 
@@ -154,7 +158,7 @@ class Window:
             mujoco.mjtFont.mjFONT_NORMAL, corner, area, str(status).replace(" | ", "\n"), "", self.context
         )
         self.glfw.swap_buffers(self.window)
-        self.clock.wait()
+        self._wait()
 
     def _make_context(self, model: mujoco.MjModel) -> mujoco.MjrContext:
         self.scene, self.option = mujoco.MjvScene(model, _MAX_GEOMS), mujoco.MjvOption()
@@ -189,7 +193,7 @@ def key_name(code: int) -> str | None:
     return name if name in MOTIONS or name in (GRIPPER, RESET) else None
 
 
-class Terminal:
+class Terminal(_Timed):
     """Reads keys from a terminal and shows images as coloured characters, for machines without a screen.
 
     Args:
@@ -211,15 +215,14 @@ class Terminal:
             raise RenderError(f"no terminal: {error}") from error
         self.settings = self.termios.tcgetattr(sys.stdin)
         tty.setcbreak(sys.stdin)
-        self.keyboard, self.reader, self.camera, self.clock = keyboard, reader, camera, _Clock()
+        super().__init__(keyboard, camera, reader)
         print(f"\x1b[2J{HELP}")
 
     def poll(self, env: BatchEnv) -> None:
         """See `Screen`."""
         while select.select([sys.stdin], [], [], 0.0)[0]:
             press_typed(self.keyboard, os.read(sys.stdin.fileno(), 64).decode(errors="ignore"))
-        if self.reader is not None:
-            self.reader.poll()
+        super().poll(env)
 
     def show(self, env: BatchEnv, status: Status) -> None:
         """See `Screen`; every fourth state is shown."""
@@ -228,7 +231,7 @@ class Terminal:
             edge = max(min(columns, 2 * (lines - 6)) // 2 * 2, 8)
             image = Image.fromarray(env.observer.render(0, self.camera)).resize((edge, edge))
             print(f"\x1b[4;1H{as_text(np.asarray(image))}\n\x1b[K{status}", flush=True)
-        self.clock.wait()
+        self._wait()
 
     def close(self) -> None:
         """Restore the settings of the terminal."""

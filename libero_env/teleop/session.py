@@ -5,6 +5,7 @@ Nothing here depends on windows: a `Screen` passes the user's input to the devic
 """
 
 from collections.abc import Callable, Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -153,8 +154,7 @@ def record_session(
     writer = DemoWriter(path, config.header() | {"generator": GENERATOR})
     recorded = writer.recorded()
     teleop.rng = np.random.default_rng([teleop.seed, len(recorded)])
-    renderer = StateRenderer(teleop.task, config.render_config)
-    try:
+    with closing(StateRenderer(teleop.task, config.render_config)) as renderer:
         while len(recorded) < n and (episode := teleop.episode(len(recorded), n)) is not None:
             number = max(recorded, default=-1) + 1
             assert episode.fixtures is not None  # `Teleop` records them
@@ -163,8 +163,6 @@ def record_session(
             writer.write(number, replace(episode, obs=obs, robot_states=robot_states, attrs=attrs))
             recorded.add(number)
             report(f"demonstration {number}: {len(episode)} steps")
-    finally:
-        renderer.close()
     if recorded:
         writer.finish()
     return len(recorded)

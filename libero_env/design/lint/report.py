@@ -1,7 +1,7 @@
 """Findings of the linter, and the lines of a task file that they refer to."""
 
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -58,13 +58,13 @@ class Report:
             line = self.lines.line(one.section, one.part)
             self.add("error", line, one.rule, one.what, f"expected {one.expected}")
 
-    def init(self, problem: Problem) -> Iterator[tuple[Atom, int]]:
-        """Yield the init atoms with their lines."""
-        yield from zip(problem.init, self.lines.init, strict=True)
+    def init(self, problem: Problem) -> Iterable[tuple[Atom, int]]:
+        """Return the init atoms with their lines."""
+        return zip(problem.init, self.lines.init, strict=True)
 
-    def goal(self, problem: Problem) -> Iterator[tuple[Atom, int]]:
-        """Yield the atoms of the goal with their lines."""
-        yield from zip(problem.goal.atoms(), self.lines.goal, strict=True)
+    def goal(self, problem: Problem) -> Iterable[tuple[Atom, int]]:
+        """Return the atoms of the goal with their lines."""
+        return zip(problem.goal.atoms(), self.lines.goal, strict=True)
 
     @property
     def broken(self) -> bool:

@@ -1,6 +1,7 @@
 """Checks that need the built scene: joints, reach, and initial states."""
 
 from collections import Counter
+from contextlib import closing
 from math import hypot, sqrt
 
 import numpy as np
@@ -133,24 +134,22 @@ def _surfaces(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None:
     """Check initial states: they exist, are at rest, their atoms hold, and the goal does not."""
-    simulations = LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies.tolist())
-    view, faults, checked = StateView(scene, simulations), Counter[tuple[str, str]](), False
-    try:
-        for i in range(starts):
-            try:
-                _set_start(task, scene, simulations, i, faults)
-            except PlacementError as error:
-                faults["placement", str(error)] += 1
-                continue
-            faults.update(("start", fault) for fault in start_errors(view))
-            if not checked:
-                _check_parts(report, scene, view)
-                _check_goal_reach(report, scene, view)
-            checked = True
-    except LiberoError as error:
-        report.add("error", report.lines.line(":init"), "start", str(error), "fix what it names")
-    finally:
-        simulations.close()
+    faults, checked = Counter[tuple[str, str]](), False
+    with closing(LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies.tolist())) as simulations:
+        view = StateView(scene, simulations)
+        try:
+            for i in range(starts):
+                try:
+                    _set_start(task, scene, simulations, i, faults)
+                except PlacementError as error:
+                    faults["placement", str(error)] += 1
+                    continue
+                faults.update(("start", fault) for fault in start_errors(view))
+                if not checked:
+                    _check_goal(report, scene, view)
+                checked = True
+        except LiberoError as error:
+            report.add("error", report.lines.line(":init"), "start", str(error), "fix what it names")
     for (rule, what), count in faults.items():
         _report_start(report, scene, rule, what, count, starts)
 
@@ -209,19 +208,14 @@ def _report_start(report: Report, scene: Scene, rule: str, what: str, count: int
     report.add(level, line, rule, f"{what}, in {count} of {starts} starts", remedy)
 
 
-def _check_parts(report: Report, scene: Scene, view: StateView) -> None:
+def _check_goal(report: Report, scene: Scene, view: StateView) -> None:
+    """Report parts that hold at the start, and objects and regions beyond the arm's length in any orientation."""
     goal = scene.problem.goal
-    if not isinstance(goal, And) or len(goal.parts) < 2:
-        return
-    for part in goal.parts:
+    for part in goal.parts if isinstance(goal, And) and len(goal.parts) > 1 else ():
         if isinstance(part, Atom) and evaluate(part, view):
             what = f"{part} holds from the beginning"
             remedy, line = "correct if it is intended to stay so", report.lines.line(":goal")
             report.add("info", line, "goal-at-start", what, remedy)
-
-
-def _check_goal_reach(report: Report, scene: Scene, view: StateView) -> None:
-    """Check that objects and regions of the goal are within the arm's length, in any orientation of the hand."""
     shoulder = np.array(scene.workspace.robot_base_pos) + (0.0, 0.0, _SHOULDER)
     for atom, line in report.goal(scene.problem):
         for name in atom.args:

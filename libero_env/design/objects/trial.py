@@ -1,5 +1,6 @@
 """Test of a new object: whether it stays where it is put down, whether it can be grasped, and a picture of it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,11 +41,7 @@ def try_object(item: ObjectModel, notify: Notify, picture: Path | None = None) -
     Raises:
         LiberoError: The model cannot be compiled, or it has no collision geoms.
     """
-    model = _scene(item)
-    found: dict[str, Any] = {**placement_parameters(surface_points(model, model.body(_BODY).id))}
-    data = mujoco.MjData(model)
-    data.qpos[:3] = (0.0, 0.0, 0.001 - found["bottom_offset"][2])
-    mujoco.mj_forward(model, data)
+    model, data, found = _put_down(item, (1.0, 0.0, 0.0, 0.0))
     if picture is not None:
         turntable(model, data, found["size"], picture)
     found |= {"stands": _stands(model, data, notify), "grasp": _grasp(model, data, item.category, notify)}
@@ -64,29 +61,8 @@ def draw_object(item: ObjectModel, picture: Path) -> Path:
     Raises:
         LiberoError: The model cannot be compiled, or nothing can be rendered on this machine.
     """
-    model = _scene(item)
-    found, data = placement_parameters(surface_points(model, model.body(_BODY).id)), mujoco.MjData(model)
-    data.qpos[:3] = (0.0, 0.0, 0.001 - found["bottom_offset"][2])
-    data.qpos[3:7] = item.rest_quat()
-    mujoco.mj_forward(model, data)
+    model, data, found = _put_down(item, item.rest_quat())
     return turntable(model, data, found["size"], picture)
-
-
-def placement_parameters(points: np.ndarray) -> dict[str, Any]:
-    """Return the parameters that placement needs, from points (n, 3) [m] on the collision geoms of an object.
-
-    Raises:
-        LiberoError: There are no points.
-    """
-    if not len(points):
-        raise LiberoError("it has no collision geoms; give it a geom with contype and conaffinity 1")
-    low, high = points.min(axis=0), points.max(axis=0)
-    return {
-        "size": [round(float(value), 5) for value in high - low],
-        "bottom_offset": [0.0, 0.0, round(float(low[2]), 5)],
-        "top_offset": [0.0, 0.0, round(float(high[2]), 5)],
-        "horizontal_radius": round(float(np.linalg.norm(points[:, :2], axis=1).max()), 5),
-    }
 
 
 def turntable(model: mujoco.MjModel, data: mujoco.MjData, size: list[float], picture: Path) -> Path:
@@ -115,6 +91,31 @@ def turntable(model: mujoco.MjModel, data: mujoco.MjData, size: list[float], pic
     picture.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.concatenate(list(rows), axis=1)).save(picture)
     return picture
+
+
+def _put_down(
+    item: ObjectModel, quat: Sequence[float] | np.ndarray
+) -> tuple[mujoco.MjModel, mujoco.MjData, dict[str, Any]]:
+    """Return a scene with an object just above a floor, and its `size` and what placement needs, [m].
+
+    Raises:
+        LiberoError: The model cannot be compiled, or it has no collision geoms.
+    """
+    model = _scene(item)
+    points = surface_points(model, model.body(_BODY).id)
+    if not len(points):
+        raise LiberoError("it has no collision geoms; give it a geom with contype and conaffinity 1")
+    low, high = points.min(axis=0), points.max(axis=0)
+    found: dict[str, Any] = {
+        "size": [round(float(value), 5) for value in high - low],
+        "bottom_offset": [0.0, 0.0, round(float(low[2]), 5)],
+        "top_offset": [0.0, 0.0, round(float(high[2]), 5)],
+        "horizontal_radius": round(float(np.linalg.norm(points[:, :2], axis=1).max()), 5),
+    }
+    data = mujoco.MjData(model)
+    data.qpos[:7] = (0.0, 0.0, 0.001 - found["bottom_offset"][2], *quat)
+    mujoco.mj_forward(model, data)
+    return model, data, found
 
 
 def _scene(item: ObjectModel) -> mujoco.MjModel:

@@ -1,7 +1,8 @@
 """Grasps from one side, usually from above: around the body, or at a wall with room for a finger on either side."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -9,6 +10,8 @@ from libero_env.errors import LiberoError
 from libero_env.expert.arm import GRIPPER, downward
 from libero_env.expert.clearance import Voxels, hand_points
 from libero_env.expert.grasping import kernels
+
+T = TypeVar("T")
 
 TURN_COST = 0.25  # for each [rad] that the hand rotates
 MISALIGNMENT_COST = 0.4  # for each [rad] between the fingers and the sides of the body
@@ -51,21 +54,6 @@ class Grasp:
     def yaw(self) -> float:
         """Direction in which the fingers close in the ground plan, from the world's x axis, modulo pi, [rad]."""
         return float(np.arctan2(self.mat[1, 0], self.mat[0, 0]))
-
-
-@dataclass(frozen=True)
-class TopGrasp:
-    """Grasp from straight above.
-
-    Attributes:
-        pos_world: Position of the grip site, (3,), [m].
-        yaw: Direction in which the fingers close, from the world's x axis, modulo pi, [rad].
-        width: Width of the body between the fingers, [m].
-    """
-
-    pos_world: np.ndarray
-    yaw: float
-    width: float
 
 
 def find_grasps(
@@ -140,16 +128,23 @@ def choose_grasp(
     Raises:
         GraspError: No part of the body is narrow enough.
     """
-    best: tuple[float, Grasp] | None = None
-    for grasp in find_grasps(cloud, surface_height, finger_axis, name=name):
-        if best is not None and grasp.cost >= best[0]:
+    candidates = [(grasp.cost, grasp) for grasp in find_grasps(cloud, surface_height, finger_axis, name=name)]
+    return _cheapest(
+        candidates, lambda grasp: kernels.open_hand_collision_depth(obstacles, grasp.pos_world, grasp.mat)
+    )
+
+
+def _cheapest(candidates: Sequence[tuple[float, T]], depth_of: Callable[[T], float]) -> T:
+    """Return the best of candidates with their costs, sorted, after those of a collision of some depth."""
+    least, best = np.inf, candidates[0][1]
+    for own, candidate in candidates:
+        if own >= least:
             break
-        depth = kernels.open_hand_collision_depth(obstacles, grasp.pos_world, grasp.mat)
-        cost = grasp.cost + DEPTH_COST * depth + COLLISION_COST * (depth > 0)
-        if best is None or cost < best[0]:
-            best = cost, grasp
-    assert best is not None
-    return best[1]
+        depth = depth_of(candidate)
+        cost = own + DEPTH_COST * depth + COLLISION_COST * (depth > 0)
+        if cost < least:
+            least, best = cost, candidate
+    return best
 
 
 def choose_top_grasp(
@@ -158,30 +153,26 @@ def choose_top_grasp(
     surface_height: float,
     finger_axis: np.ndarray,
     name: str = "body",
-) -> TopGrasp:
+) -> tuple[np.ndarray, float]:
     """Return the best grasp from straight above around the whole body, for dropping it into a container.
 
     It depends on the shape of the body alone, and avoids collisions with obstacles; the result is deterministic.
     Arguments as of `choose_grasp`.
+
+    Returns:
+        Position of the grip site, (3,), [m], and yaw in which the fingers close, from the world's x axis, modulo pi.
 
     Raises:
         GraspError: No grasp is feasible.
     """
     yaw_now = np.arctan2(finger_axis[1], finger_axis[0])
     candidates = sorted(_top_candidates(cloud, surface_height, yaw_now), key=lambda candidate: candidate[0])
-    best: tuple[float, TopGrasp] | None = None
-    for cost, grasp in candidates:
-        if grasp.width > GRIPPER.max_grasp_width:
-            continue
-        if best is not None and cost >= best[0]:
-            break
-        depth = _top_collision_depth(obstacles, grasp)
-        cost += DEPTH_COST * depth + COLLISION_COST * (depth > 0)
-        if best is None or cost < best[0]:
-            best = cost, grasp
-    if best is None:
-        raise _too_wide(name, min((grasp.width for _, grasp in candidates), default=np.inf))
-    return best[1]
+    feasible = [
+        (cost, (pos, yaw)) for cost, pos, yaw, width in candidates if width <= GRIPPER.max_grasp_width
+    ]
+    if not feasible:
+        raise _too_wide(name, min((width for *_, width in candidates), default=np.inf))
+    return _cheapest(feasible, lambda grasp: _top_collision_depth(obstacles, *grasp))
 
 
 def _too_wide(name: str, width: float) -> GraspError:
@@ -215,8 +206,8 @@ def _candidates(
 
 def _top_candidates(
     cloud: np.ndarray, surface_height: float, yaw_now: float
-) -> Iterator[tuple[float, TopGrasp]]:
-    """Yield (cost, grasp) of all grasps around the body whose height suits fingers and palm, without obstacles."""
+) -> Iterator[tuple[float, np.ndarray, float, float]]:
+    """Yield (cost, position, yaw, width) of all grasps around the body whose height suits fingers and palm."""
     bottom, top = cloud[:, 2].min(), cloud[:, 2].max()
     for height, section in _sections(cloud, surface_height):
         off_centre = abs(height - 0.5 * (bottom + top))
@@ -224,7 +215,7 @@ def _top_candidates(
             for x, y, width, shift in rows:  # the order of the sum decides between equally good grasps
                 cost = TURN_COST * turn + WIDTH_COST * width + HEIGHT_COST * off_centre + SHIFT_COST * shift
                 cost += MISALIGNMENT_COST * misalignment
-                yield cost, TopGrasp(np.array([x, y, height]), yaw, width)
+                yield cost, np.array([x, y, height]), yaw, width
 
 
 def _sections(cloud: np.ndarray, surface_height: float) -> Iterator[tuple[float, np.ndarray]]:
@@ -277,13 +268,13 @@ def _yaw_distance(yaw: float, other: float) -> float:
     return abs((yaw - other + np.pi / 2) % np.pi - np.pi / 2)
 
 
-def _top_collision_depth(obstacles: np.ndarray, grasp: TopGrasp) -> float:
+def _top_collision_depth(obstacles: np.ndarray, pos: np.ndarray, yaw: float) -> float:
     """Return how deep obstacles reach into the open fingers and the palm, [m]; 0 without a collision."""
     if not len(obstacles):
         return 0.0
-    c, s = np.cos(grasp.yaw), np.sin(grasp.yaw)
+    c, s = np.cos(yaw), np.sin(yaw)
     along, across = np.array([c, s]), np.array([-s, c])
-    offset = obstacles - grasp.pos_world
+    offset = obstacles - pos
     u, v, z = np.abs(offset[:, :2] @ along), np.abs(offset[:, :2] @ across), offset[:, 2]
     outer = GRIPPER.half_opening + GRIPPER.finger_thickness + 0.003
     fingers = (z > -GRIPPER.tip_below) & (v < GRIPPER.finger_half_width + 0.005)

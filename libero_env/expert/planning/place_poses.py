@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from itertools import product
 
 import numpy as np
 
@@ -190,17 +191,22 @@ def find_place_poses(placement: Placement) -> list[PlacePose]:
     """
     on_entity = placement.view.is_entity(placement.target)
     overlap = 3 * _MAX_OVERLAP if on_entity else _MAX_OVERLAP
-    even = [_Rotation.about_vertical(yaw) for yaw in _even_yaws(_NUM_YAWS)]
+    even = [_Rotation(rotation_about_z(yaw), 0.1 * abs(yaw)) for yaw in _even_yaws(_NUM_YAWS)]
     parallel_yaws = _parallel_yaws(placement.cloud, placement.sides[0])
-    parallel = [_Rotation.about_vertical(yaw) for yaw in parallel_yaws]
+    parallel = [_Rotation(rotation_about_z(yaw), 0.1 * abs(yaw)) for yaw in parallel_yaws]
     places = _search(placement, even, overlap)
     if places and not _on_floor(placement, places):  # a drawer does not close over what stands on its rim
         places = _on_floor(placement, _search(placement, even, overlap, _FINE_GRID)) or places
     places = places or _search(placement, parallel, overlap)
     if not places and not placement.target_is_flat:
         yaws = [*parallel_yaws, *_even_yaws(_NUM_YAWS // 2)]
-        for lean in _LEANS:
-            leaning = [_Rotation.leaning(yaw, lean, side) for side in placement.sides for yaw in yaws]
+        for lean in _LEANS:  # about the vertical, after which the top leans back against the entry direction
+            leaning = [
+                _Rotation(
+                    rotation_about(np.cross(side, UP), lean) @ rotation_about_z(yaw), 0.1 * abs(yaw), side
+                )
+                for side, yaw in product(placement.sides, yaws)
+            ]
             places += _search(placement, leaning, overlap)
     if not places:
         places = _search(placement, [*even, *parallel], 8 * overlap)
@@ -218,16 +224,6 @@ class _Rotation:
     mat: np.ndarray  # (3, 3)
     cost: float
     only_entry: np.ndarray | None = None  # the direction in which a leaning object has to come in, (3,)
-
-    @classmethod
-    def about_vertical(cls, yaw: float) -> "_Rotation":
-        return cls(rotation_about_z(yaw), 0.1 * abs(yaw))
-
-    @classmethod
-    def leaning(cls, yaw: float, lean: float, entry: np.ndarray) -> "_Rotation":
-        """Return a rotation about the vertical, after which the top leans back against the entry direction."""
-        tilt = rotation_about(np.cross(entry, UP), lean)
-        return cls(tilt @ rotation_about_z(yaw), 0.1 * abs(yaw), entry)
 
 
 def _on_floor(placement: Placement, places: list[PlacePose]) -> list[PlacePose]:

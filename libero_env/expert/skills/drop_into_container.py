@@ -3,8 +3,7 @@
 import numpy as np
 
 from libero_env.expert.arm import CLOSE, GRIPPER, OPEN, downward, finger_axis, joint_angles, lateral_ramp
-from libero_env.expert.clearance import obstacle_height
-from libero_env.expert.grasping.grasps import GraspError, TopGrasp, choose_top_grasp
+from libero_env.expert.grasping.grasps import GraspError, choose_top_grasp
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.skills.pick_place import (
     ARRIVED,
@@ -47,7 +46,8 @@ class DropIntoContainer(Skill):
         super().__init__(atom, style)
         self.container, self.shapes = container, shapes
         self._object, self._site = atom.args
-        self._plan: tuple[TopGrasp, Pose] | None = None  # the grasp, and the pose of the object then
+        # position and yaw of the grasp, and the pose of the object then
+        self._plan: tuple[np.ndarray, float, Pose] | None = None
         self._clear_height = 0.0  # [m] above the grasp, at which the fingertips are clear of the object
         self._hold_pose = Pose(np.zeros(3), np.eye(3))  # to keep while the fingers move
         self._grasp_offset = np.zeros(3)  # of the object from the grip site when it was grasped
@@ -109,7 +109,7 @@ class DropIntoContainer(Skill):
         target = goal.copy()
         target[2] += full_lift if self._back_off.active else lift
         if away > 0.05:
-            obstacles = self._obstacle_height(view, goal)
+            obstacles = self.shapes.highest(view, self._object, (pos, goal, OBSTACLE_RADIUS))
             target[2] = max(target[2], obstacles + FINGER_CLEARANCE + GRIPPER.tip_below)
         lateral_scale = lateral_ramp(pos[2], target[2], 0.02, 0.04)
         return self._toward(view, target, grasp.mat, OPEN, lateral_scale)
@@ -141,7 +141,8 @@ class DropIntoContainer(Skill):
         if away < 0.025 and pos[2] < goal[2] + 0.02:
             self._hold_pose = Pose(np.array([*goal[:2], min(goal[2], pos[2])]), mat)
             return self._start("release", view)
-        height = self._obstacle_height(view, goal) + below + 0.7 * style.carry_clearance
+        obstacles = self.shapes.highest(view, self._object, (pos, goal, OBSTACLE_RADIUS))
+        height = obstacles + below + 0.7 * style.carry_clearance
         return self._toward(view, goal, mat, CLOSE, lateral_ramp(pos[2], min(height, high), 0.0, 0.05))
 
     def _release(self, view: StateView) -> np.ndarray:
@@ -162,20 +163,14 @@ class DropIntoContainer(Skill):
             GraspError: No grasp is feasible.
         """
         now = pose_of(view, self._object)
-        if self._plan is None or has_moved(self._plan[1], now):
+        if self._plan is None or has_moved(self._plan[2], now):
             cloud = self.shapes.cloud(view, self._object)
             obstacles = self.shapes.obstacles(view, self._object)
             surface, axis = view.scene.workspace.surface_height, finger_axis(view.eef_mat)
             self._plan = None
-            self._plan = choose_top_grasp(cloud, obstacles, surface, axis, self._object), now
-            self._clear_height = cloud[:, 2].max() - self._plan[0].pos_world[2] + GRIPPER.tip_below
-        grasp, then = self._plan
-        along = np.array([-np.sin(grasp.yaw), np.cos(grasp.yaw), 0.0]) * style.grasp_shift
-        mat = downward(grasp.yaw + style.yaw_error, finger_axis(view.eef_mat))
-        return Pose(grasp.pos_world + now.pos - then.pos + along, mat)
-
-    def _obstacle_height(self, view: StateView, goal: np.ndarray) -> float:
-        """Return the height of the highest obstacle near the next 10 cm of the way to a goal (3,), [m]."""
-        obstacles = self.shapes.obstacles(view, self._object)
-        surface = view.scene.workspace.surface_height
-        return obstacle_height(obstacles, view.eef_pos, goal, OBSTACLE_RADIUS, surface)
+            self._plan = *choose_top_grasp(cloud, obstacles, surface, axis, self._object), now
+            self._clear_height = cloud[:, 2].max() - self._plan[0][2] + GRIPPER.tip_below
+        pos, yaw, then = self._plan
+        along = np.array([-np.sin(yaw), np.cos(yaw), 0.0]) * style.grasp_shift
+        mat = downward(yaw + style.yaw_error, finger_axis(view.eef_mat))
+        return Pose(pos + now.pos - then.pos + along, mat)

@@ -47,7 +47,8 @@ class MoveJoint(Skill):
     def __init__(self, address: str, state: str, *, style: MotionStyle | None = None):
         super().__init__(Atom(state.capitalize(), (address,)), style or MotionStyle())
         self.address, self.state = address, state
-        self._plan: tuple[Part, HandleGrasp] | None = None  # the grasp in the frame of the part
+        self._part: Part
+        self._grasp: HandleGrasp  # in the frame of the part
         self._failed: list[Pose] = []  # pre-grasps of earlier attempts
         self._obstacles = np.zeros((0, 3))
         self._still_steps = 0
@@ -71,16 +72,6 @@ class MoveJoint(Skill):
             return self._start("release", view)  # withdraw, and begin again
         return self._run_phase(view)
 
-    @property
-    def _part(self) -> Part:
-        assert self._plan is not None
-        return self._plan[0]
-
-    @property
-    def _grasp(self) -> HandleGrasp:
-        assert self._plan is not None
-        return self._plan[1]
-
     def _make_plan(self, view: StateView) -> bool:
         """Choose the joint and the grasp; return False where nothing is left to do or nothing can be grasped."""
         model = view.scene.model
@@ -101,7 +92,8 @@ class MoveJoint(Skill):
         except GraspError as error:
             self.failure_reason = str(error)
             return False
-        self._plan = part, grasp.relative_to(part.pose(view))
+        self._part = part
+        self._plan = self._grasp = grasp.relative_to(part.pose(view))
         self._obstacles = nearby_points(view, grasp.contact.pos, view.scene.entities)
         self._start_value = value
         self._failed.append(grasp.pregrasp)

@@ -4,10 +4,10 @@ import numpy as np
 
 from libero_env.errors import LiberoError
 from libero_env.expert.arm import CLOSE, GRIPPER, OPEN, lateral_ramp
-from libero_env.expert.clearance import hand_extent_below, obstacle_height
+from libero_env.expert.clearance import hand_extent_below
 from libero_env.expert.grasping.grasps import finger_offset
 from libero_env.expert.grasping.kernels import open_hand_collision_depth
-from libero_env.expert.planning.pick_plan import FailedAttempt, PickPlan
+from libero_env.expert.planning.pick_plan import FailedAttempt
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.expert.skills.skill import BackOff, Skill, funnel_lift, gripper_opening
@@ -54,7 +54,6 @@ class PickPlace(Skill):
         super().__init__(atom, style)
         self.shapes, self.slot = shapes, slot
         self._object = atom.args[0]
-        self._plan: PickPlan | None = None
         self._failures: list[FailedAttempt] = []
         self._clear_distance = 0.0  # [m] back along the approach, where the fingers are clear of the object
         self._hold_pose = Pose(np.zeros(3), np.eye(3))  # to keep while the fingers move
@@ -79,11 +78,6 @@ class PickPlace(Skill):
             self._hold_pose = Pose(view.eef_pos, view.eef_mat)
             self._enter("release")
         return self._run_phase(view)
-
-    @property
-    def _current_plan(self) -> PickPlan:
-        assert self._plan is not None
-        return self._plan
 
     def _update_plan(self, view: StateView) -> bool:
         """Plan where there is no plan, or where the object moved by itself; return whether there is a plan."""
@@ -169,8 +163,7 @@ class PickPlace(Skill):
         far = not level or float(np.linalg.norm((target - view.eef_pos)[:2])) > 0.03
         if self._on_line or not far:
             return target, False
-        obstacles, surface = self.shapes.obstacles(view, self._object), view.scene.workspace.surface_height
-        height = obstacle_height(obstacles, view.eef_pos, target, OBSTACLE_RADIUS, surface)
+        height = self.shapes.highest(view, self._object, (view.eef_pos, target, OBSTACLE_RADIUS))
         height = height + FINGER_CLEARANCE + hand_extent_below(view.eef_mat)
         if level:
             return np.array([*target[:2], max(target[2], height)]), True
@@ -208,7 +201,7 @@ class PickPlace(Skill):
         return self._start("release", view)
 
     def _make_transport(self, view: StateView, exit_pose: Pose | None = None) -> Transport:
-        plan, style, shapes = self._current_plan, self.style, self.shapes
+        plan, style, shapes = self._plan, self.style, self.shapes
         return Transport(view, self.atom, plan, style=style, shapes=shapes, exit_pose=exit_pose)
 
     def _replan_place(self, view: StateView, transport: Transport, blocked: bool) -> bool:
@@ -217,7 +210,7 @@ class PickPlace(Skill):
         if self._replans > MAX_REPLANS:
             return False
         if blocked:
-            self._failures.append(FailedAttempt(None, self._current_plan.place))
+            self._failures.append(FailedAttempt(None, self._plan.place))
         try:
             plan = plan_place(view, self.shapes, self.atom, self.slot, self._failures)
         except LiberoError:
@@ -275,7 +268,7 @@ class PickPlace(Skill):
 
     def _grasp_pose(self, view: StateView) -> tuple[np.ndarray, np.ndarray]:
         """Return the pose (3,), (3, 3) of the grip site at the grasp, which follows small motions of the object."""
-        grasp, start = self._current_plan.grasp, self._current_plan.object_pose
+        grasp, start = self._plan.grasp, self._plan.object_pose
         shift = view.body_pos(self._object) - start.pos
         along = grasp.mat[:, 1] * self.style.grasp_shift
         mat = rotation_about(grasp.mat[:, 2], -self.style.yaw_error) @ grasp.mat

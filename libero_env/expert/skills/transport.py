@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from libero_env.expert.arm import lateral_ramp
-from libero_env.expert.clearance import hand_extent_below, obstacle_height, overhang
+from libero_env.expert.clearance import hand_extent_below, overhang
 from libero_env.expert.planning.pick_plan import ENTRY_DISTANCE, PickPlan
 from libero_env.expert.shapes import COARSE, Shapes, pose_of
 from libero_env.expert.skills.skill import funnel_lift
@@ -156,7 +156,7 @@ class Transport:
         middle, radius, top = self._ground_plan(view)
         clouds = [self.shapes.points(view, name, COARSE) for name in view.scene.fixtures]
         fixtures = np.concatenate([*clouds, np.zeros((0, 3))])
-        fixtures = fixtures[fixtures[:, 2] > self._surface_height(view) + 0.005]
+        fixtures = fixtures[fixtures[:, 2] > view.scene.workspace.surface_height + 0.005]
         above = overhang(fixtures, middle, radius + CLEAR, top - 0.002, top + OVERHANG_HEIGHT)
         if not len(above):
             return None
@@ -186,7 +186,7 @@ class Transport:
             return "arrived"
         if self._blocked_steps > 1:
             return "blocked" if pos[2] - goal[2] > BLOCKED_DISTANCE else "arrived"
-        walls = obstacle_height(self._obstacles(view), goal, goal, 0.05, self._surface_height(view))
+        walls = self.shapes.highest(view, self._object, (goal, goal, 0.05))
         over_walls = walls + below + self._clearance
         target = goal.copy()
         width = 0.03 if drops else self._accuracy - 0.002
@@ -203,8 +203,8 @@ class Transport:
 
     def _is_beside_obstacles(self, view: StateView) -> bool:
         """Return whether something near the hand is higher than its fingertips: a hand that rotates there hits it."""
-        pos, surface = view.eef_pos, self._surface_height(view)
-        height = obstacle_height(self._obstacles(view), pos, pos, 2 * HAND_RADIUS, surface)
+        pos = view.eef_pos
+        height = self.shapes.highest(view, self._object, (pos, pos, 2 * HAND_RADIUS))
         return height > pos[2] - hand_extent_below(view.eef_mat)
 
     def _stays_above(self, away: float, turn: float, deep: bool, slow: bool) -> bool:
@@ -267,11 +267,10 @@ class Transport:
     def _path_height(self, view: StateView, goal: np.ndarray) -> float:
         """Return the height of the highest obstacle that object and hand pass on the way to a goal (3,), [m]."""
         middle, radius, _ = self._ground_plan(view)
-        radius += 0.01
-        offset = np.array([*(middle - view.eef_pos[:2]), 0.0])
-        obstacles, surface = self._obstacles(view), self._surface_height(view)
-        for_object = obstacle_height(obstacles, view.eef_pos + offset, goal + offset, radius, surface)
-        return max(for_object, obstacle_height(obstacles, view.eef_pos, goal, HAND_RADIUS, surface))
+        pos = view.eef_pos
+        offset = np.array([*(middle - pos[:2]), 0.0])
+        of_object = pos + offset, goal + offset, radius + 0.01
+        return self.shapes.highest(view, self._object, of_object, (pos, goal, HAND_RADIUS))
 
     def _ground_plan(self, view: StateView) -> tuple[np.ndarray, float, float]:
         """Return the middle of the object in the ground plan, (2,), its radius there, and its top, [m]."""
@@ -279,9 +278,3 @@ class Transport:
         plan = points[:, :2]
         middle = 0.5 * (plan.min(axis=0) + plan.max(axis=0))
         return middle, float(np.linalg.norm(plan - middle, axis=1).max()), float(points[:, 2].max())
-
-    def _obstacles(self, view: StateView) -> np.ndarray:
-        return self.shapes.obstacles(view, self._object)
-
-    def _surface_height(self, view: StateView) -> float:
-        return view.scene.workspace.surface_height
