@@ -350,7 +350,7 @@ def weights_digest(policy: Any) -> str | None:
     return digest.hexdigest()[:16] if any(counts) else None
 
 
-def _add_arrays(value: Any, digest: Any, seen: dict[int, Any], left: int = 6) -> int:
+def _add_arrays(value: Any, digest: Any, seen: dict[int, Any], left: int = 8) -> int:
     """Add the arrays in an object to a digest, and return their number; what is kept in `seen` keeps its id."""
     if id(value) in seen or not left or isinstance(value, type | ModuleType):
         return 0

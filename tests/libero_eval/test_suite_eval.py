@@ -7,6 +7,7 @@ import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,14 @@ from libero_eval.plan import choose_init_states, plan_evaluation
 from libero_eval.plan import evaluate as evaluate_request
 from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
-from libero_eval.user_policy import ORIGINAL_NAMES, CallableActor, UserPolicy, as_original, load_callable
+from libero_eval.user_policy import (
+    ORIGINAL_NAMES,
+    CallableActor,
+    UserPolicy,
+    as_original,
+    load_callable,
+    weights_digest,
+)
 from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
 from lifelong.results.run_directory import CheckpointFolder
 from lifelong.stats.intervals import wilson_interval
@@ -422,6 +430,16 @@ def test_what_a_policy_imports_and_holds_is_part_of_its_identity(module, tmp_pat
     code, held = identity("x = 10", 0.0), identity("x = 1", 1.0)
     assert code["source"] != first["source"] and code["weights"] == first["weights"]
     assert held["source"] == first["source"] and held["weights"] != first["weights"]
+
+
+def test_statistics_that_a_policys_processors_hold_are_part_of_its_identity():
+    """As those of LeRobot: steps of pipelines hold them by feature and name."""
+
+    def digest(mean: float) -> str | None:
+        step = SimpleNamespace(stats={"action": {"mean": np.full(7, mean)}})
+        return weights_digest(SimpleNamespace(net=np.ones(3), processors=(SimpleNamespace(steps=[step]),)))
+
+    assert digest(0.0) == digest(0.0) != digest(1.0)
 
 
 def test_errors_are_reported_in_one_line(module, tmp_path, capsys):

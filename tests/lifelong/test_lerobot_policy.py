@@ -3,11 +3,14 @@
 `make lerobot` makes an environment with LeRobot and runs these tests in it.
 """
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 pytest.importorskip("lerobot")
 
+from libero_eval.user_policy import weights_digest
 from lifelong.data.dataset import SequenceVLDataset, last_frames
 from lifelong.data.fake import fake_observation
 from lifelong.errors import ConfigError, PolicyError
@@ -172,6 +175,21 @@ def test_learning_rates_are_lerobots() -> None:
     factors = {group["factor"]: len(group["params"]) for group in optimizer.param_groups}
     backbone = sum(name.startswith("model.backbone") for name, _ in one.inner.named_parameters())
     assert factors == {1e-5 / 1e-4: backbone, 1.0: len(list(one.parameters())) - backbone}
+
+
+def test_weights_and_statistics_of_stock_lerobot_identify_an_evaluated_policy() -> None:
+    inner = policy().inner
+
+    def digest(mean: float) -> str | None:
+        stats = {"action": {"mean": torch.full((7,), mean), "std": torch.ones(7)}}
+        processors = factory.make_pre_post_processors(inner.config, dataset_stats=stats)
+        return weights_digest(SimpleNamespace(policy=inner, processors=processors))
+
+    first = digest(0.0)
+    assert first == digest(0.0) != digest(1.0)
+    with torch.no_grad():
+        next(inner.parameters()).view(-1)[0] += 1.0
+    assert digest(0.0) != first
 
 
 def test_chunks_do_not_depend_on_what_else_is_simulated() -> None:
