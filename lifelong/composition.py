@@ -42,7 +42,7 @@ ORIGINAL_KEYS = {
     "lifelong": "algo",
     "benchmark_name": "benchmark",
     "task_embedding_format": "language",
-    "use_wandb": "wandb",
+    "use_wandb": "tracker",
     "pretrain_model_path": "init_from",
 }
 

@@ -37,7 +37,7 @@ class RunContext:
         group_sizes: Number of tasks in each group that is one step of the sequence.
         envs: Environments by (position of the task, number of simulations).
         directory: Directory of checkpoints and records.
-        tracker: Mirror of the metrics to Weights & Biases.
+        tracker: Copies the metrics to another program.
         seed: Seed from which all randomness of the run is derived.
         progress: Whether to show progress bars; None prints lines where demonstrations are recorded.
         ranks: Rank of this process among those that train together.

@@ -93,12 +93,13 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
                     context.tracker.start(_run_name(names, settings), str(directory.path), plain)
                     _record_start(context, names, plain)
                 _run_sequence(context, pretraining, plain)
+                if ranks.first:
+                    context.tracker.finish()
             elif ranks.first:
                 print(
                     f"{directory.path} is finished; its report is written again (resume=false repeats the run)"
                 )
             if ranks.first:
-                context.tracker.finish()
                 _write_results(directory, plain)
     return directory.path
 
@@ -264,7 +265,7 @@ def _checked_parts(config: Configuration, device: torch.device) -> _Parts:
     check_memory(needs, memory_limit() + on_gpu)
     if fit.compile != "off":
         check_compiler(device)
-    return _Parts(plan, data, fit, evaluation, algorithm, config.build("wandb"), demos)
+    return _Parts(plan, data, fit, evaluation, algorithm, config.build("tracker"), demos)
 
 
 def _held(context: RunContext, plain: Mapping[str, Any], resume: bool) -> AbstractContextManager[Any]:

@@ -1,19 +1,40 @@
-"""Optional copy of a run's metrics on Weights & Biases."""
+"""Optional copies of a run's metrics in Weights & Biases, TensorBoard or trackio."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Literal
 
 from lifelong.errors import LifelongError, require_package
 
 
 class Tracker:
-    """Logs metrics to Weights & Biases (W&B).
+    """Interface of a tracker; this one does nothing."""
+
+    def start(self, name: str, directory: str, config: Mapping[str, Any]) -> None:
+        """Start a run, or resume the run of the same name.
+
+        Args:
+            directory: Folder for files of the tracker.
+            config: Configuration of the run.
+
+        Raises:
+            LifelongError: The tracker does not start.
+        """
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Log metrics by name; a step is an epoch, counted over all tasks."""
+
+    def finish(self) -> None:
+        """End the run."""
+
+
+class WandB(Tracker):
+    """Logs to Weights & Biases.
 
     Args:
-        mode: `disabled` does nothing. `offline` writes into the run directory without a login; `wandb sync` uploads
-            it later. `online` uploads at once.
-        project: Name of the W&B project.
-        entity: W&B user or team; None for the default of the login.
+        mode: `offline` writes into the run directory without a login; `wandb sync` uploads it later. `online` uploads.
+        project: Name of the project.
+        entity: User or team; None for the default of the login.
 
     Raises:
         MissingPackageError: The package wandb is not installed.
@@ -22,53 +43,99 @@ class Tracker:
     def __init__(
         self,
         *,
-        mode: Literal["disabled", "offline", "online"] = "disabled",
+        mode: Literal["offline", "online"] = "online",
         project: str = "libero-lifelong",
         entity: str | None = None,
     ):
-        if mode != "disabled":
-            require_package("wandb", "wandb")
+        require_package("wandb", "wandb")
         self.mode, self.project, self.entity = mode, project, entity
-        self._run: Any = None
 
     def start(self, name: str, directory: str, config: Mapping[str, Any]) -> None:
-        """Start a run, or resume the run of the same name.
-
-        Args:
-            directory: Folder for the files of W&B.
-            config: Configuration of the run.
-
-        Raises:
-            LifelongError: W&B does not start.
-        """
-        if self.mode == "disabled":
-            return
+        """Start a run; see `Tracker`."""
         import wandb
 
+        # an identifier of W&B has no slash
+        options: dict[str, Any] = {"id": name.replace("/", "-"), "resume": "allow", "dir": directory}
         try:
             self._run = wandb.init(
                 mode=self.mode,
                 project=self.project,
                 entity=self.entity,
                 name=name,
-                id=name.replace("/", "-"),
-                resume="allow",
-                dir=directory,
                 config=dict(config),
+                **options,
             )
         except (wandb.Error, OSError) as error:
             raise LifelongError(
-                f"W&B does not start ({error}); log in with `wandb login`, or set wandb.mode=offline"
+                f"W&B does not start ({error}); log in with `wandb login`, or set tracker.mode=offline"
             ) from error
 
-    def log(self, values: Mapping[str, float]) -> None:
-        """Log metrics by name."""
-        if self._run is not None:
-            self._run.log(dict(values))
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Log metrics by name; a step is an epoch, counted over all tasks."""
+        self._run.log(dict(values), step=step)
 
-    def finish(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Log the summary of the run, and end it."""
-        if self._run is not None:
-            self._run.summary.update(dict(summary or {}))
-            self._run.finish()
-            self._run = None
+    def finish(self) -> None:
+        """End the run."""
+        self._run.finish()
+
+
+class Trackio(Tracker):
+    """Logs to trackio, which keeps its runs in `~/.cache/huggingface/trackio`; `trackio show` draws them.
+
+    Args:
+        project: Name of the project.
+        space_id: Space of the Hugging Face Hub that shows the project; None for this machine.
+
+    Raises:
+        MissingPackageError: The package trackio is not installed.
+    """
+
+    def __init__(self, *, project: str = "libero-lifelong", space_id: str | None = None):
+        require_package("trackio", "trackio")
+        self.project, self.space_id = project, space_id
+
+    def start(self, name: str, directory: str, config: Mapping[str, Any]) -> None:
+        """Start a run; see `Tracker`."""
+        import trackio
+
+        self._run = trackio.init(
+            project=self.project, name=name, space_id=self.space_id, config=dict(config), resume="allow"
+        )
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Log metrics by name; a step is an epoch, counted over all tasks."""
+        self._run.log(dict(values), step=step)
+
+    def finish(self) -> None:
+        """End the run."""
+        self._run.finish()
+
+
+class TensorBoard(Tracker):
+    """Writes event files into the folder `tensorboard` of the run; `tensorboard --logdir runs` draws them.
+
+    Raises:
+        MissingPackageError: The package tensorboard is not installed.
+    """
+
+    def __init__(self) -> None:
+        require_package("tensorboard", "tensorboard")
+
+    def start(self, name: str, directory: str, config: Mapping[str, Any]) -> None:
+        """Start a run; see `Tracker`."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        folder = Path(directory) / "tensorboard"
+        try:
+            self._writer = SummaryWriter(folder)
+        except OSError as error:
+            raise LifelongError(f"{folder}: TensorBoard's files cannot be written ({error})") from error
+
+    def log(self, values: Mapping[str, float], step: int) -> None:
+        """Log metrics by name; a step is an epoch, counted over all tasks."""
+        for name, value in values.items():
+            self._writer.add_scalar(name, value, step)
+
+    def finish(self) -> None:
+        """End the run."""
+        self._writer.close()

@@ -202,7 +202,7 @@ def test_an_algorithm_of_the_user_shows_its_own_frames(here, monkeypatch, capsys
     monkeypatch.setattr(sys, "argv", ["train.py"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     monkeypatch.syspath_prepend(str(here))
-    words = ["--config-dir", str(here), "preset=smoke", "algo=own", "wandb.mode=disabled"]
+    words = ["--config-dir", str(here), "preset=smoke", "algo=own", "tracker=none"]
     assert launch.main([*words, f"runs_dir={here}/runs"]) == ending.MISTAKE
     found = capsys.readouterr().err
     assert found.startswith("error: code of yours raised ZeroDivisionError: float division by zero\n")

@@ -40,7 +40,7 @@ from libero_env.storage import atomic_path
 from lifelong import checkpoints
 from lifelong.algorithms.base import load_algorithm
 from lifelong.errors import ConfigError
-from lifelong.tracking import Tracker
+from lifelong.tracking import Tracker, WandB
 
 DEMOS = 50  # demonstrations of each task, where they are generated
 RESULTS = ("L_conf_mat", "S_conf_mat", "L_fwd", "S_fwd")
@@ -76,7 +76,7 @@ def run(config: Any) -> Path:
             weights = torch_load_model(path, cfg.device)[0]
         checkpoints.load_weights(policy, weights, path)
     mode: Any = os.environ.get("WANDB_MODE", "online") if cfg.use_wandb else "disabled"
-    tracker = Tracker(mode=mode, project=cfg.wandb_project)
+    tracker = Tracker() if mode == "disabled" else WandB(mode=mode, project=cfg.wandb_project)
     tracker.start(cfg.experiment_name, cfg.experiment_dir, plain(cfg))
     _Run(cfg, algo, benchmark, datasets, tracker).learn(done)
     tracker.finish()
@@ -193,7 +193,7 @@ class _Run:
             shown = f"success {np.round(rates, 2).tolist()}, loss {np.round(losses, 3).tolist()}"
             print(f"[info] after task {i}: {shown}")
             means = {"success/mean": float(rates.mean()), "loss/mean": float(losses.mean()), "tasks": i + 1}
-            self.tracker.log(means)
+            self.tracker.log(means, i + 1)
         with atomic_path(Path(self.cfg.experiment_dir, "result.pt")) as path, open(path, "wb") as file:
             torch.save(_tensors(summary), file)
 

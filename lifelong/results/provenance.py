@@ -35,7 +35,7 @@ VOLATILE = (
     "run_id",
     "runs_dir",
     "threads",
-    "wandb",
+    "tracker",
     "data.memory",
     "eval.transfer",  # how records are read, not what they hold
     "eval.shift",  # evaluations besides all others

@@ -158,7 +158,7 @@ class TaskSequence:
         if end.epoch and not self.log.read().has_loss(task, epoch):
             self.log.append(LossRecord(task=task, epoch=epoch, loss=end.loss, seconds=end.seconds))
             values = {"epoch": epoch, f"loss/{task}": end.loss, f"penalty/{task}": end.penalty}
-            context.tracker.log(values)
+            context.tracker.log(values, len(self.log.read().of(LossRecord)))
         if (phase.number, end.epoch) == (0, phase.epochs) and not self.log.read().costs(task):
             spent = costs.step_costs(
                 context.policy, context.algorithm, self.data[task], context.fit.batch_size
@@ -211,7 +211,8 @@ class TaskSequence:
             self.log.append(TaskEndRecord(task=task, best_epoch=best, seconds=spent))
         new, mean = mean_rate([r for r in row if r.task in stage]), mean_rate(row)
         values = {"success/just_learned": new, "success/mean": mean, "tasks": task + 1}
-        self.context.tracker.log({name: value for name, value in values.items() if not math.isnan(value)})
+        known = {name: value for name, value in values.items() if not math.isnan(value)}
+        self.context.tracker.log(known, len(results.of(LossRecord)))
         told = f"success {new:.0%} on it, {mean:.0%} over {len(row)} so far" if row else "not measured"
         if under and self.context.shift:
             told += f", {mean_rate(under):.0%} over {len(under)} under {self.context.shift.text}"

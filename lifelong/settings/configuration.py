@@ -45,7 +45,7 @@ GROUPS = {
     "train": "lifelong.training.settings.FitSettings",
     "eval": "lifelong.evaluation.settings.EvalSettings",
     "language": "lifelong.language.encoder.LanguageEncoder",
-    "wandb": "lifelong.tracking.Tracker",
+    "tracker": "lifelong.tracking.Tracker",
 }
 # Components of algorithms and policies.
 _COMPONENTS = (

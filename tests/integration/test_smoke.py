@@ -123,7 +123,7 @@ def test_another_configuration_in_the_same_directory_is_refused(home, tmp_path):
 
 def test_a_sweep_ends_with_a_comparison_report(home, tmp_path):
     tiny = (*(t for t in TINY if not t.startswith("algo")), "benchmark.tasks=1")
-    output = finish(start(home, tmp_path, "-m", "algo=sequential,ewc", "wandb.mode=disabled", *tiny))
+    output = finish(start(home, tmp_path, "-m", "algo=sequential,ewc", "tracker=none", *tiny))
     assert "2 runs compared" in output
     assert len(list(tmp_path.glob("sweep/algo-*/report.html"))) == 1
     assert len(list(tmp_path.rglob("results.json"))) == 2

@@ -169,7 +169,7 @@ def test_a_package_that_is_not_installed_leaves_no_directory(package, message, h
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("LIBERO_CACHE", str(here / "cache"))
     robot_assets.cache_clear()
-    assert main(["train", "preset=smoke", "wandb=offline"]) == 2
+    assert main(["train", "preset=smoke", "tracker=wandb"]) == 2
     assert message in capsys.readouterr().err and not (here / "runs").exists()
 
 

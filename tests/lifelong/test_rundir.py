@@ -5,11 +5,12 @@ import fcntl
 import os
 
 import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.results.run_directory import RunDirectory
 from lifelong.settings import build
-from lifelong.tracking import Tracker
+from lifelong.tracking import TensorBoard, WandB
 
 CONFIG = {"seed": 1, "train": {"lr": 0.1, "epochs": 3}, "device": "cpu", "runs_dir": "a"}
 
@@ -106,10 +107,30 @@ def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch) -> None:
         pass
 
 
-def test_the_tracker_is_silent_by_default_and_names_its_modes():
-    tracker = Tracker()
-    tracker.start("run", ".", {})
-    tracker.log({"loss": 1.0})
+def test_wandb_names_its_modes():
+    with pytest.raises(ConfigError, match="'offline' or 'online'"):
+        build({"_target_": "lifelong.tracking.WandB", "mode": "on"})
+
+
+def test_tensorboard_reads_what_two_starts_of_a_run_logged(tmp_path):
+    for step in (1, 2):  # a killed run, and its resumption
+        tracker = TensorBoard()
+        tracker.start("run", str(tmp_path), {})
+        tracker.log({"loss/0": 1.0 / step}, step)
+        tracker.finish()
+    read = EventAccumulator(str(tmp_path / "tensorboard"))
+    read.Reload()
+    assert [(e.step, e.value) for e in read.Scalars("loss/0")] == [(1, 1.0), (2, 0.5)]
+    (tmp_path / "file").touch()
+    with pytest.raises(LifelongError, match="TensorBoard's files cannot be written"):
+        tracker.start("run", str(tmp_path / "file"), {})
+
+
+def test_wandb_keeps_the_steps_in_the_directory_of_the_run(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    tracker = WandB(mode="offline")
+    tracker.start("libero_object/er", str(tmp_path), {"seed": 1})
+    tracker.log({"loss/0": 0.5}, 3)
+    assert tracker._run.step == 3 and tracker._run.id == "libero_object-er"
     tracker.finish()
-    with pytest.raises(ConfigError, match="'disabled', 'offline' or 'online'"):
-        build({"_target_": "lifelong.tracking.Tracker", "mode": "on"})
+    assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))

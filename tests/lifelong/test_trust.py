@@ -68,7 +68,7 @@ def test_every_target_of_the_configuration_files_may_be_saved():
 
 
 @pytest.mark.parametrize(
-    "group", sorted({*GROUPS} - {"stream", "train", "augmentation", "wandb", "pretrain"})
+    "group", sorted({*GROUPS} - {"stream", "train", "augmentation", "tracker", "pretrain"})
 )
 @pytest.mark.parametrize("target", ["posix.mkdir", "libero_eval.user_policy.importlib.import_module"])
 def test_a_strangers_run_executes_nothing(group, target, changed, tmp_path, monkeypatch):
