@@ -45,7 +45,7 @@ HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 RECORDS = HERE / "records"
 REFERENCES = ("er", "sequential", "single_task")  # that each other algorithm is compared with
-SETTINGS = ("eval.episodes=20", "threads=1", "eval.sim_threads=1", "progress=false")
+SETTINGS = ("policy=bc_mlp_small", "eval.episodes=20", "threads=1", "eval.sim_threads=1", "progress=false")
 # keys that came after the runs, with the values by which nothing changes
 ADDED = {"data.files": [], "eval.cells_share": 0.1}
 # the rate is constant, so that neither comes nearer in a few hundred steps

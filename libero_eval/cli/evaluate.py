@@ -67,7 +67,7 @@ class RobustnessOptions(RobustnessRequest):
     area under it, the severity at which half is lost, and what two perturbations take together. It can be stopped; the
     same command goes on. Examples:
 
-    libero robustness runs/libero_goal/er/bc_mlp_small_seed1 --workers 2
+    libero robustness runs/libero_goal/er/bc_transformer_small_seed1 --workers 2
 
     libero robustness expert --suite libero_goal --out eval/expert: what can be done at all
 

@@ -53,7 +53,7 @@ class Policy(nn.Module, ABC):
 
     Attributes:
         by_window: Whether the first axis of what its layers are given is that of the windows.
-        uses_history: Whether it acts on earlier frames too, which it learns from windows of several steps.
+        uses_history: Whether it needs earlier frames to act well, which it learns from windows of several steps.
     """
 
     by_window = True

@@ -190,8 +190,6 @@ class TokenPolicy(HistoryPolicy):
     with `readout="all"` the frame's own tokens beside it.
     """
 
-    uses_history = True
-
     def build_rest(
         self,
         cameras: Sequence[str],
@@ -203,6 +201,7 @@ class TokenPolicy(HistoryPolicy):
     ) -> None:
         """Build all but what reads the images, whose tokens of `dim` numbers have the names `cameras`."""
         spec, self.readout = self.spec, readout
+        self.uses_history = readout == "instruction"  # all tokens of a frame are enough to act on
         self.language = LanguageToken(language_dim=spec.language_dim, dim=dim)
         self.proprio = ProprioTokens(proprio=spec.proprio, dim=dim, **proprio)
         self.transformer = temporal(dim=dim, max_length=spec.seq_len)

@@ -188,7 +188,8 @@ def test_lines_of_the_jobs_of_a_sweep_have_their_names(here, monkeypatch, capsys
 
 
 @pytest.mark.parametrize(("words", "noted"), [
-    ("policy=bc_rnn_small", True), ("policy=bc_vilt_small", True), ("policy=bc_transformer_small", True),
+    ("policy=bc_rnn_small", True), ("policy=bc_vilt_small", True),
+    ("policy=bc_transformer_small policy.readout=instruction", True), ("policy=bc_transformer_small", False),
     ("policy=bc_rnn_small data.seq_len=2", False), ("policy=bc_mlp_small", False)
 ])  # fmt: skip
 def test_a_policy_with_a_history_that_is_given_single_frames_says_so(words, noted, here, monkeypatch, capsys):
