@@ -134,10 +134,8 @@ def serve() -> None:
 
 
 def _limit_memory() -> None:
-    try:
+    with suppress(ImportError, ValueError, OSError):  # Windows limits no processes, and macOS not this
         import resource
-    except ImportError:  # Windows
-        return
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    with suppress(ValueError, OSError):  # macOS does not limit it
+
+        _, most = resource.getrlimit(resource.RLIMIT_AS)
         resource.setrlimit(resource.RLIMIT_AS, (MEMORY if most < 0 else min(MEMORY, most), most))

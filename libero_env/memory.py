@@ -1,9 +1,11 @@
 """How much memory there is: of the machine, and what control groups and limits leave of it to this process."""
 
-import os
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
+
+import psutil
 
 from libero_env.errors import LiberoError
 from libero_env.text import show_bytes
@@ -15,31 +17,23 @@ _NAMES = {  # version of control groups -> files with the limit and with what is
 }
 
 
-def physical_memory() -> int:
-    """Return the machine's memory without swap, [bytes]."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
 def host_memory() -> tuple[int, int]:
-    """Return the available and the total bytes of host memory, or of the container if it has a limit.
-
-    Where the system does not say what is available, it is half of the total.
-    """
-    groups, meminfo = list(_groups()), _meminfo()
-    total = min([physical_memory(), *(limit for limit, _ in groups)])
-    free = [amount for _, amount in groups if amount is not None]
-    if "MemAvailable" in meminfo:
-        free.append(meminfo["MemAvailable"])
-    return max(0, min([*free, total])) if free else total // 2, total
+    """Return the available and the total bytes of host memory, or of the container if it has a limit."""
+    groups, machine = list(_groups()), psutil.virtual_memory()
+    total = min([machine.total, *(limit for limit, _ in groups)])
+    free = [machine.available, total, *(amount for _, amount in groups if amount is not None)]
+    return max(0, min(free)), total
 
 
 def memory_limit() -> int:
     """Return the most bytes that this process can have: of the machine with its swap, its container, its limits."""
-    import resource  # not on every system
+    limits = [psutil.virtual_memory().total + psutil.swap_memory().total, *(limit for limit, _ in _groups())]
+    with suppress(ImportError):  # Windows has no limits of processes
+        import resource
 
-    limits = [physical_memory() + _meminfo().get("SwapTotal", 0), *(limit for limit, _ in _groups())]
-    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return min(limits if soft == resource.RLIM_INFINITY else [*limits, soft])
+        soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+        limits += [] if soft == resource.RLIM_INFINITY else [soft]
+    return min(limits)
 
 
 def require_memory(needed: float, what: str, remedy: str, error: type[LiberoError] = LiberoError) -> None:
@@ -58,12 +52,6 @@ def require_memory(needed: float, what: str, remedy: str, error: type[LiberoErro
         raise error(
             f"{what} needs about {show_bytes(needed)} of memory; {show_bytes(there)} are free: {remedy}"
         )
-
-
-def _meminfo() -> dict[str, int]:
-    """Return what the kernel says of the machine's memory, by name, [bytes]; nothing where there is no such file."""
-    found = re.findall(r"^(\w+): +(\d+) kB$", _read(_PROC / "meminfo"), re.MULTILINE)
-    return {name: 1024 * int(amount) for name, amount in found}
 
 
 def _groups() -> Iterator[tuple[int, int | None]]:
@@ -90,6 +78,6 @@ def _free(folder: Path, limit: int, used: str) -> int | None:
 
 def _read(file: Path) -> str:
     try:
-        return file.read_text().strip()
+        return file.read_text(encoding="utf-8").strip()
     except OSError:
         return ""

@@ -21,6 +21,7 @@ from types import TracebackType
 from typing import Any, TypeVar
 
 import cloudpickle
+import psutil
 from tqdm import tqdm
 
 from libero_env.errors import LiberoError
@@ -32,6 +33,7 @@ LONGEST_SILENCE = 4 * 3600.0  # [s] for one piece of work of a pool; the longest
 LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
 # [s] for the first picture of one of several processes; seconds where cores are shared
 PICTURE_SECONDS = 120.0
+_SAME_START = 5.0  # [s]; where a clock was set, some systems shift the starts of processes
 NO_PICTURE = 76  # exit status of a worker that did not draw it in time
 NO_PICTURE_TEXT = (
     "no first picture: in some drivers several processes that draw by EGL on one GPU hang for ever (mujoco#3444). Give "
@@ -382,35 +384,29 @@ def this_machine() -> str:
     """Return what tells this machine, its boot and its process numbers apart from others."""
     parts = [socket.gethostname()]
     with suppress(OSError):
-        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text().strip())
+        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip())
     with suppress(OSError):
         parts.append(os.readlink("/proc/self/ns/pid"))
     return " ".join(parts)
 
 
-def process_start(pid: int) -> int | None:
-    """Return when a process started, in ticks since the boot; None if it has ended, or without /proc."""
-    try:
-        text = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:
-        return None
-    state, *rest = text.rpartition(")")[2].split()  # proc(5): field 3 is the state, field 22 the start
-    return None if state in "ZX" else int(rest[18])
+def process_start(pid: int | None = None) -> float:
+    """Return when a process, None for this one, has started, [s] after the boot."""
+    boot = psutil.boot_time()
+    return psutil.Process(pid).create_time() - boot
 
 
-def is_running(pid: int, start: int | None) -> bool:
-    """Return whether a process of this machine runs.
+def is_running(pid: int, start: float) -> bool:
+    """Return whether a process of this machine runs; one that has ended does not, though nobody has waited for it.
 
     Args:
         pid: Its number.
         start: When it started, of `process_start`; tells processes with the same number apart.
     """
-    if start is not None:
-        return process_start(pid) == start
     try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
+        same = abs(process_start(pid) - start) < _SAME_START
+        return same and psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
+    except psutil.NoSuchProcess:
         return False
-    except OSError:
-        pass  # it is another user's
-    return True
+    except psutil.AccessDenied:  # to the state of another user's
+        return True

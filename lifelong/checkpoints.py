@@ -13,12 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import psutil
 import safetensors.torch
 import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from libero_env.memory import physical_memory
 from libero_env.storage import atomic_path
 from libero_env.text import show_bytes
 from lifelong.errors import CheckpointError, DamagedCheckpointError
@@ -213,7 +213,7 @@ def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:
 def _check_size(path: Path) -> None:
     """Raise ValueError where a header or a file is larger than anything that `save` writes here."""
     size = path.stat().st_size
-    memory = physical_memory()
+    memory = psutil.virtual_memory().total
     if size > memory:
         raise ValueError(f"it has {show_bytes(size)}, and this machine a memory of {show_bytes(memory)}")
     with open(path, "rb") as file:

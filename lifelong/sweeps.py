@@ -47,7 +47,7 @@ class JobRecord:
         host: Name of the machine.
         machine: Identity of the machine's process numbers.
         pid: Process.
-        process_start: When the process started, in the machine's ticks.
+        process_start: When the process started, [s] after the boot.
         started: When it began, UTC.
         seconds: Time that it took, [s].
         run: Directory of the run; None before there is one.
@@ -62,8 +62,8 @@ class JobRecord:
     status: Status
     host: str = field(default_factory=socket.gethostname)
     machine: str = field(default_factory=this_machine)
-    pid: int = field(default_factory=os.getpid)
-    process_start: int | None = field(default_factory=lambda: process_start(os.getpid()))
+    pid: Annotated[int, Field(ge=1, le=2**31 - 1)] = field(default_factory=os.getpid)
+    process_start: float = field(default_factory=process_start)
     started: str = field(default_factory=utc_now)
     seconds: float = 0.0
     run: str | None = None

@@ -28,6 +28,7 @@ from libero_env.errors import DEBUG_VARIABLE, RAISED_BY, LiberoError, is_debuggi
 from libero_env.text import printable
 
 MISTAKE, DEFECT, SIGNALLED = 2, 70, 128
+_SIGPIPE = 13  # Windows has no name for it
 DEBUG = "--debug"
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 _MAX_FRAMES = 12  # of the user's code in a message
@@ -126,7 +127,7 @@ def report(error: BaseException, *, who: str = "", mistakes: tuple[type[BaseExce
         return SIGNALLED + number
     if isinstance(error, BrokenPipeError):  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # nothing is left to be flushed
-        return SIGNALLED + signal.SIGPIPE
+        return SIGNALLED + _SIGPIPE
     if is_debugging():
         traceback.print_exception(error)
     told = _told(error, mistakes)

@@ -7,6 +7,7 @@ processes.
 import importlib
 import os
 import re
+import sys
 import threading
 import weakref
 from collections.abc import Iterable, Sequence
@@ -22,10 +23,11 @@ from libero_env.parallel import after_forks, first_picture
 from libero_env.sim.appearance import SceneAppearance
 from libero_env.sim.culling import Culling
 
-BACKENDS = ("egl", "osmesa", "glfw")
+# those of MuJoCo on this system; the last one needs a display, and is used unasked only where it is the only one
+BACKENDS = {"darwin": ("cgl", "glfw"), "win32": ("glfw",)}.get(sys.platform, ("egl", "osmesa", "glfw"))
 REMEDY = (
     "install a GL library (Debian and Ubuntu: apt-get install -y libegl1 libopengl0 libgl1-mesa-dri libosmesa6), or "
-    "set MUJOCO_GL to one of egl, osmesa, glfw; `libero doctor` checks it"
+    f"set MUJOCO_GL to one of {', '.join(BACKENDS)}; `libero doctor` checks it"
 )
 FORKED = (
     "this process was forked from one that has rendered, and OpenGL does not survive that. Render first in the new "
@@ -36,7 +38,7 @@ _unreachable: list[Any] = []  # contexts of other threads and processes: to free
 
 
 class GLContext(Protocol):
-    """An OpenGL context of `mujoco.egl`, `mujoco.osmesa` or `mujoco.glfw`."""
+    """An OpenGL context, such as that of `mujoco.egl`."""
 
     def make_current(self) -> None:
         """Make this the context that OpenGL calls of the thread refer to."""
@@ -48,7 +50,8 @@ class GLContext(Protocol):
 def open_context(width: int, height: int) -> tuple[str, GLContext]:
     """Open an offscreen OpenGL context.
 
-    The environment variable `MUJOCO_GL` chooses the backend where it is set; otherwise EGL is tried, then OSMesa.
+    The environment variable `MUJOCO_GL` chooses the backend where it is set; otherwise EGL is tried, then OSMesa; on
+    macOS CGL, on Windows GLFW.
     Mesa's software renderer draws in the calling thread unless `LP_NUM_THREADS` is set; images do not depend on it.
 
     Args:
@@ -70,7 +73,7 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
     # small images gain nothing from threads, which wait for each other
     os.environ.setdefault("LP_NUM_THREADS", "0")
     failures, platform = [], os.environ.get("PYOPENGL_PLATFORM")
-    for name in (chosen,) if chosen else ("egl", "osmesa"):
+    for name in (chosen,) if chosen else BACKENDS[:-1] or BACKENDS:
         try:
             context = importlib.import_module(f"mujoco.{name}").GLContext(width, height)
             _opened_in.add(os.getpid())

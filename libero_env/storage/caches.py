@@ -167,8 +167,8 @@ def make_cache_folder(folder: Path) -> None:
 def check_trusted(folder: Path) -> None:
     """Check that no other user can have written the files of a folder of the cache.
 
-    A folder that does not exist is fine. In a cache folder where everybody may write, as `/tmp`, it must belong to this
-    user; elsewhere also to the owner of the cache folder.
+    A folder that does not exist is fine, and so is any on Windows, where profiles are private. In a cache folder where
+    everybody may write, as `/tmp`, it must belong to this user; elsewhere also to the owner of the cache folder.
 
     Raises:
         LiberoError: Another user can.
@@ -176,6 +176,8 @@ def check_trusted(folder: Path) -> None:
     try:
         status, root = folder.stat(), folder.parent.stat()
     except OSError:
+        return
+    if not hasattr(os, "geteuid"):
         return
     remedy = "set LIBERO_CACHE to a folder of your own"
     if status.st_mode & stat.S_IWOTH:

@@ -45,12 +45,12 @@ def atomic_path(target: Path, *, fsync: bool = False) -> Iterator[Path]:
 
 def sync_folder(folder: Path) -> None:
     """Wait until the names of a folder's files have reached the disk, where the file system can."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # some network file systems sync no folders
+    with suppress(OSError):  # Windows opens no folders, and some network file systems sync none
+        handle = os.open(folder, os.O_RDONLY)
+        try:
             os.fsync(handle)
-    finally:
-        os.close(handle)
+        finally:
+            os.close(handle)
 
 
 def atomic_write_text(target: Path, text: str, *, fsync: bool = False) -> None:

@@ -41,7 +41,7 @@ class Claim:
         host: Name of the machine of the holder.
         machine: Identity of the machine's process numbers: host, boot, and namespace (containers).
         pid: Process of the holder.
-        process_start: When the process started, in the machine's ticks; tells processes with the same number apart.
+        process_start: When the process started, [s] after the boot; tells processes with the same number apart.
         token: Random text that tells claims apart.
     """
 
@@ -49,7 +49,7 @@ class Claim:
     host: str
     machine: str
     pid: Annotated[int, Field(ge=1, le=2**31 - 1)]
-    process_start: Annotated[int, Field(ge=0, le=2**63 - 1)] | None
+    process_start: float
     token: str
 
 
@@ -152,9 +152,7 @@ class Claims:
 
     def _create(self, unit: str) -> Claim | None:
         pid = os.getpid()
-        claim = Claim(
-            unit, socket.gethostname(), this_machine(), pid, process_start(pid), secrets.token_hex(8)
-        )
+        claim = Claim(unit, socket.gethostname(), this_machine(), pid, process_start(), secrets.token_hex(8))
         path = self._path(unit)
         try:
             file = os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
@@ -201,7 +199,7 @@ class Claims:
         """Return the time of the file server: that of a file that is written now."""
         probe = self._folder / f".now.{secrets.token_hex(4)}"
         try:
-            with open(probe, "w") as stream:
+            with open(probe, "wb") as stream:
                 return os.fstat(stream.fileno()).st_mtime
         except OSError:  # nothing can be written: somebody looks at a folder of others
             return time.time()

@@ -23,6 +23,7 @@ import logging
 import math
 import os
 import shutil
+import threading
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -57,6 +58,7 @@ _READ_AT_ONCE = 1 << 26  # [bytes] when all frames are read
 _PATIENCE = 10.0  # [s] for a process that builds, until a line says so
 _LONGEST_BUILD = 4 * 3600.0  # [s] for it in all
 _log = logging.getLogger(__name__)
+_moving = threading.Lock()  # of the position of a file
 
 
 class FrameFile:
@@ -72,7 +74,7 @@ class FrameFile:
 
     def __init__(self, path: Path, shape: tuple[int, ...]):
         self.shape, self._path, self._size = shape, path, math.prod(shape[1:])
-        self._file = os.open(path, os.O_RDONLY)
+        self._file = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0))
         weakref.finalize(self, os.close, self._file)
         if hasattr(os, "posix_fadvise"):  # what lies beside a frame is not needed with it
             os.posix_fadvise(self._file, 0, 0, os.POSIX_FADV_RANDOM)
@@ -128,7 +130,7 @@ class FrameFile:
         left, offset = rows.reshape(-1).data, first * self._size
         while left:
             try:
-                count = os.preadv(self._file, [left], offset)
+                count = _read_at(self._file, left, offset)
             except OSError as error:
                 raise DataError(f"{self._path}: the frames cannot be read ({error})") from error
             if not count:
@@ -137,6 +139,17 @@ class FrameFile:
                     "changed it. Run the same command again: the frames are written again"
                 )
             left, offset = left[count:], offset + count
+
+
+def _read_at(file: int, place: memoryview, offset: int) -> int:
+    """Read bytes at a position of a file; return how many there were."""
+    if hasattr(os, "preadv"):
+        return os.preadv(file, [place], offset)
+    with _moving:  # on Windows
+        os.lseek(file, offset, os.SEEK_SET)
+        found = os.read(file, len(place))
+    place[: len(found)] = found
+    return len(found)
 
 
 def _runs(frames: Tensor) -> Iterator[tuple[int, int, int]]:

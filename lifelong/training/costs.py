@@ -5,12 +5,12 @@ its own.
 """
 
 import copy
-import resource
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import psutil
 import torch
 from torch import Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
@@ -141,11 +141,19 @@ def reset_peak(device: torch.device) -> None:
 
 def peak_costs(device: torch.device) -> dict[str, float]:
     """Return the peak memory of the process since its start, and of the GPU since `reset_peak`, [bytes]."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    peaks = {"peak_memory_bytes": float(peak if sys.platform == "darwin" else 1024 * peak)}
+    peaks = {"peak_memory_bytes": float(_peak_memory())}
     if device.type == "cuda":
         peaks["peak_gpu_bytes"] = float(torch.cuda.max_memory_allocated(device))
     return peaks
+
+
+def _peak_memory() -> int:
+    if sys.platform == "win32":
+        return psutil.Process().memory_info().peak_wset
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
 
 
 def _count_bytes(node: Any) -> int:

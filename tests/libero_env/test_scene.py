@@ -207,6 +207,24 @@ def test_too_large_images_and_unknown_backends_are_errors(scene, monkeypatch):
         open_context(8, 8)
 
 
+@pytest.mark.parametrize(("named", "found"), [("", "cgl"), ("cgl", "cgl"), ("egl", "valid: cgl, glfw")])
+def test_macos_draws_by_cgl(named, found):
+    code = """
+import importlib, sys, types
+from libero_env.sim import render
+sys.modules["mujoco.cgl"] = types.SimpleNamespace(GLContext=lambda width, height: None)
+sys.platform = "darwin"
+importlib.reload(render)
+try:
+    print(render.open_context(8, 8)[0])
+except render.RenderError as error:
+    print(error)
+"""
+    env = {**os.environ, "MUJOCO_GL": named}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+    assert found in done.stdout
+
+
 def test_without_opengl_the_error_names_what_to_install(monkeypatch):
     import importlib
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import psutil
 import pytest
 
 from libero_env.errors import LiberoError
@@ -184,6 +185,27 @@ Claims(Path({str(tmp_path)!r})).take('a')\nprint('taken', flush=True)\ninput()"
         while Claims(tmp_path).held():  # it has ended when it is a zombie, though nobody has waited for it
             time.sleep(0.01)
     assert Claims(tmp_path).take("a").pid == os.getpid()
+
+
+def test_a_claim_outlives_a_change_of_the_clock_and_holds_where_its_process_may_not_be_looked_at(
+    tmp_path, monkeypatch
+):
+    claims = Claims(tmp_path)
+    claims.take("a")
+    if sys.platform == "linux":
+        boot = psutil._psplatform.boot_time() + 1000
+        monkeypatch.setattr(psutil._psplatform, "boot_time", lambda: boot)
+    assert claims.take("a") is None
+
+    def denied(self):
+        raise psutil.AccessDenied(self.pid)
+
+    monkeypatch.setattr(psutil.Process, "status", denied)
+    assert claims.take("a") is None
+    text = (tmp_path / "a.json").read_text()
+    earlier = json.loads(text) | {"process_start": json.loads(text)["process_start"] - 60}
+    (tmp_path / "a.json").write_text(json.dumps(earlier))  # of another process with the same number
+    assert claims.take("a").token != earlier["token"]
 
 
 def of_another_machine(path: Path) -> None:
@@ -397,7 +419,7 @@ def damaged(text: str, **changes) -> bytes:
 def hostile_files(folder: Path, unit: str) -> dict[str, list[bytes]]:
     """Contents that are not valid, by the file of an evaluation that they take the place of."""
     units, plan = ((folder / name).read_text() for name in (f"units/{unit}.json", "evaluation.json"))
-    claim = {"unit": unit, "host": "h", "machine": this_machine(), "process_start": None, "token": "t"}
+    claim = {"unit": unit, "host": "h", "machine": this_machine(), "process_start": 1.0, "token": "t"}
     times = [1e300, float("inf"), float("nan"), -1e18, "now"]
     return {
         f"units/{unit}.json": [damaged(units, finished=t) for t in times]

@@ -1,10 +1,10 @@
 """A run's directory: one configuration, one writer at a time, no results lost."""
 
 import errno
-import fcntl
 import os
 
 import pytest
+from filelock import FileLock
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from lifelong.errors import ConfigError, LifelongError
@@ -95,10 +95,10 @@ def test_a_second_writer_is_refused(tmp_path):
 
 
 def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch) -> None:
-    def no_locks(*_) -> None:
+    def no_locks(*_, **__) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr(fcntl, "flock", no_locks)
+    monkeypatch.setattr(FileLock, "acquire", no_locks)
     directory = RunDirectory(tmp_path / "run")
     with (
         pytest.raises(ConfigError, match="cannot lock files .No locks available"),
