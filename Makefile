@@ -13,7 +13,7 @@ STAMP := $(VENV)/.installed
 GL_STAMP := $(VENV)/.gl
 ASSETS_STAMP := $(VENV)/.assets
 PEERS_STAMP := $(VENV)/.peers
-EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,tensorboard,wandb,warp,docs,dev
+EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,tensorboard,view,wandb,warp,docs,dev
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 

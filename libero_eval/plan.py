@@ -142,7 +142,7 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
     if not tasks:
         raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
     require_available(tasks)
-    protocol = _protocol(request, policy.protocol(base), tasks)
+    protocol = resolve_protocol(request, policy.protocol(base), tasks)
     identity = {**policy.identity, "seed": request.seed}
     versions = {**installed_versions(request.assets), "source": source_digest()}
     if earlier is None:
@@ -246,7 +246,7 @@ def _episodes(request: EvalRequest, tasks: Sequence[Task]) -> int | None:
     return count
 
 
-def _protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[Task]) -> EvalProtocol:
+def resolve_protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[Task]) -> EvalProtocol:
     """Return the protocol on this machine, with what the request changes; what was chosen is printed."""
     protocol, notes = resolve_world(base, tasks, request.assets)
     changes: dict[str, object] = {}

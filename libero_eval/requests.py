@@ -227,3 +227,45 @@ class SaliencyRequest:
 
     def __post_init__(self) -> None:
         validate_arguments(type(self), vars(self), prefix=("saliency",), error=ConfigError)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewRequest:
+    """Show a scene in the browser: starts, perturbations, a demonstration frame by frame, or a policy that acts.
+
+    Attributes:
+        what: A task or suite, a task file, a demonstration file that ends in .hdf5, or a run, whose policy acts.
+        policy: What acts, as of `libero eval` (default: expert).
+        start: Initial state that is shown first.
+        perturb: Perturbations that are shown first, such as camera=0.3,light=0.5.
+        perturb_seed: Seed of what perturbations draw.
+        protocol: Protocol of the episodes, as of `libero eval`.
+        bddl: Task file of demonstrations that do not state their task.
+        seed: Seed of stochastic policies.
+        assets: `builtin`, `original`, or the folder of the original's models.
+        device: auto, cpu, cuda, cuda:1.
+        allow: Packages of others whose classes a run's configuration may name (default: none; their code is
+            executed).
+        host: Address to listen on; others than this machine's own let everybody who reaches it in.
+        port: Port to listen on, 0 for a free one.
+
+    Raises:
+        ConfigError: A value is of another kind or outside of its range.
+    """
+
+    what: Positional[str]
+    policy: str | None = None
+    start: Annotated[int, Field(ge=0, lt=NUM_INIT_STATES)] = 0
+    perturb: str = ""
+    perturb_seed: Seed = 0
+    protocol: str = "libero"
+    bddl: FilePath | None = None
+    seed: Seed = 0
+    assets: str | None = None
+    device: Device = "auto"
+    allow: tuple[str, ...] = ()
+    host: str = "127.0.0.1"
+    port: Annotated[int, Field(ge=0, le=65535)] = 8080
+
+    def __post_init__(self) -> None:
+        validate_arguments(type(self), vars(self), prefix=("view",), error=ConfigError)

@@ -195,10 +195,11 @@ def iter_demos(
     yield from _read(plan, labels, pairing)
 
 
-def read_episodes(file: Path, *, check_values: bool = True) -> Iterator[Episode]:
+def read_episodes(file: Path, *, check_values: bool = True, observations: bool = True) -> Iterator[Episode]:
     """Read demonstrations one at a time with all that is recorded of them.
 
     Args:
+        observations: Whether observations are read, too.
         check_values: Whether numbers that are not finite or absurd are refused.
 
     Raises:
@@ -209,7 +210,7 @@ def read_episodes(file: Path, *, check_values: bool = True) -> Iterator[Episode]
         for name in names:
             group, where = handle["data"][name], f"{file}: {name}"
             obs = group.get("obs") if isinstance(group, h5py.Group) else None
-            stored = obs if isinstance(obs, h5py.Group) else ()
+            stored = obs if observations and isinstance(obs, h5py.Group) else ()
             keys = [key for key in stored if is_image(key) or key in LOW_DIM_KEYS]
             size = check_demo(group, where, keys)
             require_memory(size, where, _SMALLER, DemoError)

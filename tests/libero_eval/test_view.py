@@ -1,0 +1,175 @@
+"""The scene in the browser: frames, predicates, perturbations and a policy that acts; the page and its socket."""
+
+import socket
+import threading
+import time
+import urllib.request
+from contextlib import closing
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+import viser
+import zstandard
+from websockets.sync.client import connect
+
+from libero_env.cli.main import main
+from libero_env.envs.env import LiberoEnv
+from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.perturbations import Perturbation
+from libero_eval.requests import ViewRequest
+from libero_eval.viewer import POLICY, Stage, Viewer
+from tests.harness.demos import STEPS, record_wander
+
+pytestmark = pytest.mark.sim
+TASK = "libero_goal/7"  # turn on the stove
+ON_FROM = 5  # frame of the recording from which the stove is on
+ATOM = "(Turnon flat_stove_1)"
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    path = record_wander(tmp_path_factory.mktemp("demos") / "stove.hdf5", TASK, (16, 16))
+    with LiberoEnv(TASK, cameras=()) as env:
+        (knob,) = env.scene.joints["flat_stove_1"]
+        column = 1 + env.scene.model.jnt_qposadr[knob]
+        on = np.mean(env.scene.entities["flat_stove_1"].articulation["turnon"])
+    with h5py.File(path, "r+") as file:
+        file["data/demo_1/states"][ON_FROM:, column] = on
+    return path
+
+
+@pytest.fixture
+def stage(closing):
+    return lambda what, **more: closing(Stage(ViewRequest(what=str(what), **more)))
+
+
+@pytest.fixture
+def viewer(stage):
+    opened = []
+
+    def make(what, **more):
+        opened.append(Viewer(stage(what, **more), "127.0.0.1", 0))
+        opened[-1].open(opened[-1].stage.initial)
+        return opened[-1]
+
+    yield make
+    for one in opened:
+        one.close()
+
+
+def messages(frame: bytes) -> bytes:
+    """Return the messages of a frame: [size, compressed size, messages, arrays]."""
+    return zstandard.decompress(frame[16 : 16 + int.from_bytes(frame[8:16], "little")])
+
+
+def until(viewer: Viewer, condition, seconds: float = 60.0) -> None:
+    """Let the viewer look at its controls until a condition holds."""
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        viewer.update()
+
+
+def test_predicates_turn_true_in_the_frames_of_a_recording(stage, recording):
+    shown = stage(recording)
+    assert shown.sources == ("demo_0", "demo_1", POLICY)
+    shown.open(replace(shown.initial, source="demo_1"))
+    assert len(shown.frames) == STEPS
+    assert [truth[ATOM] for truth in shown.truths] == [False] * ON_FROM + [True] * (STEPS - ON_FROM)
+    assert f"`{ATOM}` false" in shown.describe(ON_FROM - 1)
+    text = shown.describe(STEPS - 1)
+    assert f"`{ATOM}` true, since frame {ON_FROM}" in text and "the goal is reached" in text
+    with h5py.File(recording) as file:
+        states, fixtures = file["data/demo_1/states"][:], file["data/demo_1"].attrs["fixtures"]
+    shown.show(7)
+    np.testing.assert_array_equal(shown.env.simulations.physics_state(0), states[7])
+    np.testing.assert_array_equal(shown.env.simulations.fixtures[0].ravel(), np.ravel(fixtures))
+
+
+def test_perturbations_change_pictures_and_those_of_physics_are_refused_in_recordings(stage, recording):
+    shown = stage(recording)
+    shown.open(shown.initial)
+    shown.show(3)
+    before = shown.picture("agentview")
+    shown.open(replace(shown.initial, perturbations=(Perturbation("camera", 1.0),)))
+    shown.show(3)
+    assert np.abs(shown.picture("agentview").astype(int) - before).mean() > 5
+    with pytest.raises(LiberoError, match="layout"):
+        shown.open(replace(shown.initial, perturbations=(Perturbation("layout", 1.0),)))
+
+
+def test_a_policy_acts_in_frames_that_stay(stage):
+    shown, steps = stage(TASK, perturb="noise=0.5"), []
+    shown.open(shown.initial)
+    assert len(shown.frames) == 1
+
+    def look():
+        steps.append(len(shown.frames))
+        if len(steps) == 6:
+            raise StopIteration
+
+    with pytest.raises(StopIteration):
+        shown.act(look)
+    assert steps == [1, 2, 3, 4, 5, 6]
+    arm = []
+    for index in (0, 5):
+        shown.show(index)
+        arm.append(shown.env.simulations.fields["qpos"][0, :7].copy())
+        assert shown.env.simulations.data(0).ncon > 0  # contacts can be drawn
+    assert np.abs(arm[1] - arm[0]).max() > 1e-3
+
+
+def test_controls_choose_frames_sources_and_perturbations(viewer, recording):
+    view = viewer(recording)
+    view.frame.value = 4
+    view.update()
+    assert view.shown == 4 and "frame 4" in view.text.content
+    view.source.value = "demo_1"
+    until(view, lambda: view.stage.choice.source == "demo_1")
+    view.play.value = True
+    until(view, lambda: not view.play.value)
+    assert view.shown == STEPS - 1 and "the goal is reached" in view.text.content
+    view.severities["layout"].value = 0.5
+    until(view, lambda: "not possible" in view.text.content)
+    view.severities["layout"].value = 0.0
+    until(view, lambda: "not possible" not in view.text.content)
+    view.source.value = POLICY
+    until(view, lambda: view.stage.choice.source == POLICY)
+
+    def restart():
+        while len(view.stage.frames) < 4:
+            time.sleep(0.01)
+        view._on_restart(None)
+
+    threading.Thread(target=restart, daemon=True).start()
+    view.play.value = True
+    view.update()  # until it is started again
+    until(view, lambda: len(view.stage.frames) == 1)
+
+
+def test_the_page_and_its_socket_are_served_and_a_client_may_come_back(viewer, capsys):
+    view = viewer(TASK)
+    with urllib.request.urlopen(f"http://127.0.0.1:{view.port}/") as page:
+        assert page.status == 200 and b"<html" in page.read(1000)
+    for _ in range(2):
+        with connect(
+            f"ws://127.0.0.1:{view.port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None
+        ) as client:
+            text = b""
+            while b"/bodies/flat_stove_1_main" not in text or b"**turn on the stove**" not in text:
+                text += messages(client.recv(timeout=30))
+    assert main(["view", TASK, "--port", str(view.port)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"--port {view.port} cannot be listened on: Address already in use" in line
+
+
+def test_options_that_mean_nothing_are_refused(tmp_path):
+    with pytest.raises(InvalidInputError, match="--bddl is of demonstration files"):
+        Stage(ViewRequest(what=TASK, bddl=tmp_path / "mine.bddl"))
+    with pytest.raises(InvalidInputError, match="leave out --policy expert"):
+        Stage(ViewRequest(what=str(tmp_path), policy="expert"))
+    with closing(socket.create_server(("127.0.0.1", 0))) as taken:
+        port = taken.getsockname()[1]
+        assert main(["view", "libero_goal/99", "--port", str(port)]) == 2
