@@ -125,8 +125,8 @@ def relearn(request: RelearnRequest, initial: Policy) -> Path:
             device=device,
             allow=allow,
         )
-        training, held_out = _windows(run, task, request, config)
-        with _opened(run, task, held_out, request.episodes) as measure:
+        training, held_out = task_windows(run, task, request.demos_held_out, config)
+        with measured_on(run, task, held_out, request.episodes) as measure:
             with before.acting(run.tasks[task]) as then:
                 learned = measure(then)
             trial = Trial(task, training, measure, back_limit(learned, request.tolerance, request.episodes))
@@ -259,14 +259,19 @@ def _recorded(log: ResultLog, task: int, start: str, request: RelearnRequest, ra
     )
 
 
-def _windows(
-    run: LoadedRun, task: int, request: RelearnRequest, config: Configuration
+def task_windows(
+    run: LoadedRun, task: int, held_out: int, config: Configuration
 ) -> tuple[TaskWindows, Batch | None]:
-    """Read the windows that the run learned from, and those to measure the error on, unless rollouts are measured."""
+    """Read the windows that the run learned from, and those to measure the error on.
+
+    Args:
+        held_out: Number of demonstrations to measure on, which follow those that were learned from; 0: None for them.
+        config: Configuration of the run.
+    """
     data: DataSettings = config.build("data")
     stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
     learned_from = stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])[task]
-    tasks, counts = [run.tasks[task]], [learned_from + request.demos_held_out]
+    tasks, counts = [run.tasks[task]], [learned_from + held_out]
     recorded = find_demos(tasks, counts, data, None)
     (path,) = perturb_demos(recorded, tasks, counts, [run.perturbations(task)], data, None)
     languages, read = run.embed(run.learned_task(task))[None], replace(data, memory="host")
@@ -275,7 +280,7 @@ def _windows(
         return DemoDatasets([path], [count], run.policy.spec, languages, read, run.device)[0]
 
     training = windows(learned_from)
-    if not request.demos_held_out:
+    if not held_out:
         return training, None
     everything = windows(sum(counts))
     rest = torch.arange(len(training), len(everything))  # windows are in the order of the demonstrations
@@ -283,7 +288,7 @@ def _windows(
 
 
 @contextmanager
-def _opened(run: LoadedRun, task: int, held_out: Batch | None, episodes: int) -> Iterator[Measure]:
+def measured_on(run: LoadedRun, task: int, held_out: Batch | None, episodes: int) -> Iterator[Measure]:
     """Yield what measures a policy on a task: its error on held-out windows, or without any, its failed rollouts."""
     if held_out is not None:
         yield partial(error_on, batch=held_out)

@@ -199,6 +199,32 @@ class RelearnRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
+class DiagnoseRequest:
+    """Measure why a run forgets: what learning moved, and which part of the policy brings an old task back.
+
+    Attributes:
+        run: The directory of a run with checkpoints after its tasks.
+        held_out: Demonstrations to measure on, after those that were learned from.
+        episodes: Rollouts to measure success by, besides the error; 0: none.
+        device: auto, cpu, cuda, cuda:1.
+        allow: Packages of others whose classes the run's configuration may name (default: none; their code is
+            executed).
+
+    Raises:
+        ConfigError: A value is of another kind or outside of its range.
+    """
+
+    run: Positional[FilePath]
+    held_out: Annotated[int, Field(ge=1, le=1000)] = 5
+    episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
+    device: Device = "auto"
+    allow: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        validate_arguments(type(self), vars(self), prefix=("diagnose",), error=ConfigError)
+
+
+@dataclass(frozen=True, kw_only=True)
 class SaliencyRequest:
     """Draw where a policy looks during a rollout, and write the run's report again.
 

@@ -79,6 +79,7 @@ def test_a_task_is_shown_as_bddl(capsys):
     (["eval", "nowhere", "--suite", "libero_goal"], "nowhere does not exist; give the directory of a run"),
     (["serve", "nowhere"], "nowhere does not exist; give the directory of a run"),
     (["relearn", "nowhere"], "nowhere does not exist; give the directory of a run"),
+    (["diagnose", "nowhere"], "nowhere does not exist; give the directory of a run"),
     (["demos", "check", "/nonexist"], "/nonexist does not exist; give demonstration files, or folders"),
     (["demos", "info", "/nonexist", "tests"], "/nonexist does not exist; give demonstration files"),
 ])  # fmt: skip

@@ -1,4 +1,4 @@
-"""Commands about a run: serve its policy, relearn its tasks, show where it looks, check its directory."""
+"""Commands about a run: serve its policy, relearn tasks, tell why it forgets, show where it looks, check it."""
 
 import asyncio
 import contextlib
@@ -6,7 +6,7 @@ from typing import Annotated
 
 from libero_env.cli.options import Device, Field, FilePath, Natural, Positional, Processes, Seed
 from libero_env.text import to_json
-from libero_eval.requests import RelearnRequest, SaliencyRequest
+from libero_eval.requests import DiagnoseRequest, RelearnRequest, SaliencyRequest
 
 
 def serve(
@@ -60,6 +60,16 @@ def relearn(request: RelearnRequest) -> None:
     measure(request, initial_policy(request.run, weights=request.initial, allow=request.allow))
     print(savings_tables(read_relearning(request.run)))
     print(write_report([request.run]))
+
+
+def diagnose(request: DiagnoseRequest) -> None:
+    """Tell why a run forgets, a line for each finding; print the page."""
+    from libero_eval.diagnosis.measure import diagnose as measure
+    from libero_eval.diagnosis.page import findings, write_diagnosis
+
+    found = measure(request)
+    print("\n".join(findings(found)))
+    print(write_diagnosis(found, request.run))
 
 
 def saliency(request: SaliencyRequest) -> None:

@@ -226,7 +226,7 @@ def finished(tmp_path, monkeypatch):
 
     monkeypatch.setattr(relearning, "restore", restore)
     monkeypatch.setattr(relearning, "read_config", read_config)
-    monkeypatch.setattr(relearning, "_windows", lambda run, task, *_: (Windows(task), held_out(task)))
+    monkeypatch.setattr(relearning, "task_windows", lambda run, task, *_: (Windows(task), held_out(task)))
     return tmp_path, ends
 
 
