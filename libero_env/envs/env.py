@@ -1,5 +1,8 @@
 """One simulation of a task as a `gymnasium.Env`."""
 
+import importlib
+import os
+import sys
 from typing import Any
 
 import gymnasium
@@ -8,7 +11,7 @@ import numpy as np
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.checks import checked_actions, checked_options, checked_seed
 from libero_env.envs.config import EnvConfig, show_options
-from libero_env.errors import LiberoError, SimulationError, UnknownNameError
+from libero_env.errors import LiberoError, RenderError, SimulationError, UnknownNameError
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ
 
@@ -27,7 +30,7 @@ class LiberoEnv(gymnasium.Env):
     Args:
         task: `Task`, or an argument of `get_task`: `libero_object/3`, `libero_object-3`, or a task's name.
         config: Configuration of the environment.
-        render_mode: None, or `rgb_array` for `render()`.
+        render_mode: None; `rgb_array` for `render()`; or `human` for a window of MuJoCo's viewer that shows every step.
         **options: Fields of `EnvConfig`, such as `camera_size=(64, 64)`, which replace those of `config`.
 
     Attributes:
@@ -54,7 +57,7 @@ class LiberoEnv(gymnasium.Env):
         >>> env.close()
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": CONTROL_HZ}
 
     @show_options
     def __init__(
@@ -67,10 +70,15 @@ class LiberoEnv(gymnasium.Env):
     ):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UnknownNameError("render_mode", render_mode, ("None", *self.metadata["render_modes"]))
+        if render_mode == "human":
+            require_display()
         self.render_mode = render_mode
+        self._window: Any = None
         self.batch = batch = BatchEnv(task, 1, config=config, **options)
         self.config, self.task, self.scene = batch.config, batch.task, batch.scene
         self.simulations, self.observer, self.view = batch.simulations, batch.observer, batch.views[0]
+        if render_mode == "human" and self.config.backend.is_warp:
+            raise RenderError("render_mode human shows simulations of backend=mujoco, not of warp")
         self.observation_space = batch.single_observation_space
         self.action_space = batch.single_action_space
 
@@ -104,6 +112,7 @@ class LiberoEnv(gymnasium.Env):
         observations, infos = self.batch.reset(seed=[seed], options=options)
         if seed is not None:
             self._np_random, self._np_random_seed = self.batch.generators[0], seed
+        self._show()
         return _first(observations), self._info(infos)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
@@ -124,6 +133,7 @@ class LiberoEnv(gymnasium.Env):
         observations, rewards, terminated, truncated, infos = self.batch.advance(action[None])
         if "errors" in infos:
             raise SimulationError(infos["errors"])
+        self._show()
         return (
             _first(observations),
             float(rewards[0]),
@@ -156,15 +166,41 @@ class LiberoEnv(gymnasium.Env):
     def render(self) -> np.ndarray | None:  # type: ignore[override]  # Gymnasium declares any type
         """Return the image of the agent's camera, (H, W, 3) uint8, in `rgb_array` mode, else None."""
         self.batch.require_open()
+        self._show()
         return self.observer.render(0, "agentview") if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Free the simulation and the OpenGL context. Idempotent."""
+        """Free the simulation, the OpenGL context and the window. Idempotent."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
         self.batch.close()
+
+    def _show(self) -> None:
+        """Show the state in the window of `human` mode, which is opened once."""
+        if self.render_mode != "human":
+            return
+        if self._window is None:
+            viewer: Any = importlib.import_module("mujoco.viewer")
+            self._window = viewer.launch_passive(self.simulations.model, self.simulations.data(0))
+            self._window.opt.geomgroup[0] = 0  # collision shapes are hidden
+        self._window.sync()
 
     def _info(self, infos: dict[str, Any]) -> dict[str, Any]:
         atoms = zip(self.batch.atoms, map(bool, infos["progress"][0]), strict=True)
         return {**_first(infos), "success": bool(infos["success"][0]), "progress": dict(atoms)}
+
+
+def require_display() -> None:
+    """Check that a window can be opened.
+
+    Raises:
+        RenderError: There is no screen.
+    """
+    if sys.platform.startswith("linux") and not (
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    ):
+        raise RenderError("no window: neither DISPLAY nor WAYLAND_DISPLAY names a screen")
 
 
 def _first(rows: dict[str, Any]) -> dict[str, Any]:

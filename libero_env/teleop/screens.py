@@ -12,6 +12,7 @@ import numpy as np
 from PIL import Image
 
 from libero_env.envs.batch import BatchEnv
+from libero_env.envs.env import require_display
 from libero_env.errors import LiberoError, RenderError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP
@@ -115,10 +116,7 @@ class Window(_Timed):
     """
 
     def __init__(self, keyboard: Keyboard, camera: str, reader: MouseReader | None = None, size: int = 640):
-        if sys.platform.startswith("linux") and not (
-            os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-        ):
-            raise RenderError("no window: neither DISPLAY nor WAYLAND_DISPLAY names a screen")
+        require_display()
         try:
             self.glfw: Any = importlib.import_module("glfw")
         except ImportError as error:

@@ -24,6 +24,7 @@ from libero_env.errors import (
     SimulationError,
     UnknownNameError,
 )
+from libero_env.mujoco_compat import mujoco
 from libero_env.sim.osc import rotate
 
 TASK = "libero_object/3"
@@ -431,3 +432,40 @@ def test_a_simulation_that_diverges_ends_its_episode_with_an_error(first):
         _, info = pair.reset(options={"init_state": 0, "reset_mask": [False, True]})
         assert "errors" not in info and pair.running.all()
         np.testing.assert_array_equal(pair.get_state(1), alone.get_state(0))
+
+
+def test_a_window_shows_every_step_of_human_mode(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(RenderError, match="no window: neither DISPLAY nor WAYLAND_DISPLAY names a screen"):
+        LiberoEnv(TASK, cameras=(), render_mode="human")
+    monkeypatch.setenv("DISPLAY", ":0")
+    shown = []
+
+    class Window:
+        opt = mujoco.MjvOption()
+
+        def sync(self):
+            shown.append(data[0].time)
+
+        def close(self):
+            shown.append("closed")
+
+    data = []
+
+    def launch_passive(model, state):
+        assert model.nq == state.qpos.size and not data
+        data.append(state)
+        return Window()
+
+    monkeypatch.setattr("mujoco.viewer.launch_passive", launch_passive)
+    env = LiberoEnv(TASK, cameras=(), render_mode="human")
+    env.reset(seed=1)
+    env.step(np.zeros(7))
+    assert env.render() is None
+    env.close()
+    env.close()
+    start, moved = shown[0], shown[1]
+    assert moved - start == pytest.approx(0.05) and shown[2:] == [moved, "closed"]
+    assert not Window.opt.geomgroup[0]
