@@ -270,10 +270,12 @@ def task_windows(
     """
     data: DataSettings = config.build("data")
     stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
-    learned_from = stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])[task]
-    tasks, counts = [run.tasks[task]], [learned_from + held_out]
-    recorded = find_demos(tasks, counts, data, None)
-    (path,) = perturb_demos(recorded, tasks, counts, [run.perturbations(task)], data, None)
+    learned = stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])
+    learned_from, needed = learned[task], list(learned)
+    needed[task] += held_out
+    recorded = find_demos(run.tasks, needed, data, None)[task]  # data.files may name files of every task
+    tasks, counts = [run.tasks[task]], [needed[task]]
+    (path,) = perturb_demos([recorded], tasks, counts, [run.perturbations(task)], data, None)
     languages, read = run.embed(run.learned_task(task))[None], replace(data, memory="host")
 
     def windows(count: int) -> TaskWindows:

@@ -14,6 +14,7 @@ from libero_eval import relearning
 from libero_eval.relearning import Trial, error_on, failure_share, relearn, steps_until
 from libero_eval.requests import RelearnRequest
 from lifelong.algorithms import Sequential
+from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
@@ -281,3 +282,19 @@ def test_a_run_that_is_not_finished_is_refused(finished, monkeypatch) -> None:
     monkeypatch.setattr(relearning, "restore", lambda *_, **__: unfinished)
     with pytest.raises(LifelongError, match="is not finished: 1 of 2 tasks are learned"):
         relearn(replace(SETTINGS, run=folder), policy())
+
+
+def test_demonstrations_are_asked_for_with_all_tasks_as_files_of_all_may_be_named(monkeypatch) -> None:
+    class Asked(Exception):
+        pass
+
+    def find_demos(tasks, counts, data, progress):
+        raise Asked(list(tasks), list(counts))
+
+    settings = DataSettings(demos=4, image_size=16, seq_len=1, views=("agentview_rgb",), proprio=())
+    monkeypatch.setattr(relearning, "find_demos", find_demos)
+    run = SimpleNamespace(tasks=("a", "b", "c"), group_sizes=())
+    config = SimpleNamespace(build={"data": settings}.get, values={})
+    with pytest.raises(Asked) as asked:
+        relearning.task_windows(run, 1, 2, config)
+    assert asked.value.args == (["a", "b", "c"], [4, 6, 4])
