@@ -61,7 +61,7 @@ def _swap_text(swap: Swap) -> str:
         return f"{start}; nothing is lost."
     best = min(swap.swapped, key=lambda part: swap.swapped[part])
     shares = ", ".join(f"{part} {percent(swap.restored(part), 0)} %" for part in swap.swapped)
-    verdict = f"the {best} restores most" if swap.restored(best) > 0 else "no part alone restores anything"
+    verdict = f"the {best} restores the largest share" if swap.restored(best) > 0 else "no part restores any"
     return f"{start}; put back alone, {verdict} of what was lost ({shares})."
 
 
@@ -98,7 +98,7 @@ def swap_figure(found: Diagnosis) -> Figure:
     bars = {"just learned": [swap.learned for swap in swaps]}
     bars |= {f"{part} put back": [swap.swapped[part] for swap in swaps] for part in swaps[0].swapped}
     bars["at the end"] = [swap.final for swap in swaps]
-    figure = Figure(figsize=(max(4.0, 1.0 + 0.9 * len(swaps)), 2.9), layout="constrained")
+    figure = Figure(figsize=(max(5.2, 1.0 + 0.9 * len(swaps)), 2.9), layout="constrained")
     axes, width = figure.subplots(), 0.8 / len(bars)
     for place, (label, values) in enumerate(bars.items()):
         middle = np.arange(len(swaps)) + (place - (len(bars) - 1) / 2) * width
