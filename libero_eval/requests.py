@@ -156,8 +156,16 @@ class RobustnessRequest(Request):
         return EvalRequest(**{**shared, "perturb": perturb, "out": out})
 
 
+class _Checked:
+    """Options whose values are checked when they are given; messages begin with the command's name."""
+
+    def __post_init__(self) -> None:
+        command = type(self).__name__.removesuffix("Request").lower()
+        validate_arguments(type(self), vars(self), prefix=(command,), error=ConfigError)
+
+
 @dataclass(frozen=True, kw_only=True)
-class RelearnRequest:
+class RelearnRequest(_Checked):
     """Measure how many steps a forgotten task of a run takes until it is back, and write the run's report again.
 
     Attributes:
@@ -189,9 +197,6 @@ class RelearnRequest:
     device: Device = "auto"
     allow: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("relearn",), error=ConfigError)
-
     @property
     def demos_held_out(self) -> int:
         """Number of demonstrations to measure on; none where rollouts are measured."""
@@ -199,7 +204,7 @@ class RelearnRequest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DiagnoseRequest:
+class DiagnoseRequest(_Checked):
     """Measure why a run forgets: what learning moved, and which part of the policy brings an old task back.
 
     Attributes:
@@ -220,12 +225,9 @@ class DiagnoseRequest:
     device: Device = "auto"
     allow: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("diagnose",), error=ConfigError)
-
 
 @dataclass(frozen=True, kw_only=True)
-class SaliencyRequest:
+class SaliencyRequest(_Checked):
     """Draw where a policy looks during a rollout, and write the run's report again.
 
     Attributes:
@@ -251,12 +253,9 @@ class SaliencyRequest:
     device: Device = "auto"
     allow: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("saliency",), error=ConfigError)
-
 
 @dataclass(frozen=True, kw_only=True)
-class ViewRequest:
+class ViewRequest(_Checked):
     """Show a scene in the browser: starts, perturbations, a demonstration frame by frame, or a policy that acts.
 
     Attributes:
@@ -292,6 +291,3 @@ class ViewRequest:
     allow: tuple[str, ...] = ()
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8080
-
-    def __post_init__(self) -> None:
-        validate_arguments(type(self), vars(self), prefix=("view",), error=ConfigError)

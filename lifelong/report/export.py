@@ -4,9 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from glob import glob
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from libero_env.errors import UnknownNameError
 from libero_env.storage import atomic_path
 from libero_env.text import flatten
 from lifelong.errors import LifelongError
@@ -18,7 +17,6 @@ from lifelong.stats.metrics import METRIC_NAMES
 if TYPE_CHECKING:
     import pandas as pd
 
-FORMATS = ("csv", "latex", "parquet")
 _TITLES = {"final_success": "final", "just_learned": "just learned"}
 
 
@@ -55,7 +53,9 @@ def find_runs(patterns: Sequence[str | Path]) -> list[Run]:
     return [load_run(path) for path in found]
 
 
-def export_runs(patterns: Sequence[str | Path], form: str, target: Path) -> Path:
+def export_runs(
+    patterns: Sequence[str | Path], form: Literal["csv", "latex", "parquet"], target: Path
+) -> Path:
     """Write runs as `csv` or `parquet`, a row each (`load_runs`), or as `latex`, a row a method over its seeds.
 
     The LaTeX table is of the package booktabs: the mean over seeds and its 95 % interval, in percent.
@@ -63,8 +63,6 @@ def export_runs(patterns: Sequence[str | Path], form: str, target: Path) -> Path
     Raises:
         LifelongError: The runs cannot be read or compared, or the file cannot be written.
     """
-    if form not in FORMATS:
-        raise UnknownNameError("format", form, FORMATS)
     content = _latex(find_runs(patterns)) if form == "latex" else load_runs(*patterns)
     try:
         with atomic_path(target) as part:

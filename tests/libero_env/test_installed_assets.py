@@ -247,7 +247,8 @@ def test_intact_packages_are_not_installed_again(site, monkeypatch):
 
 def test_without_pip_the_message_names_the_alternatives(monkeypatch):
     monkeypatch.setattr(published.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MissingPackageError, match=r"pip is not installed.*ensurepip.*uv pip install"):
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(MissingPackageError, match=r"has no pip, and there is no uv.*ensurepip.*pip install"):
         install()
 
 

@@ -156,7 +156,7 @@ def test_the_folder_of_the_cache_is_no_option(capsys):
 def test_without_pip_and_uv_the_line_names_them(index, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     monkeypatch.setenv("PATH", "")
-    with pytest.raises(MissingPackageError, match="neither pip nor uv"):
+    with pytest.raises(MissingPackageError, match="has no pip, and there is no uv"):
         robot.robot_assets()
 
 
