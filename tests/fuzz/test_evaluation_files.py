@@ -79,6 +79,7 @@ def test_any_text_of_a_result_is_read_or_refused(text, tmp_path_factory):
 @given(values=mutated([{"extends": "openpi"} | {k: CARD[k] for k in ("episode", "pixels")}, {**CARD}]))
 @examples(short=40, long=2000)
 def test_any_card_is_read_or_refused(values, tmp_path_factory):
-    path = tmp_path_factory.getbasetemp() / "card.yaml"
+    path = tmp_path_factory.getbasetemp() / "cards" / "card.yaml"
+    path.parent.mkdir(exist_ok=True)
     path.write_text(yaml.safe_dump(values), encoding="utf-8", errors="replace")
     survive("cards of protocols", lambda: load_protocol(str(path)).require())

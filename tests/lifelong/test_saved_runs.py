@@ -48,7 +48,8 @@ TRANSFORMER = (
 )
 RESNET_T = (
     *("policy=bc_transformer_small", "policy.embed_dim=8", *ENCODER, *TRANSFORMER),
-    "policy.head.hidden=32",
+    *("policy/head=deterministic_small", "policy.head.hidden=32", "policy.readout=instruction"),
+    "policy.encoder.stem_film=false",
 )
 # Their commands.
 COMMANDS = {
@@ -56,7 +57,7 @@ COMMANDS = {
     "ewc": ("algo=ewc", "algo.strength=null", "algo.estimator.windows=16", *RESNET_T),
     "packnet": (*("algo=packnet", "policy=bc_rnn_small", "policy/head=gmm_small"),
      *("policy.image_embed=8", "policy.text_embed=8", *ENCODER, "policy.temporal.hidden=16"),
-     *("policy.head.hidden=16", "policy.head.modes=2")),
+     *("policy.head.hidden=16", "policy.head.modes=2", "policy.head.min_std=0.02")),
     "sequential": (*("algo=sequential", "data.image_size=64", "data.seq_len=6"),
      *("policy=bc_vilt_small", "policy/head=flow_small", "policy.head.hidden=16"),
      *("policy.patch_embed=16", "policy.embed_dim=16", "policy.encoder.width=8", *TRANSFORMER),

@@ -243,7 +243,7 @@ def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, 
     assert (path / "report.html").is_file()
 
     settings, config = RelearnRequest(run=path, held_out=1), read_config(path / "config.yaml", ())
-    training, held_out = relearning._windows(loaded, 1, settings, config)
+    training, held_out = relearning.task_windows(loaded, 1, settings.held_out, config)
     shifted = next(folder.rglob(f"under-instruction=0.6*/{TASKS[1].name}_demo.hdf5"))
     first, other = read_episodes(shifted)  # learned from, and held out
     assert len(training) == len(first) and len(held_out) == len(other)

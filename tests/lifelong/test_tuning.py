@@ -25,7 +25,13 @@ TUNED = {
     if isinstance(kind, type) and getattr(kind, "tuned", None)
 }
 FAST = ("--steps", "2", "--stream", "61,62", "--beside")
-WORDS = [*TINY, "algo=ewc", "algo.estimator.windows=2", "train.batch_size=4"]
+WORDS = [
+    *TINY,
+    "policy/head=deterministic_small",
+    "algo=ewc",
+    "algo.estimator.windows=2",
+    "train.batch_size=4",
+]
 
 
 def outcome(label: str, *finals: tuple[float, float]) -> Outcome:
