@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -28,6 +27,7 @@ from libero_eval.requests import Request
 from lifelong.errors import LifelongError, MissingObservationError, PolicyError
 from lifelong.evaluation.actors import Actor
 from lifelong.evaluation.environments import Obs
+from lifelong.settings.configuration import require_same_module
 
 _WRITE = "write module:function, such as my_policy:make"
 _PROJECT = ("libero", "libero_env", "libero_eval", "lifelong")  # whose version is in the result
@@ -279,12 +279,7 @@ def _imported(module: str, text: str) -> ModuleType:
         )
     if not all(part.isidentifier() for part in parts):
         raise LifelongError(f"{text}: {module!r} is not a name of a module; {_WRITE}")
-    loaded, found = getattr(sys.modules.get(parts[0]), "__file__", None), PathFinder.find_spec(parts[0])
-    if loaded and found and found.origin and not os.path.samefile(loaded, found.origin):
-        raise LifelongError(
-            f"{text}: this process has already imported {parts[0]} from {loaded}, which is not {found.origin}; "
-            "evaluate the other in a process of its own"
-        )
+    require_same_module(parts[0], sys.path, text)
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:

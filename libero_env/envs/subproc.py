@@ -157,7 +157,7 @@ class SubprocEnv(LiberoVectorEnv):
             start = {} if request.init_states is None else {"init_state": int(request.init_states[i])}
             how = {"seed": request.seeds[i], "options": {**others, **start}}
             self._workers[i].send("call", "reset", (), how)
-        answers, more = self._collect(ids, self.timeout)
+        answers, more = self._collect_observed(ids)
         for i, (observation, info) in answers.items():
             self._note(i, observation, info)
             self._running[i], self._success[i] = True, bool(info.get("success", False))
@@ -178,7 +178,7 @@ class SubprocEnv(LiberoVectorEnv):
         ids = [int(i) for i in np.flatnonzero(self._running)]
         for i in ids:
             self._workers[i].send("call", "step", (actions[i],), {})
-        answers, failed = self._collect(ids, self.timeout)
+        answers, failed = self._collect_observed(ids)
         rewards = np.zeros(self.num_envs)
         terminated, truncated = np.zeros(self.num_envs, bool), np.zeros(self.num_envs, bool)
         for i, (observation, reward, end, cut, info) in answers.items():
@@ -266,6 +266,20 @@ class SubprocEnv(LiberoVectorEnv):
         for i, failure in failures.items():
             self._handle_failure(i, failure, keep_running)
         return answers, {i: failure.reason for i, failure in failures.items()}
+
+    def _collect_observed(self, ids: Sequence[int]) -> tuple[dict[int, Any], dict[int, str]]:
+        """Return answers that begin with an observation, as `_collect`; one that lacks an entry is a failure."""
+        answers, failed = self._collect(ids, self.timeout)
+        for i in list(answers):
+            observation = answers[i][0]
+            if lacking := [key for key in self._rows[i] if key not in observation]:
+                failed[i] = (
+                    f"its observation has no {lacking[0]}, which its observation_space has; it has "
+                    f"{', '.join(observation) or 'nothing'}"
+                )
+                del answers[i]
+                self._handle_failure(i, Failure(failed[i], lost=False), keep_running=False)
+        return answers, failed
 
     def _handle_failure(self, i: int, failure: Failure, keep_running: bool) -> None:
         """Replace a worker whose process is lost; end its episode and clear its observation."""

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
+from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from inspect import isclass
 from types import NoneType, UnionType
@@ -288,7 +289,9 @@ def _resolve(name: str) -> Target:
     """Return the class or function of a name; modules are looked for in the current folder, too, after all others."""
     try:
         package = name.partition(".")[0]
-        if package not in sys.modules and os.getcwd() not in sys.path and find_spec(package) is None:
+        if package in sys.modules and package != "__main__":  # which is run, not found
+            require_same_module(package, [*sys.path, os.getcwd()], f"names {name}")
+        elif os.getcwd() not in sys.path and find_spec(package) is None:
             sys.path.append(os.getcwd())  # for good: processes that this one starts need it as well
         target = pkgutil.resolve_name(name)
     except (ImportError, AttributeError, ValueError) as error:
@@ -298,6 +301,28 @@ def _resolve(name: str) -> Target:
     if not callable(target):
         raise ConfigError(f"names {name}, which is not a class or function")
     return target
+
+
+def require_same_module(package: str, folders: Sequence[str], text: str) -> None:
+    """Check that a module that has been imported is the one that an import from some folders would find.
+
+    Args:
+        package: Name of the module, without points.
+        folders: Folders in the order in which they are searched.
+        text: What names the module, with which the message begins.
+
+    Raises:
+        ConfigError: It is another file.
+    """
+    loaded, found = (
+        getattr(sys.modules.get(package), "__file__", None),
+        PathFinder.find_spec(package, folders),
+    )
+    if loaded and found and found.origin and not os.path.samefile(loaded, found.origin):
+        raise ConfigError(
+            f"{text}: this process has already imported {package} from {loaded}, which is not {found.origin}; "
+            "use the other in a process of its own"
+        )
 
 
 def _own_class(parts: Sequence[str]) -> Target | None:

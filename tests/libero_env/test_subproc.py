@@ -46,7 +46,8 @@ def counter(fault="", at=3, size=2):
                 return self.observe(), float(action.sum()), self.count >= 6, False, {}
 
             def observe(self):
-                return {"count": np.array(float(self.count)), "own": np.full(size, float(self.count))}
+                seen = {"count": np.array(float(self.count)), "own": np.full(size, float(self.count))}
+                return seen if fault != "lack" or self.count < at else {"count": seen["count"]}
 
             def pid(self):
                 return os.getpid()
@@ -112,7 +113,13 @@ def test_finished_environments_do_not_move_until_reset(envs):
 
 
 @pytest.mark.parametrize(
-    ("fault", "says"), [("die", "exit code 3"), ("hang", "no answer within 1 s"), ("raise", "a step too far")]
+    ("fault", "says"),
+    [
+        ("die", "exit code 3"),
+        ("hang", "no answer within 1 s"),
+        ("raise", "a step too far"),
+        ("lack", "its observation has no own, which its observation_space has; it has count"),
+    ],
 )
 def test_the_others_continue_when_a_worker_fails(envs, fault, says):
     env = envs([counter(), counter(fault), counter()])

@@ -108,6 +108,23 @@ def test_a_class_of_a_notebook_is_found(monkeypatch):
     assert session.__spec__ is None and find_target("__main__.Mine") is dict
 
 
+def test_a_module_of_another_folder_that_is_loaded_already_is_refused(tmp_path, monkeypatch):
+    for folder in ("mine", "theirs"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "a_policy_of_both.py").write_text("class Mine: pass\n")
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(tmp_path / "mine")
+    first = find_target("a_policy_of_both.Mine")
+    assert find_target("a_policy_of_both.Mine") is first
+    sys.path.remove(str(tmp_path / "mine"))
+    monkeypatch.chdir(tmp_path / "theirs")
+    with pytest.raises(
+        ConfigError, match="already imported a_policy_of_both from .*mine.*, which is not .*theirs"
+    ):
+        find_target("a_policy_of_both.Mine")
+    del sys.modules["a_policy_of_both"]
+
+
 @dataclass
 class Part:
     size: int
