@@ -19,6 +19,7 @@ from libero_env.perturbations import format_perturbations, parse_perturbations
 from libero_env.sim.backend import Backend
 from libero_env.tasks import Task
 from libero_env.tasks.published import require_available
+from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.policies import SELECTION, ExpertPolicy, PolicyUnderTest, RunPolicy
@@ -255,6 +256,8 @@ def resolve_protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[T
     if request.perturb is not None:
         perturbations = parse_perturbations(request.perturb, request.perturb_seed)
         changes["world.perturb"] = format_perturbations(perturbations)
+    if request.control_freq:
+        changes["world.control_freq"] = request.control_freq
     if request.robot:
         changes["world.robot"] = request.robot
     if request.backend is not None:
@@ -275,6 +278,8 @@ def _check_options(request: EvalRequest, earlier: EvaluationResult | None) -> No
     """
     if request.after is not None and _kind(request.policy_name) != "run":
         raise ConfigError(f"--after is of runs, and {request.policy} is none")
+    if request.control_freq not in (None, CONTROL_HZ) and _kind(request.policy_name) == "expert":
+        raise ConfigError(f"--control-freq {request.control_freq}: the expert acts at {CONTROL_HZ} Hz only")
     if request.despite and earlier is None:
         raise ConfigError(f"--despite is of results that are run again, and {request.policy} is none")
 
@@ -334,6 +339,7 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
         unit_starts=result.unit_starts or len(result.init_states),
         policy_threads=request.policy_threads or threads,
         horizon=None,
+        control_freq=None,
         robot=None,
         perturb=None,
         size=None,

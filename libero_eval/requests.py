@@ -20,6 +20,7 @@ from libero_env.cli.options import (
 )
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.parallel import cpu_count
+from libero_env.timing import ControlFreq
 from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
 
@@ -45,6 +46,8 @@ class Request:
         protocol: libero, openpi, ..., see `libero protocols list`; or a file of your own, my.yaml.
         perturb_seed: Seed of what perturbations draw.
         horizon: Maximum number of control steps (default: the protocol's).
+        control_freq: Control steps per second, 20 or another that divides 500; steps are counted, so that a horizon
+            then lasts shorter or longer (default: the protocol's).
         size: Image size in pixels, for a policy that does not define it.
         names: What a policy of your own receives: this package's observations, the original's, or the protocol's inputs
             (default: native for upright images, otherwise original).
@@ -81,6 +84,7 @@ class Request:
     protocol: str = "libero"
     perturb_seed: Seed = 0
     horizon: Horizon | None = None
+    control_freq: ControlFreq | None = None
     size: Side | None = None
     names: Literal["native", "original", "protocol"] | None = None
     name: Annotated[str, Field(min_length=1, max_length=100)] | None = None

@@ -16,14 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from libero_env.demos.config import RenderConfig
-from libero_env.demos.observe import fixture_poses, recorded_robot, recorded_task
+from libero_env.demos.observe import fixture_poses, recorded_frequency, recorded_robot, recorded_task
 from libero_env.demos.read import Episode, read_episodes
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations import KINDS, Perturbation, format_perturbations, parse_perturbations
 from libero_env.sim.observations import image_name
 from libero_env.tasks import Task, find_tasks, read_task
-from libero_env.timing import CONTROL_PERIOD
 from libero_eval.plan import load_policy, resolve_protocol
 from libero_eval.protocols.environment import ProtocolEnv
 from libero_eval.protocols.files import load_protocol
@@ -97,6 +96,7 @@ class Stage:
             seed=request.seed,
             assets=request.assets,
             robot=None if self._file is None else recorded_robot(self._file),
+            control_freq=None if self._file is None else recorded_frequency(self._file),
             device=request.device,
             allow=request.allow,
         )
@@ -214,7 +214,10 @@ class Stage:
     def describe(self, index: int) -> str:
         """Return the instruction and the atoms of the goal in a frame, and since when they hold, as Markdown."""
         assert self.env is not None
-        lines = [f"**{self.env.task.language}**", f"{index * CONTROL_PERIOD:.2f} s, frame {index}:"]
+        lines = [
+            f"**{self.env.task.language}**",
+            f"{index / self.env.config.control_freq:.2f} s, frame {index}:",
+        ]
         for atom, holds in self.truths[index].items():
             since = index
             while since and self.truths[since - 1][atom] == holds:
@@ -461,7 +464,7 @@ class Viewer:
 
     def _pace(self) -> None:
         """Wait until a control step has passed since the last frame."""
-        self._next = max(self._next + CONTROL_PERIOD, time.monotonic())
+        self._next = max(self._next + 1.0 / self.stage.protocol.world.control_freq, time.monotonic())
         time.sleep(self._next - time.monotonic() if self._next > time.monotonic() else 0.0)
 
     def _draw_scene(self) -> None:

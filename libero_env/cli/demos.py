@@ -291,9 +291,9 @@ def replay_file(
         assets: Where models come from: builtin, original, or a folder with the original's.
         bddl: Task file of what was recorded (default: the task that the file states).
     """
+    from libero_env.demos.observe import recorded_frequency
     from libero_env.demos.replay import replay
     from libero_env.demos.video import check_video_path, write_video
-    from libero_env.timing import CONTROL_HZ
 
     if video:
         check_video_path(video)
@@ -311,7 +311,7 @@ def replay_file(
         import numpy as np
 
         frames = [result.frames for result in results if result.frames is not None]
-        print(write_video(video, np.concatenate(frames), CONTROL_HZ))
+        print(write_video(video, np.concatenate(frames), recorded_frequency(file)))
     return int(lost > 0)
 
 

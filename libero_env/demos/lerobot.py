@@ -19,7 +19,7 @@ from libero_env.demos.contents import EXPORTED_STATE, json_attribute, read_heade
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.lerobot_layout import OWN, PUBLISHED, Layout
 from libero_env.demos.lerobot_writers import ImageDatasetWriter, VideoDatasetWriter, write_json
-from libero_env.demos.observe import recorded_robot, recorded_task
+from libero_env.demos.observe import recorded_robot, recorded_task, require_default_frequency
 from libero_env.demos.read import Episode, Labels, read_episodes
 from libero_env.demos.replay import Regeneration, regenerate
 from libero_env.demos.write import require_absent
@@ -61,6 +61,7 @@ def export_lerobot(
     require_absent(root)
     with atomic_folder(root) as folder, closing(VideoDatasetWriter(folder, OWN, video_mb)) as dataset:
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
+            require_default_frequency(file, "export to LeRobot's format")
             language = _language(file, task)
             for episode in read_episodes(file):
                 where = f"{file}: {episode.name}"
@@ -107,6 +108,7 @@ def export_published(
     exported, failed = 0, []
     with atomic_folder(root) as folder, closing(writer(folder, layout)) as dataset:
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
+            require_default_frequency(file, f"the layout {name}")
             recorded = task or recorded_task(file)
             for episode in regenerate(file, config, recorded):
                 where = f"{file}: {episode.name}"

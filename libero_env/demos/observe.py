@@ -12,7 +12,7 @@ import numpy as np
 from libero_env.assets.pack import Pack
 from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.config import RenderConfig
-from libero_env.demos.contents import picture_size, read_header
+from libero_env.demos.contents import json_attribute, picture_size, read_header
 from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
 from libero_env.demos.read import Episode
 from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
@@ -25,6 +25,8 @@ from libero_env.tasks import Task, bddl, get_suite
 from libero_env.tasks.builder import language_from_name
 from libero_env.tasks.problem import same_meaning
 from libero_env.tasks.task import FILE
+from libero_env.text import shown
+from libero_env.timing import CONTROL_HZ, FREQUENCIES
 
 _OPEN_FILE = "<_io."  # begins what `str(open(file))` returns
 
@@ -39,6 +41,28 @@ def recorded_robot(file: Path) -> str:
     """
     header = read_header(file)
     return str(header.get("robot", "robosuite-1.4.1" if "generator" in header else "libero"))
+
+
+def recorded_frequency(file: Path) -> int:
+    """Return the control steps per second that were recorded, [Hz]; files that do not state it have 20.
+
+    Raises:
+        DemoError: It is not a demonstration file, or was recorded at a frequency that no environment has.
+    """
+    made_with = json_attribute(read_header(file), "env_args", file).get("env_kwargs")
+    stated = made_with.get("control_freq", CONTROL_HZ) if isinstance(made_with, dict) else CONTROL_HZ
+    if stated not in FREQUENCIES:
+        valid = ", ".join(map(str, FREQUENCIES))
+        raise DemoError(
+            f"{file}: attribute env_args: control_freq is {shown(stated)}; expected one of {valid}"
+        )
+    return int(stated)
+
+
+def require_default_frequency(file: Path, use: str) -> None:
+    """Raise a DemoError unless a file was recorded at 20 Hz; `use` names what needs it."""
+    if (hz := recorded_frequency(file)) != CONTROL_HZ:
+        raise DemoError(f"{file} was recorded at {hz} Hz; {use} is for {CONTROL_HZ} Hz")
 
 
 def recorded_task(file: Path) -> Task:
@@ -115,6 +139,7 @@ class StateRenderer:
         task: Task whose scene is simulated.
         assets: Where models come from, as for `LiberoEnv`.
         robot: Model of the arm, see `libero_env.assets.robot`.
+        control_freq: Control steps per second, [Hz].
     """
 
     def __init__(
@@ -124,6 +149,7 @@ class StateRenderer:
         assets: Pack | str | Path | None = None,
         *,
         robot: str = DEFAULT_ROBOT,
+        control_freq: int = CONTROL_HZ,
     ):
         self.task = task
         self.env = LiberoEnv(
@@ -133,6 +159,7 @@ class StateRenderer:
             assets=assets,
             drawing=config.drawing,
             robot=robot,
+            control_freq=control_freq,
             observations=(*config.modalities, "proprioception", "ee_quat"),
             perturb=config.perturb,
         )
@@ -155,7 +182,8 @@ class StateRenderer:
         Raises:
             DemoError: It is not a demonstration file, or names no task.
         """
-        return cls(task or recorded_task(file), config, assets, robot=recorded_robot(file))
+        arm, hz = recorded_robot(file), recorded_frequency(file)
+        return cls(task or recorded_task(file), config, assets, robot=arm, control_freq=hz)
 
     @property
     def scene(self) -> Scene:

@@ -32,9 +32,9 @@ from libero_env.sim.engine import Goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward
 from libero_env.sim.scene import InitialStates
-from libero_env.sim.simulation import WATCHED, Indices, Watch
+from libero_env.sim.simulation import Indices, Watch
 from libero_env.tasks import Task
-from libero_env.timing import CONTROL_HZ
+from libero_env.timing import CONTROL_HZ, PHYSICS_HZ
 from libero_env.validation import validate
 
 Count = Annotated[int, Field(ge=1)]
@@ -136,6 +136,7 @@ class BatchEnv(LiberoVectorEnv):
         self.num_envs = num = validate(Count, num_envs, prefix=("num_envs",))
         threads = validate(Threads, num_threads, prefix=("num_threads",))
         self.render_mode, self.render_images = None, True
+        self.metadata = {**self.metadata, "render_fps": config.control_freq}
         self.reward = Reward(config.reward, config.reward_scale)
         scenes = open_scenes(task, config, num)
         self.task, self.scene, self.perturbed = scenes.task, scenes.scene, scenes.perturbed
@@ -144,6 +145,7 @@ class BatchEnv(LiberoVectorEnv):
         self.simulations = make_simulations(
             self.scene.model, num, threads, self.scene.fixture_bodies, config.backend
         )
+        self.simulations.substeps = PHYSICS_HZ // config.control_freq
         self.simulations.set_controller(config.controller, config.control_delta, scenes.rest)
         self.observer = make_observer(
             self.scene,
@@ -223,7 +225,7 @@ class BatchEnv(LiberoVectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Apply actions for 50 ms in every simulation that is in an episode.
+        """Apply actions for a control step, by default 50 ms, in every simulation that is in an episode.
 
         Args:
             actions: Action of each simulation, (num_envs, 7) by default.
@@ -417,16 +419,16 @@ class BatchEnv(LiberoVectorEnv):
         if self.config.observed == AFTER:
             self._step_simulations(ids, actions)
             return self._observe(ids)
-        seen = self.proprioception()
+        seen, (first, second) = self.proprioception(), self.simulations.watched
 
         def watch(done: int, rows: np.ndarray) -> None:
-            if done not in WATCHED:
+            if done not in (first, second):
                 return
             now = self.proprioception()
-            if done == WATCHED[0]:
+            if done == first:
                 self._render_observed(rows)
             for name, values in now.items():
-                if (done == WATCHED[1]) == is_of_joints(name):
+                if (done == second) == is_of_joints(name):
                     seen[name][rows] = values[rows]
 
         self._step_simulations(ids, actions, watch)

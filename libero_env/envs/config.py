@@ -18,9 +18,11 @@ from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
 from libero_env.text import shown
+from libero_env.timing import CONTROL_HZ, PHYSICS_HZ, ControlFreq
 from libero_env.validation import checked
 
 AFTER, SUBSTEP = OBSERVED = ("after", "substep")
+_LARGEST_OBSERVED_WITHIN = PHYSICS_HZ // 4  # [Hz]
 Constructor = TypeVar("Constructor", bound=Callable[..., None])
 
 
@@ -74,8 +76,9 @@ class EnvConfig:
     Attributes:
         cameras: Names of the cameras that are rendered for each observation; empty for none.
         camera_size: Height and width of the images, pixels; one number is both.
-        horizon: Number of steps after which an episode is truncated.
+        horizon: Number of control steps after which an episode is truncated, whatever their length.
         observations: Names of observations, see `libero_env.sim.observations`.
+        control_freq: Control steps per second, [Hz]; it divides 500, the physics steps per second.
         controller: Name of the controller, which defines the action, see `libero_env.sim.controller`.
         control_delta: Whether actions are relative to the current pose.
         reward: `sparse` or `staged`, see `libero_env.sim.rewards`.
@@ -101,6 +104,7 @@ class EnvConfig:
     camera_size: Size = (128, 128)
     horizon: Annotated[int, BeforeValidator(_number), Field(ge=1, le=10**9)] = 600
     observations: Names = DEFAULT_OBSERVATIONS
+    control_freq: Annotated[ControlFreq, BeforeValidator(_number)] = CONTROL_HZ
     controller: str = "osc_pose"
     control_delta: bool = True
     reward: str = "sparse"
@@ -112,6 +116,14 @@ class EnvConfig:
     observed: Annotated[str, _known("time of observation", OBSERVED)] = AFTER
     backend: Annotated[Backend, PlainValidator(Backend.read)] = Backend()
     perturb: Annotated[tuple[Any, ...], PlainValidator(checked_perturbations)] = ()
+
+    def __post_init__(self) -> None:
+        if self.observed == SUBSTEP and self.control_freq > _LARGEST_OBSERVED_WITHIN:
+            raise InvalidInputError(
+                f"observed is {SUBSTEP}, which looks two physics steps before the end of a control step; at "
+                f"control_freq {self.control_freq} there are not as many: expected at most "
+                f"{_LARGEST_OBSERVED_WITHIN}, or observed={AFTER}"
+            )
 
     @property
     def pack(self) -> Pack:

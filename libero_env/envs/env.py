@@ -17,7 +17,7 @@ from libero_env.timing import CONTROL_HZ
 
 
 class LiberoEnv(gymnasium.Env):
-    """A task of the benchmark at 20 Hz.
+    """A task of the benchmark, by default at 20 Hz.
 
     Observations: `<camera>_rgb` (H, W, 3) uint8, first row on top; `joint_states` (7,) rad; `gripper_states` (2,) m;
     `ee_pos` (3,) m; `ee_ori` (3,) axis-angle; `libero_env.sim.observations` lists the others. All describe the state
@@ -79,6 +79,7 @@ class LiberoEnv(gymnasium.Env):
         self.simulations, self.observer, self.view = batch.simulations, batch.observer, batch.views[0]
         if render_mode == "human" and self.config.backend.is_warp:
             raise RenderError("render_mode human shows simulations of backend=mujoco, not of warp")
+        self.metadata = {**self.metadata, "render_fps": self.config.control_freq}
         self.observation_space = batch.single_observation_space
         self.action_space = batch.single_action_space
 
@@ -116,7 +117,7 @@ class LiberoEnv(gymnasium.Env):
         return _first(observations), self._info(infos)
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
-        """Apply an action for 50 ms.
+        """Apply an action for a control step, by default 50 ms.
 
         Args:
             action: Action, (7,) by default, see `action_space`; values outside of it are clipped.

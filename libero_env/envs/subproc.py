@@ -112,6 +112,7 @@ class SubprocEnv(LiberoVectorEnv):
                     f"{shown(spec)} is not an environment; expected a dictionary or a function"
                 )
         common = {"config": EnvConfig.from_options(config, options)}
+        self.metadata = {**self.metadata, "render_fps": common["config"].control_freq}
         factories = [spec if callable(spec) else _factory({**common, **spec}) for spec in specs]
         self.num_envs, self.render_mode = len(specs), None
         self.tasks = tuple(_task_name(spec) for spec in specs)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from libero_env.envs.batch import BatchEnv
+from libero_env.errors import InvalidInputError
 from libero_env.expert.arm import OPEN, limit_elbow_extension
 from libero_env.expert.planning.goal_plan import Step, plan_goal
 from libero_env.expert.planning.pick_planner import is_graspable
@@ -19,6 +20,7 @@ from libero_env.expert.variation import ActionNoise, MotionStyle
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
+from libero_env.timing import CONTROL_HZ, SUBSTEPS
 
 MAX_STEPS = 600  # control steps of an attempt
 
@@ -90,7 +92,13 @@ class Expert:
 
         Raises:
             UnsupportedGoalError: The goal needs a skill that does not exist.
+            InvalidInputError: The simulation is not controlled at 20 Hz, for which its motions are made.
         """
+        if (substeps := view.simulations.substeps) != SUBSTEPS:
+            raise InvalidInputError(
+                f"the expert acts at {CONTROL_HZ} Hz; this simulation has {substeps} physics steps per action, "
+                f"expected {SUBSTEPS}: leave control_freq={CONTROL_HZ}"
+            )
         if self.shapes is None:
             self.shapes = Shapes(view.scene)
         if self.skill is None or self.skill.done(view):

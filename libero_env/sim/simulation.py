@@ -1,7 +1,7 @@
 """Closed-loop simulations of one model: physics and controller, without tasks and images.
 
-A control step has 25 substeps. Each substep runs the controller on the current kinematics, then the rest of the step,
-then the kinematics. `LoopSimulations` steps one MjData after another (one simulation, or MuJoCo without
+A control step has 25 substeps at 20 Hz. Each substep runs the controller on the current kinematics, then the rest of
+the step, then the kinematics. `LoopSimulations` steps one MjData after another (one simulation, or MuJoCo without
 `mujoco.batch`), `BatchSimulations` steps on a thread pool, to the same bits. `libero_env.sim.mjwarp` steps on a GPU in
 single precision.
 """
@@ -36,8 +36,6 @@ FIELDS = (
 # Those that the controller sees of the arm, not of contacts.
 _CONTROLLED = ("qpos", "qvel", "xanchor", "xaxis", "site_xpos", "site_xmat", MASS_FIELD)
 
-# Substeps after which the original observes: kinematics of the first, positions of the second.
-WATCHED = (SUBSTEPS - 2, SUBSTEPS - 1)
 INTEGRATED = -1  # between integration and kinematics of each substep; of `LoopSimulations` only
 
 # The original calls mj_forward twice in each substep. Where that moves the solver's warm start we do it, too.
@@ -50,7 +48,9 @@ FORKED = (
 DIVERGED = "it has diverged: positions, velocities or accelerations are not numbers, or are huge"
 _UNSTABLE = [getattr(mujoco.mjtWarning, f"mjWARN_BADQ{what}") for what in ("POS", "VEL", "ACC")]
 Indices = Sequence[int] | np.ndarray
-Watch = Callable[[int, np.ndarray], None]  # one of `WATCHED` or `INTEGRATED`, indices of the simulations
+Watch = Callable[
+    [int, np.ndarray], None
+]  # number of substeps done or `INTEGRATED`, indices of the simulations
 Inputs = tuple[np.ndarray, ...]  # fields that the kernel of a controller takes, (num, ...)
 
 
@@ -86,7 +86,7 @@ class Simulations(ABC):
         arm: Indices of the arm in the model.
         fields: Field of MjData by name, (num, ...), for reading. Kinematics are those of the current state.
         backend: Backend that steps them.
-        substeps: Number of substeps of a control step; may be set for `LoopSimulations`.
+        substeps: Number of substeps of a control step; may be set.
         controller_state: Controller that runs, its goals and gripper commands; may be replaced by another.
     """
 
@@ -104,6 +104,11 @@ class Simulations(ABC):
         self.fields: Mapping[str, np.ndarray] = {}
         self.rest = REST
         self._outdated = np.zeros(num, bool)
+
+    @property
+    def watched(self) -> tuple[int, int]:
+        """Substeps after which the original observes: kinematics of the first, positions of the second."""
+        return self.substeps - 2, self.substeps - 1
 
     @abstractmethod
     def _start(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, time: float) -> None:
@@ -249,7 +254,7 @@ class Simulations(ABC):
 
         Args:
             actions: Action of each simulation, (num, action_dim), finite; rows of other simulations are not used.
-            watch: Function that is called after each substep of `WATCHED`, with the number of substeps done and the
+            watch: Function that is called after each substep of `watched`, with the number of substeps done and the
                 indices of the simulations whose fields are of that moment; by `LoopSimulations` with `INTEGRATED`
                 in each substep, too.
 
@@ -393,7 +398,7 @@ class LoopSimulations(Simulations):
                 if substep + 1 == self.substeps and not self.ends_current:
                     break
                 mujoco.mj_step1(model, data)
-                if watch is not None and substep + 1 in WATCHED:
+                if watch is not None and substep + 1 in self.watched:
                     self._gather(np.array([i]))
                     watch(substep + 1, np.array([i]))
         self._gather(ids)
@@ -449,11 +454,11 @@ class BatchSimulations(Simulations):
     ) -> None:
         kernel, state = self.controller_state.controller.kernel, self.controller_state.arrays
         ctrl, constants, stage = self.fields["ctrl"], self._constants, mujoco.mjtStage.mjSTAGE_VEL
-        for substep in range(SUBSTEPS):
+        for substep in range(self.substeps):
             seen = self._own_inputs if first is None or substep else first
             kernel(ids, actions, *seen, *state, ctrl, *constants)
             self._batch.step(ids, nstep=1, stage=stage)
-            if watch is not None and substep + 1 in WATCHED:
+            if watch is not None and substep + 1 in self.watched:
                 watch(substep + 1, ids)
 
     def _warm_start(self, i: int) -> list[np.ndarray]:

@@ -61,6 +61,7 @@ class ProtocolEnv(BatchEnv):
             observations=tuple(observations),
             controller=world.controller,
             control_delta=world.delta,
+            control_freq=world.control_freq,
             semantics=world.predicates,
             assets=assets,
             drawing=world.drawing if drawing == "protocol" else drawing,

@@ -16,6 +16,7 @@ from pydantic import Field
 from libero_env.errors import LiberoError
 from libero_env.tasks import Task
 from libero_env.text import plain, shown, suggest
+from libero_env.timing import ControlFreq
 from libero_env.validation import validate
 from lifelong.errors import ProtocolError, ProtocolMismatchError
 
@@ -50,7 +51,7 @@ class Simulation:
         seed_per_start: With `every_reset`: what is added to the seed for each initial state.
         seed_per_task: With `every_reset`: what is added to the seed for each task of the suite.
         loads: Number of times the original had loaded the task before the first counted reset.
-        control_freq: Control steps per second, [Hz].
+        control_freq: Control steps per second, [Hz]; it divides 500. Steps and horizons are counted, not timed.
         controller: Name of the controller, see `libero_env.sim.controller`.
         delta: Whether actions are relative to the present pose.
         predicates: Semantics of the goals, see `libero_env.sim.predicates`.
@@ -71,7 +72,7 @@ class Simulation:
     seed_per_start: int | None
     seed_per_task: int | None
     loads: Annotated[int, Field(le=10_000)] | None
-    control_freq: int
+    control_freq: ControlFreq
     controller: Literal["osc_pose"]
     delta: bool
     predicates: Literal["original", "strict"]
@@ -88,8 +89,6 @@ class Simulation:
             for name in ("seed_per_start", "seed_per_task"):
                 if value := getattr(self, name):
                     yield f"world.{name} is {value}, but world.seeding is once"
-        if self.control_freq != 20:
-            yield f"world.control_freq is {self.control_freq}; the benchmark runs at 20 Hz"
 
 
 @dataclass(frozen=True)
@@ -105,8 +104,8 @@ class Episodes:
         success: `first_hit`: the episode ends when the goal holds; `accumulated`: the goal must have held at any time;
             `final`: the goal must hold at the end, which no run offers yet.
         errors: What an error of the policy does: `failure`, the episode counts as one; `stop`, the evaluation ends.
-        observed: When observations are taken: `substep`, as the original does, before the last of the 25 physics steps
-            of a control step; `after`, after it.
+        observed: When observations are taken: `substep`, as the original does, before the last physics step of a
+            control step; `after`, after it.
     """
 
     reset_order: tuple[Literal["seed", "reset", "set_init_state", "settle"], ...]

@@ -16,7 +16,6 @@ from typing import Any
 from libero_env.errors import LiberoError
 from libero_env.tasks import Task
 from libero_env.text import json_safe
-from libero_env.timing import CONTROL_PERIOD
 from libero_eval.evaluation_file import EvaluationResult, TaskResult
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.work.claims import LEASE
@@ -246,7 +245,7 @@ class Evaluation:
         }
 
     def _save_videos(self, unit: Unit, done: Rollouts) -> None:
-        folder, seconds = self.out / "videos", CONTROL_PERIOD * self.record_every
+        folder, seconds = self.out / "videos", self.record_every / self.protocol.world.control_freq
         filmed = [e for e in done.episodes if e.init_state in self.init_states[: self.videos]]
         for frames, episode in zip(done.recordings, filmed, strict=False):
             if frames:

@@ -12,7 +12,7 @@ from libero_env.demos.config import DemoConfig, RenderConfig
 from libero_env.demos.contents import demo_names, read_header
 from libero_env.demos.generate import demo_path, ensure_demos
 from libero_env.demos.hdf5 import open_demo_file
-from libero_env.demos.observe import recorded_robot, recorded_task
+from libero_env.demos.observe import recorded_frequency, recorded_robot, recorded_task
 from libero_env.demos.read import demo_lengths
 from libero_env.demos.rendering import RenderJob, ensure_rendered
 from libero_env.errors import DemoError
@@ -21,6 +21,7 @@ from libero_env.sim.scene import FAST
 from libero_env.tasks import Task
 from libero_env.tasks.problem import same_meaning
 from libero_env.text import closest
+from libero_env.timing import CONTROL_HZ
 from lifelong.data import DemoSource, open_windows
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import StageWindows, TaskWindows
@@ -159,6 +160,8 @@ def _misfit(file: Path, required: int, data: DataSettings) -> str:
         return f"was rendered under {header['perturb']}; use data.perturb or stream.perturb"
     if "generator" in header and recorded_robot(file) != data.robot:
         return f"has the robot {recorded_robot(file)}; data.robot is {data.robot}"
+    if (hz := recorded_frequency(file)) != CONTROL_HZ:
+        return f"was recorded at {hz} Hz; runs act at {CONTROL_HZ} Hz"
     if data.seed is not None and header.get("seed", data.seed) != data.seed:
         return f"was recorded with seed {header['seed']}; data.seed is {data.seed}"
     if data.drawing and "generator" in header and header.get("drawing", FAST) != data.drawing:

@@ -11,6 +11,7 @@ import pytest
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import ActionError, LiberoError, SimulationError, UnknownNameError
 from libero_env.geometry import quat_to_axis_angle
+from libero_env.tasks import get_suite
 from tests.harness.recorded import OPEN, write_actions
 
 pytestmark = pytest.mark.sim
@@ -143,8 +144,14 @@ def test_absolute_actions_start_from_the_same_state(envs):
 
 def test_bad_settings_are_named(plugin, envs):
     make = plugin.settings.Settings
-    with pytest.raises(LiberoError, match="fps is 10; LIBERO is controlled at 20 Hz"):
+    with pytest.raises(UnknownNameError, match="fps"):
+        make(cameras=CAMERAS, size=(32, 32), fps=30)
+    assert (
         make(cameras=CAMERAS, size=(32, 32), fps=10)
+        .env_config(get_suite("libero_goal").tasks[0])
+        .control_freq
+        == 10
+    )
     with pytest.raises(UnknownNameError, match="absolute, relative"):
         make(cameras=CAMERAS, size=(32, 32), control_mode="delta")
     with pytest.raises(LiberoError, match="agentview_image"):

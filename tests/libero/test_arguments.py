@@ -9,6 +9,7 @@ import pytest
 from libero._adapters.controllers import DEFAULTS
 from libero._adapters.observations import Observable
 from libero.libero.envs import TASK_MAPPING, ControlEnv
+from libero_env import LiberoEnv
 from libero_env.assets.robot import REST_QPOS
 from libero_env.errors import LiberoError, UnknownNameError
 
@@ -76,6 +77,22 @@ def test_frequencies_have_the_original_number_of_physics_steps(make_env):
     drive(env)
     assert np.isclose(env.sim.data.time, 0.256)
     assert np.isclose(env.env.cur_time, 8 / 30)
+
+
+def test_the_native_environment_moves_at_10_hz_as_the_original_does(make_env):
+    hz = 10
+    joints = next(q for config, more, q in CONTROLLERS if "kp" not in config and more == {"control_freq": hz})
+    env = make_env(**BLIND, control_freq=hz)
+    env.reset()
+    start, bodies = env.sim.get_state().flatten(), env.env.simulations.read_fixtures()
+    with LiberoEnv("libero_object/0", cameras=(), control_freq=hz) as native:
+        native.simulations.fixtures[0] = bodies
+        native.set_state(start)
+        rng = np.random.RandomState(0)
+        for _ in range(8):
+            native.step(np.append(rng.uniform(-1.3, 1.3, 6), 1.0))
+        np.testing.assert_allclose(native.simulations.fields["qpos"][0, :7], joints, atol=1.5e-6)
+        assert np.isclose(native.get_state()[0] - start[0], 8 / hz)
 
 
 def test_gains_and_scales_of_a_controller_can_be_set_until_the_next_reset(make_env):

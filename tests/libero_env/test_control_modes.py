@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from libero_env.envs.batch import BatchEnv
+from libero_env.envs.config import EnvConfig
 from libero_env.envs.env import LiberoEnv
-from libero_env.errors import ActionError, LiberoError, UnknownNameError
+from libero_env.errors import ActionError, InvalidInputError, LiberoError, UnknownNameError
+from libero_env.expert import Expert
 from libero_env.sim.controller import (
     CONTROLLERS,
     JOINT_SCALE,
@@ -151,6 +153,42 @@ def test_the_velocity_loop_is_a_pid_with_a_smoothed_derivative_that_stops_summin
         wanted = 6 * limit * (error + 0.005 * total + 0.001 * np.mean(changes, axis=0)) + bias[0, :7]
         np.testing.assert_allclose(ctrl[0, :7], np.clip(wanted, -limit, limit), atol=1e-9)
         saturated = bool((np.abs(wanted) > limit).any())
+
+
+@pytest.mark.parametrize("observed", ["after", "substep"])
+def test_batch_and_single_simulations_have_the_same_bits_at_another_frequency(closing, observed):
+    options = {"control_freq": 50, "observed": observed, "camera_size": (16, 16)}
+    one, many = closing(LiberoEnv(TASK, **options)), closing(BatchEnv(TASK, 2, num_threads=1, **options))
+    one.reset(options={"init_state": 3})
+    many.reset(options={"init_state": 3})
+    assert one.metadata["render_fps"] == many.metadata["render_fps"] == 50
+    rng, before = np.random.default_rng(0), one.get_state()[0]
+    for _ in range(4):
+        action = rng.uniform(-1.0, 1.0, 7)
+        seen, both = one.step(action)[0], many.step(np.stack([action] * 2))[0]
+        for name, value in seen.items():
+            np.testing.assert_array_equal(both[name][1], value, err_msg=name)
+    assert np.isclose(one.get_state()[0] - before, 4 / 50)
+
+
+def test_frequencies_that_physics_steps_do_not_fill_are_refused():
+    for wrong in (0, 30, 12.5, 501, "fast"):
+        with pytest.raises(InvalidInputError, match="control_freq"):
+            EnvConfig(control_freq=wrong)
+    with pytest.raises(
+        InvalidInputError, match="30 Hz does not divide the 500 Hz of the physics; expected one of 1, 2,"
+    ):
+        EnvConfig(control_freq=30)
+    with pytest.raises(InvalidInputError, match="control_freq 250 .*at most 125, or observed=after"):
+        EnvConfig(control_freq=250, observed="substep")
+    assert EnvConfig(control_freq=np.float64(10)).control_freq == 10
+
+
+def test_the_expert_acts_at_one_frequency(closing):
+    env = closing(LiberoEnv(TASK, cameras=(), control_freq=10))
+    env.reset(options={"init_state": 0})
+    with pytest.raises(InvalidInputError, match="the expert acts at 20 Hz; .* 50 physics steps per action"):
+        Expert(env.task, np.random.default_rng(0)).act(env.view)
 
 
 def test_unknown_controllers_are_errors():

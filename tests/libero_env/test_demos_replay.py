@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -21,6 +22,7 @@ from libero_env.errors import DemoError
 from libero_env.expert import UnsupportedGoalError
 from libero_env.expert.expert import Attempt
 from libero_env.tasks import get_task
+from lifelong.data import demonstrations
 from tests.harness.demos import STEPS, record_wander, wander
 
 pytestmark = pytest.mark.sim
@@ -58,6 +60,26 @@ def test_actions_replay_to_the_same_states(path):
         assert result.steps == STEPS and result.drift.shape == (STEPS,)
         assert result.drift.max() < 1e-9 and result.arm_drift.max() < 1e-9
         assert result.recorded and not result.success  # a random walk reaches nothing
+
+
+def test_a_recording_of_another_frequency_is_replayed_at_it_and_not_exported(path, tmp_path):
+    slow = tmp_path / "slow.hdf5"
+    slow.write_bytes(path.read_bytes())
+    with h5py.File(slow, "a") as file:
+        made = json.loads(file["data"].attrs["env_args"])
+        made["env_kwargs"]["control_freq"] = 10
+        file["data"].attrs["env_args"] = json.dumps(made)
+    (first, *_), (same, *_) = replay(slow), replay(path)
+    assert first.arm_drift[1] > 1e-3 > same.arm_drift[1]  # each action is held for 100 ms
+    with pytest.raises(DemoError, match="was recorded at 10 Hz; export to LeRobot's format is for 20 Hz"):
+        export_lerobot([slow], tmp_path / "set")
+    settings = SimpleNamespace(robot="libero", image_size=32)
+    assert demonstrations._misfit(slow, 1, settings) == "was recorded at 10 Hz; runs act at 20 Hz"
+    with h5py.File(slow, "a") as file:
+        made["env_kwargs"]["control_freq"] = 30
+        file["data"].attrs["env_args"] = json.dumps(made)
+    with pytest.raises(DemoError, match="control_freq is 30; expected one of 1, 2, 4"):
+        next(iter(replay(slow)))
 
 
 def test_images_depend_on_the_poses_of_fixtures(path, tmp_path):

@@ -98,6 +98,7 @@ BAD = {
     "source of nothing": ("extends: openpi\nsources: {worlds: x}", r"sources\.worlds is not a key"),
     "no mapping": ("- 1", "is not a protocol"),
     "no YAML": ("a: [", "not valid YAML"),
+    "frequency": ("extends: openpi\nworld: {control_freq: 30}", "control_freq.*30 Hz does not divide the 500 Hz"),
     "circle": ("extends: mine.yaml", "extend each other in a circle"),
     "unknown base": ("extends: opennpi", "extends: unknown protocol 'opennpi'. Did you mean 'openpi'"),
 }  # fmt: skip
@@ -268,5 +269,10 @@ def test_protocols_from_the_command_line(tmp_path, capsys):
     assert cli.main(["protocols", "diff", "openpi", str(mine)]) == 1
     assert capsys.readouterr().out.splitlines()[1].split() == ["action.replan", "5", "10"]
     assert cli.main(["protocols", "diff", "openpi", "openpi"]) == 0
+    assert (
+        load_protocol(write(tmp_path, "extends: openpi\nworld: {control_freq: 10}")).world.control_freq == 10
+    )
+    assert cli.main(["eval", "expert", "--suite", "libero_goal/3", "--control-freq", "10"]) == 2
+    assert "--control-freq 10: the expert acts at 20 Hz only" in capsys.readouterr().err
     assert cli.main(["protocols", "show", "opennpi"]) == 2
     assert "Did you mean 'openpi'" in capsys.readouterr().err

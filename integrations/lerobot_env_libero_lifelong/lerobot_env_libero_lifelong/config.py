@@ -22,7 +22,7 @@ class LiberoLifelongEnv(EnvConfig):
     Attributes:
         task: Names of suites, separated by commas: `libero_spatial,libero_goal`.
         task_ids: Indices of the tasks of each suite; None for all.
-        fps: Rate of control, [Hz]; 20 is the only one.
+        fps: Rate of control, [Hz], which divides 500; data of LIBERO are of 20.
         episode_length: Maximum number of steps of the policy; None for those of LeRobot, 280 to 520 by suite.
         obs_type: `pixels_agent_pos`, images and state, or `pixels`.
         render_mode: `rgb_array`.

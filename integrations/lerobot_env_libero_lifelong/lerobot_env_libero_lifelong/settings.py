@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from libero_env.envs.config import EnvConfig
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.tasks import Task, get_suite
-from libero_env.timing import CONTROL_HZ
+from libero_env.timing import CONTROL_HZ, FREQUENCIES
 
 OBS_TYPES = ("pixels_agent_pos", "pixels")
 CONTROL_MODES = ("relative", "absolute")
@@ -54,7 +54,7 @@ class Settings:
             LeRobot's own environments, in the states that LIBERO publishes, with fixtures placed by the episode's seed.
             `new`: in new placements, by seed.
         control_mode: `relative` or `absolute`.
-        fps: Rate of control, [Hz].
+        fps: Rate of control, [Hz]; data of LIBERO are of 20, those that are labelled with 10 fps, too.
         drawing: As in `libero_env.envs.config.EnvConfig`; so are `robot` and `assets`.
 
     Raises:
@@ -79,11 +79,8 @@ class Settings:
             raise UnknownNameError("control_mode", self.control_mode, CONTROL_MODES)
         if self.starts not in STARTS:
             raise UnknownNameError("starts", self.starts, STARTS)
-        if self.fps != CONTROL_HZ:
-            raise LiberoError(
-                f"fps is {self.fps}; LIBERO is controlled at {CONTROL_HZ} Hz, and data that are labelled with "
-                f"10 fps are of this rate too: leave fps={CONTROL_HZ}"
-            )
+        if self.fps not in FREQUENCIES:
+            raise UnknownNameError("fps", self.fps, FREQUENCIES)
         if not self.cameras or not all(camera.endswith("_image") for camera in self.cameras):
             raise LiberoError(
                 f"camera_name is {','.join(self.cameras)!r}; expected names such as agentview_image,"
@@ -114,6 +111,7 @@ class Settings:
             horizon=self.wait_steps + self.steps(task),
             observations=("rgb", *OBSERVED),
             control_delta=self.control_delta,
+            control_freq=self.fps,
             drawing=self.drawing,
             robot=self.robot,
             assets=self.assets,

@@ -57,6 +57,7 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         self._task, self.settings, self.num_envs = task, settings, num_envs
         self.task, self.task_description, self.task_id = task.name, task.language, task.index
         self.render_mode = "rgb_array"
+        self.metadata = {**self.metadata, "render_fps": settings.fps}
         self._processes = processes and settings.control_delta and settings.starts != "original"
         self._max_episode_steps = settings.steps(task)
         self.single_observation_space = _observation_space(settings)

@@ -17,8 +17,7 @@ from libero_env.sim.backend import Backend
 from libero_env.sim.mjwarp import kernels
 from libero_env.sim.mjwarp.device import DeviceFields, allocate, can_capture, choose_device, room_for
 from libero_env.sim.osc import REST, osc_torques
-from libero_env.sim.simulation import CLOSED, DIVERGED, WATCHED, Indices, Inputs, Simulations, Watch
-from libero_env.timing import SUBSTEPS
+from libero_env.sim.simulation import CLOSED, DIVERGED, Indices, Inputs, Simulations, Watch
 
 _log = logging.getLogger(__name__)
 _ROWS_PER_CONTACT = 4  # of constraints; contacts with rolling friction, which have 6, are few
@@ -186,12 +185,12 @@ class WarpSimulations(Simulations):
                 self._control_on_host(ids, actions, first)
                 self._physics()
                 done = 1
-            for until in (*WATCHED, SUBSTEPS) if watch is not None else (SUBSTEPS,):
+            for until in (*self.watched, self.substeps) if watch is not None else (self.substeps,):
                 if until > done:
                     self._run(until - done)
                     done = until
                     self._copies.clear()
-                    if watch is not None and done in WATCHED:
+                    if watch is not None and done in self.watched:
                         watch(done, ids)
         self.controller_state.gripper[:] = self._control.gripper.numpy()
 
