@@ -13,6 +13,7 @@ STAMP := $(VENV)/.installed
 GL_STAMP := $(VENV)/.gl
 ASSETS_STAMP := $(VENV)/.assets
 PEERS_STAMP := $(VENV)/.peers
+BROWSER_STAMP := $(VENV)/.browser
 EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,tensorboard,view,wandb,warp,docs,dev
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
@@ -41,6 +42,15 @@ $(PEERS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --constraint constraints.txt --no-deps robosuite robomimic
 	@touch $@
 
+# Chromium or Chrome, in which tests look at pages
+$(BROWSER_STAMP): $(STAMP)
+	@if ! $(BIN)/python -c "from tests.harness.browser import program; program()" 2>/dev/null && \
+	  [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	  apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium; \
+	fi
+	@$(BIN)/python -c "from tests.harness.browser import program; print('pages are looked at in', program())"
+	@touch $@
+
 gl: $(GL_STAMP)
 
 # a frame is drawn; where that fails, the libraries are installed and it is tried again
@@ -63,7 +73,7 @@ $(ASSETS_STAMP): $(STAMP)
 train: setup
 	$(BIN)/python train.py algo=ewc benchmark=libero_object $(ARGS)
 
-test: setup lint $(PEERS_STAMP)
+test: setup lint $(PEERS_STAMP) $(BROWSER_STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist=worksteal $(ARGS)
 
 lint: $(STAMP)

@@ -1,7 +1,8 @@
 """What the documentation takes from the code while it is built: the references, and three tables.
 
-MkDocs calls `on_page_markdown` for every page (`hooks` in mkdocs.yml). A page asks for a part with a line such as
-`<!-- generated: commands -->`. Links to files outside this folder become their paths, as the site has none of these.
+MkDocs calls the functions `on_...` (`hooks` in mkdocs.yml). The references have a page for each group of commands and
+of keys. A page asks for a part with a line such as `<!-- generated: commands -->`. Links to files outside this folder
+become their paths, as the site has none of these.
 """
 
 import contextlib
@@ -9,13 +10,16 @@ import inspect
 import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import yaml
+from markdown.extensions.toc import slugify
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
 
-from libero_env.cli.main import ALL, bind
+from libero_env.cli.main import COMMANDS, bind
 from libero_env.objects import object_names
 from libero_env.tasks import get_suite, suite_names
 
@@ -33,9 +37,49 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
     return OUTSIDE.sub(lambda m: f"`{m[2]}`" if m[1] in m[2] else f"{m[1]} (`{m[2]}`)", markdown)
 
 
-def command_reference() -> str:
-    """A section for each command of `libero`: what its help prints."""
-    return "\n".join(f"## libero {name}\n\n```text\n{command_help(name)}```\n" for name in ALL)
+def on_config(config: MkDocsConfig) -> None:
+    """Put the pages of the references into the navigation, each below the page that lists them."""
+    for section in (entry for entry in config.nav if "Reference" in entry):
+        section["Reference"] = [
+            {title: [page, *pages(page)]} if (title := REFERENCES.get(page)) else page
+            for page in section["Reference"]
+        ]
+
+
+def on_files(files: Files, config: MkDocsConfig) -> None:
+    """Add the pages of the references, which no file holds."""
+    for reference in REFERENCES:
+        for name, content in pages(reference).items():
+            files.append(File.generated(config, name, content=content))
+
+
+@cache
+def pages(reference: str) -> dict[str, str]:
+    """The pages of a reference: the name of each, and its text."""
+    parts = command_reference() if reference == "commands.md" else configuration_reference()
+    stem = reference.removesuffix(".md")
+    return {
+        f"{stem}-{title.lower().replace(' ', '-')}.md": f"# {title}\n\n{text}"
+        for title, text in parts.items()
+    }
+
+
+def listed(reference: str) -> str:
+    """A list of a reference's pages, each with links to its sections."""
+    lines = []
+    for name, text in pages(reference).items():
+        title = text.splitlines()[0].lstrip("# ")
+        sections = [f"[`{s}`]({name}#{slugify(s, '-')})" for s in re.findall("^## (.*)$", text, re.M)]
+        lines.append(f"- [{title}]({name}): {', '.join(sections)}")
+    return "\n".join(lines)
+
+
+def command_reference() -> dict[str, str]:
+    """A page for each heading of the list of commands, with a section for each command: what its help prints."""
+    return {
+        heading: "\n".join(f"## libero {name}\n\n```text\n{command_help(name)}```\n" for name in names)
+        for heading, names in COMMANDS.items()
+    }
 
 
 def command_help(name: str) -> str:
@@ -58,8 +102,8 @@ def groups() -> dict[str, list[Path]]:
     return {name: files for name, files in found.items() if files}
 
 
-def configuration_reference() -> str:
-    """A section for the keys at the top, and one for each group."""
+def top_keys() -> str:
+    """A table of the keys at the top."""
     from lifelong.settings import RunSettings
 
     comments = _comments(CONFIGS / "config.yaml")
@@ -69,11 +113,19 @@ def configuration_reference() -> str:
         for k, v in top.items()
         if k in RunSettings.__dataclass_fields__
     ]
-    text = ["## At the top", "", "| key | default | valid | what |", "|---|---|---|---|", *rows, ""]
+    return "\n".join(["| key | default | valid | what |", "|---|---|---|---|", *rows])
+
+
+def configuration_reference() -> dict[str, str]:
+    """A page for each group of keys, with a section for itself and one for each of its subgroups."""
+    top = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))
     chosen = {k: v for d in top["defaults"] if isinstance(d, dict) for k, v in d.items()}
+    found: dict[str, str] = {}
     for name, files in groups().items():
-        text += [f"## {name}", "", _group(name, files, chosen.get(name)), ""]
-    return "\n".join(text)
+        section = f"## {name}\n\n{_group(name, files, chosen.get(name))}\n\n"
+        page = name.partition("/")[0]
+        found[page] = found.get(page, "") + section
+    return found
 
 
 def _group(name: str, files: list[Path], default: str | None) -> str:
@@ -247,7 +299,7 @@ def _about(file: Path) -> str:
         if not line.startswith("#"):
             break
         said += [] if "@package" in line else [line.lstrip("# ")]
-    return f": {' '.join(said)}" if said else ""
+    return f": {_cell(' '.join(said))}" if said else ""
 
 
 def _value(value: Any) -> str:
@@ -256,7 +308,9 @@ def _value(value: Any) -> str:
 
 
 def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|")
+    """Return text for the cell of a table; outside of code, what stands in angle brackets is not HTML."""
+    parts = " ".join(text.split()).replace("|", "\\|").split("`")
+    return "`".join(part if i % 2 else part.replace("<", "&lt;") for i, part in enumerate(parts))
 
 
 PROTOCOL_ROWS = {
@@ -314,23 +368,23 @@ FAMILIES = {
 
 
 def gallery() -> str:
-    """Tables of pictures: objects by family, and tasks by suite. experiments/objects/gallery.py draws them."""
+    """Pictures: objects by family, and tasks by suite. experiments/objects/gallery.py draws them."""
     parts = ["## Objects"]
     for family, names in families().items():
-        cells = [f"{_picture(f'objects/{name}', name, 150)}<br>`{name}`" for name in names]
-        parts += [f"### {FAMILIES[family]}", _picture_table(5, cells)]
+        found = [_picture(f"objects/{name}", name, f"<code>{name}</code>") for name in names]
+        parts += [f"### {FAMILIES[family]}", _pictures(found)]
     parts += [
         "## Tasks",
         "The first initial state of each task as the camera `agentview` sees it, and the instruction. "
         "A task's id is its suite and number, such as `libero_goal/3`.",
     ]
     for suite in suite_names():
-        cells = [
-            f"{_picture(f'tasks/{suite}-{task.index}', task.id, 190)}<br>{task.index}: {task.language}"
+        found = [
+            _picture(f"tasks/{suite}-{task.index}", task.id, f"{task.index}: {task.language}")
             for task in get_suite(suite).tasks
             if task.suite == suite
         ]
-        parts += [f"### {suite}", _picture_table(4, cells)] if cells else []
+        parts += [f"### {suite}", _pictures(found)] if found else []
     return "\n\n".join(parts)
 
 
@@ -346,22 +400,24 @@ def families() -> dict[str, list[str]]:
     return {family: [n for n in names if owner.get(n, "") == family] for family in FAMILIES}
 
 
-def _picture(file: str, name: str, width: int) -> str:
-    """HTML, because Markdown has no widths and the tables must fit the page."""
-    return f'<img src="images/gallery/{file}.jpg" alt="{name}" width="{width}">'
+def _picture(file: str, name: str, caption: str) -> str:
+    path = f"images/gallery/{file}.jpg"
+    return (
+        f'<figure><img src="{path}" alt="{name}" loading="lazy"><figcaption>{caption}</figcaption></figure>'
+    )
 
 
-def _picture_table(columns: int, cells: Sequence[str]) -> str:
-    """A Markdown table; its first row of cells stands where the header would."""
-    padded = [*cells, *[""] * (-len(cells) % columns)]
-    rows = [f"| {' | '.join(padded[i : i + columns])} |" for i in range(0, len(padded), columns)]
-    return "\n".join([rows[0], "|" + " :-: |" * columns, *rows[1:]])
+def _pictures(found: Sequence[str]) -> str:
+    """As many beside each other as the page is wide; Markdown has nothing of that kind."""
+    return "\n".join(['<div class="pictures">', *found, "</div>"])
 
 
+REFERENCES = {"commands.md": "Commands", "configuration.md": "Configuration"}
 PARTS = {
+    "commands": partial(listed, "commands.md"),
+    "configuration": partial(listed, "configuration.md"),
     "gallery": gallery,
-    "commands": command_reference,
-    "configuration": configuration_reference,
+    "keys": top_keys,
     "perturbations": perturbation_table,
     "protocols": protocol_table,
 }

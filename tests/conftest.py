@@ -5,6 +5,7 @@ import importlib
 import os
 import sys
 from collections import UserDict
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,15 @@ def closing():
     """Return a function that returns its argument, which is closed at the end of the test."""
     with contextlib.ExitStack() as stack:
         yield lambda opened: stack.enter_context(contextlib.closing(opened))
+
+
+@pytest.fixture(scope="session")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator:
+    """A tab of a browser, in which pages are looked at."""
+    from tests.harness.browser import browser  # with a package that not every environment has
+
+    with browser(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -156,7 +156,7 @@ def learned(tmp_path, monkeypatch):
     return learn
 
 
-def test_a_finished_run_is_diagnosed_and_its_page_written(learned):
+def test_a_finished_run_is_diagnosed_and_its_page_written(learned, tab):
     request = learned("sequential")
     found = diagnose(request)
     assert found.learned == 3 and not found.notes
@@ -167,7 +167,9 @@ def test_a_finished_run_is_diagnosed_and_its_page_written(learned):
     )
     assert all(0 < o.all <= 1 for o in found.overlaps)
     assert diagnose(request) == found, "the same call gives the same numbers"
-    page = write_diagnosis(found, request.run).read_text(encoding="utf-8")
+    written = write_diagnosis(found, request.run)
+    assert tab.faults_on_a_phone(written) == []
+    page = written.read_text(encoding="utf-8")
     assert "Parts put back" in page and "Updates of later tasks" in page
     saved = json.loads((request.run / "diagnosis.json").read_text(encoding="utf-8"))
     assert saved["swaps"][0]["learned"] == found.swaps[0].learned

@@ -246,11 +246,13 @@ def test_the_file_holds_everything(found, tmp_path):
         write_comparison(found, tmp_path / "file" / "c.json")
 
 
-def test_the_page_needs_no_other_file(found, tmp_path):
+def test_the_page_needs_no_other_file_and_reads_on_a_phone(found, tmp_path, tab):
     pytest.importorskip("matplotlib")
     from libero_eval.judging.page import write_page
 
-    text = write_page(found, tmp_path / "new" / "compare.html").read_text()
+    page = write_page(found, tmp_path / "new" / "compare.html")
+    assert tab.faults_on_a_phone(page) == []
+    text = page.read_text()
     assert text.count("<svg") == 3 and "http" not in text.replace("http://www.w3.org", "")
     assert "<h2>good − bad</h2>" in text and "Control arm" in text and "libero_object/9" in text
 

@@ -118,7 +118,7 @@ def test_a_start_from_which_a_simulation_error_ended_an_episode_is_left_out_of_a
     )
 
 
-def test_the_page_and_the_text_say_the_same_numbers(tmp_path) -> None:
+def test_the_page_and_the_text_say_the_same_numbers(tmp_path, tab) -> None:
     policy = Robustness(
         "sequential",
         outcomes({(): 10, A: 3, B: 0, C: 9, BOTH: 0}),
@@ -127,6 +127,7 @@ def test_the_page_and_the_text_say_the_same_numbers(tmp_path) -> None:
     )
     expert = Robustness("expert", outcomes({(): 10, A: 10, B: 10, C: 10}))
     page = write_robustness([policy, expert], tmp_path)
+    assert tab.faults_on_a_phone(page) == []
     text = page.read_text()
     assert "Robustness of sequential" in text and text.count("<svg") == 1, "no radar of two kinds"
     assert "camera=1" in text and ">2</td>" in text, "draws that were given up are told"

@@ -36,6 +36,7 @@ from lifelong.results.records import (
 from lifelong.results.summary import read_episodes, summarize
 from lifelong.stats.methods import MethodRun, statistics
 from lifelong.stats.metrics import METRIC_NAMES, Curve
+from tests.harness.browser import PHONE
 
 GROCERIES = [
     "alphabet soup", "cream cheese", "salad dressing", "bbq sauce", "ketchup", "tomato sauce", "butter", "milk",
@@ -190,6 +191,23 @@ def test_the_page_loads_no_other_file(finished: Path):
     assert page.open == []
     assert page.loads and all(v.startswith(("data:", "#")) for v in page.loads)
     assert "@import" not in (finished / "report.html").read_text()
+
+
+def test_a_run_reads_on_a_phone(finished: Path, tab):
+    assert tab.faults_on_a_phone(finished / "report.html") == []
+    rows = tab.evaluate(
+        "[...document.querySelectorAll('table.metrics tbody tr')].map(row => [...row.cells].map(c => "
+        "(({left, right, top, bottom}) => [left, right, top, bottom])(c.getBoundingClientRect())))"
+    )
+    assert len(rows) == len(METRIC_NAMES)
+    for name, *_, meaning in rows:
+        assert meaning[2] >= name[3], "the meaning stands below the name"
+        assert 0 <= meaning[0] < meaning[1] <= PHONE
+        assert meaning[3] - name[2] < 150, "a row is not much taller than its text"
+    cells = tab.evaluate(
+        "[...document.querySelectorAll('table.heat td')].map(c => c.getBoundingClientRect().right)"
+    )
+    assert cells and max(cells) <= PHONE, "the matrix is seen as a whole"
 
 
 def test_the_page_describes_the_whole_run(finished: Path):
@@ -369,6 +387,10 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     runs = [make_run(folder / f"{a}{s}", a, s, tasks=3) for a in ("ewc", "er") for s in (1, 2, 3)]
     page = write_report(runs, folder / "all")
     return page, json.loads((page.parent / "comparison.json").read_text())
+
+
+def test_a_comparison_reads_on_a_phone(compared: tuple[Path, dict], tab):
+    assert tab.faults_on_a_phone(compared[0]) == []
 
 
 def test_means_and_intervals_of_the_comparison(compared: tuple[Path, dict]):

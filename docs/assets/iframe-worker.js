@@ -1,0 +1,21 @@
+// Browsers start no worker for a page from disk. Its script then runs in a hidden frame, which is given the same messages.
+if (location.protocol === "file:") {
+  window.Worker = class extends EventTarget {
+    constructor(url) {
+      super()
+      const frame = document.createElement("iframe")
+      frame.hidden = true
+      document.body.append(frame)
+      this.inside = frame.contentWindow
+      this.inside.postMessage = (data) => this.dispatchEvent(new MessageEvent("message", { data }))
+      const script = this.inside.document.createElement("script")
+      script.src = url
+      this.loaded = new Promise((done) => script.addEventListener("load", done))
+      this.inside.document.body.append(script)
+    }
+
+    postMessage(data) {
+      this.loaded.then(() => this.inside.dispatchEvent(new MessageEvent("message", { data })))
+    }
+  }
+}
