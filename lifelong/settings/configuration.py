@@ -289,7 +289,7 @@ def _resolve(name: str) -> Target:
     """Return the class or function of a name; modules are looked for in the current folder, too, after all others."""
     try:
         package = name.partition(".")[0]
-        if package in sys.modules and package != "__main__":  # which is run, not found
+        if package in sys.modules:  # perhaps without a specification, as the module of a notebook is
             require_same_module(package, [*sys.path, os.getcwd()], f"names {name}")
         elif os.getcwd() not in sys.path and find_spec(package) is None:
             sys.path.append(os.getcwd())  # for good: processes that this one starts need it as well
@@ -314,11 +314,11 @@ def require_same_module(package: str, folders: Sequence[str], text: str) -> None
     Raises:
         ConfigError: It is another file.
     """
-    loaded, found = (
-        getattr(sys.modules.get(package), "__file__", None),
-        PathFinder.find_spec(package, folders),
-    )
-    if loaded and found and found.origin and not os.path.samefile(loaded, found.origin):
+    loaded = getattr(sys.modules.get(package), "__file__", None)
+    if not loaded or package == "__main__":  # which is run, not found
+        return
+    found = PathFinder.find_spec(package, folders)
+    if found and found.origin and os.path.realpath(loaded) != os.path.realpath(found.origin):
         raise ConfigError(
             f"{text}: this process has already imported {package} from {loaded}, which is not {found.origin}; "
             "use the other in a process of its own"

@@ -5,6 +5,7 @@ import sys
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
+from zipfile import ZipFile
 
 import pytest
 import torch
@@ -100,12 +101,25 @@ def test_whose_classes_a_group_names_is_asked_of_a_group_that_is_there(whole):
         Configuration({key: value for key, value in whole.items() if key != "policy"}).is_own("policy")
 
 
-def test_a_class_of_a_notebook_is_found(monkeypatch):
-    """The module `__main__` of an interactive session has no specification."""
-    session = ModuleType("__main__")
+@pytest.mark.parametrize("name", ["__main__", "a_module_made_in_a_cell"])
+def test_a_class_of_a_notebook_is_found(name, tmp_path, monkeypatch):
+    """The module `__main__` of an interactive session has no specification; a file of its name is another thing."""
+    session = ModuleType(name)
     session.Mine = dict
-    monkeypatch.setitem(sys.modules, "__main__", session)
-    assert session.__spec__ is None and find_target("__main__.Mine") is dict
+    monkeypatch.setitem(sys.modules, name, session)
+    monkeypatch.chdir(tmp_path)  # which is not in sys.path
+    assert session.__spec__ is None and find_target(f"{name}.Mine") is dict
+    (tmp_path / "__main__.py").touch()
+    monkeypatch.setattr(session, "__file__", "a_script.py", raising=False)
+    assert find_target(f"{name}.Mine") is dict
+
+
+def test_a_module_in_an_archive_is_found(tmp_path, monkeypatch):
+    with ZipFile(tmp_path / "mine.zip", "w") as archive:
+        archive.writestr("a_zipped_policy.py", "class Mine: pass")
+    monkeypatch.syspath_prepend(tmp_path / "mine.zip")
+    assert find_target("a_zipped_policy.Mine") is find_target("a_zipped_policy.Mine")
+    del sys.modules["a_zipped_policy"]
 
 
 def test_a_module_of_another_folder_that_is_loaded_already_is_refused(tmp_path, monkeypatch):
