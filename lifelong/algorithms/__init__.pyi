@@ -12,6 +12,7 @@ from .lora import LoRA
 from .lwf import LwF
 from .m2distill import M2Distill
 from .mas import MAS
+from .mir import MIR
 from .mlr import MLR
 from .multitask import Multitask
 from .omla import OMLA
@@ -19,6 +20,7 @@ from .packnet import PackNet
 from .sequential import Sequential
 from .si import SI
 from .single_task import SingleTask
+from .slca import SLCA
 
 __all__ = [
     "AGEM",
@@ -27,9 +29,11 @@ __all__ = [
     "ER",
     "EWC",
     "MAS",
+    "MIR",
     "MLR",
     "OMLA",
     "SI",
+    "SLCA",
     "Algorithm",
     "Averaging",
     "CompressedER",

@@ -7,6 +7,7 @@
     phases() -> phases                                then, for the phases of the task
     begin_phase(phase, policy)                        before the first step of each phase
     trained(policy) -> parameters                     before the first step, and when a run resumes
+    rate_factors(policy) -> factors                   then: the learning rates of parts of the policy
     mode_train(policy)                                before the steps of each epoch
     mix(batch, generator) -> batch                    each step, before the loss
     penalty(policy) -> scalar or None                 each step, after the loss
@@ -145,6 +146,10 @@ class Algorithm:
     def count_trained(self, policy: Policy) -> int:
         """Count the numbers that steps move: all of `trained`, unless the algorithm holds some of them."""
         return sum(p.numel() for p in self.trained(policy))
+
+    def rate_factors(self, policy: Policy) -> Mapping[str, float]:
+        """Return factors of the learning rate: beginning of parameters' names -> factor. By default the policy's."""
+        return policy.rate_factors() if isinstance(policy, Policy) else {}
 
     def mode_train(self, policy: Policy) -> None:
         """Put the policy in training mode; an algorithm may keep some layers in evaluation mode."""

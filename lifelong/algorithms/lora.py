@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +29,14 @@ class LoRA(FrozenBase):
     recurrent. Gradients come from the chain rule, dL/dB = s G A^T and dL/dA = s B^T G with G = dL/dW_k; the optimiser
     moves A and B, and W_k is computed again after each step.
 
+    `adapters` may be other than TAIL's:
+
+    * `shared`: one adapter learns through the whole stream after the base, with one set of own copies; one policy
+      acts on all tasks, as in the continual fine-tuning of large policies (Hu et al. 2026, arXiv:2603.11653).
+    * `averaged`: every task learns an adapter on the base, and one policy acts on all tasks, with the mean of what
+      they change. Where the base learned tasks of its own, it counts as one that changes nothing. This is the uniform
+      model soup of Wortsman et al. 2022, arXiv:2203.05482. While a task is learned, its own adapter acts.
+
     Departures: TAIL adapts large pretrained encoders and a transformer; here the base is the policy after the first
     `base_tasks`, or as it was pretrained with `base_tasks=0`, and by default every matrix is adapted,
     because a base that has learned one task has no general features. There is no dropout before A.
@@ -50,6 +58,7 @@ class LoRA(FrozenBase):
         adapted: Sequence[str] = ("*",),
         own: Sequence[str] = ("*bias*", "*norm*"),
         base_tasks: Natural = 1,
+        adapters: Literal["own", "shared", "averaged"] = "own",
     ):
         """Create the algorithm.
 
@@ -61,9 +70,10 @@ class LoRA(FrozenBase):
             own: Patterns of names of parameters of which every task has its own copy.
             base_tasks: Number of tasks (stages, where tasks are learned together) that train the whole policy,
                 which is frozen afterwards; 0 for a pretrained policy.
+            adapters: Whether a task acts with its own adapter, all with the one that they share, or with their average.
         """
         super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
-        self.own, self.base_last = tuple(own), -1
+        self.own, self.base_last, self.adapters = tuple(own), -1, adapters
         self.base: dict[str, Tensor] = {}  # frozen values of all that a task may change
         self.kept: dict[int, dict[str, Tensor]] = {}  # learned task -> its own copies
 
@@ -76,6 +86,8 @@ class LoRA(FrozenBase):
             return
         if not self.base:
             self.base = {n: p.detach().clone() for n, p in policy.named_parameters() if n in names}
+        elif self.adapters == "shared":
+            return
         adapted = {name: base for name, base in self.base.items() if not matches(name, self.own)}
         self.library.add(task_index, adapted, self.rank, draws)
         put_weights(policy, self.base)
@@ -115,7 +127,7 @@ class LoRA(FrozenBase):
     ) -> None:
         """Store the task's own copies; its A and B are stored already."""
         self._draw_seed(generator)
-        if task_index in self.library:
+        if task_index in self.library and self.adapters != "shared":
             params = dict(policy.named_parameters())
             names = self.base.keys() - self.library[task_index].keys()
             self.kept[task_index] = {n: params[n].detach().clone() for n in sorted(names)}
@@ -123,14 +135,24 @@ class LoRA(FrozenBase):
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
         """Yield the policy with the task's adapter; unchanged for the present task and those not begun."""
-        learned = [-1] if task_index <= self.base_last else [t for t in self.kept if t >= task_index]
-        values: dict[str, Tensor] = {}
-        if self.base and learned:
-            stage = min(learned)  # index of the last task of a stage
-            sums = {name: self._sum(name, pair) for name, pair in self.library.get(stage, {}).items()}
-            values = self.base | sums | self.kept.get(stage, {})
-        with acting_with(policy, values):
+        with acting_with(policy, self._acting(task_index)):
             yield policy
+
+    def _acting(self, task_index: int) -> dict[str, Tensor]:
+        """Return the weights that act on a task, where they are not the policy's own."""
+        learns = self.task_index in self.library and self.task_index not in self.kept
+        if not self.base or self.adapters == "shared" or (learns and self.adapters == "averaged"):
+            return {}
+        if self.adapters == "averaged":
+            found = [self._weights(task) for task in ([-1] if self.base_last >= 0 else []) + list(self.kept)]
+            return {name: torch.stack([one[name] for one in found]).mean(0) for name in self.base}
+        learned = [-1] if task_index <= self.base_last else [t for t in self.kept if t >= task_index]
+        return self._weights(min(learned)) if learned else {}  # index of the last task of a stage
+
+    def _weights(self, stage: int) -> dict[str, Tensor]:
+        """Return the weights with a stage's adapter and own copies; those of the base where it has none."""
+        sums = {name: self._sum(name, pair) for name, pair in self.library.get(stage, {}).items()}
+        return self.base | sums | self.kept.get(stage, {})
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows]) -> None:
         """Restore what `state_dict` returned.
@@ -143,7 +165,9 @@ class LoRA(FrozenBase):
             check_pairs(of_task, self.base)
 
     def _present(self) -> Mapping[str, Mapping[str, nn.Parameter]]:
-        """Return the present task's pairs; none while the base is learned."""
+        """Return the present task's pairs, or those that all tasks share; none while the base is learned."""
+        if self.adapters == "shared":
+            return next(iter(self.library.values()), {})
         return self.library.get(self.task_index, {})
 
     def _choose(self, policy: Policy) -> list[str]:

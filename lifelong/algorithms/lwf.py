@@ -3,7 +3,7 @@
 import copy
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -58,13 +58,16 @@ class LwF(Algorithm):
     forgetting" (section 3), distil the old tasks' output layers on the new task's images; a policy with an instruction
     has one output layer, and the instruction takes the place of the choice among them. No data are kept. Observations
     are not augmented in this term.
+
+    With `instruction="own"`, l is the new task's own instruction: self-distillation, which holds the policy near what
+    it would have done on what is seen now. No instruction of an earlier task is needed.
     """
 
     state_form = {"teacher": Weights(), "languages": {int: Tensor}}
     tuned = {"strength": (0.03, 0.1, 0.3, 1.0, 3.0)}
     plain_start = True
 
-    def __init__(self, *, strength: NonNegative = 3.0):
+    def __init__(self, *, strength: NonNegative = 3.0, instruction: Literal["earlier", "own"] = "earlier"):
         """Create the algorithm.
 
         Args:
@@ -72,15 +75,18 @@ class LwF(Algorithm):
                 summed over an action's dimensions, weighs errors of 0.05 as the absolute error of a deterministic
                 head does (3 * 7 * 0.05^2 = 0.05). The divergence of mixtures has the unit of their loss: 1 weighs
                 both alike.
+            instruction: Instruction with which both are asked: those of earlier tasks, or the window's own.
         """
-        self.strength = strength
+        self.strength, self.own = strength, instruction == "own"
         self.teacher = Teacher()
         self.languages: dict[int, Tensor] = {}  # position of each learned task -> (L,)
         self.distilled: Batch | None = None  # made by `mix`, used by `penalty`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch unchanged; earlier instructions are drawn for a copy of it."""
-        if self.languages:
+        if self.languages and self.own:
+            self.distilled = batch
+        elif self.languages:
             drawn = torch.randint(len(self.languages), (len(batch),), generator=generator)
             languages = torch.stack(list(self.languages.values()))
             language = languages[to_device(drawn, languages.device)].to(batch.observation.language)

@@ -144,6 +144,21 @@ class SequenceVLDataset:
         steps = torch.arange(self.seq_len, device=self.last.device)
         return torch.minimum(indices[:, None] + steps, self.last[indices][:, None])
 
+    def narrowed(self, indices: Tensor) -> tuple["SequenceVLDataset", Tensor]:
+        """Return these windows without frames that none of the given ones (n,) covers, and the given ones' indices.
+
+        Frames on disk stay as they are: they take no memory.
+        """
+        used = self.frames(indices if len(indices) else torch.zeros(1, dtype=torch.int64)).unique()
+        if isinstance(self.images, FrameFile) or len(used) == len(self):
+            return self, indices
+        # demonstrations end at the last of their frames that is still there: no given window reaches beyond it
+        last = torch.searchsorted(used, self.last[used], right=True) - 1
+        rows = {name: getattr(self, name)[used] for name in ("images", "actions")}
+        proprio = {name: reading[used] for name, reading in self.proprio.items()}
+        places = torch.searchsorted(used, indices.to(used.device)).to(indices.device)
+        return replace(self, proprio=proprio, last=last, **rows), places
+
     def batch(self, indices: Tensor) -> Batch:
         """Return the windows of the given indices, (B,) int64 in [0, W), as one batch.
 

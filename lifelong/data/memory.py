@@ -6,7 +6,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from lifelong.data.windows import JoinedWindows, TaskWindows, WindowSubset, count_frames
+from lifelong.data.windows import JoinedWindows, KeptWindows, TaskWindows, count_frames, gripper_phases
 from lifelong.errors import DataError
 from lifelong.types import Batch, Count
 
@@ -78,7 +78,8 @@ class ReplayMemory(TaskMemory[Tensor]):
 
     The budget is split evenly over the tasks: when a task is added, the shares of the others shrink. A task keeps a
     prefix of one random permutation of its windows, so a smaller share is again a uniform sample without replacement.
-    Only indices are kept; frames stay in the datasets.
+    In memory are the frames of these windows only. The state has their indices: frames are read from the
+    demonstrations again.
 
     Args:
         budget: Largest number of windows over all tasks.
@@ -86,7 +87,7 @@ class ReplayMemory(TaskMemory[Tensor]):
 
     def __init__(self, budget: Count) -> None:
         super().__init__(budget)  # a task's windows are indices (n,) into its dataset
-        self._datasets: dict[int, TaskWindows] = {}
+        self._held: dict[int, KeptWindows] = {}
 
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
         """Add a task.
@@ -99,14 +100,22 @@ class ReplayMemory(TaskMemory[Tensor]):
         """
         task = dataset.task_id
         self._require_new(task)
-        self._datasets[task] = dataset
-        self.tasks[task] = torch.randperm(len(dataset), generator=generator)[: self.budget]
-        self._shrink()
+        order = self._order(dataset, generator)[: self.budget]
+        shares = self._shares({**self.shares, task: len(order)})
+        for other, held in self._held.items():
+            self._hold(other, held.first(shares[other]) if shares[other] < len(held) else held)
+        self._hold(task, KeptWindows.of(dataset, order[: shares[task]].clone()))
 
-    def _shrink(self) -> None:
-        """Reduce every task to its share; what small tasks do not need is given to the others."""
-        for task, share in even_shares(self.shares, self.budget).items():
-            self.tasks[task] = self.tasks[task][:share].clone()
+    def _order(self, dataset: TaskWindows, generator: torch.Generator) -> Tensor:
+        """Return a task's windows (W,) in the order in which they are kept: the first as long as there is room."""
+        return torch.randperm(len(dataset), generator=generator)
+
+    def _shares(self, sizes: Mapping[int, int]) -> dict[int, int]:
+        """Return each task's share; what small tasks do not need is given to the others."""
+        return even_shares(sizes, self.budget)
+
+    def _hold(self, task: int, windows: KeptWindows) -> None:
+        self._held[task], self.tasks[task] = windows, windows.ids
 
     def sample(self, n: int, generator: torch.Generator) -> Batch:
         """Return windows drawn uniformly over all that are held, those of one task after those of another.
@@ -122,12 +131,11 @@ class ReplayMemory(TaskMemory[Tensor]):
 
     def _windows(self, chosen: Tensor) -> Batch:
         """Return windows by their positions (B,) in the memory."""
-        kept = [WindowSubset(self._datasets[task], indices) for task, indices in self.tasks.items()]
-        return JoinedWindows(kept).batch(chosen)
+        return JoinedWindows(list(self._held.values())).batch(chosen)
 
     def count_frames(self) -> int:
         """Count the frames of the windows, one that several windows cover once."""
-        return sum(count_frames(self._datasets[task], indices) for task, indices in self.tasks.items())
+        return sum(count_frames(held.dataset, held.places) for held in self._held.values())
 
     def state_dict(self) -> dict[str, Any]:
         """Return the budget and the indices by task id; frames are read again from the demonstrations."""
@@ -154,14 +162,39 @@ class ReplayMemory(TaskMemory[Tensor]):
             raise DataError(
                 f"the memory holds windows of tasks {absent}; there are datasets of {sorted(datasets)}"
             )
-        held = {task: datasets[task] for task in indices}
+        held: dict[int, KeptWindows] = {}
         for task, kept in indices.items():
-            if len(kept) and int(kept.max()) >= len(held[task]):
+            dataset = datasets[task]  # one at a time is whole
+            if len(kept) and int(kept.max()) >= len(dataset):
                 raise DataError(
                     f"the memory holds window {int(kept.max())} of task {task}, whose dataset has "
-                    f"{len(held[task])}: its demonstrations are not those of the interrupted run"
+                    f"{len(dataset)}: its demonstrations are not those of the interrupted run"
                 )
-        self.budget, self.tasks, self._datasets = int(state["budget"]), indices, held
+            held[task] = KeptWindows.of(dataset, kept)
+        self.budget, self.tasks, self._held = int(state["budget"]), indices, held
+
+
+class PhaseMemory(ReplayMemory):
+    """As many windows of each phase of a task, within one budget.
+
+    The phase-centric memory of PHASER (Chen et al. 2026, arXiv:2606.03598): in a uniform sample, short phases such as
+    a grasp are rare. Phases are `lifelong.data.windows.gripper_phases`, and those with few windows give room to others.
+
+    Departures: the paper also finds phases by a vision-language model, and replays most what is most at risk; here a
+    phase ends where the gripper's command changes, and windows are drawn uniformly over the memory.
+
+    Args:
+        budget: Largest number of windows over all tasks.
+    """
+
+    def _order(self, dataset: TaskWindows, generator: torch.Generator) -> Tensor:
+        """Return the windows (W,) so that every beginning of them has as many of each phase, at random otherwise."""
+        order = super()._order(dataset, generator)
+        phases = gripper_phases(dataset)[order]
+        turn = torch.zeros_like(order)  # number of earlier windows of the same phase
+        for phase in phases.unique():
+            turn[phases == phase] = torch.arange(int((phases == phase).sum()))
+        return order[turn.argsort(stable=True)]
 
 
 class FirstWindows(ReplayMemory):
@@ -203,7 +236,10 @@ class FirstWindows(ReplayMemory):
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
         """Add a task; see `ReplayMemory.add`. The shares of the other tasks stay as they are."""
         super().add(dataset, generator)
-        self.tasks[dataset.task_id] = torch.arange(min(self.per_task, len(dataset)))
-
-    def _shrink(self) -> None:
         self.budget = self.per_task * len(self.tasks)
+
+    def _order(self, dataset: TaskWindows, generator: torch.Generator) -> Tensor:
+        return torch.arange(min(self.per_task, len(dataset)))
+
+    def _shares(self, sizes: Mapping[int, int]) -> dict[int, int]:
+        return dict(sizes)

@@ -9,6 +9,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from lifelong.errors import DataError
 from lifelong.types import Batch, to_device
 
 _CHUNK = 8  # windows that are read at a time
@@ -125,6 +126,61 @@ class WindowSubset:
         _expect(self.dataset, self.chosen[indices])
 
 
+@dataclass(frozen=True, eq=False)
+class KeptWindows:
+    """Windows of a dataset that are kept when it is gone, with the ids that they had in it.
+
+    Attributes:
+        dataset: Dataset that holds their frames, and no others where it can.
+        places: Their indices in it, (n,) int64.
+        ids: Their indices in the dataset that they are of, (n,) int64.
+    """
+
+    dataset: WindowDataset
+    places: Tensor
+    ids: Tensor
+
+    @classmethod
+    def of(cls, dataset: WindowDataset, ids: Tensor) -> "KeptWindows":
+        """Return windows of a dataset by their indices (n,)."""
+        return cls(*_holding(dataset, ids), ids)
+
+    def first(self, count: int) -> "KeptWindows":
+        """Return the first windows."""
+        return KeptWindows(*_holding(self.dataset, self.places[:count]), self.ids[:count].clone())
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def batch(self, indices: Tensor) -> Batch:
+        """Return the windows of the given indices ((B,) int64 in [0, n)) as one batch."""
+        batch = self.dataset.batch(self.places[indices])
+        return replace(batch, window_ids=to_device(self.ids[indices], batch.window_ids.device))
+
+    def expect(self, indices: Tensor) -> None:
+        """Read the windows of the given indices, (B,) int64 in [0, n), ahead where the dataset can."""
+        _expect(self.dataset, self.places[indices])
+
+
+def _holding(dataset: WindowDataset, indices: Tensor) -> tuple[WindowDataset, Tensor]:
+    """Return a dataset that holds some windows (n,), without other frames where it can, and their indices in it."""
+    if isinstance(dataset, WindowSubset):
+        return _holding(dataset.dataset, dataset.chosen[indices])
+    if not isinstance(dataset, StageWindows):
+        narrowed = getattr(dataset, "narrowed", None)
+        return narrowed(indices) if narrowed else (dataset, indices)
+    parts: list[WindowDataset] = []
+    places, start, end = torch.zeros_like(indices), 0, 0
+    for part in dataset.datasets:
+        mine = (indices >= start) & (indices < start + len(part))
+        if mine.any():
+            held, found = _holding(part, indices[mine] - start)
+            places[mine] = found + end
+            parts, end = [*parts, held], end + len(held)
+        start += len(part)
+    return StageWindows(parts, dataset.task_id), places
+
+
 @torch.no_grad()
 def of_episodes(dataset: WindowDataset, read: Callable[[Batch], Tensor]) -> tuple[Tensor, Tensor]:
     """Read something of every demonstration's first window.
@@ -150,6 +206,60 @@ def of_episodes(dataset: WindowDataset, read: Callable[[Batch], Tensor]) -> tupl
     ends, of_window = getattr(dataset, "last", torch.arange(len(dataset))).unique(return_inverse=True)
     starts = torch.cat([ends.new_zeros(1), ends[:-1] + 1])
     return torch.cat([read(dataset.batch(indices)) for indices in starts.split(_CHUNK)]), of_window
+
+
+def frames_of(dataset: WindowDataset, readings: Sequence[str], most: int) -> tuple[Tensor, Tensor]:
+    """Return readings and actions of the frames of a dataset, on the CPU.
+
+    A dataset that reads a file has them in arrays (`proprio`, `actions`). Of others, the first frames of up to `most`
+    windows at equal distances are read.
+
+    Args:
+        dataset: Windows, which may be parts or joins of others.
+        readings: Names of the readings, which are joined.
+        most: Largest number of windows that are read.
+
+    Returns:
+        Readings (F, D), and actions (F, A).
+    """
+    if isinstance(dataset, JoinedWindows):
+        parts = [frames_of(part, readings, most) for part in dataset.datasets]
+        return torch.cat([r for r, _ in parts]), torch.cat([a for _, a in parts])
+    proprio, actions = getattr(dataset, "proprio", None), getattr(dataset, "actions", None)
+    if proprio is None or actions is None:
+        chosen = torch.linspace(0, len(dataset) - 1, min(len(dataset), most)).long().unique()
+        batches = [dataset.batch(part) for part in chosen.split(256)]
+        proprio = {n: torch.cat([b.observation.proprio[n][:, 0] for b in batches]) for n in readings}
+        actions = torch.cat([b.actions[:, 0] for b in batches])
+    return torch.cat([proprio[name] for name in readings], dim=1).cpu(), actions.cpu()
+
+
+def gripper_phases(dataset: WindowDataset) -> Tensor:
+    """Return in which phase of its demonstration each window begins, (W,) int64.
+
+    A phase ends where the command of the gripper, the last entry of an action, changes its sign: reaching, carrying,
+    releasing, and as many again where something is grasped twice.
+
+    Args:
+        dataset: Windows, which may be parts or joins of others.
+
+    Raises:
+        DataError: It does not know its actions (`actions`) and the ends of its demonstrations (`last`).
+    """
+    if isinstance(dataset, JoinedWindows):
+        return torch.cat([gripper_phases(part) for part in dataset.datasets])
+    if isinstance(dataset, WindowSubset):
+        return gripper_phases(dataset.dataset)[dataset.chosen]
+    if not (hasattr(dataset, "actions") and hasattr(dataset, "last")):
+        raise DataError(
+            f"{type(dataset).__name__} does not say where its demonstrations end, without which there are no phases"
+        )
+    closes, last = dataset.actions[:, -1].cpu() > 0, dataset.last.cpu()
+    same = torch.cat([torch.tensor([False]), last[1:] == last[:-1]])
+    switched = same & (closes != closes.roll(1))
+    passed = switched.cumsum(0)
+    first = torch.where(same, 0, torch.arange(len(last))).cummax(0).values
+    return passed - passed[first]
 
 
 def count_frames(dataset: WindowDataset, indices: Tensor) -> int:

@@ -270,8 +270,10 @@ def matches(name: str, patterns: Sequence[str]) -> bool:
     return any(fnmatchcase(name, pattern) for pattern in patterns)
 
 
-def matching(names: Sequence[str], patterns: Sequence[str], kind: str) -> list[str]:
-    """Return the names that match one of the patterns.
+def matching(
+    names: Sequence[str], patterns: Sequence[str], kind: str, key: str = "algo.adapted"
+) -> list[str]:
+    """Return the names that match one of the patterns, which are those of a key.
 
     Raises:
         ConfigError: There is none; the message lists some of the names that exist.
@@ -279,9 +281,7 @@ def matching(names: Sequence[str], patterns: Sequence[str], kind: str) -> list[s
     chosen = [name for name in names if matches(name, patterns)]
     if not chosen:
         some = ", ".join(list(names)[:5])
-        raise ConfigError(
-            f"algo.adapted={list(patterns)} matches no {kind} of the policy, which has {some}, ..."
-        )
+        raise ConfigError(f"{key}={list(patterns)} matches no {kind} of the policy, which has {some}, ...")
     return chosen
 
 

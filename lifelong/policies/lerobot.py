@@ -9,7 +9,7 @@ Shape legend: B batch, T steps of a window, A action, D sizes of all readings, L
 import importlib
 import inspect
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from lifelong.data.windows import JoinedWindows, WindowDataset
+from lifelong.data.windows import WindowDataset, frames_of
 from lifelong.errors import ConfigError, MissingPackageError, PolicyError
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, Count, Observation, PolicySpec
@@ -152,7 +152,7 @@ class LeRobotPolicy(Policy):
         """Take note of the text of the instruction, and of the statistics of readings and actions; see `Policy`."""
         self._remember(dataset.batch(torch.zeros(1, dtype=torch.int64)).observation.language[0], instruction)
         if self.when == "latest" or (self.when == "first" and int(self.met) == 1):
-            readings, actions = _frames_of(dataset, tuple(self.spec.proprio))
+            readings, actions = frames_of(dataset, tuple(self.spec.proprio), _MOST)
             frames = torch.cat([readings, actions], dim=1).double()
             moments = (frames.mean(0), frames.std(0, unbiased=False), frames.amin(0), frames.amax(0))
             self.moments.copy_(torch.stack(moments).to(self.moments))
@@ -334,21 +334,6 @@ class LeRobotPolicy(Policy):
             yield
         finally:
             model.training = before
-
-
-def _frames_of(dataset: WindowDataset, readings: Iterable[str]) -> tuple[Tensor, Tensor]:
-    """Return the readings (F, D) and the actions (F, A) of all frames, or of many of them, of a data set."""
-    names = tuple(readings)
-    if isinstance(dataset, JoinedWindows):
-        parts = [_frames_of(part, names) for part in dataset.datasets]
-        return torch.cat([r for r, _ in parts]), torch.cat([a for _, a in parts])
-    proprio, actions = getattr(dataset, "proprio", None), getattr(dataset, "actions", None)
-    if proprio is None or actions is None:
-        chosen = torch.linspace(0, len(dataset) - 1, min(len(dataset), _MOST)).long().unique()
-        batches = [dataset.batch(part) for part in chosen.split(256)]
-        proprio = {n: torch.cat([b.observation.proprio[n][:, 0] for b in batches]) for n in names}
-        actions = torch.cat([b.actions[:, 0] for b in batches])
-    return torch.cat([proprio[name] for name in names], dim=1).cpu(), actions.cpu()
 
 
 def lerobot_module(module: str) -> Any:

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
@@ -103,7 +103,7 @@ def fit(
     if not len(dataset):
         raise TrainingError("the dataset has no windows: check that its demonstrations are not empty")
     device, size = device_of(policy), settings.batch_size
-    optimizer = _make_optimizer(algorithm.trained(policy), settings, policy)
+    optimizer = _make_optimizer(algorithm.trained(policy), settings, policy, algorithm.rate_factors(policy))
     default_step = Step(policy, algorithm, optimizer, settings, augment, ranks)
     step, load = step or default_step, load or partial(batches_in_order, dataset)
     steps, windows = _epoch_size(len(dataset), settings)
@@ -205,9 +205,10 @@ def _shuffled_indices(windows: int, count: int, draws: torch.Generator) -> Tenso
     return order[:count]
 
 
-def _make_optimizer(trained: list[nn.Parameter], settings: FitSettings, policy: Policy) -> torch.optim.AdamW:
+def _make_optimizer(
+    trained: list[nn.Parameter], settings: FitSettings, policy: Policy, factors: Mapping[str, float]
+) -> torch.optim.AdamW:
     """Return the optimiser; parameters with the same factor of the learning rate are a group."""
-    factors = policy.rate_factors() if isinstance(policy, Policy) else {}
     of_parameter = {
         id(parameter): factor
         for beginning, factor in factors.items()

@@ -142,6 +142,38 @@ def test_lora_old_outputs_stay_bit_identical(kind, head, tmp_path):
         assert torch.equal(answers(later, later_policy, old), value)
 
 
+def test_one_adapter_learns_through_the_stream_and_one_policy_acts():
+    policy, algorithm, alone = make_policy(), LoRA(rank=2, alpha=4.0, adapters="shared"), make_policy()
+    learn_frames(algorithm, policy, 0, 1)
+    learn_frames(LoRA(rank=2, alpha=4.0), alone, 0, 1)
+    sequences.assert_same(dict(policy.state_dict()), dict(alone.state_dict()))  # the first adapter is LoRA's
+    learn_frames(algorithm, policy, 2)
+    assert list(algorithm.library) == [1] and not algorithm.kept
+    now, base = {n: p.detach().clone() for n, p in policy.named_parameters()}, algorithm.base
+    for name, pair in algorithm.library[1].items():
+        low = (now[name] - base[name]).flatten(1)
+        torch.testing.assert_close(low, 2.0 * pair["b"] @ pair["a"], rtol=1e-4, atol=1e-5)
+    for task in range(3):
+        with algorithm.policy_for(task, policy) as acting:
+            assert all(torch.equal(p, now[n]) for n, p in acting.named_parameters())
+
+
+@pytest.mark.parametrize("base_tasks", [0, 1])
+def test_the_average_of_adapters_acts_on_all_tasks(base_tasks):
+    policy, algorithm = make_policy(), LoRA(rank=2, alpha=4.0, adapters="averaged", base_tasks=base_tasks)
+    alone, separate = make_policy(), LoRA(rank=2, alpha=4.0, base_tasks=base_tasks)
+    learn_frames(algorithm, policy, 0, 1, 2)
+    learn_frames(separate, alone, 0, 1, 2)
+    found = []
+    for task in range(3):
+        with separate.policy_for(task, alone):
+            found.append({n: p.detach().clone() for n, p in alone.named_parameters()})
+    expected = {name: torch.stack([one[name] for one in found]).mean(0) for name in found[0]}
+    for task in range(4):  # the last is a task to come
+        with algorithm.policy_for(task, policy):
+            torch.testing.assert_close(dict(policy.named_parameters()), expected, rtol=1e-5, atol=1e-6)
+
+
 def test_lora_covers_every_kind_of_layer_and_running_statistics():
     torch.manual_seed(0)
     policy, algorithm = DeepPolicy(), LoRA(rank=1)

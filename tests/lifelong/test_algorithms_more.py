@@ -246,6 +246,17 @@ def test_lwf_keeps_the_outputs_for_old_instructions_on_new_windows():
     assert policy.linear.bias.grad.tolist() == pytest.approx([3.0, 0.0])
 
 
+def test_self_distillation_asks_with_the_windows_own_instruction():
+    policy, algorithm, draws = Linear(), LwF(strength=3.0, instruction="own"), generator(0)
+    batch = everything(1)
+    batch.observation.language.fill_(7.0)
+    learn(algorithm, policy, 0)
+    assert algorithm.mix(batch, draws) is batch and algorithm.distilled is batch
+    with torch.no_grad():
+        policy.linear.bias += torch.tensor([0.5, 0.0])
+    assert algorithm.penalty(policy).item() == pytest.approx(3.0 * 0.25)
+
+
 def test_lwf_teacher_is_constant_while_the_policy_learns():
     torch.manual_seed(0)
     policy, algorithm = Deep(), LwF()

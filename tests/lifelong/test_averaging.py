@@ -77,6 +77,22 @@ def test_shares_of_the_tasks(share, base, expected) -> None:
     assert tuple(learner.share_of(k) for k in range(1, 5)) == expected
 
 
+def test_parts_of_the_policy_have_shares_of_their_own() -> None:
+    found = torch.nn.Sequential(torch.nn.Linear(1, 1), torch.nn.Linear(1, 1))
+    learner, draws = Averaging(share=0.5, parts={"0.*": 0.25, "*": 1.0}, base_tasks=0), torch.Generator()
+    for p in found.parameters():
+        p.data.fill_(0.0)
+    learner.begin_task(0, Windows(0), found)
+    for p in found.parameters():
+        p.data.fill_(4.0)
+    learner.end_task(0, Windows(0), found, draws)
+    assert [p.item() for p in found.parameters()] == [1.0, 1.0, 4.0, 4.0]
+    with pytest.raises(
+        ConfigError, match=r"algo\.parts=\['wings'\] matches no weight of the policy, which has 0"
+    ):
+        Averaging(parts={"wings": 0.5}).begin_task(0, Windows(0), found)
+
+
 def test_statistics_of_batch_normalisation_are_averaged_and_counts_are_not() -> None:
     found = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.BatchNorm1d(2))
     learner, draws = Averaging(share=0.5, base_tasks=0), torch.Generator()

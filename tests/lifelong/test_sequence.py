@@ -5,7 +5,7 @@ import copy
 import pytest
 
 from lifelong import algorithms as algos
-from lifelong.data.memory import ReplayMemory
+from lifelong.data.memory import PhaseMemory, ReplayMemory
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.settings import build
 from lifelong.training.costs import COSTS
@@ -32,11 +32,15 @@ EVERY = ALGORITHMS | {
     "lwf": algos.LwF,
     "m2distill": lambda: algos.M2Distill(budget=12),
     "mas": algos.MAS,
+    "mir": lambda: algos.MIR(memory=ReplayMemory(25), candidates=2),
     "mlr": lambda: algos.MLR(budget=30, adjustment=0.3),
     "multitask": algos.Multitask,
     "omla": lambda: algos.OMLA(rank=2, alpha=4.0),
+    "phase_er": lambda: algos.ER(memory=PhaseMemory(25)),
+    "self_distillation": lambda: algos.LwF(instruction="own"),
     "si": algos.SI,
     "single_task": algos.SingleTask,
+    "slca": algos.SLCA,
 }
 COMPAT = {
     f"{name} of the original": lambda words=words: build(composed(*words, "compat=libero").algo)
@@ -44,6 +48,9 @@ COMPAT = {
         ("er", ("algo=er", "algo.memory.budget=5")),
         ("packnet", ("algo=packnet",)),
     )
+} | {
+    f"lora, {kind}": lambda kind=kind: algos.LoRA(rank=2, alpha=4.0, adapters=kind)
+    for kind in ("shared", "averaged")
 }
 
 

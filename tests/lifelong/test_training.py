@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from libero_env.errors import InvalidInputError
-from lifelong.algorithms import ER, EWC, Sequential
+from lifelong.algorithms import ER, EWC, SLCA, Sequential
 from lifelong.data import fake_batch
 from lifelong.data.memory import ReplayMemory
 from lifelong.errors import ConfigError, TrainingError
@@ -20,6 +20,7 @@ from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 from lifelong.types import Batch, PolicySpec
 from tests.harness import ranks_worker as worker
+from tests.harness.algorithms import learn_frames, make_policy
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 from tests.harness.policies import small_rnn, small_transformer, small_vilt
 
@@ -395,6 +396,28 @@ def test_parts_of_a_policy_learn_at_a_factor_of_the_rate():
     moved = {name for name, value in policy.state_dict().items() if not torch.equal(value, before[name])}
     assert moved and not any(name.startswith("encoders") for name in moved)
     assert any(name.startswith("encoders") for name in before)
+
+
+def test_slca_moves_the_representation_slowly_after_the_first_task():
+    algorithm, policy = SLCA(factor=0.5), make_policy()
+    learn_frames(algorithm, policy, 0)
+    assert not algorithm.rate_factors(policy) and algorithm.state_dict() == {"base_left": 1}
+    policy.rate_factors = lambda: {"encoders.agentview_rgb.stem": 0.1, "head": 2.0}
+    algorithm.begin_task(1, None, policy)
+    factors = algorithm.rate_factors(policy)
+    slow = [name for name, _ in policy.named_parameters() if name.startswith("encoders")]
+    assert slow and all(
+        factors[name] == pytest.approx(0.05 if name.startswith("encoders.agentview_rgb.stem") else 0.5)
+        for name in slow
+    )
+    assert set(factors) - set(slow) == {"encoders.agentview_rgb.stem", "head"}
+    frozen, policy = SLCA(factor=0.0, base_tasks=0), make_policy()
+    before = copy.deepcopy(policy.state_dict())
+    learn_frames(frozen, policy, 0)
+    moved = {name for name, value in policy.state_dict().items() if not torch.equal(value, before[name])}
+    assert moved and not any(name.startswith("encoders") for name in moved)
+    with pytest.raises(ConfigError, match=r"algo\.slow=\['wings'\] matches no parameter"):
+        SLCA(slow=["wings"]).begin_task(0, None, policy)
 
 
 @pytest.mark.parametrize(("device", "asynchronous"), [("cpu", False), ("cuda", True)])
