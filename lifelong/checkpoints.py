@@ -3,6 +3,9 @@
 Tensors are stored under their path in the tree; everything else is JSON in the file's header, with a SHA-256 over all
 of it. Equal trees give equal files. Nothing is executed on load, a file is either complete or does not exist, and one
 that was damaged later is refused.
+
+A file may refer to tensors of other checkpoints in its folder instead of holding them again: what an algorithm keeps of
+earlier tasks is then stored once, not once for each later task. The checksum is over these tensors, too.
 """
 
 import hashlib
@@ -27,6 +30,7 @@ FORMAT = "lifelong-checkpoint/1"
 MAX_DEPTH = 64  # dictionaries within dictionaries
 MAX_TREE = 64 << 20  # [bytes] of everything but the tensors
 
+_REFERRED = 1024  # [bytes] of a tensor from which on a reference is smaller
 _ENTRY = "lifelong"  # the only one in the header: the library writes several in random order
 _DTYPES = (
     *(torch.float32, torch.float64, torch.float16, torch.bfloat16),
@@ -34,7 +38,9 @@ _DTYPES = (
 )
 
 
-def save(path: Path, tree: dict[str, Any], *, previous: Path | None = None) -> None:
+def save(
+    path: Path, tree: dict[str, Any], *, previous: Path | None = None, beside: Path | None = None
+) -> None:
     """Write a tree to a file, which replaces an older one in one step. It is on disk when this returns.
 
     Args:
@@ -42,6 +48,7 @@ def save(path: Path, tree: dict[str, Any], *, previous: Path | None = None) -> N
         tree: Nested dictionaries (with keys of type str or int), lists and tuples. Leaves are tensors, str, int,
             float, bool or None.
         previous: Name that an older file is given, in the same folder; None for one that is replaced.
+        beside: Checkpoint in the same folder, to whose tensors the file may refer.
 
     Raises:
         CheckpointError: A leaf is of another type, or the file cannot be written.
@@ -52,6 +59,9 @@ def save(path: Path, tree: dict[str, Any], *, previous: Path | None = None) -> N
     if len(text) > MAX_TREE:
         raise CheckpointError(f"cannot store {show_bytes(len(text))} besides tensors in {path}")
     head = {"format": FORMAT, "sha256": _digest(text, tensors), "tree": plain}
+    if elsewhere := _stored_beside(beside, tensors):
+        head["elsewhere"] = elsewhere
+        tensors = {name: tensor for name, tensor in tensors.items() if name not in elsewhere}
     content = safetensors.torch.save(tensors, {_ENTRY: json.dumps(head, separators=(",", ":"))})
     try:
         with atomic_path(path, fsync=True) as temporary:
@@ -80,6 +90,7 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         with safe_open(path, framework="pt", device="cpu") as file:
             head = _head(file.metadata() or {})
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+        tensors |= _tensors_of(path.parent, head.get("elsewhere", {}))
         text = json.dumps(head["tree"], separators=(",", ":"))
         if _digest(text, tensors) != head["sha256"]:
             raise ValueError("its content does not have the checksum that it was written with")
@@ -198,6 +209,46 @@ def _head(metadata: Mapping[str, str]) -> dict[str, Any]:
         stated = head.get("format") if isinstance(head, dict) else None
         raise ValueError(f"the format is {stated!r}; this version reads {FORMAT!r}")
     return head
+
+
+def _stored_beside(beside: Path | None, tensors: Mapping[str, Tensor]) -> dict[str, str]:
+    """Return the names of the files that hold large tensors under their names, to the bit, as a checkpoint has them."""
+    if beside is None or not beside.is_file():
+        return {}
+    large = {name: tensor for name, tensor in tensors.items() if tensor.nbytes >= _REFERRED}
+    try:
+        with safe_open(beside, framework="pt", device="cpu") as file:
+            where = _head(file.metadata() or {}).get("elsewhere", {}) | dict.fromkeys(
+                file.keys(), beside.name
+            )
+        where = {name: place for name, place in where.items() if name in large}
+        there = _tensors_of(beside.parent, where)
+    except (OSError, SafetensorError, ValueError):  # which is found out when it is loaded
+        return {}
+    return {name: where[name] for name, tensor in there.items() if _same_bits(tensor, large[name])}
+
+
+def _same_bits(a: Tensor, b: Tensor) -> bool:
+    if a.dtype != b.dtype or a.shape != b.shape:
+        return False
+    return torch.equal(a.reshape(-1).view(torch.uint8), b.reshape(-1).view(torch.uint8))
+
+
+def _tensors_of(folder: Path, where: Any) -> dict[str, Tensor]:
+    """Return tensors of files in a folder, given each one's file; raise ValueError where one is not there."""
+    if not isinstance(where, dict) or not all(isinstance(name, str) for name in where.values()):
+        raise ValueError("what it says of other files is not valid")
+    found: dict[str, Tensor] = {}
+    for name in sorted(set(where.values())):
+        path = folder / name
+        if Path(name).name != name or path.suffix != ".safetensors" or path.is_symlink():
+            raise ValueError(f"it refers to {name!r}, which is not a checkpoint of its folder")
+        if not path.is_file():
+            raise ValueError(f"it needs {name} beside it, which is missing")
+        _check_size(path)
+        with safe_open(path, framework="pt", device="cpu") as file:
+            found |= {key: file.get_tensor(key) for key, place in where.items() if place == name}
+    return found
 
 
 def _digest(text: str, tensors: Mapping[str, Tensor]) -> str:

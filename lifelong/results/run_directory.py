@@ -59,9 +59,10 @@ class CheckpointFolder:
         return sorted(int(name) for name in names if name.isascii() and name.isdecimal())
 
     def save_task(self, task: int, policy: Mapping[str, Tensor], algorithm: Mapping[str, Any]) -> None:
-        """Write the checkpoint after a task."""
+        """Write the checkpoint after a task; what the one before it holds already, it refers to."""
         state = {"run": self._run(), "task": task, "policy": dict(policy), "algorithm": dict(algorithm)}
-        checkpoints.save(self.task_path(task), state)
+        earlier = [self.task_path(other) for other in self.tasks() if other < task]
+        checkpoints.save(self.task_path(task), state, beside=earlier[-1] if earlier else None)
         self.previous_path.unlink(missing_ok=True)  # the task is safe without it
 
     def save_progress(self, state: Mapping[str, Any]) -> None:

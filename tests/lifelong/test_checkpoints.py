@@ -11,7 +11,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from lifelong import checkpoints
-from lifelong.errors import CheckpointError
+from lifelong.errors import CheckpointError, DamagedCheckpointError
+from lifelong.results.run_directory import CheckpointFolder
 from tests.harness.checkpoints import write_forged
 
 
@@ -200,3 +201,58 @@ def test_a_form_names_the_first_difference():
             checkpoints.check(good | changed, form, "x", net)
     with pytest.raises(CheckpointError, match="lacks weight"):
         checkpoints.check({"bias": torch.ones(2)}, checkpoints.Weights(complete=True), "x", net)
+
+
+def stored(folder, name, tree, beside=None):
+    """Save a tree and return its file."""
+    path = folder / f"{name}.safetensors"
+    checkpoints.save(path, tree, beside=beside)
+    return path
+
+
+def test_what_a_file_beside_it_holds_is_stored_once(tmp_path):
+    old, nan = torch.randn(1000), torch.full((300,), torch.nan)
+    first = stored(tmp_path, "task_0", {"kept": {0: old, "nan": nan}, "w": torch.zeros(1000)})
+    second = stored(tmp_path, "task_1", {"kept": {0: old, "nan": nan}, "w": torch.ones(1000)}, first)
+    tree = {"kept": {0: old, "nan": nan, 1: torch.ones(10)}, "w": torch.ones(1000), "moved": old}
+    third = stored(tmp_path, "task_2", tree, second)
+    assert [p.stat().st_size // 1000 for p in (first, second, third)] == [9, 4, 4]
+    back = checkpoints.load(third)
+    assert torch.equal(back["kept"][0], old) and torch.equal(back["w"], torch.ones(1000))
+    assert back["kept"]["nan"].isnan().all() and torch.equal(back["moved"], old)
+    assert torch.equal(checkpoints.load(second)["kept"][0], old)
+
+    stored(tmp_path, "task_0", {"kept": {0: old + 1, "nan": nan}, "w": torch.zeros(1000)})
+    with pytest.raises(DamagedCheckpointError, match="does not have the checksum"):
+        checkpoints.load(third)
+    first.unlink()
+    with pytest.raises(DamagedCheckpointError, match=r"task_2.*it needs task_0\.safetensors beside it"):
+        checkpoints.load(third)
+    whole = stored(tmp_path, "task_3", {"kept": {0: old}}, third)  # what cannot be read is not referred to
+    assert torch.equal(checkpoints.load(whole)["kept"][0], old)
+
+
+@pytest.mark.parametrize("place", ["../task_0.safetensors", "config.yaml", "link.safetensors", 3])
+def test_only_checkpoints_of_the_folder_are_read_besides(tmp_path, place, monkeypatch):
+    (tmp_path / "run").mkdir()
+    weights = torch.randn(1000)
+    stored(tmp_path, "task_0", {"w": weights})
+    (tmp_path / "run" / "link.safetensors").symlink_to(tmp_path / "task_0.safetensors")
+    monkeypatch.setattr(checkpoints, "_stored_beside", lambda beside, tensors: {"/w": place})
+    forged = stored(tmp_path / "run", "task_1", {"w": weights})
+    with pytest.raises(DamagedCheckpointError, match="not a checkpoint of its folder|is not valid"):
+        checkpoints.load(forged)
+
+
+def test_checkpoints_of_a_run_hold_what_is_new(tmp_path):
+    folder, learned, sizes = CheckpointFolder(tmp_path), {}, []
+    for task in range(6):
+        learned[task] = {"w": torch.randn(10_000)}
+        folder.save_task(task, learned[task], {"learned": dict(learned)})
+        sizes.append(folder.task_path(task).stat().st_size)
+    assert max(sizes) < 1.02 * sizes[0]
+    for task in range(6):
+        state = folder.load_task(folder.task_path(task))
+        assert all(
+            torch.equal(state["algorithm"]["learned"][k]["w"], learned[k]["w"]) for k in range(task + 1)
+        )
