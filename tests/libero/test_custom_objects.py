@@ -392,3 +392,55 @@ def test_offsets_of_a_class_are_those_of_placement(tmp_path, suite):
     model = get_object("wide_brick")
     assert (model.horizontal_radius, model.bottom_offset) == (0.09, (0.0, 0.0, -0.05))
     assert model.top_offset == (0.0, 0.0, 0.03), "of the file"
+
+
+def test_subclasses_of_the_benchmarks_classes_have_its_models(tmp_path, suite):
+    """As in the original: the file of the nearest class, or of the category that is named."""
+    milk, ketchup = get_object_fn("milk"), get_object_fn("ketchup")
+
+    @register_object
+    class RedCan(milk):
+        pass
+
+    @register_object
+    class SmallCan(milk):
+        def __init__(self, name="small_can", obj_name="ketchup"):
+            super().__init__(name, obj_name)
+            self.rotation, self.rotation_axis = (0.5, 0.5), "y"
+
+    OBJECTS_DICT["blue_can"] = lambda name: ketchup(name=name)
+    OBJECTS_DICT["carton"] = milk
+    assert get_object("red_can").rotation == get_object("milk").rotation
+    assert get_object("small_can").rotation == {"y": (0.5, 0.5)}
+    for category, cls, model in (
+        ("red_can", RedCan, "milk"),
+        ("small_can", SmallCan, "ketchup"),
+        ("blue_can", ketchup, "ketchup"),
+        ("carton", milk, "milk"),
+    ):
+        path = task_with(category, suite, tmp_path)
+        path.write_text(path.read_text().replace("butter_1 - butter", f"butter_1 - {model}"))
+        env = ControlEnv(bddl_file_name=path, use_camera_obs=False)
+        env.reset()
+        own, same = (env.env.get_object(f"{name}_1") for name in (category, "butter"))
+        assert type(own) is cls and (own.bottom_offset == same.bottom_offset).all()
+        masses = [env.sim.model.body_mass[env.sim.model.body_name2id(item.root_body)] for item in (own, same)]
+        assert masses[0] == masses[1]
+        env.close()
+
+
+def test_a_class_of_the_benchmark_can_be_replaced(tmp_path, suite):
+    (tmp_path / "brick.xml").write_text(BRICK)
+    family, mass = get_object_fn("milk").__base__, get_object("milk").spec.compile().body_mass[1]
+    for file, expected in (("milk", mass), (str(tmp_path / "brick.xml"), 0.048)):
+
+        @register_object
+        class Milk(family):
+            def __init__(self, name="milk", obj_name=file):
+                super().__init__(name, obj_name)
+
+        env = ControlEnv(bddl_file_name=suite.get_task_bddl_file_path(0), use_camera_obs=False)
+        env.reset()
+        assert type(env.env.get_object("milk_1")) is Milk
+        assert env.sim.model.body_mass[env.sim.model.body_name2id("milk_1_main")] == pytest.approx(expected)
+        env.close()

@@ -25,9 +25,18 @@ class _Objects(UserDict):
 
     def __setitem__(self, category: str, made_by: Any) -> None:
         super().__setitem__(category, made_by)
-        is_builtin = isinstance(made_by, type) and issubclass(made_by, BuiltinObject)
-        if not (is_builtin and category in builtin_names()):
+        if not _is_benchmarks(category, made_by):
             register_model(category, lambda: model_of(made_by(name=category), category))
+
+
+def _is_benchmarks(category: str, made_by: Any) -> bool:
+    """Return whether a category of the benchmark keeps its model: its class, or a user's without a file of its own."""
+    if not (isinstance(made_by, type) and issubclass(made_by, BuiltinObject) and category in builtin_names()):
+        return False
+    if made_by.__init__ is BuiltinObject.__init__ or not made_by.family:
+        return category_of(made_by.__name__) == category
+    item = made_by(name=category)
+    return not hasattr(item, "file") and item.model_category == category
 
 
 OBJECTS_DICT: MutableMapping[str, Any] = _Objects()
@@ -148,7 +157,8 @@ class BuiltinObject(BaseObject):
 
     Args:
         name: Name of the instance; by default the category.
-        obj_name: Of a user-defined category the path of its file, or its stem in the folder of the family.
+        obj_name: Category of the benchmark whose model it has, by default that of the nearest class; or the path of a
+            file, or its stem in the folder of the family.
         joints: Joints, see `MujocoXMLObject`.
         model: Model that a scene has built.
     """
@@ -168,10 +178,13 @@ class BuiltinObject(BaseObject):
         self.name = name or self.category_name
         if model is not None:
             self.__dict__["model"] = model
-        if self.family and self.category_name not in builtin_names():
+        names = [obj_name] if obj_name else [category_of(cls.__name__) for cls in type(self).__mro__]
+        known = next((name for name in names if name in builtin_names()), None)
+        self.model_category = known or self.category_name
+        if self.family and known is None:
             self._own_file(obj_name or self.category_name, joints)
             return
-        physics = model or _parameters(self.category_name)
+        physics = model or _parameters(self.model_category)
         self.rotation = dict(physics.rotation) or None
         self.rotation_axis = physics.rotation_axis
         if self.rotation and self.rotation_axis in self.rotation and len(self.rotation) == 1:
@@ -189,7 +202,7 @@ class BuiltinObject(BaseObject):
     @cached_property
     def model(self) -> ObjectModel:
         """Model in the pack in use."""
-        return facade_pack().build(self.category_name)
+        return facade_pack().build(self.model_category)
 
 
 def _properties(articulation: Mapping[str, tuple[float, float]]) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObje
 from libero.libero.envs.objects import SiteObject
 from libero.libero.envs.robots import Panda
 from libero_env.mujoco_compat import mujoco
-from libero_env.objects.builtin import builtin_names
 from libero_env.objects.model import ObjectModel
 from libero_env.sim.scene import Scene
 
@@ -33,10 +32,10 @@ def _instance(name: str, model: ObjectModel) -> BaseObject:
     if cls is None:  # a category that is registered only with `libero_env`
         cls = type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
         return cls(name=name, model=model)
-    is_builtin = (
-        isinstance(cls, type) and issubclass(cls, BuiltinObject) and model.category in builtin_names()
+    takes_model = (
+        isinstance(cls, type) and issubclass(cls, BuiltinObject) and cls.__init__ is BuiltinObject.__init__
     )
-    return cls(name=name, model=model) if is_builtin else cls(name=name)
+    return cls(name=name, model=model) if takes_model else cls(name=name)
 
 
 def scene_sites(scene: Scene) -> dict[str, SiteObject]:
