@@ -1,6 +1,6 @@
 """Lookup of object models by category: builtin, registered in this process, or in the user's folder of objects."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects import builtin, folder
@@ -36,6 +36,14 @@ def get_object(category: str) -> ObjectModel:
     if (directory := folder.find(category)) is not None:
         return folder.load(directory, category)
     raise UnknownNameError("object category", category, object_names())
+
+
+def version_of(category: str) -> Hashable:
+    """Return what tells models of a user-defined category apart: its builder, or the times of its files; else None."""
+    if category in _registered or category in builtin.builtin_names():
+        return _registered.get(category)
+    directory = folder.find(category)
+    return directory and tuple((path, path.lstat().st_mtime_ns) for path in sorted(directory.iterdir()))
 
 
 def object_names() -> tuple[str, ...]:

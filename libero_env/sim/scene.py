@@ -22,6 +22,7 @@ from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.mujoco_compat import log_warnings, mujoco, set_damping
+from libero_env.objects.catalog import version_of
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY, ObjectModel
 from libero_env.tasks.problem import Atom, Problem, ProblemError, Region, Violation
 from libero_env.text import suggest
@@ -290,21 +291,18 @@ class _SceneCache:
         self._lock = RLock()
 
     def __call__(self, *key: Any) -> Scene:
-        """Return the scene of arguments of `_compile_scene`; it is compiled if it is not there."""
+        """Return the scene of arguments of `_compile_scene`; it is compiled if it is not there, or objects are new."""
+        arguments, problem = key, key[0]
+        categories = {*problem.objects.values(), *problem.fixtures.values()}
+        key = (*arguments, frozenset((category, version_of(category)) for category in categories))
         with self._lock:
             if key not in self._scenes:
-                self._scenes[key] = scene = _compile_scene(*key)
+                self._scenes[key] = scene = _compile_scene(*arguments)
                 self._bytes += mujoco.mj_sizeModel(scene.model)
             self._scenes.move_to_end(key)
             while self._bytes > self._max_bytes and len(self._scenes) > 1:
                 self._bytes -= mujoco.mj_sizeModel(self._scenes.popitem(last=False)[1].model)
             return self._scenes[key]
-
-    def cache_clear(self) -> None:
-        """Drop all scenes."""
-        with self._lock:
-            self._scenes.clear()
-            self._bytes = 0
 
 
 _build_scene = _SceneCache()

@@ -1,16 +1,19 @@
 """Every object of the catalog: parameters, stability, visuals, and behaviour in a scene."""
 
 import itertools
+from dataclasses import replace
 
 import mujoco
 import numpy as np
 import pytest
 
 from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.objects import ObjectModel, catalog, get_object, object_names, register_object
+from libero_env.objects import ObjectModel, builtin, catalog, get_object, object_names, register_object
 from libero_env.objects.builtin import builtin_names
 from libero_env.objects.builtin.physics import load_physics
 from libero_env.objects.model import rest_quat
+from libero_env.sim.scene import build_scene
+from libero_env.tasks import get_task
 from tests.harness.models import bounds
 
 pytestmark = pytest.mark.sim
@@ -340,6 +343,15 @@ def test_users_register_and_replace_objects(scratch_catalog):
     assert "cube" in object_names() and get_object("cube").spec.compile().ngeom == 1
     register_object("milk", cube)
     assert get_object("milk").category == "cube" and builtin_names() <= set(object_names())
+
+
+def test_scenes_follow_what_is_registered_again(scratch_catalog):
+    problem, masses = get_task("libero_object/0").problem, []
+    for category in ("ketchup", "butter"):
+        register_object("milk", lambda category=category: replace(builtin.build(category), category="milk"))
+        masses.append(build_scene(problem).model.body("milk_1_main").mass[0])
+        assert masses[-1] == build_scene(problem).model.body("milk_1_main").mass[0]
+    assert masses[0] != masses[1]
 
 
 def test_bad_registrations_are_named(scratch_catalog):
