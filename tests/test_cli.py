@@ -180,6 +180,7 @@ def test_doctor_survives_a_machine_without_gl(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "vulkan")
     finding = doctor.check_gl()
     assert not finding.ok and "MUJOCO_GL=vulkan is not a backend; valid: egl, osmesa, glfw" in finding.detail
+    assert finding.remedy == "unset MUJOCO_GL"
     monkeypatch.delenv("MUJOCO_GL")
     for probe in ("import os; os.abort()", "raise SystemExit(3)", "raise OSError('no libGL')"):
         monkeypatch.setattr(doctor, "_PROBE", probe)

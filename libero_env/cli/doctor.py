@@ -188,7 +188,8 @@ def check_gl() -> Finding:
         return Finding("GL", text, False, GL_REMEDY)
     found = json.loads(text)
     if "error" in found:
-        return Finding("GL", found["error"], False, GL_REMEDY)
+        wrong = re.match(r"(\w+)=.*Or unset it$", found["error"])
+        return Finding("GL", found["error"], False, f"unset {wrong[1]}" if wrong else GL_REMEDY)
     detail = f"{found['backend']} on {found['device']}, a 128x128 frame takes {found['milliseconds']:.1f} ms"
     if "llvmpipe" in found["device"] and (gpu := gpu_name()):
         remedy = "let EGL find the driver: in a container NVIDIA_DRIVER_CAPABILITIES=all, else the vendor's EGL file"
