@@ -196,6 +196,7 @@ def test_a_suite_that_is_only_a_list_of_names(monkeypatch, tmp_path):
     class Mine(benchmark.Benchmark):
         name = "mine"
 
+    assert benchmark.libero_task_map is libero_task_map
     monkeypatch.setitem(libero_task_map, "mine", ["open_the_box"])
     suite = Mine()
     suite._make_benchmark()

@@ -34,11 +34,15 @@ class Task(NamedTuple):
 
 
 def __getattr__(name: str) -> Any:
-    """Return `task_maps` (suite -> task name -> Task) or `task_orders`, which are read at the first use."""
+    """Return `task_maps` (suite -> task name -> Task), `task_orders` or `libero_task_map`, read at the first use."""
     if name == "task_maps":
         return _task_maps()
     if name == "task_orders":
         return load_data("task_orders.yaml")
+    if name == "libero_task_map":
+        from libero.libero.benchmark.libero_suite_task_map import libero_task_map
+
+        return libero_task_map
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
