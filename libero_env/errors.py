@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from libero_env.text import suggest
 
 DEBUG_VARIABLE = "LIBERO_DEBUG"  # environment variable that asks for every traceback
+QUIET_VARIABLE = "LIBERO_QUIET"  # environment variable that asks for no progress
 MAX_LISTED = 64  # valid names in a message; all categories of objects fit
 RAISED_BY = "raised by "  # a note on an error from code of the user begins so; then follows whose code it is
 
@@ -127,6 +128,11 @@ class DemoError(LiberoError, ValueError):
 def is_debugging() -> bool:
     """Return whether the user wants to see every traceback, also those of errors that say everything."""
     return os.environ.get(DEBUG_VARIABLE, "0") not in ("", "0")
+
+
+def is_quiet() -> bool:
+    """Return whether the user wants to see results, notes and errors only, and no progress."""
+    return os.environ.get(QUIET_VARIABLE, "0") not in ("", "0")
 
 
 @contextmanager

@@ -24,7 +24,7 @@ import cloudpickle
 import psutil
 from tqdm import tqdm
 
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, is_quiet
 
 _log = logging.getLogger(__name__)
 _DAMAGED = (EOFError, pickle.UnpicklingError, ValueError, LookupError, TypeError, AttributeError, ImportError)
@@ -300,9 +300,15 @@ def progress_bar(*iterable: Any, progress: bool | None = None, **options: Any) -
         progress: True shows the bar anywhere, False shows nothing, None shows what fits stderr.
         options: Further arguments of `tqdm.tqdm`.
     """
-    if progress is None and not sys.stderr.isatty():
+    if progress is None and not sys.stderr.isatty() and not is_quiet():
         return _ProgressLines(*iterable, **options)
-    return tqdm(*iterable, disable=progress is False, **options)
+    return tqdm(*iterable, disable=progress is False or is_quiet(), **options)
+
+
+def tell_progress(text: str) -> None:
+    """Print a line on stderr, above the bar of a terminal, unless the user wants to see no progress."""
+    if not is_quiet():
+        tqdm.write(text, file=sys.stderr)
 
 
 class _ProgressLines(tqdm):

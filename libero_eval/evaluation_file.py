@@ -7,6 +7,7 @@ stands apart, under `times`: two evaluations with the same outcomes have the sam
 
 import hashlib
 import json
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
@@ -149,6 +150,12 @@ class EvaluationResult:
             raise EvaluationFileError(f"tasks are counted twice: {', '.join(twice)}")
 
     @property
+    def policy(self) -> str | None:
+        """Word that names the policy on a command line: a run, a module, a server; None where that is not stated."""
+        stated = (self.evaluated.get(key) for key in ("run", "policy", "server"))
+        return next((str(word) for word in stated if word), None)
+
+    @property
     def success(self) -> Estimate:
         """Mean success over tasks; see `overall`."""
         return overall(self.tasks)
@@ -261,6 +268,26 @@ def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
                 float(np.mean([row[i] for row in result.atoms_ever]))
             )
     return {name: float(np.mean(values)) for name, values in rates.items()}
+
+
+def permission_names(policy: str) -> list[str]:
+    """Return the names by which a user allows that a result's policy is run again; none where that needs no permission.
+
+    Code of a module would be run. A server would be sent pictures, and the key that is in the environment.
+    """
+    if "://" in policy:
+        host = policy.partition("://")[2].partition("/")[0]
+        return [policy, host, host.rpartition(":")[0]]
+    if ":" in policy and not Path(policy).exists():
+        module = policy.partition(":")[0]
+        return [module.partition(".")[0], module]
+    return []
+
+
+def again(result: EvaluationResult, path: str) -> str:
+    """Return the command that runs a result again, from its file."""
+    names = permission_names(result.policy or "")
+    return shlex.join(["libero", "eval", path, *(["--allow", names[0]] if names else [])])
 
 
 def _digest(rows: Any) -> str:

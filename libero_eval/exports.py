@@ -1,13 +1,15 @@
-"""Results of an evaluation in the formats of vla-eval and of LeRobot."""
+"""Results of an evaluation in the formats of vla-eval, of LeRobot, and of the model cards of Hugging Face."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
-from libero_env.storage import write_json
-from libero_eval.evaluation_file import EvaluationResult, TaskResult
+from libero_env.storage import atomic_write_text, write_json
+from libero_eval.evaluation_file import EvaluationResult, TaskResult, overall
+from libero_eval.judging.evaluation_page import facts
 from lifelong.errors import writing
 
 
@@ -57,6 +59,43 @@ def export_lerobot(result: EvaluationResult, folder: Path) -> list[Path]:
         "overall": {**overall, "eval_s": seconds, "eval_ep_s": seconds / overall["n_episodes"]},
     }
     return [_write(folder / "eval_info.json", info)]
+
+
+def export_eval_results(
+    result: EvaluationResult, folder: Path, dataset: str, source: str | None = None
+) -> list[Path]:
+    """Write `.eval_results/SUITE.yaml` for each suite, which the Hugging Face Hub reads in the repository of a model.
+
+    Args:
+        result: The evaluation.
+        folder: Folder of the repository.
+        dataset: Id on the Hub of the benchmark's data set, whose `eval.yaml` names the suites as its tasks.
+        source: Address of where this is from, such as a repository with `eval.json`.
+
+    Raises:
+        ResultsError: A file cannot be written.
+    """
+    paths = []
+    for suite, tasks in _by_suite(result).items():
+        success, described = overall(tasks), dict(facts(result))
+        about = [
+            f"success in percent over {sum(len(task.successes) for task in tasks)} episodes of {len(tasks)} tasks",
+            f"95 % interval {100 * success.low:.1f} to {100 * success.high:.1f}",
+            *(f"{name} {described[name]}" for name in ("protocol", "models", "robot") if name in described),
+        ]
+        entry = {
+            "dataset": {"id": dataset, "task_id": suite},
+            "value": round(100 * success.value, 2),
+            **({"date": result.times["finished"]} if result.times.get("finished") else {}),
+            **({"source": {"url": source, "name": "libero-lifelong"}} if source else {}),
+            "evaluation_framework": "libero-lifelong",
+            "notes": ", ".join(about),
+        }
+        path = folder / ".eval_results" / f"{suite}.yaml"
+        with writing(path, "the result"):
+            atomic_write_text(path, yaml.safe_dump([entry], sort_keys=False, allow_unicode=True, width=1000))
+        paths.append(path)
+    return paths
 
 
 def _aggregate(result: EvaluationResult, suite: str, tasks: Sequence[TaskResult]) -> dict[str, Any]:

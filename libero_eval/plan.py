@@ -21,7 +21,7 @@ from libero_env.tasks import Task
 from libero_env.tasks.published import require_available
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate
-from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
+from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, permission_names
 from libero_eval.policies import SELECTION, ExpertPolicy, PolicyUnderTest, RunPolicy
 from libero_eval.protocols.environment import resolve_world
 from libero_eval.protocols.files import load_protocol
@@ -317,7 +317,7 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
     path = Path(request.policy_name)
     stated = {key: value for key, value in result.evaluated.items() if key in _Evaluated.__annotations__}
     evaluated = validate(_Evaluated, stated, source=str(path), prefix=("evaluated",), error=ResultsError)
-    policy = next((evaluated[key] for key in ("run", "policy", "server") if key in evaluated), None)
+    policy = result.policy
     if policy is None:
         raise ResultsError(f"{path} does not say which policy it is of: {dict(result.evaluated)}")
     _check_allowed(policy, request)
@@ -348,19 +348,10 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
 
 
 def _check_allowed(policy: str, request: EvalRequest) -> None:
-    """Refuse code and servers that a result, which may be somebody else's, names: unless the user has allowed them.
-
-    A server would be sent pictures, and the key that is in the environment.
-    """
-    if "://" in policy:
-        host = policy.partition("://")[2].partition("/")[0]
-        names, what = [policy, host, host.rpartition(":")[0]], "which would be connected to"
-    elif ":" in policy and not Path(policy).exists():
-        module = policy.partition(":")[0]
-        names, what = [module.partition(".")[0], module], "whose code would be run"
-    else:
-        return
-    if not set(names) & set(request.allow):
+    """Refuse code and servers that a result, which may be somebody else's, names: unless the user has allowed them."""
+    names = permission_names(policy)
+    what = "which would be connected to" if "://" in policy else "whose code would be run"
+    if names and not set(names) & set(request.allow):
         raise ConfigError(
             f"{request.policy} is of the policy {policy}, {what}; if you know and trust it, "
             f"allow it with --allow {names[0]}"

@@ -16,6 +16,7 @@ from libero_env.assets.pack import select_pack
 from libero_env.assets.robot import robot_assets
 from libero_env.demos.read import demo_origin
 from libero_env.envs.batch import BatchEnv
+from libero_env.errors import is_quiet
 from libero_env.memory import memory_limit
 from libero_env.perturbations import format_perturbations
 from libero_env.sim.scene import default_drawing
@@ -220,7 +221,7 @@ def _build_contexts(
         tracker=parts.tracker,
         seed=settings.seed,
         device=device,
-        progress=progress if ranks.first else False,
+        progress=progress if ranks.first and not is_quiet() else False,
         ranks=ranks,
         perturb=plan.perturb if plan.stream.perturb else (),
         shift=shift,

@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         The exit status, see `libero_env.cli.ending`.
     """
-    with ending.debugging(sys.argv[1:] if argv is None else argv) as words:
+    with ending.general_options(sys.argv[1:] if argv is None else argv) as words:
         try:
             with ending.interruptible(), process_group() as ranks:
                 return _launch(read_options(words), ranks)

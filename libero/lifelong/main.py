@@ -28,7 +28,7 @@ def main() -> int:
         except Exception as error:  # noqa: BLE001 - told by kind
             status = max(status, ending.report(error))
 
-    with ending.debugging(sys.argv[1:]) as words:
+    with ending.general_options(sys.argv[1:]) as words:
         sys.argv[1:] = words  # where Hydra reads them
         os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # errors are printed below, in one line
         try:

@@ -22,7 +22,7 @@ def script(prog: str = "") -> Callable[[Callable[..., int | None]], Callable[...
 
         @functools.wraps(work)
         def main(argv: Sequence[str] | None = None) -> int:
-            with ending.debugging(sys.argv[1:] if argv is None else argv) as words:
+            with ending.general_options(sys.argv[1:] if argv is None else argv) as words:
                 call = parse(work, words, name)
                 try:
                     with ending.interruptible():

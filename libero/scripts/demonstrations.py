@@ -184,7 +184,7 @@ def check_dataset_integrity(paths: Positional[tuple[Path, ...]] = (), *, num_dem
         num_demos: Demonstrations expected in each file.
     """
     files = find_demo_files(paths or [datasets_folder()])
-    broken = check_files(files, num_demos)
+    broken = sum(bool(row["faults"]) for row in check_files(files, num_demos))
     print(f"{len(files) - broken} of {len(files)} files are complete")
     return int(broken > 0)
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic.dataclasses import dataclass
 
+from libero_env.cli.answer import Answer
 from libero_env.cli.options import (
     Field,
     FilePath,
@@ -220,7 +221,7 @@ def info(paths: Files = ()) -> int:
     return int(broken > 0)
 
 
-def check(paths: Files = ()) -> int:
+def check(paths: Files = ()) -> Answer:
     """Read files completely; report what is in them, broken, or missing for training; return 1 if one is broken.
 
     Args:
@@ -228,11 +229,12 @@ def check(paths: Files = ()) -> int:
     """
     from libero_env.demos.curate import find_demo_files
 
-    return int(check_files(find_demo_files(paths)) > 0)
+    rows = check_files(find_demo_files(paths))
+    return Answer("", rows, status=int(any(row["faults"] for row in rows)))
 
 
-def check_files(files: Iterable[Path], num_demos: int | None = None) -> int:
-    """Read files completely and print one line about each; return the number of broken files.
+def check_files(files: Iterable[Path], num_demos: int | None = None) -> list[dict[str, Any]]:
+    """Read files completely and print one line about each; return path, demonstrations, faults and notes of each.
 
     Args:
         files: Demonstration files.
@@ -240,25 +242,27 @@ def check_files(files: Iterable[Path], num_demos: int | None = None) -> int:
     """
     from libero_env.demos.curate import examine
 
-    broken = 0
+    rows: list[dict[str, Any]] = []
     for path in files:
         try:
             stats = examine(path)
         except DemoError as error:
-            broken += 1
+            rows.append({"path": path, "demonstrations": None, "faults": [str(error)], "notes": []})
             print(f"FAIL  {error}")
             continue
         faults = list(map(str, stats.faults))
         if num_demos not in (None, len(stats.lengths)):
             faults.append(f"{len(stats.lengths)} demonstrations; expected {num_demos}")
-        broken += bool(faults)
+        rows.append(
+            {"path": path, "demonstrations": len(stats.lengths), "faults": faults, "notes": list(stats.notes)}
+        )
         for fault in faults:
             print(f"FAIL  {path}: {fault}")
         if not faults:
             print(f"ok    {path}: {len(stats.lengths)} demonstrations, {stats}")
         for note in stats.notes:
             print(f"note  {path}: {note}")
-    return broken
+    return rows
 
 
 def task_of(bddl: Path | None) -> "Task | None":

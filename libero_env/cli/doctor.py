@@ -17,6 +17,7 @@ from pathlib import Path
 from libero_env.assets.pack import BUILTIN, VARIABLE, chosen_assets, facade_assets, pack_of
 from libero_env.assets.published import find_distribution
 from libero_env.assets.robot import ROBOSUITE_VERSION, installed_robot, robot_cache
+from libero_env.cli.answer import Answer
 from libero_env.errors import LiberoError
 from libero_env.paths import cache_dir, config_file, demos_dir, read_config
 from libero_env.storage import check_trusted
@@ -321,28 +322,21 @@ def render_findings(findings: Iterable[Finding]) -> str:
     return "\n".join(rows)
 
 
-def findings_json(findings: Sequence[Finding]) -> str:
-    """Return the findings as JSON: `ok`, whether all that is essential works, and `findings` with their fields."""
-    content = {"ok": not is_broken(findings), "findings": [asdict(finding) for finding in findings]}
-    return json.dumps(content, indent=1, ensure_ascii=False)
-
-
 def is_broken(findings: Iterable[Finding]) -> bool:
     """Return whether an essential check failed."""
     return any(finding.essential and not finding.ok for finding in findings)
 
 
-def doctor(*, gl: bool = False, gpu: bool = False, json: bool = False) -> int:
+def doctor(*, gl: bool = False, gpu: bool = False) -> Answer:
     """Say what this machine has and lacks, and how to fix it; return 1 where something essential is broken.
 
     Args:
         gl: Only draw a frame.
         gpu: Only check the GPU, some minutes: driver, renderers that draw at once, MuJoCo Warp, PyTorch; 1 is returned
             where there is none.
-        json: Print the findings as JSON.
     """
     findings = examine_gpu() if gpu else examine(gl_only=gl)
     if not (gl or gpu) and importlib.util.find_spec("lifelong"):
         findings += importlib.import_module("lifelong.cli.runs").examine()
-    print(findings_json(findings) if json else render_findings(findings))
-    return int(is_broken(findings))
+    content = {"ok": not is_broken(findings), "findings": [asdict(finding) for finding in findings]}
+    return Answer(render_findings(findings), content, status=int(is_broken(findings)))

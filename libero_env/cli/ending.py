@@ -5,10 +5,12 @@
 | 0 | it did what was asked |
 | 1 | it found something broken or missing, which is its result |
 | 2 | it was asked for something that is not valid, or a policy or another part of the user's raised an error |
+| 3 | it was to decide something, and what it was given does not: `libero compare --gate` |
 | 70 | this package has a fault: a traceback, and a request to report it |
 | 128 + n | signal n ended it: 129 SIGHUP, 130 SIGINT (Ctrl-C), 141 SIGPIPE, 143 SIGTERM |
 
-`--debug`, or the environment variable `LIBERO_DEBUG=1`, which worker processes inherit, shows every traceback.
+`--debug`, or the environment variable `LIBERO_DEBUG=1`, which worker processes inherit, shows every traceback;
+`--quiet`, or `LIBERO_QUIET=1`, shows no progress.
 """
 
 import errno
@@ -24,12 +26,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from libero_env.errors import DEBUG_VARIABLE, RAISED_BY, LiberoError, is_debugging
+from libero_env.errors import DEBUG_VARIABLE, QUIET_VARIABLE, RAISED_BY, LiberoError, is_debugging
 from libero_env.text import printable
 
-MISTAKE, DEFECT, SIGNALLED = 2, 70, 128
+MISTAKE, UNDECIDED, DEFECT, SIGNALLED = 2, 3, 70, 128
 _SIGPIPE = 13  # Windows has no name for it
-DEBUG = "--debug"
+EVERYWHERE = {"--debug": DEBUG_VARIABLE, "--quiet": QUIET_VARIABLE}  # options of every command
 _SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 _MAX_FRAMES = 12  # of the user's code in a message
 _ROOTS = [
@@ -89,8 +91,8 @@ def interruptible() -> Iterator[None]:
 
 
 @contextmanager
-def debugging(words: Sequence[str]) -> Iterator[list[str]]:
-    """Yield the words of a command line without `--debug`, which counts for this command and its processes.
+def general_options(words: Sequence[str]) -> Iterator[list[str]]:
+    """Yield the words of a command line without `--debug` and `--quiet`, which count for this command's processes, too.
 
     Standard streams that are closed lead nowhere, as else the first files that are opened would take their place.
     """
@@ -99,17 +101,16 @@ def debugging(words: Sequence[str]) -> Iterator[list[str]]:
             # the lowest free number, which is this one
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
             setattr(sys, name, open(number, mode))  # noqa: SIM115 - until the process ends
-    rest = [word for word in words if word != DEBUG]
-    before = os.environ.get(DEBUG_VARIABLE)
-    if len(rest) < len(words):
-        os.environ[DEBUG_VARIABLE] = "1"
+    before = {variable: os.environ.get(variable) for variable in EVERYWHERE.values()}
+    os.environ |= {EVERYWHERE[word]: "1" for word in words if word in EVERYWHERE}
     try:
-        yield rest
+        yield [word for word in words if word not in EVERYWHERE]
     finally:
-        if before is None:
-            os.environ.pop(DEBUG_VARIABLE, None)
-        else:
-            os.environ[DEBUG_VARIABLE] = before
+        for variable, value in before.items():
+            if value is None:
+                os.environ.pop(variable, None)
+            else:
+                os.environ[variable] = value
 
 
 def report(error: BaseException, *, who: str = "", mistakes: tuple[type[BaseException], ...] = ()) -> int:

@@ -26,12 +26,14 @@ class Command:
         help: What it does, for lists of commands.
         resume: How to go on after an interruption.
         reads_words: Whether the function takes the words as they are, as its only argument.
+        flags: Which of `libero_env.cli.answer.FLAGS` it has; its function returns an `Answer`.
     """
 
     target: str
     help: str
     resume: str = ""
     reads_words: bool = False
+    flags: tuple[str, ...] = ()
 
 
 COMMANDS: dict[str, dict[str, Command]] = {  # by heading
@@ -54,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # names of files need not be text
             stream.reconfigure(errors="backslashreplace")
-    with ending.debugging(sys.argv[1:] if argv is None else argv) as words:
+    with ending.general_options(sys.argv[1:] if argv is None else argv) as words:
         try:
             status = _run(words)
             sys.stdout.flush()
@@ -106,7 +108,7 @@ def bind(name: str, words: Sequence[str]) -> Callable[[], int | None]:
         return partial(function, words)
     from libero_env.cli.options import parse
 
-    return parse(function, words, f"libero {name}")
+    return parse(function, words, f"libero {name}", command.flags)
 
 
 def load(command: Command) -> Callable[..., Any]:
@@ -143,4 +145,4 @@ def _lines(topic: str) -> Iterator[str]:
             yield f"  {name:18} {command.help}"
         if rows:
             yield ""
-    yield "libero COMMAND --help explains one; --debug shows the traceback of every error; --version"
+    yield "libero COMMAND --help explains one; --quiet: no progress; --debug: the traceback of every error; --version"

@@ -21,6 +21,8 @@ from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from libero_env.cli import ending
+from libero_env.cli.answer import FLAGS, tell
+from libero_env.text import suggest
 
 __all__ = ["Positional", "arg"]
 
@@ -78,31 +80,39 @@ def modalities(*, depth: bool, segmentation: str | None) -> tuple[str, ...]:
     )
 
 
-def parse(function: Callable[..., Any], words: Sequence[str], prog: str) -> Callable[[], Any]:
+def parse(
+    function: Callable[..., Any], words: Sequence[str], prog: str, flags: Sequence[str] = ()
+) -> Callable[[], Any]:
     """Read words as arguments of a function.
 
     Args:
         function: Function of a command.
         words: Words of the command line after the command's name.
         prog: The command, such as `libero demos generate`.
+        flags: Which of `libero_env.cli.answer.FLAGS` it has, in addition to its own options.
 
     Returns:
         The call, to be made without arguments. After `--help`, or after an error told in one line, the process ends.
     """
     target = options_of(function)
+    captured = capture(target, flags)
     wants_help = bool({"-h", "--help"} & set(words))
     printed = io.StringIO()
     try:
         with contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed):
-            arguments = tyro.cli(_capture(target), prog=prog, args=list(words), config=_CONFIG)
+            arguments = tyro.cli(captured, prog=prog, args=list(words), config=CONFIG)
     except SystemExit as ended:
         if ended.code:
-            _fail(_unboxed(printed.getvalue()), prog)
+            _fail(_named_near(_unboxed(printed.getvalue()), captured), prog)
         raise
+    chosen = [flag for flag in flags if arguments.pop(flag)]
     values = _checked(target, arguments, prog)
-    if target is function:
-        return functools.partial(function, **values)
-    return functools.partial(function, target(**values))
+    call = (
+        functools.partial(function, **values)
+        if target is function
+        else functools.partial(function, target(**values))
+    )
+    return functools.partial(tell, call, chosen) if flags else call
 
 
 def options_of(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -111,7 +121,7 @@ def options_of(function: Callable[..., Any]) -> Callable[..., Any]:
     return hints[0] if len(hints) == 1 and dataclasses.is_dataclass(hints[0]) else function  # type: ignore[return-value]
 
 
-_CONFIG = (
+CONFIG = (
     tyro.conf.FlagCreatePairsOff,
     tyro.conf.DisallowNone,
     tyro.conf.HelptextFromCommentsOff,
@@ -119,8 +129,8 @@ _CONFIG = (
 )
 
 
-def _capture(target: Callable[..., Any]) -> Callable[..., dict[str, Any]]:
-    """Return a function with the options of another that returns its arguments, for tyro."""
+def capture(target: Callable[..., Any], flags: Sequence[str] = ()) -> Callable[..., dict[str, Any]]:
+    """Return a function with the options of another, and with flags, that returns its arguments, for tyro."""
 
     def captured(**arguments: Any) -> dict[str, Any]:
         return arguments
@@ -134,6 +144,15 @@ def _capture(target: Callable[..., Any]) -> Callable[..., dict[str, Any]]:
         )
         for name, p in inspect.signature(target).parameters.items()
         for default in [made.get(name, p.default)]
+    ]
+    parameters += [
+        inspect.Parameter(
+            flag,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=False,
+            annotation=Annotated[bool, arg(help=FLAGS[flag], help_behavior_hint="")],
+        )
+        for flag in flags
     ]
     captured.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     captured.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": dict[str, Any]}
@@ -184,6 +203,17 @@ def _unboxed(text: str) -> str:
     return " ".join(" ".join(lines[:rule]).split()).removesuffix(".")
 
 
+def _named_near(message: str, captured: Callable[..., Any]) -> str:
+    """Return tyro's message; of an option that does not exist, one that names the nearest that does."""
+    found = re.match(r"Unrecognized options: (--[\w-]+)", message)
+    if found is None:
+        return message[:1].lower() + message[1:]
+    with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
+        tyro.cli(captured, args=["--help"], config=CONFIG)
+    names = re.findall(r"(?<![\w-])--[\w-]+", text.getvalue())
+    return f"unknown option {found[1]}.{suggest(found[1], [*names, *ending.EVERYWHERE])}"
+
+
 def _fail(message: str, prog: str) -> NoReturn:
-    print(f"error: {message}; see {prog} --help", file=sys.stderr)
+    print(f"error: {message}{'' if message.endswith('?') else ';'} see {prog} --help", file=sys.stderr)
     raise SystemExit(ending.MISTAKE)

@@ -2,9 +2,11 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
+from libero_env.cli.answer import Answer
 from libero_env.cli.options import (
     Field,
     FilePath,
@@ -96,7 +98,7 @@ def certify_tasks(
     require: Share = 0.8,
     disturb: bool = False,
     again: bool = False,
-) -> int:
+) -> Answer:
     """Measure the success of the expert, and print the tasks below the required rate; return 1 if there are any.
 
     What was measured before is not run again.
@@ -125,14 +127,16 @@ def certify_tasks(
     )
     write_results(certificates, out, assets=assets, disturb=disturb)
     short = [certificate for certificate in certificates if certificate.rate < require]
+    lines = []
     for one in short:
         reason = next((o.reason for o in one.outcomes if not o.success), "")
-        print(f"FAIL  {one.task} {one.name}: {100 * one.rate:.0f} %, such as: {reason}")
+        lines.append(f"FAIL  {one.task} {one.name}: {100 * one.rate:.0f} %, such as: {reason}")
     good, total = sum(len(c.lengths) for c in certificates), sum(len(c.outcomes) for c in certificates)
-    print(
+    lines.append(
         f"{good}/{total} = {100 * good / total:.1f} %; {len(short)} of {len(certificates)} tasks under {require:.0%}"
     )
-    return int(bool(short))
+    data = [{**c.summary(), "passed": c not in short} for c in certificates]
+    return Answer("\n".join(lines), data, status=int(bool(short)))
 
 
 def lint(
@@ -141,7 +145,7 @@ def lint(
     assets: str | None = None,
     level: Literal["error", "warning", "info"] = "warning",
     starts: Annotated[int, Field(ge=0, le=1000)] = 5,
-) -> int:
+) -> Answer:
     """Report what is wrong or doubtful in tasks, and how to fix it; return 1 if one has an error.
 
     Args:
@@ -150,15 +154,16 @@ def lint(
         level: Lowest level that is printed.
         starts: Initial states to check; 0 simulates nothing.
     """
-    counts, number = Counter[str](), 0
+    found, number = list["Finding"](), 0
     for findings in _lint(tasks, assets, starts):
         number += 1
-        counts.update(finding.level for finding in findings)
+        found += findings
         for finding in findings:
             if LEVELS.index(finding.level) <= LEVELS.index(level):
                 print(finding, flush=True)
-    print(f"{number} tasks: {counts['error']} errors, {counts['warning']} warnings, {counts['info']} notes")
-    return int(counts["error"] > 0)
+    counts = Counter(finding.level for finding in found)
+    text = f"{number} tasks: {counts['error']} errors, {counts['warning']} warnings, {counts['info']} notes"
+    return Answer(text, [asdict(finding) for finding in found], status=int(counts["error"] > 0))
 
 
 def _lint(names: Sequence[str], assets: str | None, starts: int) -> "Iterator[list[Finding]]":

@@ -25,7 +25,7 @@ from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.record import RecordingReport, record_chunk, recorders
 from libero_env.demos.write import REMEDY, DemoWriter, OtherRecordingError
 from libero_env.errors import DemoError, InvalidInputError
-from libero_env.parallel import check_main_guard, cpu_count, progress_bar, run_each
+from libero_env.parallel import check_main_guard, cpu_count, progress_bar, run_each, tell_progress
 from libero_env.paths import demos_dir
 from libero_env.tasks import Task, get_suite
 
@@ -268,7 +268,7 @@ def _record(
     if progress is not False:
         count = sum(map(len, missing))
         folders = ", ".join(sorted({str(job.path.parent.parent) for job in jobs}))
-        tqdm.write(f"recording {count} demonstrations of {len(jobs)} tasks in {folders}", file=sys.stderr)
+        tell_progress(f"recording {count} demonstrations of {len(jobs)} tasks in {folders}")
     bar = progress_bar(
         total=n * len(jobs),
         initial=sum(report.recorded for report in reports),
@@ -310,7 +310,7 @@ def _recording_lock(folder: Path) -> Iterator[None]:
                 lock.acquire(timeout=seconds)
             except Timeout:
                 seconds, what = _WAIT_SECONDS, f"demonstrations in {folder}"
-                tqdm.write(f"another process records {what}; waiting for it", file=sys.stderr)
+                tell_progress(f"another process records {what}; waiting for it")
     except OSError as error:
         raise DemoError(
             f"{folder}: demonstrations cannot be recorded there ({error.strerror or error}); choose another folder"

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -11,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.demos.config import MASK_NAMES, PERTURBED_HEADER, RenderConfig
@@ -22,7 +20,7 @@ from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
 from libero_env.demos.read import read_episodes
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
-from libero_env.parallel import progress_bar
+from libero_env.parallel import progress_bar, tell_progress
 from libero_env.perturbations.perturbation import format_perturbations, reword_task
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
@@ -119,7 +117,7 @@ def _render(jobs: Sequence[RenderJob], workers: int, progress: bool | None) -> N
     """Render jobs while no other process writes in their folders."""
     if progress is not False:
         folders = ", ".join(sorted({str(job.path.parent) for job in jobs}))
-        tqdm.write(f"rendering demonstrations of {len(jobs)} tasks in {folders}", file=sys.stderr)
+        tell_progress(f"rendering demonstrations of {len(jobs)} tasks in {folders}")
     with progress_bar(total=len(jobs), desc="render", unit="file", progress=progress) as bar:
         for _ in run_each(RenderJob.render, [(job,) for job in jobs], workers):
             bar.update(1)

@@ -2,12 +2,14 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from libero_env.cli.answer import Answer
+from libero_env.cli.ending import UNDECIDED
 from libero_env.cli.options import Field, FilePath, Positional, Probability, Share, arg
 from lifelong.errors import ConfigError
 
@@ -26,8 +28,9 @@ def compare(
     allow: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
     alpha: Probability = 0.05,
     tasks: bool = False,
+    gate: Share | None = None,
     out: FilePath | None = None,
-) -> None:
+) -> Answer:
     """Say whether evaluated policies differ, start by start, and what chance alone makes.
 
     Args:
@@ -38,22 +41,28 @@ def compare(
         allow: Compare although this setting differs, such as protocol.horizon, environment.robot or tasks.
         alpha: Probability of a false difference.
         tasks: Show every task in the terminal.
+        gate: Say whether the second result is worse than the first by more than this difference in success, such as
+            0.05. The exit status is 1 for a regression, 3 where these episodes do not decide it.
         out: Folder for compare.html and compare.json.
     """
     from libero_eval.judging.comparison import compare_groups, write_comparison
-    from libero_eval.judging.page import render
+    from libero_eval.judging.comparison import gate as judge
+    from libero_eval.judging.page import gate_text, render, write_page
 
     groups = [*_single_groups(results), *(_group(words) for words in group)]
     first_twice = _single_groups(control) if control else None
     pair = (first_twice[0], first_twice[1]) if first_twice else None
     comparison = compare_groups(groups, control=pair, allow=allow, alpha=alpha)
-    print(render(comparison, tasks=tasks))
+    lines, data, status, page = [render(comparison, tasks=tasks)], comparison.to_plain(), 0, None
+    if gate is not None:
+        found = judge(comparison, gate)
+        lines += ["", gate_text(found, comparison)]
+        data["gate"] = {**asdict(found), "verdict": found.verdict}
+        status = {"regression": 1, "no regression": 0, "undecided": UNDECIDED}[found.verdict]
     if out:
-        from libero_eval.judging.page import write_page
-
-        print()
-        print(write_page(comparison, out / "compare.html"))
-        print(write_comparison(comparison, out / "compare.json"))
+        lines += ["", str(write_comparison(comparison, out / "compare.json"))]
+        page = write_page(comparison, out / "compare.html")
+    return Answer("\n".join(lines), data, page, status)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,23 +107,72 @@ def power(options: PowerOptions) -> None:
         print(power_text.answer(question))
 
 
+def board(
+    results: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
+    *,
+    allow: tyro.conf.UseAppendAction[tuple[str, ...]] = (),
+    alpha: Probability = 0.05,
+    out: FilePath = Path("board.html"),
+) -> Answer:
+    """Rank evaluated policies on a page: success with intervals, tiers by paired tests, commands that run them again.
+
+    Args:
+        results: Files eval.json, or folders, for all such files in them; NAME=RESULT names one. Results of one policy
+            on other tasks make one row.
+        allow: Rank although this setting differs, such as protocol.horizon or environment.robot; starts: rank by the
+            episodes that all have.
+        alpha: Probability of a false difference among all pairs.
+        out: The page, or a folder for it.
+    """
+    from libero_eval.judging.board import make_board, render_board, write_board
+
+    entries = _single_groups([word for given in results for word in _results_in(given)], by_name=True)
+    found = make_board(entries, allow, alpha)
+    return Answer(render_board(found), asdict(found), write_board(found, entries, out))
+
+
+def _results_in(word: str) -> list[str]:
+    """Return the results that a word names: all files eval.json in a folder."""
+    name, path = _named(word)
+    if not Path(path).is_dir():
+        return [word]
+    files = sorted(Path(path).rglob("eval.json"))
+    if not files:
+        raise ConfigError(
+            f"{path} holds no evaluation: there is no eval.json in it; `libero eval` writes one"
+        )
+    return [f"{name}={file}" if name else str(file) for file in files]
+
+
 def export(
     results: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
     *,
-    format: Annotated[Literal["vla-eval", "lerobot", "csv", "latex", "parquet"], arg(name="as")],
+    format: Annotated[
+        Literal["vla-eval", "lerobot", "eval-results", "csv", "latex", "parquet"], arg(name="as")
+    ],
+    dataset: Annotated[str, Field(pattern=r"^[\w.-]+/[\w.-]+$")] | None = None,
+    source: Annotated[str, Field(pattern=r"^https?://\S+$")] | None = None,
     out: FilePath | None = None,
 ) -> None:
     """Write an evaluation as another tool's result file, or runs as a table, and print the files.
 
     Args:
         results: A file eval.json or its folder; for a table runs, folders of runs, or patterns.
-        format: vla-eval: SUITE_aggregate.json for each suite; lerobot: eval_info.json; csv, parquet: a row a run, with
-            metrics, costs and configuration; latex: a row a method, means over seeds with 95 % intervals.
+        format: vla-eval: SUITE_aggregate.json for each suite; lerobot: eval_info.json; eval-results:
+            .eval_results/SUITE.yaml, which the Hugging Face Hub shows on the model's page; csv, parquet: a row a run,
+            with metrics, costs and configuration; latex: a row a method, means over seeds with 95 % intervals.
+        dataset: With eval-results: the benchmark's data set on the Hub, ORG/NAME.
+        source: With eval-results: address of where the result is from, such as a repository with eval.json.
         out: Folder of the files (default: the evaluation's, or the working directory).
     """
     from libero_eval.evaluation_file import EvaluationResult
-    from libero_eval.exports import export_lerobot, export_vla_eval
+    from libero_eval.exports import export_eval_results, export_lerobot, export_vla_eval
 
+    for option, value in (("--dataset", dataset), ("--source", source)):
+        if value and format != "eval-results":
+            raise ConfigError(f"{option} is of --as eval-results, not of --as {format}")
+    if format == "eval-results" and dataset is None:
+        raise ConfigError("--as eval-results needs --dataset ORG/NAME: the benchmark's data set on the Hub")
     if format in ("csv", "latex", "parquet"):
         from lifelong.report.export import export_runs
 
@@ -125,8 +183,12 @@ def export(
     if len(results) > 1:
         raise ConfigError(f"--as {format} takes one evaluation, not {len(results)}")
     content, path = EvaluationResult.read(results[0]), Path(results[0])
-    write = {"vla-eval": export_vla_eval, "lerobot": export_lerobot}[format]
-    print(*write(content, out or (path if path.is_dir() else path.parent)), sep="\n")
+    folder = out or (path if path.is_dir() else path.parent)
+    if dataset is not None:
+        print(*export_eval_results(content, folder, dataset, source), sep="\n")
+    else:
+        write = {"vla-eval": export_vla_eval, "lerobot": export_lerobot}[format]
+        print(*write(content, folder), sep="\n")
 
 
 def _question(options: PowerOptions) -> "Question":
@@ -162,16 +224,24 @@ def _observed(words: Sequence[str]) -> tuple[float, float, float]:
     return first, second - first, counts.discordant / counts.pairs
 
 
-def _single_groups(words: Sequence[str]) -> "list[Group]":
+def _single_groups(words: Sequence[str], *, by_name: bool = False) -> "list[Group]":
+    """Return a group for each result: its label is the one that is given, or tells the paths apart.
+
+    Args:
+        words: Results, RESULT or NAME=RESULT.
+        by_name: Whether the name that its evaluation gave to the policy goes before the path.
+    """
     from libero_eval.evaluation_file import EvaluationResult
     from libero_eval.judging.comparability import Group
 
     split = [_named(w) for w in words]
     labels = _labels([path for _, path in split])
-    return [
-        Group(name or label, (EvaluationResult.read(path),), (path,))
-        for (name, path), label in zip(split, labels, strict=True)
-    ]
+    groups = []
+    for (name, path), label in zip(split, labels, strict=True):
+        result = EvaluationResult.read(path)
+        stated = result.evaluated.get("name") if by_name else None
+        groups.append(Group(str(name or stated or label), (result,), (path,)))
+    return groups
 
 
 def _group(words: Sequence[str]) -> "Group":

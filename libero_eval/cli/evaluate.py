@@ -3,11 +3,13 @@
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from libero_env.cli.answer import Answer
 from libero_env.cli.options import FilePath
+from libero_env.storage import read_json
 from libero_eval.requests import EvalRequest, RobustnessRequest
 
 if TYPE_CHECKING:
@@ -28,16 +30,17 @@ class EvalOptions(EvalRequest):
     status: FilePath | None = None
 
 
-def evaluate(options: EvalOptions) -> None:
-    """Evaluate a policy; print a row for each task, the mean, and the file of the results."""
+def evaluate(options: EvalOptions) -> Answer:
+    """Evaluate a policy; print a row for each task, the mean, the file of the results, and their page."""
     from libero_eval.evaluation_file import FILE_NAME
+    from libero_eval.judging.evaluation_page import write_evaluation_page
     from libero_eval.plan import evaluate as run
     from libero_eval.plan import plan_evaluation
     from libero_eval.work.progress import HEADER, describe_status, table_row, total_rows
 
     if options.status:
-        print(describe_status(options.status))
-        return
+        text, progress = describe_status(options.status)
+        return Answer(text, {**asdict(progress), "seconds_left": progress.seconds_left})
     evaluation = plan_evaluation(options)
     heads = [HEADER]
 
@@ -46,17 +49,25 @@ def evaluate(options: EvalOptions) -> None:
         heads.clear()
 
     result = run(options, evaluation, on_task=print_row, on_progress=_print_progress)
-    print(*total_rows(result.tasks), evaluation.out / FILE_NAME, sep="\n")
     for name in ("renderer", "instruction_set"):
         if isinstance(values := result.environment.get(name), list):
             listed = ", ".join(map(str, values))
             print(f"the processes differ in {name} ({listed}): bits may too", file=sys.stderr)
+    file = evaluation.out / FILE_NAME
+    data = {
+        "success": result.success,
+        "suites": result.suites,
+        "tasks": {task.task: task.success for task in result.tasks},
+        "result": file,
+    }
+    text = "\n".join([*total_rows(result.tasks), str(file)])
+    return Answer(text, data, write_evaluation_page(result, evaluation.out))
 
 
 def _print_progress(progress: object) -> None:
-    from tqdm import tqdm
+    from libero_env.parallel import tell_progress
 
-    tqdm.write(str(progress), file=sys.stderr)  # above the bar of a terminal
+    tell_progress(str(progress))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,7 +95,7 @@ class RobustnessOptions(RobustnessRequest):
     report: tuple[str, ...] = ()
 
 
-def robustness(options: RobustnessOptions) -> None:
+def robustness(options: RobustnessOptions) -> Answer:
     """Evaluate all conditions, print the table, and write the page."""
     from libero_eval.robustness.study import study_robustness
 
@@ -93,7 +104,7 @@ def robustness(options: RobustnessOptions) -> None:
         return _finish([_read(word) for word in options.report], folder)
     beside = [_read(word) for word in options.beside]  # before hours of work
     name, folder = study_robustness(options, _print_condition)
-    _finish([_read(f"{options.name or name}={folder}"), *beside], folder)
+    return _finish([_read(f"{options.name or name}={folder}"), *beside], folder)
 
 
 def _print_condition(condition: str, result: "EvaluationResult", done: int, count: int) -> None:
@@ -113,9 +124,9 @@ def _read(word: str) -> "Robustness":
     return read_study(Path(folder), name)
 
 
-def _finish(policies: "Sequence[Robustness]", folder: Path) -> None:
-    """Print the table of the first policy, and write the page."""
+def _finish(policies: "Sequence[Robustness]", folder: Path) -> Answer:
+    """Return the table of the first policy, and write the page."""
     from libero_eval.robustness.page import render, write_robustness
 
-    print(f"\n{render(policies[0])}\n")
-    print(write_robustness(policies, folder))
+    page = write_robustness(policies, folder)
+    return Answer(f"\n{render(policies[0])}\n", read_json(page.with_suffix(".json")), page)

@@ -2,10 +2,11 @@
 
 import asyncio
 import contextlib
+from dataclasses import asdict
 from typing import Annotated
 
+from libero_env.cli.answer import Answer
 from libero_env.cli.options import Device, Field, FilePath, Natural, Positional, Processes, Seed
-from libero_env.text import to_json
 from libero_eval.requests import DiagnoseRequest, RelearnRequest, SaliencyRequest
 
 
@@ -50,41 +51,40 @@ def serve(
         asyncio.run(server.run(ready))
 
 
-def relearn(request: RelearnRequest) -> None:
+def relearn(request: RelearnRequest) -> Answer:
     """Relearn tasks of a run; print the savings, and the page."""
     from libero_eval.relearning import relearn as measure
     from lifelong.pretraining import initial_policy
     from lifelong.report.page import write_report
-    from lifelong.results.relearning import read_relearning, savings_tables
+    from lifelong.results.relearning import by_measure, read_relearning, savings, savings_tables
 
     measure(request, initial_policy(request.run, weights=request.initial, allow=request.allow))
-    print(savings_tables(read_relearning(request.run)))
-    print(write_report([request.run]))
+    records = read_relearning(request.run)
+    rows = [{**asdict(row), "share": row.share} for part in by_measure(records) for row in savings(part)]
+    return Answer(savings_tables(records), rows, write_report([request.run]))
 
 
-def diagnose(request: DiagnoseRequest) -> None:
+def diagnose(request: DiagnoseRequest) -> Answer:
     """Tell why a run forgets, a line for each finding; print the page."""
     from libero_eval.diagnosis.measure import diagnose as measure
     from libero_eval.diagnosis.page import findings, write_diagnosis
 
     found = measure(request)
-    print("\n".join(findings(found)))
-    print(write_diagnosis(found, request.run))
+    return Answer("\n".join(findings(found)), asdict(found), write_diagnosis(found, request.run))
 
 
-def saliency(request: SaliencyRequest) -> None:
+def saliency(request: SaliencyRequest) -> Answer:
     """Draw the saliency of an episode of a run; print the sheet, and the page."""
     from libero_eval.saliency import draw_saliency
     from lifelong.report.page import write_report
 
     path = draw_saliency(request)
-    print(path)
-    print(write_report([path.parents[1]]))
+    return Answer(str(path), {"sheet": path}, write_report([path.parents[1]]))
 
 
 def check(
-    runs: Positional[Annotated[tuple[FilePath, ...], Field(min_length=1)]], *, json: bool = False
-) -> int:
+    runs: Positional[Annotated[tuple[FilePath, ...], Field(min_length=1)]],
+) -> Answer:
     """Read everything in run directories and change nothing.
 
     The configuration, every line of results.jsonl, every checkpoint with its checksum, results.json against the
@@ -92,20 +92,14 @@ def check(
 
     Args:
         runs: Run directories, or folders of them.
-        json: Print the findings as JSON.
     """
     from libero_eval.check import examine, find_runs
 
     examined = [examine(run) for run in dict.fromkeys(run for path in runs for run in find_runs(path))]
-    if json:
-        rows = [
-            {"path": e.path, "sound": e.sound, **e.counts, "findings": list(e.findings)} for e in examined
-        ]
-        print(to_json(rows), end="")
-    else:
-        for e in examined:
-            counts = ", ".join(f"{count} {name}" for name, count in e.counts.items())
-            print(f"{e.path}: {'sound' if e.sound else 'FAULTS'} ({counts})")
-            for finding in e.findings:
-                print(f"  {finding.level}: {finding.text}")
-    return int(not all(e.sound for e in examined))
+    rows = [{"path": e.path, "sound": e.sound, **e.counts, "findings": list(e.findings)} for e in examined]
+    lines = []
+    for e in examined:
+        counts = ", ".join(f"{count} {name}" for name, count in e.counts.items())
+        lines.append(f"{e.path}: {'sound' if e.sound else 'FAULTS'} ({counts})")
+        lines += [f"  {finding.level}: {finding.text}" for finding in e.findings]
+    return Answer("\n".join(lines), rows, status=int(not all(e.sound for e in examined)))

@@ -108,12 +108,12 @@ def match(first: Group, second: Group) -> Matched:
     Raises:
         ComparisonError: They have no start in common.
     """
-    tables = [[_outcomes(r) for r in group.results] for group in (first, second)]
+    tables = [[outcomes(r) for r in group.results] for group in (first, second)]
     shared = set.intersection(*(set(t) for group in tables for t in group))
     if not shared:
         raise ComparisonError(
             f"{first.label} and {second.label} were not evaluated in the same starts: "
-            f"{_starts(first)} against {_starts(second)}"
+            f"{starts_text(first)} against {starts_text(second)}"
         )
     order = [t.task for t in first.results[0].tasks if any(key[0] == t.task for key in shared)]
     keys = sorted(shared, key=lambda key: (order.index(key[0]), key[1]))
@@ -136,7 +136,8 @@ def same_policy(first: EvaluationResult, second: EvaluationResult) -> bool:
     return a == b
 
 
-def _outcomes(result: EvaluationResult) -> dict[tuple[str, int], bool]:
+def outcomes(result: EvaluationResult) -> dict[tuple[str, int], bool]:
+    """Return whether each episode succeeded, by task and initial state; those that do not count are left out."""
     return {
         (task.task, start): won
         for task in result.tasks
@@ -157,7 +158,8 @@ def _lesser_differences(first: EvaluationResult, second: EvaluationResult) -> di
     }
 
 
-def _starts(group: Group) -> str:
+def starts_text(group: Group) -> str:
+    """Return which tasks and initial states the first result of a group is of, for messages."""
     result = group.results[0]
     task = result.tasks[0]
     return f"{len(result.tasks)} tasks from {task.task}, starts {_ranges(task.init_states)}"

@@ -21,7 +21,14 @@ from libero_eval.judging.comparability import (
 )
 from libero_eval.judging.group_scores import GroupScores, group_scores
 from lifelong.errors import ConfigError, writing
-from lifelong.stats.episodes import ALPHA, Difference, SequentialTest, difference, sequential_test
+from lifelong.stats.episodes import (
+    ALPHA,
+    Difference,
+    SequentialTest,
+    difference,
+    score_interval,
+    sequential_test,
+)
 from lifelong.stats.intervals import Estimate, holm, wilson_interval
 from lifelong.stats.power import Question, shown_difference
 
@@ -81,6 +88,51 @@ class Rate:
     episodes: int
     errors: int
     success: Estimate
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Whether the second of two policies is worse than the first by more than a margin.
+
+    Attributes:
+        margin: Loss of success that is accepted.
+        loss: Success of the first minus that of the second, with Tango's interval at the level of the tests.
+        pairs: Number of starts that both were evaluated in.
+        enough: Number of pairs that would decide it if the policies went on to differ as they do; None where more pairs
+            decide nothing, as the loss is the margin.
+    """
+
+    margin: float
+    loss: Estimate
+    pairs: int
+    enough: int | None
+
+    @property
+    def verdict(self) -> str:
+        """`regression`: the whole interval is above the margin; `no regression`: none of it; otherwise `undecided`."""
+        if self.loss.low > self.margin:
+            return "regression"
+        return "no regression" if self.loss.high <= self.margin else "undecided"
+
+
+def gate(comparison: "Comparison", margin: float) -> Gate:
+    """Decide whether the second policy of a comparison is worse than the first by more than a margin.
+
+    Raises:
+        ConfigError: The comparison is not one of two policies with a result each.
+    """
+    labels = [rate.label for rate in comparison.rates]
+    found = [c for c in (*comparison.comparisons, *comparison.controls) if [c.first, c.second] == labels]
+    counts = found[0].total.difference.counts if found else None
+    if counts is None:
+        raise ConfigError(
+            "--gate judges two results: first the one to keep up with, then the one that is judged"
+        )
+    loss = score_interval(counts, 1 - comparison.alpha)
+    away = abs(loss.value - margin)
+    half = loss.high - loss.value if loss.value < margin else loss.value - loss.low
+    enough = math.ceil(counts.pairs * (half / away) ** 2) if away else None  # intervals narrow with the root
+    return Gate(margin, loss, counts.pairs, enough)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from libero_env.storage import atomic_write_text
 from libero_env.text import text_table
-from libero_eval.judging.comparison import Comparison, Contrast, Row
+from libero_eval.judging.comparison import Comparison, Contrast, Gate, Row
 from libero_eval.judging.group_scores import Profile
 from lifelong.errors import writing
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below, shorten
@@ -54,6 +54,21 @@ def verdict(c: Contrast, alpha: float) -> str:
             "in four of five cases."
         )
     return text
+
+
+def gate_text(g: Gate, comparison: Comparison) -> str:
+    """Return one sentence on what a gate decided, and why."""
+    (first, second), level = (rate.label for rate in comparison.rates), 100 * (1 - comparison.alpha)
+    low, high = (f"{100 * end:.1f}".replace("-", "−") for end in (g.loss.low, g.loss.high))
+    found = f"{second} loses {points(g.loss)} points against {first} in {g.pairs} starts"
+    margin = f"the margin of {100 * g.margin:g}"
+    told = {
+        "regression": f"all of the {level:g} % interval is above {margin}",
+        "no regression": f"the {level:g} % interval ends at {high}, not above {margin}",
+        "undecided": f"the {level:g} % interval from {low} to {high} contains {margin}",
+    }
+    more = f"; about {g.enough} starts that differ as often would decide" if g.enough else ""
+    return f"{g.verdict}: {found}, {told[g.verdict]}{more if g.verdict == 'undecided' else ''}"
 
 
 def sequential_text(c: Contrast) -> str:

@@ -82,8 +82,8 @@ def busy_seconds(spans: Iterable[tuple[float, float]]) -> float:
     return total
 
 
-def describe_status(path: Path) -> str:
-    """Return how far an evaluation is, who works on which unit, and what went wrong, as text.
+def describe_status(path: Path) -> tuple[str, Progress]:
+    """Return how far an evaluation is, as text with who works on which unit and what went wrong, and as numbers.
 
     Args:
         path: Folder of the evaluation.
@@ -97,9 +97,10 @@ def describe_status(path: Path) -> str:
     done = {name: read_unit(file)[0] for name, file in files.items() if file.exists()}
     held = {name: one for name, one in store.claims.held().items() if name in units}
     errors = {name: one for name, one in store.errors().items() if name in units}
+    progress = measure_progress(units, done, len(held), len(errors))
     lines = [
         f"policy    {', '.join(f'{k} {shorten(str(v))}' for k, v in plan['evaluated'].items())}",
-        f"progress  {measure_progress(units, done, len(held), len(errors))}",
+        f"progress  {progress}",
     ]
     for name, claim in sorted(held.items()):
         lines.append(f"running   {name} by {claim.holder}, seen {max(0.0, claim.silent):.0f} s ago")
@@ -109,7 +110,7 @@ def describe_status(path: Path) -> str:
         lines.append(f"result    {path / FILE_NAME}")
     elif not held:
         lines.append("stopped   no process works on it; the same command goes on")
-    return "\n".join(lines)
+    return "\n".join(lines), progress
 
 
 HEADER = f"{'task':<18} {'successes':>9} {'%':>6} {'95 %':>13} {'steps':>6}  instruction"

@@ -7,7 +7,7 @@ replaced: nothing is lost when a process is killed, and nothing can be counted t
     units/            results, one file for each unit
     claims/           which process works on which unit
     errors/           errors of units, with tracebacks
-    eval.json         the result, once all units are done
+    eval.json         the result, once all units are done; eval.html, its page
 """
 
 import hashlib
@@ -37,10 +37,11 @@ from lifelong.errors import ConfigError, LifelongError, writing
 from lifelong.results.provenance import utc_now
 
 PLAN_NAME = "evaluation.json"
+PAGE_NAME = "eval.html"
 PLAN_FORMAT = "libero-evaluation-plan/1"
 UNIT_FORMAT = "libero-evaluation-unit/1"
 AGAIN = "name another folder with --out, or repeat the evaluation with --again"
-PARTS = (PLAN_NAME, FILE_NAME, "units", "claims", "errors")
+PARTS = (PLAN_NAME, FILE_NAME, PAGE_NAME, "units", "claims", "errors")
 FOLDERS = ("units", "claims", "errors", "videos")
 MAX_BYTES = 64 << 20  # of a file in the folder
 MAX_ERROR = 20_000  # characters of a traceback that is kept

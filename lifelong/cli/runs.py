@@ -2,10 +2,13 @@
 
 import importlib.util
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from libero_env.cli.answer import Answer
 from libero_env.cli.options import Field, FilePath, Positional
+from libero_env.storage import read_json
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,20 +54,22 @@ def data_settings(words: Sequence[str]) -> "DataSettings":
     return build(compose_run(words)[0].data)
 
 
-def status(folders: Positional[tuple[FilePath, ...]] = (Path("runs"),)) -> None:
+def status(folders: Positional[tuple[FilePath, ...]] = (Path("runs"),)) -> Answer:
     """Print what runs, what failed, and what is left of each sweep.
 
     Args:
         folders: Folders of sweeps, or of runs, for all of their sweeps.
     """
-    from lifelong.sweeps import find_sweeps, read_sweep, status_lines
+    from lifelong.sweeps import Sweep, find_sweeps, read_sweep, status_lines
 
+    sweeps: list[Sweep] = []
     for folder in folders:
-        sweeps = find_sweeps(folder)
-        if not sweeps:
+        found = find_sweeps(folder)
+        if not found:
             raise ConfigError(f"{folder} holds no sweep; `libero train -m KEY=A,B` starts one")
-        for one in sweeps:
-            print(*status_lines(read_sweep(one)), sep="\n")
+        sweeps += map(read_sweep, found)
+    lines = [line for sweep in sweeps for line in status_lines(sweep)]
+    return Answer("\n".join(lines), [{**asdict(sweep), "missing": sweep.missing} for sweep in sweeps])
 
 
 def report(
@@ -75,7 +80,7 @@ def report(
     all_pairs: bool = False,
     margin: Annotated[float, Field(gt=0, lt=1)] = 0.05,
     other_worlds: bool = False,
-) -> None:
+) -> Answer:
     """Write a page about one run, or about several side by side; print which of several differ significantly.
 
     Args:
@@ -90,9 +95,9 @@ def report(
     from lifelong.report.page import comparison_text, shift_text, write_report
 
     page = write_report(run_dirs, out, Plan(reference, all_pairs, margin, other_worlds))
-    print(page)
-    for line in comparison_text(page) if len(run_dirs) > 1 else shift_text(run_dirs[0]):
-        print(line)
+    lines = comparison_text(page) if len(run_dirs) > 1 else shift_text(run_dirs[0])
+    file = page.parent / "comparison.json" if len(run_dirs) > 1 else run_dirs[0] / "results.json"
+    return Answer("\n".join(lines), read_json(file) if file.is_file() else None, page)
 
 
 def examine() -> "list[Finding]":

@@ -165,8 +165,8 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "atoms": atom_rows(run.results.subgoals(), labels),
         "most_forgotten": most_forgotten(run.results.subgoals().atoms),
         "costs": task_costs(run, labels),
-        "media": _media(run.path / "videos"),
-        "saliency": _media(run.path / "saliency"),
+        "media": media(run.path / "videos"),
+        "saliency": media(run.path / "saliency"),
         "config_text": run.config_text,
         "versions": {**record.versions, **{k.replace("_", " "): v for k, v in record.conditions.items()}},
         "run_dir": run.path.resolve().name,
@@ -373,7 +373,7 @@ def _task_rows(run: Run, rates: np.ndarray) -> list[dict[str, Any]]:
     return rows
 
 
-def _media(folder: Path) -> dict[str, Any]:
+def media(folder: Path, pattern: str = "*") -> dict[str, Any]:
     """Return the images and videos of a folder as data URLs, with captions from text files of the same stem."""
     items: list[dict[str, Any]] = []
     left_out: list[str] = []
@@ -382,7 +382,7 @@ def _media(folder: Path) -> dict[str, Any]:
         require_own_folders(folder.parent, folder.name)
     except InvalidInputError as error:
         return {"items": items, "left_out": [str(error)]}
-    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+    for path in sorted(folder.glob(pattern)) if folder.is_dir() else []:
         kind = MEDIA_TYPES.get(path.suffix.lower())
         if kind is None:
             continue

@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from libero_env.errors import is_quiet
 from lifelong.context import RunContext
 from lifelong.data.windows import TaskWindows
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
@@ -103,7 +104,7 @@ class TaskSequence:
         title = f"Task {task + 1}/{len(context.tasks)}: {context.instructions[task]}"
         if len(stage) > 1:
             title = f"Tasks {stage[0] + 1}-{task + 1}/{len(context.tasks)}: together"
-        say(self.context, f"{title} ({len(dataset)} windows)")
+        self._tell(f"{title} ({len(dataset)} windows)")
         context.ranks.barrier()  # all have read the saved progress
         costs.reset_peak(context.device)
         if saved is None:
@@ -171,7 +172,7 @@ class TaskSequence:
             return
         success = mean_rate([self.evaluator.evaluate("curve", task, member, epoch) for member in phase.stage])
         loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
-        say(self.context, f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
+        self._tell(f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
         if phase.selects_best and phase.best_epoch(self.log.read(), end.epoch) == end.epoch:
             self.recovery.save_best(phase, end)
 
@@ -216,7 +217,11 @@ class TaskSequence:
         told = f"success {new:.0%} on it, {mean:.0%} over {len(row)} so far" if row else "not measured"
         if under and self.context.shift:
             told += f", {mean_rate(under):.0%} over {len(under)} under {self.context.shift.text}"
-        say(self.context, f"  learned: {told}{self._eta(task)}")
+        self._tell(f"  learned: {told}{self._eta(task)}")
+
+    def _tell(self, progress: str) -> None:
+        if not is_quiet():
+            say(self.context, progress)
 
     def _eta(self, task: int) -> str:
         """Return an estimate of the remaining time, from the time that training and evaluation took so far."""

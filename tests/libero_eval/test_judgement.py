@@ -1,17 +1,19 @@
 """Comparison of evaluated policies: what may be compared, what is counted, texts, pages, exports and commands."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from libero_env.cli.main import main  # noqa: E402
-from libero_eval.exports import export_lerobot, export_vla_eval  # noqa: E402
+from libero_eval.exports import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
 from libero_eval.judging.comparability import Group, check_comparable, match, settings  # noqa: E402
-from libero_eval.judging.comparison import Comparison, compare_groups, write_comparison  # noqa: E402
+from libero_eval.judging.comparison import Comparison, compare_groups, gate, write_comparison  # noqa: E402
 from libero_eval.judging.group_scores import group_scores  # noqa: E402
-from libero_eval.judging.page import render  # noqa: E402
+from libero_eval.judging.page import gate_text, render  # noqa: E402
 from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
 from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
 
@@ -291,6 +293,31 @@ def test_exports_to_lerobot(tmp_path):
     assert values["overall"]["pc_success"] == pytest.approx(100 / 3) and values["overall"]["eval_ep_s"] == 10
 
 
+def test_exports_to_model_cards_are_entries_as_the_hub_documents_them(tmp_path):
+    result = result_of(
+        task_result("libero_goal/3", [1, 0, 1]),
+        task_result("libero_object/0", [1, 1, 1, 1]),
+        environment=ENVIRONMENT | {"models_digest": "fa0e"},
+    )
+    paths = export_eval_results(result, tmp_path, "org/libero", "https://example.org/eval.json")
+    assert [str(p.relative_to(tmp_path)) for p in paths] == [
+        ".eval_results/libero_goal.yaml", ".eval_results/libero_object.yaml"
+    ]  # fmt: skip
+    (entry,) = yaml.safe_load(paths[0].read_text())
+    notes = entry.pop("notes")
+    assert entry == {
+        "dataset": {"id": "org/libero", "task_id": "libero_goal"},
+        "value": 66.67,
+        "date": "2026-01-01T00:00:00+00:00",
+        "source": {"url": "https://example.org/eval.json", "name": "libero-lifelong"},
+        "evaluation_framework": "libero-lifelong",
+    }
+    assert "over 3 episodes of 1 tasks, 95 % interval 20.8 to 93.9" in notes
+    assert "protocol openpi, models builtin fa0e" in notes
+    bare = export_eval_results(replace(result, times={}), tmp_path, "org/libero")
+    assert not {"date", "source"} & yaml.safe_load(bare[1].read_text())[0].keys()
+
+
 def written(folder: Path, **results) -> None:
     for name, result in results.items():
         result.write(folder / name / "eval.json")
@@ -311,16 +338,76 @@ def test_commands(tmp_path, monkeypatch, capsys):
     assert main(["power", "--episodes", "500"]) == 0 and "worse by" in capsys.readouterr().out
     assert main(["results", "export", "a", "--as", "lerobot", "--out", "x"]) == 0
     assert capsys.readouterr().out.strip() == "x/eval_info.json"
+    assert main(["results", "export", "a", "--as", "eval-results", "--dataset", "org/libero"]) == 0
+    assert capsys.readouterr().out.strip() == "a/.eval_results/libero_goal.yaml"
+
+
+def lost(count: int, episodes: int = 100):
+    """A result with so many failures, and one that never fails in the same starts."""
+    wins = np.arange(episodes) >= count
+    return result_of(task_result("libero_goal/0", wins), policy="other:make"), result_of(
+        task_result("libero_goal/0", np.ones(episodes, bool))
+    )
+
+
+@pytest.mark.parametrize(("failures", "margin", "verdict", "status"), [
+    (20, 0.05, "regression", 1),
+    (0, 0.05, "no regression", 0),
+    (5, 0.05, "undecided", 3),
+    (8, 0.05, "undecided", 3),
+])  # fmt: skip
+def test_a_gate_says_what_it_decided_and_why(
+    failures, margin, verdict, status, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    new, old = lost(failures)
+    written(tmp_path, old=old, new=new)
+    assert main(["compare", "old", "new", "--gate", str(margin)]) == status
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith(f"{verdict}: new loses +{failures}.0 [") and "in 100 starts" in line
+    assert main(["compare", "old", "new", "--gate", str(margin), "--json"]) == status
+    said = json.loads(capsys.readouterr().out)["gate"]
+    assert said["verdict"] == verdict and said["loss"]["value"] == pytest.approx(failures / 100)
+    assert ("would decide" in line) == (verdict == "undecided" and failures != 5), (
+        "with a loss that is the margin, more episodes do not help"
+    )
+    # the other way round, nothing is lost
+    assert main(["compare", "new", "old", "--gate", str(margin), "--quiet"]) == 0
+
+
+def test_a_gate_decides_with_as_many_pairs_as_it_asks_for():
+    def judged(count: int, episodes: int):
+        new, old = lost(count, episodes)
+        return gate(compare_groups([side("old", old), side("new", new)]), 0.05)
+
+    asked = judged(8, 100).enough
+    assert judged(round(0.08 * asked * 1.1), round(asked * 1.1)).verdict == "regression"
+    assert judged(round(0.08 * asked / 2), asked // 2).verdict == "undecided"
+
+
+def test_a_gate_judges_a_policy_against_its_own_earlier_result():
+    """As after a change of the code: one policy twice is otherwise a control arm."""
+    twins = [side("then", drawn_result(0.9, 1)), side("now", drawn_result(0.9, 1))]
+    comparison = compare_groups(twins)
+    assert not comparison.comparisons and gate(comparison, 0.01).verdict == "no regression"
+    assert "+0.0 [−0.8, 0.8] points" in gate_text(gate(comparison, 0.01), comparison)
+    three = compare_groups([*twins, side("b", drawn_result(0.9, 2, policy="b:b"))])
+    with pytest.raises(ConfigError, match="--gate judges two results"):
+        gate(three, 0.01)
 
 
 @pytest.mark.parametrize(("words", "message"), [
     (["compare", "a"], "needs two results"),
+    (["compare", "a", "b", "--open"], "--open shows a page, and none was written"),
     (["compare", "a", "nothing"], "nothing does not exist"),
     (["compare", "a", "old"], "the format is libero-evaluation/99"),
     (["compare", "a", "nan"], "successes.3 is nan; expected true or false"),
     (["compare", "--group", "a"], "--group NAME RESULT"),
     (["power", "--base", "0.9", "--difference", "0.2"], "above 1"),
     (["power", "a"], "takes two results, not 1"),
+    (["results", "export", "a", "--as", "eval-results"], "needs --dataset ORG/NAME"),
+    (["results", "export", "a", "--as", "lerobot", "--dataset", "a/b"], "--dataset is of --as eval-results"),
+    (["results", "export", "a", "--as", "vla-eval", "--out", "/dev/full"], "_aggregate.json: the result"),
     (["power", "--difference", "0.05", "--discordance", "0.01"], "is impossible"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(words, message, tmp_path, monkeypatch, capsys):

@@ -283,7 +283,7 @@ def test_units_that_fail_are_not_counted_and_the_others_are_kept(tmp_path):
     assert not (tmp_path / "eval.json").exists()
     entry = json.loads((tmp_path / "errors" / "libero_goal_01_starts_03_04.json").read_text())
     assert "Traceback" in entry["errors"][0]["traceback"]
-    assert "error     libero_goal_01_starts_03_04, 1 attempts: RuntimeError" in describe_status(tmp_path)
+    assert "error     libero_goal_01_starts_03_04, 1 attempts: RuntimeError" in describe_status(tmp_path)[0]
     policy = Still()
     assert len(evaluate(tmp_path, policy, **TWO).tasks) == 2
     assert set(policy.instructions) == {TASKS[1].language}, "the first task was kept"
@@ -456,7 +456,7 @@ def test_hostile_files_in_the_folder_end_in_one_line_or_count_for_nothing(tmp_pa
             (tmp_path / "units" / f"{unit}.json").unlink(missing_ok=True)
             if content != "device":  # /dev/zero was not touched for a lease, or was
                 assert evaluate(tmp_path, **TWO, lease=60)
-            assert "4 of 4 units" in describe_status(tmp_path) or content == "device"
+            assert "4 of 4 units" in describe_status(tmp_path)[0] or content == "device"
             continue
         for ask in (lambda: evaluate(tmp_path, **TWO), lambda: describe_status(tmp_path)):
             with pytest.raises(LifelongError, match="remove it|--again") as caught:
@@ -552,9 +552,9 @@ def test_the_status_says_who_holds_what_and_what_is_left(tmp_path):
     plan.store.join(plan.units)
     with plan.pool() as pool:
         plan.store.publish(plan.units[0], plan.evaluate(plan.units[0], pool))
-    assert "stopped" in describe_status(tmp_path)
+    assert "stopped" in describe_status(tmp_path)[0]
     plan.store.claims.take(plan.units[1].name)
-    text = describe_status(tmp_path)
+    text, progress = describe_status(tmp_path)
     assert "1 of 4 units, 2 of 8 episodes" in text and "policy    policy still" in text
     assert f"running   {plan.units[1].name} by " in text and f":{os.getpid()}, seen 0 s ago" in text
 

@@ -2,6 +2,7 @@
 
 import importlib.util
 import io
+import itertools
 import os
 import sys
 from pathlib import Path
@@ -246,6 +247,17 @@ def test_progress_is_lines_where_there_is_no_terminal(monkeypatch):
             bar.update(1)
             bar.update(1)
         assert stream.getvalue().endswith(expected) if "%" not in expected else expected in stream.getvalue()
+
+
+def test_quiet_shows_no_progress(monkeypatch):
+    monkeypatch.setattr(parallel, "LINE_SECONDS", 0.0)
+    monkeypatch.setenv("LIBERO_QUIET", "1")
+    for stream, progress in itertools.product((io.StringIO(), Terminal()), (None, True)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        parallel.tell_progress("recording")
+        with parallel.progress_bar(total=1, progress=progress, file=stream) as bar:
+            bar.update(1)
+        assert stream.getvalue() == ""
 
 
 def test_short_work_prints_no_lines(monkeypatch):

@@ -82,8 +82,12 @@ def test_acting_leaves_the_policy_as_it_was(make):
     assert set(vars(policy)) == names and not any(m._forward_hooks for m in policy.modules())
 
 
-def test_the_records_are_complete(tmp_path):
+@pytest.mark.parametrize("quiet", ["0", "1"])
+def test_the_records_are_complete(quiet, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("LIBERO_QUIET", quiet)
     sequence(p := run_context(tmp_path, "packnet")).run()
+    shown = capsys.readouterr()
+    assert (shown.out == "") == (quiet == "1") and not shown.err
     results = p.directory.log.read()
     assert len(results.of(TaskEndRecord)) == TASKS
     evals = results.of(EvalRecord)

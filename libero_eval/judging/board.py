@@ -1,0 +1,237 @@
+"""A leaderboard of evaluated policies: success with intervals, and tiers of what paired tests do not tell apart."""
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from libero_env.storage import atomic_write_text
+from libero_env.text import text_table
+from libero_eval.evaluation_file import again
+from libero_eval.judging.comparability import Group, check_comparable, outcomes, starts_text
+from libero_eval.judging.evaluation_page import facts
+from libero_eval.judging.page import interval_text, p_text
+from lifelong.errors import ComparisonError, writing
+from lifelong.report.tables import page_template, percent
+from lifelong.stats.episodes import ALPHA, Difference, Pairs, difference
+from lifelong.stats.intervals import Estimate, holm, wilson_interval
+
+STARTS = "starts"  # what `allow` names where policies ran other episodes
+
+
+@dataclass(frozen=True)
+class Standing:
+    """A policy on the board.
+
+    Attributes:
+        label: Its name.
+        tier: Number of its tier, from 1.
+        success: Success over the episodes that all policies ran, with Wilson's interval.
+        suites: Success over all of its episodes of each suite.
+        episodes: Number of its episodes.
+        finished: Day on which it was evaluated; empty where that is not recorded.
+        paths: Files of its results.
+    """
+
+    label: str
+    tier: int
+    success: Estimate
+    suites: dict[str, Estimate]
+    episodes: int
+    finished: str
+    paths: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two policies in the episodes that all ran, first minus second; `adjusted` is the p-value after Holm."""
+
+    first: str
+    second: str
+    difference: Difference
+    adjusted: float
+
+
+@dataclass(frozen=True)
+class Board:
+    """Policies, best first.
+
+    Attributes:
+        rows: The policies.
+        suites: Names of the suites.
+        shared: Number of episodes that all of them ran.
+        pairs: Every two of them.
+        notes: What differs between the results and was allowed, or matters little.
+        alpha: Probability of a false difference among all pairs.
+    """
+
+    rows: tuple[Standing, ...]
+    suites: tuple[str, ...]
+    shared: int
+    pairs: tuple[Pair, ...]
+    notes: tuple[str, ...]
+    alpha: float
+
+
+def make_board(entries: Sequence[Group], allow: Iterable[str] = (), alpha: float = ALPHA) -> Board:
+    """Rank policies. Results of one policy on other tasks make one row.
+
+    Args:
+        entries: Results, each a group of its own.
+        allow: Settings that may differ, see `check_comparable`; `starts`: the episodes, of which the shared ones count.
+        alpha: Probability of a false difference among all pairs.
+
+    Raises:
+        ComparisonError: The results were made differently, or have no episode in common; the message names both values.
+    """
+    notes = check_comparable(entries, allow)
+    groups = _joined(entries)
+    notes += _check_starts(groups, STARTS in allow)
+    tables = [outcomes(group.results[0]) for group in groups]
+    keys = sorted(set.intersection(*map(set, tables)))
+    if not keys:
+        raise ComparisonError(f"no episode is common to {', '.join(group.label for group in groups)}")
+    won = np.array([[table[key] for key in keys] for table in tables], dtype=bool)
+    order = sorted(range(len(groups)), key=lambda i: (-won[i].mean(), groups[i].label))
+    groups, won = [groups[i] for i in order], won[order]
+    numbers = {task: number for number, task in enumerate(dict.fromkeys(task for task, _ in keys))}
+    tasks, starts = np.array([numbers[task] for task, _ in keys]), np.array([start for _, start in keys])
+    rivals = list(combinations(range(len(groups)), 2))
+    found = [difference(Pairs(tasks, starts, won[[a]].T, won[[b]].T), draws=0) for a, b in rivals]
+    adjusted = dict(zip(rivals, holm([one.p_value for one in found]), strict=True))
+    tiers = _tiers(len(groups), {pair for pair, p in adjusted.items() if p <= alpha})
+    return Board(
+        rows=tuple(_standing(group, tier, row) for group, tier, row in zip(groups, tiers, won, strict=True)),
+        suites=tuple(dict.fromkeys(suite for group in groups for suite in group.results[0].suites)),
+        shared=len(keys),
+        pairs=tuple(
+            Pair(groups[a].label, groups[b].label, one, adjusted[a, b])
+            for (a, b), one in zip(rivals, found, strict=True)
+        ),
+        notes=tuple(notes),
+        alpha=alpha,
+    )
+
+
+def _joined(entries: Sequence[Group]) -> list[Group]:
+    """Return a group for each policy: results of the same one on other tasks are one."""
+    groups: list[Group] = []
+    for entry in entries:
+        (result,) = entry.results
+        names = {task.task for task in result.tasks}
+        for place, group in enumerate(groups):
+            (first,) = group.results
+            alike = first.evaluated == result.evaluated and first.protocol == result.protocol
+            if alike and names.isdisjoint(task.task for task in first.tasks):
+                whole = replace(first, tasks=(*first.tasks, *result.tasks))
+                groups[place] = Group(group.label, (whole,), (*group.paths, *entry.paths))
+                break
+        else:
+            groups.append(entry)
+    labels = [group.label for group in groups]
+    return [
+        replace(group, label=f"{group.label} ({group.paths[0]})") if labels.count(group.label) > 1 else group
+        for group in groups
+    ]
+
+
+def _check_starts(groups: Sequence[Group], allowed: bool) -> list[str]:
+    """Return a note for each policy that ran other episodes than the first one.
+
+    Raises:
+        ComparisonError: One did, and that is not allowed.
+    """
+    ran = [
+        {(task.task, start) for task in group.results[0].tasks for start in task.starts} for group in groups
+    ]
+    lines = [
+        f"{STARTS}: {starts_text(groups[0])} in {groups[0].label}, {starts_text(group)} in {group.label}"
+        for group, episodes in zip(groups, ran, strict=True)
+        if episodes != ran[0]
+    ]
+    if lines and not allowed:
+        listed = "\n  ".join(lines)
+        raise ComparisonError(
+            f"these results are not of the same episodes:\n  {listed}\n"
+            f"evaluate the same ones, or rank by those that all have with --allow {STARTS}"
+        )
+    return [f"{line}; allowed" for line in lines]
+
+
+def _tiers(count: int, apart: set[tuple[int, int]]) -> list[int]:
+    """Return the tier of each policy, best first: one that is worse than any of the tier above begins the next.
+
+    Args:
+        count: Number of policies.
+        apart: Pairs of which the first is shown to be better.
+    """
+    tiers, begin = list[int](), 0
+    for place in range(count):
+        if any((above, place) in apart for above in range(begin, place)):
+            begin = place
+        tiers.append((tiers[-1] + (begin == place)) if tiers else 1)
+    return tiers
+
+
+def _standing(group: Group, tier: int, won: NDArray[np.bool_]) -> Standing:
+    (result,) = group.results
+    wins: dict[str, list[bool]] = {}
+    for task in result.tasks:
+        wins.setdefault(task.suite, []).extend(task.successes)
+    return Standing(
+        label=group.label,
+        tier=tier,
+        success=_rate(won),
+        suites={suite: _rate(np.array(successes)) for suite, successes in wins.items()},
+        episodes=sum(map(len, wins.values())),
+        finished=str(result.times.get("finished", ""))[:10],
+        paths=group.paths,
+    )
+
+
+def _rate(won: NDArray[np.bool_]) -> Estimate:
+    low, high = wilson_interval(won.sum(), len(won))
+    return Estimate(float(won.mean()), float(low), float(high))
+
+
+def render_board(board: Board) -> str:
+    """Return the board as plain text for a terminal."""
+    several = board.suites if len(board.suites) > 1 else ()
+    rows = [["tier", "policy", *(["all"] if several else board.suites), "95 %", *several, "episodes"]]
+    for row in board.rows:
+        cells = [percent(row.suites[suite].value) if suite in row.suites else "–" for suite in several]
+        success = [percent(row.success.value), interval_text(row.success)]
+        rows.append([str(row.tier), row.label, *success, *cells, str(row.episodes)])
+    return "\n".join([text_table(rows, left=2), *(f"note: {note}" for note in board.notes)])
+
+
+def write_board(board: Board, entries: Sequence[Group], path: Path) -> Path:
+    """Write the page; it needs no other file and no network.
+
+    Args:
+        board: The board.
+        entries: The results that it was made of.
+        path: File of the page, or a folder for `board.html`.
+
+    Raises:
+        ResultsError: The page cannot be written.
+    """
+    path = path / "board.html" if path.is_dir() or not path.suffix else path
+    results = {entry.paths[0]: entry.results[0] for entry in entries}
+    page = page_template("board.html", "libero_eval.judging").render(
+        title=f"{len(board.rows)} policies on {', '.join(board.suites)}",
+        facts=[fact for fact in facts(entries[0].results[0]) if fact[0] not in ("episodes", "finished")],
+        notes=board.notes,
+        board=board,
+        commands=[[again(results[file], os.path.relpath(file)) for file in row.paths] for row in board.rows],
+        alpha=board.alpha,
+        interval_text=interval_text,
+        p_text=p_text,
+    )
+    with writing(path, "the page"):
+        atomic_write_text(path, page)
+    return path

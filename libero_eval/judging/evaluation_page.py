@@ -1,0 +1,71 @@
+"""The page of one evaluation: success on each task with its interval, and the recorded episodes that failed."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from libero_env.storage import atomic_write_text
+from libero_env.text import flatten
+from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, again, overall
+from libero_eval.judging.page import interval_text
+from libero_eval.work.store import PAGE_NAME
+from lifelong.errors import writing
+from lifelong.report.page import media
+from lifelong.report.tables import page_template
+
+
+def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
+    """Write the page beside the result's file; it needs no other file and no network.
+
+    Raises:
+        ResultsError: The page cannot be written.
+    """
+    suites = {name: [task for task in result.tasks if task.suite == name] for name in result.suites}
+    means = {"mean over tasks": result.tasks, **(suites if len(suites) > 1 else {})}
+    page = page_template("evaluation.html", "libero_eval.judging").render(
+        title=f"{name_of(result)} on {', '.join(suites)}",
+        facts=facts(result),
+        notes=[f"{task.task}: {task.error_note}" for task in result.tasks if task.error_note],
+        means=[_row(name, tasks) for name, tasks in means.items()],
+        tasks=[_row(task.task, [task], task.instruction) for task in result.tasks],
+        media=media(folder / "videos", "*_failure.*"),
+        command=again(result, os.path.relpath(folder / FILE_NAME)),
+        versions={**flatten(result.versions), **flatten(result.environment)},
+        interval_text=interval_text,
+    )
+    with writing(folder, "the page"):
+        atomic_write_text(folder / PAGE_NAME, page)
+    return folder / PAGE_NAME
+
+
+def name_of(result: EvaluationResult) -> str:
+    """Return the name of the policy: what its user called it, or the word that it was evaluated by."""
+    return str(result.evaluated.get("name") or result.policy or "policy")
+
+
+def facts(result: EvaluationResult) -> list[tuple[str, str]]:
+    """Return what a reader needs to know of how the episodes were run, by name."""
+    protocol, environment = result.protocol, result.environment
+    models = (environment.get("models"), environment.get("models_digest"))
+    found = {
+        "protocol": " ".join(str(protocol[key]) for key in ("name", "digest") if key in protocol),
+        "models": " ".join(str(value) for value in models if value),
+        "robot": environment.get("robot"),
+        "MuJoCo": result.versions.get("mujoco"),
+        "episodes": sum(len(task.init_states) for task in result.tasks),
+        "finished": str(result.times.get("finished", "")).replace("T", " ").replace("+00:00", " UTC"),
+    }
+    return [(name, str(value)) for name, value in found.items() if value]
+
+
+def _row(name: str, tasks: Sequence[TaskResult], text: str = "") -> dict[str, Any]:
+    errors = [error for task in tasks for error in task.errors if error]
+    return {
+        "name": name,
+        "text": text,
+        "wins": sum(sum(task.successes) for task in tasks),
+        "episodes": sum(len(task.successes) for task in tasks),
+        "success": overall(tasks),
+        "notes": [f"{len(errors)} ended with an error, such as: {errors[0]}"] if errors and text else [],
+    }

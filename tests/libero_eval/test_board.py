@@ -1,0 +1,164 @@
+"""A leaderboard of evaluations, and the page of one."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from libero_env.cli.main import main
+from libero_eval.judging.board import make_board, write_board
+from libero_eval.judging.comparability import Group
+from libero_eval.judging.evaluation_page import write_evaluation_page
+from lifelong.errors import ComparisonError
+from lifelong.stats.intervals import wilson_interval
+from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result
+
+
+def entry(label: str, result) -> Group:
+    return Group(label, (result,), (f"{label}/eval.json",))
+
+
+def won(label: str, successes, task: str = "libero_goal/0", **changes) -> Group:
+    return entry(label, result_of(task_result(task, successes), policy=f"{label}:make", **changes))
+
+
+def first(count: int, of: int = 100) -> np.ndarray:
+    return np.arange(of) < count
+
+
+def test_tiers_are_what_paired_tests_tell_apart():
+    """97 against 100 of the same starts is no evidence; the same rates of 80 and 100 are."""
+    board = make_board([won("b", first(97)), won("d", first(50)), won("a", first(100)), won("c", first(80))])
+    assert [(row.label, row.tier) for row in board.rows] == [("a", 1), ("b", 1), ("c", 2), ("d", 3)]
+    low, high = map(float, wilson_interval(97, 100))
+    assert (board.rows[1].success.low, board.rows[1].success.high) == (low, high)
+    smallest = min(board.pairs, key=lambda pair: pair.difference.p_value)
+    assert len(board.pairs) == 6 and smallest.adjusted == pytest.approx(6 * smallest.difference.p_value)
+
+
+def test_the_order_of_the_files_changes_nothing():
+    entries = [won("a", first(60)), won("b", first(60)), won("c", first(20))]
+    assert make_board(entries).rows == make_board(entries[::-1]).rows
+
+
+def test_results_of_one_policy_on_other_suites_are_a_row():
+    parts = [
+        won("a", first(50), "libero_goal/0"),
+        entry("a2", result_of(task_result("libero_object/0", first(100)), policy="a:make")),
+        entry("b", drawn_result(0.5, 1, suites=("libero_goal", "libero_object"), tasks=1, policy="b:make")),
+    ]
+    board = make_board(parts, ["starts", "tasks"])
+    (row,) = [row for row in board.rows if row.label == "a"]
+    assert row.episodes == 200 and row.paths == ("a/eval.json", "a2/eval.json")
+    assert {name: e.value for name, e in row.suites.items()} == {"libero_goal": 0.5, "libero_object": 1.0}
+    assert board.shared == 100 and row.success.value == pytest.approx(1.0), "the first 50 starts of each"
+
+
+MODELS = [{"environment": ENVIRONMENT | {"models_digest": digest}} for digest in ("11", "22")]
+
+
+@pytest.mark.parametrize(("changes", "allow", "named"), [
+    ({"protocol": PROTOCOL | {"settle_steps": 5}}, "protocol", "protocol.settle_steps: 10 in a, 5 in b"),
+    ({"protocol": PROTOCOL | {"horizon": 600}}, "protocol.horizon", "protocol.horizon: not recorded in a, 600 in b"),
+    (MODELS[1], "environment.models_digest", "environment.models_digest: 11 in a, 22 in b"),
+])  # fmt: skip
+def test_results_made_differently_are_refused_by_name(changes, allow, named):
+    entries = [won("a", first(50), **MODELS[0]), won("b", first(9), **(MODELS[0] | changes))]
+    with pytest.raises(ComparisonError) as error:
+        make_board(entries)
+    assert named in str(error.value) and f"--allow {allow}" in str(error.value)
+    assert f"{named}; allowed" in make_board(entries, [allow]).notes
+
+
+def test_other_episodes_are_refused_by_name():
+    a, fewer = won("a", first(50)), won("b", first(9, 50))
+    with pytest.raises(
+        ComparisonError, match="libero_goal/0, starts 0–99 in a, .*starts 0–49 in b\\n.*--allow starts"
+    ):
+        make_board([a, fewer])
+    board = make_board([a, fewer], ["starts"])
+    assert board.shared == 50 and board.rows[0].success.value == 1.0 and "; allowed" in board.notes[0]
+    with pytest.raises(ComparisonError, match="no episode is common to a, b"):
+        make_board([a, won("b", first(9), "libero_goal/1")], ["starts"])
+
+
+def test_a_start_that_a_simulation_error_ended_is_left_out_for_all():
+    lost = ((0, "the solver diverged"),)
+    whole, part = (
+        won("a", first(2, 4)),
+        task_result("libero_goal/0", [1, 0, 0], starts=(1, 2, 3), simulation_errors=lost),
+    )
+    board = make_board([whole, entry("b", result_of(part, policy="b:make"))])
+    assert board.shared == 3 and {row.episodes for row in board.rows} == {3, 4}
+
+
+def test_the_page_shows_rows_intervals_and_commands(tmp_path, monkeypatch, tab):
+    monkeypatch.chdir(tmp_path)
+    entries = [won("a", first(100)), won("<b>", first(20))]
+    page = write_board(make_board(entries), entries, tmp_path / "new")
+    assert page == tmp_path / "new" / "board.html" and tab.faults_on_a_phone(page) == []
+    text = page.read_text()
+    assert "libero eval a/eval.json --allow a<" in text and "&lt;b&gt;" in text and "<b></td>" not in text
+    assert "[96.3, 100.0]" in text and 'class="next"' in text and "http" not in text
+    assert "prefers-color-scheme: dark" in text and 'data-name="libero_goal"' in text
+
+
+@pytest.fixture
+def there(tmp_path, monkeypatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    won("good", first(90)).results[0].write("eval/good/eval.json")
+    won("bad", first(40)).results[0].write("eval/bad/eval.json")
+    return tmp_path
+
+
+def test_the_command(there, capsys, monkeypatch):
+    shown = []
+    monkeypatch.setattr("webbrowser.open", lambda address: shown.append(address) or True)
+    assert main(["board", "eval", "--open"]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[1].split()[:3] == ["1", "good", "90.0"] and out[2].split()[:3] == ["2", "bad", "40.0"]
+    assert out[-1] == "board.html" and shown == [(there / "board.html").as_uri()]
+    assert main(["board", "first=eval/bad", "eval/good/eval.json", "--json", "--out", "x.html"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert [(row["label"], row["tier"]) for row in rows] == [("good", 1), ("first", 2)]
+    assert Path("x.html").is_file()
+
+
+def test_without_a_browser_a_note_says_where_the_page_is(there, capsys, monkeypatch):
+    monkeypatch.setattr("webbrowser.open", lambda address: False)
+    assert main(["board", "eval", "--open"]) == 0
+    assert capsys.readouterr().err == "note: no browser could be started; the page is board.html\n"
+
+
+def test_bad_input_is_one_line_and_writes_nothing(there, capsys):
+    Path("empty").mkdir()
+    Path("eval/cut").mkdir()
+    Path("eval/cut/eval.json").write_text(Path("eval/bad/eval.json").read_text()[:500])
+    for words, message in (
+        (["board", "empty"], "empty holds no evaluation: there is no eval.json in it"),
+        (["board", "eval"], "eval/cut/eval.json"),
+        (["board", "nowhere"], "nowhere does not exist"),
+        (["board", "eval/bad", "eval/good", "--out", "/dev/full/page.html"], "the page cannot be written"),
+    ):
+        assert main(words) == 2
+        said = capsys.readouterr()
+        assert message in said.err and said.err.count("\n") == 1 and not said.out
+    assert sorted(path.name for path in there.iterdir()) == ["empty", "eval"]
+
+
+def test_the_page_of_an_evaluation_shows_its_failures(tmp_path, tab):
+    videos = tmp_path / "videos"
+    videos.mkdir()
+    for name in ("libero_goal_00_start_01_failure", "libero_goal_00_start_00_success"):
+        (videos / f"{name}.webp").write_bytes(name.encode())
+    errors = (None, "ServerError: closed <here>", None)
+    tasks = task_result("libero_goal/0", [1, 0, 1], errors=errors), task_result("libero_object/0", [0, 0, 0])
+    page = write_evaluation_page(result_of(*tasks), tmp_path)
+    text = page.read_text()
+    assert tab.faults_on_a_phone(page) == []
+    assert text.count("<img") == 1 and "start 01 failure" in text and "start 00 success" not in text
+    assert "do what libero_goal/0 asks" in text and "[20.8, 93.9]" in text and "2 of 3" in text
+    assert "1 ended with an error, such as: ServerError: closed &lt;here&gt;" in text
+    assert ">libero_object</td>" in text and "mean over tasks" in text and "2 of 6" in text
+    assert "--allow mine" in text and "http" not in text
