@@ -49,6 +49,7 @@ class PolicySpec:
         action_dim: Number of entries of an action, A.
         language_dim: Size of the embedding of an instruction, L.
         seq_len: Number of steps in a window of training data, T.
+        measured: Whether policies normalise by statistics of the data, which they are given, in place of constants.
     """
 
     views: tuple[str, ...] = ("agentview_rgb", "eye_in_hand_rgb")
@@ -57,6 +58,7 @@ class PolicySpec:
     action_dim: int = 7
     language_dim: int = 384
     seq_len: int = 10
+    measured: bool = False
 
 
 def to_device(x: Tensor, device: torch.device | str) -> Tensor:

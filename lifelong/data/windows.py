@@ -208,7 +208,7 @@ def of_episodes(dataset: WindowDataset, read: Callable[[Batch], Tensor]) -> tupl
     return torch.cat([read(dataset.batch(indices)) for indices in starts.split(_CHUNK)]), of_window
 
 
-def frames_of(dataset: WindowDataset, readings: Sequence[str], most: int) -> tuple[Tensor, Tensor]:
+def frames_of(dataset: WindowDataset, readings: Sequence[str], most: int = 20_000) -> tuple[Tensor, Tensor]:
     """Return readings and actions of the frames of a dataset, on the CPU.
 
     A dataset that reads a file has them in arrays (`proprio`, `actions`). Of others, the first frames of up to `most`
@@ -232,6 +232,16 @@ def frames_of(dataset: WindowDataset, readings: Sequence[str], most: int) -> tup
         proprio = {n: torch.cat([b.observation.proprio[n][:, 0] for b in batches]) for n in readings}
         actions = torch.cat([b.actions[:, 0] for b in batches])
     return torch.cat([proprio[name] for name in readings], dim=1).cpu(), actions.cpu()
+
+
+def frame_moments(frames: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    """Return mean, standard deviation, least and largest value of readings and actions over frames, (4, D + A).
+
+    Args:
+        frames: Readings (F, D) and actions (F, A) of some datasets, see `frames_of`.
+    """
+    values = torch.cat([torch.cat(pair, dim=1) for pair in frames]).double()
+    return torch.stack([values.mean(0), values.std(0, unbiased=False), values.amin(0), values.amax(0)])
 
 
 def gripper_phases(dataset: WindowDataset) -> Tensor:

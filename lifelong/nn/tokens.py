@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lifelong.errors import PolicyError
+
 # Fixed centre and scale per modality, so that inputs are of order one from the first task on and no statistic
 # drifts from task to task: rest pose of the arm [rad], half the finger travel [m], the workspace [m].
 _CENTRE_AND_SCALE: dict[str, tuple[tuple[float, ...], float]] = {
@@ -27,17 +29,54 @@ class ProprioScaling(nn.Module):
             which the gripper's 0.04 m all but vanish).
         dropout: Chance, in training, that a whole modality of a whole window is zeroed, so that the policy
             does not learn to read the action off the arm's pose alone.
+        measured: Whether modalities are brought to mean 0 and variance 1 by statistics, see `take`, which are stored
+            with the weights.
+
+    Raises:
+        PolicyError: Readings are not to be normalised, and there are statistics for it.
     """
 
-    def __init__(self, *, proprio: Mapping[str, int], normalise: bool = True, dropout: float = 0.0) -> None:
+    def __init__(
+        self,
+        *,
+        proprio: Mapping[str, int],
+        normalise: bool = True,
+        dropout: float = 0.0,
+        measured: bool = False,
+    ) -> None:
         super().__init__()
+        if measured and not normalise:
+            raise PolicyError(
+                "policy.normalise_proprio=false leaves readings as they are, and data.statistics says what normalises "
+                "them; set data.statistics=constants or policy.normalise_proprio=true"
+            )
         self.names, self.dropout = tuple(proprio), dropout
+        if measured:
+            self.register_buffer("taken", torch.tensor(False))
         for name, size in proprio.items():
             centre, scale = _CENTRE_AND_SCALE.get(name, ((0.0,) * size, 1.0))
-            if not normalise or len(centre) != size:
+            if not normalise or measured or len(centre) != size:
                 centre, scale = (0.0,) * size, 1.0
-            self.register_buffer(f"centre_{name}", torch.tensor(centre), persistent=False)
-            self.register_buffer(f"scale_{name}", torch.tensor(scale), persistent=False)
+            scales = torch.full((size,), scale) if measured else torch.tensor(scale)
+            self.register_buffer(f"centre_{name}", torch.tensor(centre), persistent=measured)
+            self.register_buffer(f"scale_{name}", scales, persistent=measured)
+
+    def take(self, mean: Tensor, deviation: Tensor, *, once: bool) -> None:
+        """Normalise by these statistics from now on.
+
+        Args:
+            mean: Means of all modalities in order, (sum of D).
+            deviation: Their standard deviations; what does not vary is left as large as it is.
+            once: Whether statistics that were taken before are kept.
+        """
+        if once and bool(self.taken):
+            return
+        sizes = [len(getattr(self, f"centre_{name}")) for name in self.names]
+        scale = torch.where(deviation > 1e-6, deviation, 1.0)
+        for name, m, s in zip(self.names, mean.split(sizes), scale.split(sizes), strict=True):
+            getattr(self, f"centre_{name}").copy_(m)
+            getattr(self, f"scale_{name}").copy_(s)
+        self.taken.fill_(True)
 
     def forward(self, proprio: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Scale the readings, name -> (B, T, D); in order."""
@@ -54,10 +93,18 @@ class ProprioTokens(nn.Module):
     """One token per modality: a linear map to E numbers (`dim`) of the reading, scaled by `ProprioScaling`."""
 
     def __init__(
-        self, *, proprio: Mapping[str, int], dim: int, normalise: bool = True, dropout: float = 0.0
+        self,
+        *,
+        proprio: Mapping[str, int],
+        dim: int,
+        normalise: bool = True,
+        dropout: float = 0.0,
+        measured: bool = False,
     ) -> None:
         super().__init__()
-        self.scaling = ProprioScaling(proprio=proprio, normalise=normalise, dropout=dropout)
+        self.scaling = ProprioScaling(
+            proprio=proprio, normalise=normalise, dropout=dropout, measured=measured
+        )
         self.linears = nn.ModuleDict({name: nn.Linear(size, dim) for name, size in proprio.items()})
 
     def forward(self, proprio: Mapping[str, Tensor]) -> list[Tensor]:

@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from lifelong.data.settings import Statistics
 from lifelong.data.windows import WindowDataset
 from lifelong.errors import PolicyError
 from lifelong.types import Batch, Observation, PolicySpec
@@ -54,10 +55,12 @@ class Policy(nn.Module, ABC):
     Attributes:
         by_window: Whether the first axis of what its layers are given is that of the windows.
         uses_history: Whether it needs earlier frames to act well, which it learns from windows of several steps.
+        statistics: What it normalises by where `data.statistics` does not say.
     """
 
     by_window = True
     uses_history = False
+    statistics: Statistics = "constants"
 
     def __init__(self, spec: PolicySpec) -> None:
         super().__init__()
@@ -100,13 +103,31 @@ class Policy(nn.Module, ABC):
         return (self.predict(batch) - teacher["mean"]).square().sum(-1)
 
     def meet_task(self, dataset: WindowDataset, instruction: str) -> None:
-        """Take note of a task before it is learned: statistics of its data, or its text. By default nothing.
+        """Take note of a task before it is learned, such as of its text. By default nothing.
 
         What is noted must be in the policy's `state_dict`.
 
         Args:
             instruction: The instruction as text.
         """
+
+    def normalise(self, moments: Tensor, *, once: bool) -> None:
+        """Normalise by statistics of the frames that `data.statistics` names, from the coming task on.
+
+        They must be in the policy's `state_dict`.
+
+        Args:
+            moments: Mean, standard deviation, least and largest value (4, D + A) of the readings of `spec.proprio`, in
+                order, and of the actions.
+            once: Whether statistics that the policy has are kept.
+
+        Raises:
+            PolicyError: The policy does not implement it.
+        """
+        raise PolicyError(
+            f"{type(self).__name__} has no normalise(moments, once=...), which data.statistics needs: implement it, or "
+            "set data.statistics=constants"
+        )
 
     def rate_factors(self) -> Mapping[str, float]:
         """Return factors of the learning rate: beginning of parameters' names -> factor. By default none."""

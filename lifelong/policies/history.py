@@ -98,6 +98,13 @@ class HistoryPolicy(Policy):
         """Number of frames used to act: `seq_len`, less where a head learns from the steps that follow."""
         return self.spec.seq_len - self.head.chunk + 1
 
+    def normalise(self, moments: Tensor, *, once: bool) -> None:
+        """Normalise readings by statistics; see `Policy`. Actions are in [-1, 1], and stay as they are."""
+        mean, deviation, *_ = moments[:, : sum(self.spec.proprio.values())]
+        for module in self.modules():
+            if isinstance(module, ProprioScaling):
+                module.take(mean, deviation, once=once)
+
     def distribution(self, observation: Observation) -> dict[str, Tensor]:
         """Return the parameters of the action distribution at every step of a window; see the head."""
         return self.head(self.over_time(self.encode(observation)))
@@ -166,7 +173,9 @@ class VectorPolicy(HistoryPolicy):
         sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": image_embed}
         self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
         self.language = LanguageToken(language_dim=spec.language_dim, dim=text_embed)
-        self.proprio = ProprioScaling(proprio=spec.proprio, normalise=normalise, dropout=dropout)
+        self.proprio = ProprioScaling(
+            proprio=spec.proprio, normalise=normalise, dropout=dropout, measured=spec.measured
+        )
         parts = {"language": text_embed, "proprio": sum(spec.proprio.values())}
         self._sizes = dict.fromkeys(spec.views, image_embed) | parts
         return sum(self._sizes.values())
@@ -203,7 +212,7 @@ class TokenPolicy(HistoryPolicy):
         spec, self.readout = self.spec, readout
         self.uses_history = readout == "instruction"  # all tokens of a frame are enough to act on
         self.language = LanguageToken(language_dim=spec.language_dim, dim=dim)
-        self.proprio = ProprioTokens(proprio=spec.proprio, dim=dim, **proprio)
+        self.proprio = ProprioTokens(proprio=spec.proprio, dim=dim, measured=spec.measured, **proprio)
         self.transformer = temporal(dim=dim, max_length=spec.seq_len)
         self._sizes = {"language": 1, "proprio": len(spec.proprio)} | dict.fromkeys(cameras, 1)
         tokens = 1 + (sum(self._sizes.values()) if readout == "all" else 0)

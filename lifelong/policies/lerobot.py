@@ -12,12 +12,12 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from lifelong.data.windows import WindowDataset, frames_of
+from lifelong.data.windows import WindowDataset
 from lifelong.errors import ConfigError, MissingPackageError, PolicyError
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, Count, Observation, PolicySpec
@@ -50,9 +50,6 @@ FOLDER = "lerobot"  # in a run's directory, in LeRobot's format
 _IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}
 _TASKS, _LETTERS = 256, 256  # instructions that a policy can remember, and bytes of each
 _KINDS = ("mean", "std", "min", "max")
-_MOST = 20_000  # frames that statistics are computed from, where a data set has no arrays of all
-
-Statistics = Literal["first", "latest", "none"]
 
 
 class LeRobotPolicy(Policy):
@@ -67,8 +64,6 @@ class LeRobotPolicy(Policy):
         type: LeRobot's name of the policy, such as `act` or `diffusion`.
         settings: Fields of LeRobot's configuration of that type.
         act_steps: Number of actions of a chunk that are executed before the next is planned; None for all.
-        statistics: What readings and actions are normalised with: `first`, the statistics of the first task, for all;
-            `latest`, those of the task that was learned last, which changes what earlier tasks' actions mean; `none`.
         language: Whether policies without text read the instruction's embedding, as `observation.environment_state`.
         pretrained: Folder, or name on the Hugging Face Hub, of a policy to begin with; its own settings hold.
 
@@ -78,6 +73,7 @@ class LeRobotPolicy(Policy):
     """
 
     by_window = False  # the axis of time comes first in ACT's layers
+    statistics = "first"
 
     def __init__(
         self,
@@ -86,12 +82,11 @@ class LeRobotPolicy(Policy):
         type: str,
         settings: Mapping[str, Any],
         act_steps: Count | None,
-        statistics: Statistics,
         language: bool,
         pretrained: str | None,
     ) -> None:
         super().__init__(spec)
-        self.type, self.when = type, statistics
+        self.type = type
         self.language = language and type in WITH_EMBEDDING
         try:
             self.inner = self._build(settings, act_steps, pretrained)
@@ -149,15 +144,8 @@ class LeRobotPolicy(Policy):
         }
 
     def meet_task(self, dataset: WindowDataset, instruction: str) -> None:
-        """Take note of the text of the instruction, and of the statistics of readings and actions; see `Policy`."""
-        self._remember(dataset.batch(torch.zeros(1, dtype=torch.int64)).observation.language[0], instruction)
-        if self.when == "latest" or (self.when == "first" and int(self.met) == 1):
-            readings, actions = frames_of(dataset, tuple(self.spec.proprio), _MOST)
-            frames = torch.cat([readings, actions], dim=1).double()
-            moments = (frames.mean(0), frames.std(0, unbiased=False), frames.amin(0), frames.amax(0))
-            self.moments.copy_(torch.stack(moments).to(self.moments))
-
-    def _remember(self, embedding: Tensor, instruction: str) -> None:
+        """Take note of the text of the instruction; see `Policy`."""
+        embedding = dataset.batch(torch.zeros(1, dtype=torch.int64)).observation.language[0]
         number, text = int(self.met), instruction.encode()
         if number == _TASKS or len(text) > _LETTERS:
             raise PolicyError(
@@ -167,6 +155,11 @@ class LeRobotPolicy(Policy):
         self.keys[number] = embedding.to(self.keys)
         self.texts[number, : len(text)] = torch.tensor(list(text), dtype=torch.uint8).to(self.texts.device)
         self.met.add_(1)
+
+    def normalise(self, moments: Tensor, *, once: bool) -> None:
+        """Normalise readings and actions by statistics; see `Policy`."""
+        if not (once and bool(self.moments.any())):
+            self.moments.copy_(moments)
 
     def instructions(self, language: Tensor) -> list[str]:
         """Return the texts of embeddings (B, L).
@@ -284,14 +277,14 @@ class LeRobotPolicy(Policy):
         if self._processors is None or self._processors[0] != key:
             make = lerobot_module("policies.factory").make_pre_post_processors
             self.inner.config.device = self.moments.device.type
-            self._processors = (key, make(self.inner.config, dataset_stats=self.statistics()))
+            self._processors = (key, make(self.inner.config, dataset_stats=self.lerobot_statistics()))
         return self._processors[1]
 
-    def statistics(self) -> dict[str, dict[str, Tensor]]:
+    def lerobot_statistics(self) -> dict[str, dict[str, Tensor]]:
         """Return the statistics as LeRobot has them; of images those of ImageNet, its default."""
         colours = {name: torch.tensor(values).view(3, 1, 1) for name, values in _IMAGENET.items()}
         statistics = {IMAGES.get(view, f"observation.images.{view}"): colours for view in self.spec.views}
-        if self.when == "none" or not int(self.met):
+        if not bool(self.moments.any()):
             return statistics
         state, action = (
             self.moments.detach()

@@ -13,9 +13,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from torch import Tensor
+
 from libero_env.errors import is_quiet
 from lifelong.context import RunContext
-from lifelong.data.windows import TaskWindows
+from lifelong.data.windows import TaskWindows, frame_moments, frames_of
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.seeding import END_TASK, FIT, generator, seeded
 from lifelong.sequence.measuring import Evaluator
@@ -48,6 +50,7 @@ class TaskSequence:
         self.stages = learning_stages(context.algorithm, context.group_sizes)
         self.data = StageData(datasets, self.stages, context.stream, context.seed)
         self.evaluator = Evaluator(context, self.stages)
+        self._frames: dict[int, tuple[Tensor, Tensor]] = {}  # readings and actions of stages
         self._reached = -1  # number of the stage after which the policy is; -1: before the first
         self.recovery = Recovery(context, self.data)
         context.algorithm.set_augmentation(context.augment)
@@ -109,6 +112,7 @@ class TaskSequence:
         costs.reset_peak(context.device)
         if saved is None:
             context.policy.meet_task(dataset, context.instructions[task])
+            self._normalise(number)
             context.algorithm.begin_task(task, dataset, context.policy)
         first, resume = (0, None) if saved is None else (saved["phase"], saved["fit"])
         for phase in phases[first:]:
@@ -118,6 +122,19 @@ class TaskSequence:
         if not context.ranks.first:
             self.recovery.apply_stage(stage)
         self._reached = number
+
+    def _normalise(self, number: int) -> None:
+        """Give the policy the statistics of the stages that count before a stage is learned."""
+        kind = self.context.data.statistics or self.context.policy.statistics
+        if kind == "constants":
+            return
+        stages = {"seen": range(number + 1), "stream": range(len(self.stages))}.get(kind, [number])
+        for stage in stages:
+            if stage not in self._frames:
+                dataset = self.data[self.stages[stage][-1]]
+                self._frames[stage] = frames_of(dataset, tuple(self.context.policy.spec.proprio))
+        moments = frame_moments([self._frames[stage] for stage in stages])
+        self.context.policy.normalise(moments, once=kind in ("first", "stream"))
 
     def _train(self, phase: TrainingPhase, dataset: TaskWindows, resume: dict[str, Any] | None) -> None:
         """Train for one phase, from its first step or a saved epoch, and load the weights that are kept."""

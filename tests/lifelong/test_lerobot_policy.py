@@ -13,6 +13,7 @@ pytest.importorskip("lerobot")
 from libero_eval.user_policy import weights_digest
 from lifelong.data.dataset import SequenceVLDataset, last_frames
 from lifelong.data.fake import fake_observation
+from lifelong.data.windows import frame_moments, frames_of
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.policies.lerobot import FOLDER, LeRobotPolicy, lerobot_module
 from lifelong.settings import build
@@ -37,7 +38,7 @@ def spec(steps: int = 8) -> PolicySpec:
 
 def policy(type: str = "act", steps: int = 8, **changes) -> LeRobotPolicy:
     given = {
-        "settings": SMALL[type], "act_steps": None, "statistics": "first", "language": True, "pretrained": None
+        "settings": SMALL[type], "act_steps": None, "language": True, "pretrained": None
     }  # fmt: skip
     torch.manual_seed(0)
     return LeRobotPolicy(spec=spec(steps), type=type, **(given | changes))
@@ -85,10 +86,12 @@ def by_hand(data: SequenceVLDataset, starts, type: str, steps: int) -> dict:
 
 
 @pytest.mark.parametrize("type", SMALL)
-@pytest.mark.parametrize("statistics", ["first", "none"])
-def test_the_loss_of_a_batch_and_the_actions_are_stock_lerobots(tmp_path, type, statistics) -> None:
-    ours, data = policy(type, statistics=statistics), dataset()
+@pytest.mark.parametrize("normalised", [True, False])
+def test_the_loss_of_a_batch_and_the_actions_are_stock_lerobots(tmp_path, type, normalised) -> None:
+    ours, data = policy(type), dataset()
     ours.meet_task(data, "pick up the soup")
+    if normalised:
+        ours.normalise(moments(data), once=True)
     ours.save_beside(tmp_path)
     config = configs.PreTrainedConfig.from_pretrained(tmp_path / FOLDER)
     stock = factory.get_policy_class(type).from_pretrained(tmp_path / FOLDER, config=config)
@@ -138,18 +141,22 @@ def test_a_policy_is_as_it_was_when_its_weights_are_loaded() -> None:
         again.instructions(torch.zeros(1, 6))
 
 
+def moments(data):
+    return frame_moments([frames_of(data, tuple(spec().proprio))])
+
+
 def test_statistics_are_of_the_task_that_was_asked_for() -> None:
     tasks = [dataset(seed=0), dataset(seed=1)]
-    for when, expected in (("first", tasks[0]), ("latest", tasks[1])):
-        one = policy(statistics=when)
+    for once, expected in ((True, tasks[0]), (False, tasks[1])):
+        one = policy()
         for task in tasks:
-            one.meet_task(task, "text")
-        found = one.statistics()
+            one.normalise(moments(task), once=once)
+        found = one.lerobot_statistics()
         assert torch.allclose(found["action"]["mean"], expected.actions.mean(0), atol=1e-6)
         assert torch.allclose(
             found["observation.state"]["std"][:3], expected.proprio["ee_pos"].std(0, correction=0)
         )
-    assert set(policy(statistics="none").statistics()) == {
+    assert set(policy().lerobot_statistics()) == {
         "observation.images.image",
         "observation.images.image2",
     }
@@ -171,7 +178,9 @@ def test_losses_of_windows_and_distillation() -> None:
 
 def test_learning_rates_are_lerobots() -> None:
     one = policy(settings=SMALL["act"] | {"optimizer_lr": 1e-4, "optimizer_lr_backbone": 1e-5})
-    optimizer = _make_optimizer(list(one.parameters()), FitSettings(epochs=1, lr=1e-3), one)
+    optimizer = _make_optimizer(
+        list(one.parameters()), FitSettings(epochs=1, lr=1e-3), one, one.rate_factors()
+    )
     factors = {group["factor"]: len(group["params"]) for group in optimizer.param_groups}
     backbone = sum(name.startswith("model.backbone") for name, _ in one.inner.named_parameters())
     assert factors == {1e-5 / 1e-4: backbone, 1.0: len(list(one.parameters())) - backbone}
