@@ -18,6 +18,7 @@ REGISTRIES = (  # which users add to, besides those that are sent to workers
     "libero.libero.utils.task_generation_utils:TASK_INFO", "libero.lifelong.algos:REGISTERED_ALGOS",
     "libero.lifelong.models.base_policy:REGISTERED_POLICIES"
 )  # fmt: skip
+KEPT: set[str] = set()  # modules that are not of a temporary folder
 
 
 @pytest.fixture(autouse=True)
@@ -31,10 +32,11 @@ def forgetting(tmp_path_factory):
         table.clear()
         table.update(copied(entries))
     sys.path[:] = path
-    base = tmp_path_factory.getbasetemp()
-    for name, module in list(sys.modules.items()):
-        if base in Path(getattr(module, "__file__", None) or "").parents:
+    folder = f"{tmp_path_factory.getbasetemp()}{os.sep}"
+    for name in sys.modules.keys() - KEPT:
+        if str(getattr(sys.modules[name], "__file__", None)).startswith(folder):
             del sys.modules[name]
+    KEPT.update(sys.modules)
 
 
 def registry(address: str) -> dict:
@@ -55,6 +57,15 @@ def shared() -> Path:
     if not (path / "official").is_dir():
         pytest.skip(f"the original's data are not at {path} (set LIBERO_SHARED)")
     return path
+
+
+@pytest.fixture(scope="session")
+def demos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which all processes of the tests record the demonstrations that they share."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "demos"
+    folder.mkdir(exist_ok=True)
+    return folder
 
 
 @pytest.fixture
