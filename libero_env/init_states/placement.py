@@ -298,12 +298,15 @@ def sample_settled(
     i: int,
     rng: np.random.Generator,
     fixtures: np.ndarray | None = None,
+    *,
+    only_places: bool = False,
 ) -> Start:
     """Sample a start that is at rest, where the init atoms are true and the goal is false.
 
     Args:
         i: Index of the simulation to settle the objects in.
         fixtures: Poses of the fixtures, (nfixtures, 7); None samples them.
+        only_places: Whether the goal and predicates of the user's own are not looked at.
 
     Raises:
         PlacementError: As `sample_start`; or no sample of 20 comes to rest where it should. Scenes of unusual size have
@@ -319,7 +322,7 @@ def sample_settled(
             reason = str(error)
             continue
         simulations.reset([i], qpos[None], np.zeros((1, simulations.model.nv)))
-        if not (reason := "; ".join(start_errors(view))):
+        if not (reason := "; ".join(start_errors(view, only_places))):
             return Start(qpos, start.fixtures)
     raise PlacementError(
         f"{scene.problem.language!r}: none of {samples} sampled starts agrees with the task: {reason}"
@@ -338,11 +341,15 @@ def sample_states(scene: Scene, generators: Sequence[np.random.Generator]) -> In
     return np.stack([np.concatenate([[0.0], s.qpos, speed, s.fixtures.ravel()]) for s in starts])
 
 
-def start_errors(view: StateView) -> list[str]:
-    """Return the reasons why a state is not a valid start: init atoms that are false, a goal that is true."""
+def start_errors(view: StateView, only_places: bool = False) -> list[str]:
+    """Return why a state is not a valid start: init atoms that are false, a goal that is true.
+
+    Args:
+        only_places: Whether the goal and predicates of the user's own are not looked at.
+    """
     faults = []
     for atom in view.scene.problem.init:
-        if atom.args[0] in view.scene.fixtures:
+        if atom.args[0] in view.scene.fixtures or (only_places and atom.predicate not in BUILTIN_PREDICATES):
             continue
         region = view.scene.problem.region(atom.args[-1])
         if atom.predicate == "On" and region is not None:
@@ -351,7 +358,7 @@ def start_errors(view: StateView) -> list[str]:
             is_true = evaluate(atom, view)
         if not is_true:
             faults.append(f"{atom} does not hold")
-    if evaluate(view.scene.problem.goal, view):
+    if not only_places and evaluate(view.scene.problem.goal, view):
         faults.append("the goal holds already")
     return faults
 

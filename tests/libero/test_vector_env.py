@@ -218,27 +218,29 @@ class Libero_Floor_Manipulation(TASK_MAPPING["libero_floor_manipulation"]):
 
 class Upright(UnaryAtomic):
     def __call__(self, state):
-        return state.env.timestep > 0
+        return True  # at the start, too, as in the original
 
 class Can(MujocoXMLObject):
     def __init__(self, name="can"):
         super().__init__(folder / "can.xml", name)
 
 def atspeed(state, speed, word):
-    return state.env.timestep > 0 and (speed, word) == ("0.5", "slow")
+    return (speed, word) == ("0.5", "slow")
 
 update_predicate_fn_dict("upright", Upright)
 VALIDATE_PREDICATE_FN_DICT["atspeed"] = atspeed
 OBJECTS_DICT["red_can"] = lambda name: Can(name)
 register_predicate("always", lambda view, name: view.scene.objects[name].category == "red_can")
 
-def write(name, goal):
+def write(name, goal, init=""):
     text = get_task("libero_object/0").bddl_text.replace("milk_1 - milk", "milk_1 - red_can")
+    text = text.replace("(:init", f"(:init {init}")
     (folder / name).write_text(text[: text.index("(:goal")] + f"(:goal {goal}))")
     return str(folder / name)
 
 GOAL = "(And (Upright milk_1) (Not (Not (Upright milk_1))) (Atspeed milk_1 0.5 slow))"
-make = lambda: OffScreenRenderEnv(bddl_file_name=write("own.bddl", GOAL), use_camera_obs=False)
+INIT = "(Atspeed milk_1 9 fast)"  # for the problem class to read; a reset does not look at it
+make = lambda: OffScreenRenderEnv(bddl_file_name=write("own.bddl", GOAL, INIT), use_camera_obs=False)
 
 def category(name):
     from libero_env.objects import get_object

@@ -347,12 +347,12 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         return joints + noise["magnitude"] * self.rng.uniform(-1.0, 1.0, 7)
 
     def _sample(self) -> Start:
-        """Return a settled initial state; the arm holds its pose, whatever the controller."""
+        """Return a settled initial state, where objects are in their places; the arm holds its pose."""
         controller, self.simulations.controller_state = self.simulations.controller_state, ControllerState(1)
         self.simulations.ends_current, self.simulations.substeps = True, SUBSTEPS
         try:
             fixtures = None if self._resets is None else self._resets.reset()
-            return sample_settled(self.scene, self.simulations, 0, self.rng, fixtures)
+            return sample_settled(self.scene, self.simulations, 0, self.rng, fixtures, only_places=True)
         finally:
             self.simulations.controller_state, self.simulations.ends_current = controller, False
             self.simulations.substeps = self._substeps
