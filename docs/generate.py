@@ -8,6 +8,7 @@ become their paths, as the site has none of these.
 import contextlib
 import inspect
 import io
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
@@ -34,7 +35,17 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
         marker = f"<!-- generated: {name} -->"
         if marker in markdown:
             markdown = markdown.replace(marker, part())
-    return OUTSIDE.sub(lambda m: f"`{m[2]}`" if m[1] in m[2] else f"{m[1]} (`{m[2]}`)", markdown)
+    return OUTSIDE.sub(_outside, markdown)
+
+
+def _outside(link: re.Match[str]) -> str:
+    text, path = link[1], link[2]
+    if repository := os.environ.get("GITHUB_REPOSITORY"):
+        notebook = path.endswith(".ipynb")
+        server = "https://colab.research.google.com/github" if notebook else "https://github.com"
+        text += " (in Colab)" if notebook else ""
+        return f"[{text}]({server}/{repository}/blob/{os.environ['GITHUB_REF_NAME']}/{path})"
+    return f"`{path}`" if text in path else f"{text} (`{path}`)"
 
 
 def on_config(config: MkDocsConfig) -> None:

@@ -156,7 +156,7 @@ def check_line(line: str) -> None:
     elif words[0] == "python":
         assert (ROOT / words[1]).is_file() or words[1] == "-m", line
     else:
-        known = ("docker", "export", "git", "pip", "python3.11", ".venv/bin/pip", "source", "make")
+        known = ("docker", "export", "git", "pip", "python3.11", ".venv/bin/pip", "source", "make", "uv")
         assert words[0] in known, line
 
 
@@ -311,6 +311,21 @@ def test_every_page_is_in_the_navigation():
 
     nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
     assert sorted(pages(nav)) == [page.name for page in PAGES]
+
+
+def test_files_outside_lead_to_their_repository_where_it_is_known(monkeypatch):
+    monkeypatch.delenv("GITHUB_REPOSITORY", raising=False)
+    shown = "[First](../notebooks/1_quick_walkthrough.ipynb), [laptop](../experiments/laptop/README.md)"
+    assert generate().on_page_markdown(shown) == (
+        "First (`notebooks/1_quick_walkthrough.ipynb`), `experiments/laptop/README.md`"
+    )
+    monkeypatch.setenv("GITHUB_REPOSITORY", "someone/robots")
+    monkeypatch.setenv("GITHUB_REF_NAME", "v1.0.0")
+    colab = "https://colab.research.google.com/github/someone/robots/blob/v1.0.0"
+    assert generate().on_page_markdown(shown) == (
+        f"[First (in Colab)]({colab}/notebooks/1_quick_walkthrough.ipynb), "
+        "[laptop](https://github.com/someone/robots/blob/v1.0.0/experiments/laptop/README.md)"
+    )
 
 
 def test_the_gallery_is_whole():

@@ -13,7 +13,7 @@ from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 # pictures that each draws
-PICTURES = {"1_quick_walkthrough": 4, "2_scenes_and_tasks": 2, "3_custom_objects": 3, "4_algorithms": 2}
+PICTURES = {"1_quick_walkthrough": 6, "2_scenes_and_tasks": 2, "3_custom_objects": 3, "4_algorithms": 1}
 LARGEST = 300_000  # bytes
 
 
