@@ -16,7 +16,7 @@ from libero_env.text import json_safe
 from lifelong.errors import ComparisonError
 from lifelong.report.runs import Group, Run, check_same_world, unlike
 from lifelong.results.provenance import few_of
-from lifelong.stats.intervals import mean_and_standard_error
+from lifelong.stats.intervals import mean_and_half_width
 from lifelong.stats.methods import MARGIN, MethodRun, statistics
 from lifelong.stats.metrics import METRIC_NAMES, metric_values
 
@@ -48,9 +48,9 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
         plan: Pairs to be compared.
 
     Returns:
-        `groups`: by label, with `runs`, `seeds`, `orders`, `metrics` (mean, standard_error, low, high, the value of
-        each seed or order), `published` (FWT and AUC of eq. 3 as written), `forgetting_by_task` (NBT by task name),
-        `subgoals` and `costs`. `differences` and `statistics`: see `lifelong.stats.methods.statistics`.
+        `groups`: by label, with `runs`, `seeds`, `orders`, `told_task`, `metrics` (mean, standard_error, low, high, the
+        value of each seed or order), `published` (FWT and AUC of eq. 3 as written), `forgetting_by_task` (NBT by task
+        name), `subgoals` and `costs`. `differences` and `statistics`: see `lifelong.stats.methods.statistics`.
         `after_base_stage`: `metrics` by label and `differences` over the later tasks alone, as if the sequence began
         with them, of the methods whose runs all learned a task after a base stage; None if there are none. `backend`:
         what simulated all rollouts. `conditions`: sentences about all else in which runs differ, see
@@ -153,6 +153,7 @@ def _group(group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None)
         "seeds": [r.record.seed for r in group.runs],
         "orders": len({r.record.tasks for r in group.runs}),
         "measured": len(runs),
+        "told_task": group.told_task,
         "metrics": metrics or {name: dict(_UNKNOWN) for name in METRIC_NAMES},
         "published": _published(runs),
         "forgetting_by_task": _forgetting(runs),
@@ -216,8 +217,8 @@ def costs_of(runs: Sequence[Run]) -> dict[str, float]:
 
 def _mean(values: Sequence[float]) -> dict[str, float]:
     known = [v for v in values if not np.isnan(v)]
-    mean, error = mean_and_standard_error(known)
-    return {"mean": mean, "standard_error": error}
+    mean, half = mean_and_half_width(known)
+    return {"mean": mean, "half_width": half}
 
 
 def check_same_back_end(of: Mapping[str, str]) -> None:

@@ -21,7 +21,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from libero_env.storage import atomic_path
-from lifelong.stats.intervals import mean_and_standard_error, wilson_interval
+from lifelong.stats.intervals import Estimate, mean_and_half_width, wilson_interval
 from lifelong.stats.metrics import Curve
 
 # Okabe and Ito's colours, distinguishable for colour-blind readers, without yellow, which is too light on white
@@ -177,7 +177,7 @@ def learning_figure(
 
 
 def forgetting_figure(lines: Sequence[Line]) -> Figure:
-    """Draw average success over the tasks learned so far against their number, ± one standard error.
+    """Draw average success over the tasks learned so far against their number, with Student's 95 % band over seeds.
 
     Lines of the same colour differ in dashes and markers.
     """
@@ -188,24 +188,13 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
         figure = Figure(figsize=(5.6, 2.8 + room) if named else (3.5, 2.7), layout="constrained")
         axes = figure.subplots()
         for number, line in enumerate(lines):
-            columns = [mean_and_standard_error(c[~np.isnan(c)]) for c in line.values.T]
-            mean, error = 100 * np.array(columns).T
-            x, (turn, place) = np.arange(1, len(mean) + 1), divmod(number, len(LINE_COLOURS))
-            colour, marker = LINE_COLOURS[place], LINE_MARKERS[(place + turn) % len(LINE_MARKERS)]
-            axes.plot(
-                x,
-                mean,
-                color=colour,
-                ls=LINE_DASHES[turn % len(LINE_DASHES)],
-                marker=marker,
-                mfc="white" if turn % 2 else colour,
-                ms=3.8,
-                lw=1.4,
-                label=shorten(line.label),
-                clip_on=False,
-            )
+            columns = [mean_and_half_width(c[~np.isnan(c)]) for c in line.values.T]
+            mean, half = 100 * np.array(columns).T
+            x, look = np.arange(1, len(mean) + 1), _look(number)
+            axes.plot(x, mean, **look, lw=1.4, label=shorten(line.label), clip_on=False)
             band = 0.18 if len(lines) <= len(LINE_COLOURS) else 0.06
-            axes.fill_between(x, mean - error, mean + error, color=colour, alpha=band, lw=0)
+            low, high = np.clip(mean - half, 0, 100), np.clip(mean + half, 0, 100)
+            axes.fill_between(x, low, high, color=look["color"], alpha=band, lw=0)
         longest = max(line.values.shape[1] for line in lines)
         first = 1 + _first_known([line.values for line in lines])
         axes.set_xlim(first - 0.2, longest + 0.2)
@@ -218,6 +207,38 @@ def forgetting_figure(lines: Sequence[Line]) -> Figure:
         if named:
             legend_below(figure)
     return figure
+
+
+def storage_figure(points: Mapping[str, tuple[float, Estimate]]) -> Figure:
+    """Draw AUC with its 95 % interval against the bytes that a method keeps from task to task.
+
+    Args:
+        points: Bytes and AUC of each method.
+    """
+    least = min([size for size, _ in points.values() if size > 0], default=1.0)
+    with matplotlib.rc_context(STYLE):
+        room = 0.18 * math.ceil(len(points) / _legend_columns(list(points)))
+        figure = Figure(figsize=(5.6, 2.8 + room), layout="constrained")
+        axes = figure.subplots()
+        axes.set_xscale("symlog", linthresh=least)  # methods that keep nothing stand at 0
+        for number, (label, (size, auc)) in enumerate(points.items()):
+            ends = np.nan_to_num([[auc.value - auc.low], [auc.high - auc.value]])
+            look = _look(number) | {"ls": "none"}
+            axes.errorbar([size], [100 * auc.value], 100 * ends, **look, elinewidth=0.8, label=shorten(label))
+        axes.set_xlabel("kept from task to task (bytes)")
+        axes.set_ylabel("AUC (%)")
+        axes.grid(lw=0.4, alpha=0.3, color=INK)
+        hide_spines(axes)
+        legend_below(figure)
+    return figure
+
+
+def _look(number: int) -> dict[str, Any]:
+    """Return colour, dashes and marker of a method, which no other of up to 49 has."""
+    turn, place = divmod(number, len(LINE_COLOURS))
+    colour, marker = LINE_COLOURS[place], LINE_MARKERS[(place + turn) % len(LINE_MARKERS)]
+    dashes, filling = LINE_DASHES[turn % len(LINE_DASHES)], "white" if turn % 2 else colour
+    return {"color": colour, "ls": dashes, "marker": marker, "mfc": filling, "ms": 3.8}
 
 
 def as_svg(figure: Figure) -> str:

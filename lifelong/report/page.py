@@ -11,7 +11,7 @@ import numpy as np
 
 from libero_env.errors import InvalidInputError
 from libero_env.storage import atomic_write_text, read_bounded, require_own_folders
-from libero_env.text import duration
+from libero_env.text import duration, quantity
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import MUJOCO, Plan, compare, findings, write_comparison
 from lifelong.report.figures import (
@@ -22,6 +22,7 @@ from lifelong.report.figures import (
     heatmap_figure,
     learning_figure,
     save,
+    storage_figure,
 )
 from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
 from lifelong.report.tables import (
@@ -34,12 +35,14 @@ from lifelong.report.tables import (
     run_heatmap,
     shift_table,
     task_costs,
+    triangle,
 )
 from lifelong.results.records import RunRecord
 from lifelong.results.relearning import by_measure, read_relearning, savings_heads, savings_rows
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_scores
 from lifelong.results.summary import write_episodes
+from lifelong.stats.intervals import Estimate
 from lifelong.stats.metrics import METRIC_NAMES, Metrics, metric_values
 
 METRIC_TEXTS = {
@@ -185,6 +188,8 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
     panels, heatmaps, lines = zip(*map(_success_of, groups), strict=True)
     save(heatmap_figure(panels), folder / "heatmap")
     save(forgetting_figure(lines), folder / "forgetting")
+    if stored := _stored(found):
+        save(storage_figure(stored), folder / "storage")
     benchmarks = sorted({r.record.benchmark for r in runs})
     texts: dict[str, str] = {}
     for run in (run for group in groups for run in group.runs):
@@ -226,6 +231,8 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),
         "heatmaps": heatmaps,
         "forgetting": as_svg(forgetting_figure(lines)),
+        "storage": as_svg(storage_figure(stored)) if stored else None,
+        "triangles": {name: rows for name in METRIC_TEXTS if (rows := triangle(found, name))},
         "runs": [_run_row(run, group.label, folder) for group in groups for run in group.runs],
     }
 
@@ -316,9 +323,27 @@ def _published(run: Run) -> dict[str, float] | None:
 def _group_rows(metrics: Mapping[str, dict[str, Any]], found: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row of metrics for each group."""
     return [
-        {"label": label, "count": found["groups"][label]["measured"], "cells": cells}
+        {
+            "label": label,
+            "count": found["groups"][label]["measured"],
+            "told": found["groups"][label]["told_task"],
+            "stored": quantity(size, "B")
+            if (size := found["groups"][label]["costs"].get("stored_bytes")) is not None
+            else "–",
+            "cells": cells,
+        }
         for label, cells in metrics.items()
     ]
+
+
+def _stored(found: dict[str, Any]) -> dict[str, tuple[float, Estimate]]:
+    """Return the bytes that methods keep, and their AUC; nothing where fewer than two have both."""
+    points = {}
+    for label, group in found["groups"].items():
+        auc, size = group["metrics"]["auc"], group["costs"].get("stored_bytes", np.nan)
+        if np.isfinite(size) and np.isfinite(auc["mean"]):
+            points[label] = size, Estimate(auc["mean"], auc["low"], auc["high"])
+    return points if len(points) > 1 else {}
 
 
 def _forgotten(

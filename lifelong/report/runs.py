@@ -18,6 +18,7 @@ from lifelong.results.records import RunRecord, TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.stats.metrics import Metrics, lifelong_metrics
 
+_TOLD = ("packnet", "lora", "omla", "single_task")
 _BASICS = ("algo", "benchmark", "policy", "preset")
 # of keys that change no result by themselves
 _IGNORED = (
@@ -77,6 +78,12 @@ class Group:
         if all(r.record.tasks == first.tasks for r in self.runs):
             return short_labels(first.instructions)
         return [f"task {i + 1}" for i in range(len(first.tasks))]
+
+    @property
+    def told_task(self) -> bool:
+        """Whether its policies are told the number of the task at test time, which most methods are not."""
+        settings = dict(_identity(self.runs[0]))
+        return settings["algo"] in _TOLD and settings.get("algo.adapters", "own") == "own"
 
 
 def load_run(path: Path) -> Run:

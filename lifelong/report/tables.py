@@ -14,7 +14,7 @@ from lifelong.report.runs import Run
 from lifelong.results.results import Results
 from lifelong.results.shifts import ShiftScore
 from lifelong.results.subgoals import AtomRates, Subgoals
-from lifelong.stats.intervals import mean_and_standard_error, wilson_interval
+from lifelong.stats.intervals import mean_and_half_width, wilson_interval
 
 # costs by their names in `lifelong.training.costs`: head of the column, its tooltip, and how a value is shown
 _bytes, _flop = (partial(quantity, unit=unit) for unit in ("B", "FLOP"))
@@ -56,6 +56,20 @@ def percent(value: float | None, digits: int = 1) -> str:
         return "–"
     text = f"{100 * value:.{digits}f}"
     return text.removeprefix("-") if float(text) == 0 else text.replace("-", "−")
+
+
+def triangle(found: Mapping[str, Any], metric: str) -> list[dict[str, Any]]:
+    """Return a row for each method but the last: its differences to all that follow it, where all pairs are compared.
+
+    Args:
+        found: Result of `lifelong.report.comparison.compare`.
+        metric: Metric whose differences are shown.
+    """
+    labels = list(found["groups"])
+    of = {(d["of"], d["less"]): d["metrics"][metric] for d in found["differences"]}
+    if len(labels) < 3 or len(of) < len(labels) * (len(labels) - 1) / 2:
+        return []
+    return [{"label": row, "cells": [of.get((row, column)) for column in labels[1:]]} for row in labels[:-1]]
 
 
 def cost_table(rows: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, Any] | None:
@@ -142,15 +156,15 @@ def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:
 
 
 def mean_heatmap(matrices: np.ndarray, mean: np.ndarray, labels: Sequence[str]) -> dict[str, Any]:
-    """Return the cells of the mean over seeds, with its standard error as the tooltip."""
+    """Return the cells of the mean over seeds, with Student's t interval as the tooltip."""
 
     def spread(i: int, j: int) -> tuple[float, int]:
         values = matrices[:, i, j][~np.isnan(matrices[:, i, j])]
-        return 100 * mean_and_standard_error(values)[1], len(values)
+        return 100 * mean_and_half_width(values)[1], len(values)
 
     def hint(i: int, j: int) -> str:
-        error, count = spread(i, j)
-        return f"mean of {count} seeds, standard error {error:.1f}" if count > 1 else "one seed"
+        half, count = spread(i, j)
+        return f"mean of {count} seeds ± {half:.1f} (95 %)" if count > 1 else "one seed"
 
     return _grid(mean, labels, hint, lambda i, j: "")
 

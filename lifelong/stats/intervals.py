@@ -6,6 +6,7 @@ from statistics import NormalDist
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 Floats = NDArray[np.float64]
 
@@ -73,6 +74,13 @@ def mean_and_standard_error(values: ArrayLike) -> tuple[float, float]:
     v = np.asarray(values, dtype=float)
     mean = float(v.mean()) if v.size else float("nan")
     return mean, float(v.std(ddof=1) / np.sqrt(v.size)) if v.size > 1 else float("nan")
+
+
+def mean_and_half_width(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the mean over seeds and half of Student's t interval; NaN for the interval of one seed."""
+    mean, error = mean_and_standard_error(values)
+    df = np.size(values) - 1
+    return mean, float(special.stdtrit(df, 0.5 + confidence / 2)) * error if df > 0 else float("nan")
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -17,7 +17,15 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from lifelong.stats.intervals import UNKNOWN, Estimate, Floats, holm, mean_and_standard_error, wilson_interval
+from lifelong.stats.intervals import (
+    UNKNOWN,
+    Estimate,
+    Floats,
+    holm,
+    mean_and_half_width,
+    mean_and_standard_error,
+    wilson_interval,
+)
 from lifelong.stats.metrics import METRIC_NAMES, METRIC_RANGES, Scores, lifelong_metrics, metric_values
 
 ALPHA = 0.05
@@ -71,10 +79,7 @@ def mean_over_seeds(values: Floats, episodes: int, possible: tuple[float, float]
         episodes: Number of different episodes of all seeds together, see `Scores.episodes_of`.
         possible: Least and largest value of the metric; a success rate's are (0, 1).
     """
-    mean, error = mean_and_standard_error(values)
-    half = (
-        float(special.stdtrit(len(values) - 1, 0.5 + CONFIDENCE / 2)) * error if len(values) > 1 else np.nan
-    )
+    mean, half = mean_and_half_width(values, CONFIDENCE)
     low, high = max(mean - half, possible[0]), min(mean + half, possible[1])
     if possible != (0.0, 1.0):
         return Estimate(mean, low, high) if half > 1e-9 or mean == 0 else replace(UNKNOWN, value=mean)

@@ -18,9 +18,18 @@ from libero_env.tasks import get_suite
 from libero_env.text import json_safe
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import Plan
-from lifelong.report.figures import Line, Panel, forgetting_figure, heatmap_figure, learning_figure
+from lifelong.report.figures import (
+    LINE_MARKERS,
+    Line,
+    Panel,
+    forgetting_figure,
+    heatmap_figure,
+    learning_figure,
+    storage_figure,
+)
 from lifelong.report.page import comparison_text, write_report
 from lifelong.report.runs import group_runs, load_run, short_labels
+from lifelong.report.tables import triangle
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record
 from lifelong.results.records import (
@@ -34,6 +43,7 @@ from lifelong.results.records import (
     signed_line,
 )
 from lifelong.results.summary import read_episodes, summarize
+from lifelong.stats.intervals import Estimate
 from lifelong.stats.methods import MethodRun, statistics
 from lifelong.stats.metrics import METRIC_NAMES, Curve
 from tests.harness.browser import PHONE
@@ -297,7 +307,7 @@ def test_several_runs_side_by_side(tmp_path: Path):
         "report.html",
         "comparison.json",
         "episodes.csv.gz",
-        *(f"{stem}.{kind}" for stem in ("heatmap", "forgetting") for kind in ("png", "pdf")),
+        *(f"{stem}.{kind}" for stem in ("heatmap", "forgetting", "storage") for kind in ("png", "pdf")),
     }
 
 
@@ -377,6 +387,35 @@ def test_no_two_of_twenty_lines_look_the_same():
         (line.get_color(), line.get_linestyle(), line.get_marker(), line.get_markerfacecolor())
         for line in figure.axes[0].lines
     }
+    assert len(looks) == 20
+
+
+def test_all_pairs_are_a_triangle_and_oracles_and_memory_have_columns(tmp_path: Path):
+    runs = [
+        make_run(tmp_path / f"{a}{s}", a, s, tasks=3) for a in ("ewc", "er", "packnet") for s in (1, 2, 3)
+    ]
+    out = write_report(runs, tmp_path / "compared", Plan(all_pairs=True))
+    found = json.loads((out.parent / "comparison.json").read_text())
+    rows, labels = triangle(found, "auc"), list(found["groups"])
+    assert [row["label"] for row in rows] == labels[:2]
+    shown = [[m and m["value"] for m in row["cells"]] for row in rows]
+    mean = [found["groups"][label]["metrics"]["auc"]["mean"] for label in labels]
+    assert shown[0] == pytest.approx([mean[0] - mean[1], mean[0] - mean[2]]) and min(shown[0]) >= 0
+    assert shown[1][0] is None and shown[1][1] == pytest.approx(mean[1] - mean[2])
+    assert {label: g["told_task"] for label, g in found["groups"].items()} == {
+        "ewc": False, "er": False, "packnet": True
+    }  # fmt: skip
+    text = Page(out.read_text()).text
+    assert "Task told" in text and "AUC: all pairs" in text and "standard error" not in text
+    assert triangle(found | {"differences": found["differences"][:2]}, "auc") == []  # not all pairs
+
+
+def test_auc_stands_against_what_is_stored():
+    points = {str(n): (1e3 * n, Estimate(0.5, 0.4, 0.6)) for n in range(20)}
+    figure = storage_figure(points)
+    drawn = [line for line in figure.axes[0].lines if line.get_marker() in LINE_MARKERS]
+    assert [line.get_xdata()[0] for line in drawn] == [size for size, _ in points.values()]
+    looks = {(line.get_color(), line.get_marker(), line.get_markerfacecolor()) for line in drawn}
     assert len(looks) == 20
 
 
