@@ -8,11 +8,13 @@ from .expert.expert import Expert
 from .objects.catalog import register_object
 from .sim.predicates import register_predicate
 from .tasks.builder import make_task
+from .tasks.cameras import Camera
 from .tasks.suites import get_suite, get_task, read_task
 from .tasks.task import Suite, Task
 
 __all__ = [
     "BatchEnv",
+    "Camera",
     "Expert",
     "LiberoEnv",
     "LiberoError",

@@ -16,7 +16,9 @@ import numpy as np
 from pydantic import Field
 
 from libero_env.envs.checks import checked_numbers
+from libero_env.envs.config import Cameras
 from libero_env.errors import code_of
+from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.tasks import Task
 from libero_env.validation import validate
 from libero_eval.policies import PolicyUnderTest
@@ -55,7 +57,7 @@ class UserPolicy(PolicyUnderTest):
         super().__init__(request)
         name = request.policy_name
         self.policy = load_callable(name)
-        self.cameras = self._attribute("cameras", tuple[str, ...], ("agentview", "robot0_eye_in_hand"))
+        self.cameras = self._attribute("cameras", Cameras, DEFAULT_CAMERAS)
         self.observations = self._attribute("observations", tuple[str, ...], OBSERVATIONS)
         named = self._attribute("identity", dict[str, Any], {})
         if "weights" not in named and (weights := weights_digest(self.policy)):

@@ -47,7 +47,8 @@ class RecordingRequest:
         n: Demonstrations of each task.
         size: Size of the images, 128 or 120x160 (default: 128, or that of --for).
         training: Overrides of libero train, such as preset=laptop: size, drawing and robot are those of this run.
-        cameras: Cameras to render.
+        cameras: Cameras to render: names, or texts such as "top,pos=0.4 0 1.6,lookat=0 0 0.9,fovy=60,body=world",
+            each of which adds a camera.
         no_images: Record states, proprioception and actions only; `rerender` can add images later.
         drawing: How images are drawn (default: that of the models).
         depth: Record depth too, in metres.
@@ -290,7 +291,7 @@ def replay_file(
         by: What is replayed.
         demo: Numbers of demonstrations (default: all).
         video: Video to write, .mp4, .webp or .gif.
-        cameras: Cameras of the video.
+        cameras: Cameras of the video, as of `demos generate`.
         size: Size of the video, 128 or 120x160.
         assets: Where models come from: builtin, original, or a folder with the original's.
         bddl: Task file of what was recorded (default: the task that the file states).
@@ -342,7 +343,7 @@ def rerender_file(
             demonstration. Size, cameras and drawing are then by default those of the file.
         perturb_seed: Seed of the samples.
         size: Size of the images, 128 or 120x160 (default: 128).
-        cameras: Cameras to render (default: agentview robot0_eye_in_hand).
+        cameras: Cameras to render, as of `demos generate` (default: agentview robot0_eye_in_hand).
         drawing: How images are drawn (default: that of the models).
         depth: Render depth too, in metres.
         segmentation: Render a segmentation too; the file's attribute segmentation_names names its numbers.

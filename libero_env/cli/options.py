@@ -26,7 +26,7 @@ from libero_env.text import suggest
 
 __all__ = ["Positional", "arg"]
 
-MAX_SIDE = 1024  # pixels, as in libero_env.sim.render, which is slow to import
+MAX_SIDE = 16384  # pixels; what OpenGL draws here, which may be less, libero_env.sim.render knows
 MAX_PROCESSES = 1024  # also of threads
 MAX_STEPS = 1_000_000  # of an episode; 14 hours
 MAX_SEED = 2**63 - 1  # what HDF5 and JSON readers keep

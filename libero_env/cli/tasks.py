@@ -248,7 +248,7 @@ def preview(
     Args:
         task: A file that ends in .yaml or .bddl, or such as libero_goal/3.
         starts: Number of initial states, one per row.
-        cameras: One per column (default: agentview robot0_eye_in_hand birdview).
+        cameras: One per column, as of `libero demos generate` (default: agentview robot0_eye_in_hand birdview).
         size: Side of a picture, pixels.
         video: Also write a video of the expert, by default as webp.
         out: File of the pictures (default: TASK.png here); the video is written beside it.

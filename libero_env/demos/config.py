@@ -15,7 +15,7 @@ from libero_env.assets.pack import select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.contents import Pairing
 from libero_env.demos.write import make_header
-from libero_env.envs.config import Drawing, Names, Robot, Size
+from libero_env.envs.config import Cameras, Drawing, Names, Robot, Size
 from libero_env.errors import InvalidInputError
 from libero_env.perturbations.episodes import checked_perturbations
 from libero_env.perturbations.perturbation import KINDS, Perturbation, format_perturbations
@@ -24,6 +24,7 @@ from libero_env.sim.observations import DEFAULT_CAMERAS, segmentation_labels
 from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
 from libero_env.sim.scene import FAST, Scene, build_scene, default_drawing
 from libero_env.tasks import Task, get_task, read_task
+from libero_env.tasks.cameras import camera_name
 from libero_env.tasks.suites import OWN
 from libero_env.tasks.task import FILE
 from libero_env.timing import CONTROL_HZ
@@ -84,7 +85,7 @@ class RenderConfig:
     """What is rendered of each state.
 
     Attributes:
-        cameras: Names of the cameras in the model.
+        cameras: As for `EnvConfig`.
         size: (height, width) of the images, pixels.
         modalities: Kinds of image: `rgb`, `depth`, and at most one of `segmentation_instance`, `segmentation_class`
             and `segmentation_element`.
@@ -96,7 +97,7 @@ class RenderConfig:
         InvalidInputError: A value is not valid, or a perturbation changes what happens.
     """
 
-    cameras: Names = DEFAULT_CAMERAS
+    cameras: Cameras = DEFAULT_CAMERAS
     size: Size = (128, 128)
     modalities: Names = ("rgb",)
     drawing: Drawing | None = None
@@ -152,7 +153,7 @@ class DemoConfig:
     pairing: Pairing = "aligned"
     disturb: bool = True
     variation: Variation = Variation()
-    cameras: Names = DEFAULT_CAMERAS
+    cameras: Cameras = DEFAULT_CAMERAS
     modalities: Names = ("rgb",)
     drawing: Drawing | None = None
     robot: Robot = DEFAULT_ROBOT
@@ -271,7 +272,7 @@ def _env_kwargs(render: RenderConfig) -> dict[str, Any]:
         "robots": ["Panda"],
         "controller_configs": controller,
         "control_freq": CONTROL_HZ,
-        "camera_names": sorted(render.cameras, reverse=True),
+        "camera_names": sorted(map(camera_name, render.cameras), reverse=True),
         "camera_heights": height,
         "camera_widths": width,
         "camera_depths": "depth" in render.modalities,

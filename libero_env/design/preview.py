@@ -13,6 +13,7 @@ from libero_env.expert import Expert
 from libero_env.expert.expert import MAX_STEPS
 from libero_env.perturbations.perturbation import Perturbation
 from libero_env.sim.observations import image_name
+from libero_env.tasks.cameras import camera_name
 from libero_env.tasks.task import Task
 from libero_env.timing import CONTROL_HZ
 
@@ -49,7 +50,7 @@ def contact_sheet(
     draw = ImageDraw.Draw(sheet)
     for i in range(starts):
         for k, camera in enumerate(cameras):
-            words = f"{camera}, start {i}"
+            words = f"{camera_name(camera)}, start {i}"
             draw.rectangle((k * size, i * size, k * size + 7 * len(words), i * size + _BAND), fill=(0, 0, 0))
             draw.text((k * size + 3, i * size + 1), words, fill=(255, 255, 255))
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -31,7 +31,7 @@ from libero_env.perturbations.sampling import start_name
 from libero_env.sim.engine import Goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward
-from libero_env.sim.scene import InitialStates
+from libero_env.sim.scene import BUFFER_SIDE, InitialStates
 from libero_env.sim.simulation import Indices, Watch
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ, PHYSICS_HZ
@@ -390,7 +390,7 @@ class BatchEnv(LiberoVectorEnv):
 
     def _check_memory(self) -> None:
         """Raise if the simulations and their images do not fit into memory."""
-        if self.num_envs == 1:
+        if self.num_envs == 1 and max(self.config.camera_size) <= BUFFER_SIDE:
             return
         height, width = self.config.camera_size
         images = 16 * height * width * len(self.config.cameras)
@@ -398,7 +398,7 @@ class BatchEnv(LiberoVectorEnv):
         state = 0 if self.config.backend.is_warp else model.narena + model.nbuffer // 8  # on the device
         require_memory(
             self.num_envs * (state + images),
-            f"num_envs={self.num_envs}",
+            f"num_envs={self.num_envs}" if self.num_envs > 1 else f"camera_size={height}x{width}",
             "take fewer simulations or smaller images",
         )
 

@@ -17,6 +17,7 @@ from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
+from libero_env.tasks.cameras import camera_text, distinct_cameras
 from libero_env.text import shown
 from libero_env.timing import CONTROL_HZ, PHYSICS_HZ, ControlFreq
 from libero_env.validation import checked
@@ -63,6 +64,11 @@ def _known(kind: str, names: Iterable[str]) -> AfterValidator:
 
 Pixels = Annotated[int, BeforeValidator(_number), Field(ge=1)]  # the renderer knows the largest size
 Size = Annotated[tuple[Pixels, Pixels], BeforeValidator(_square)]
+Cameras = Annotated[
+    tuple[Annotated[str, BeforeValidator(camera_text)], ...],
+    BeforeValidator(_tuple),
+    AfterValidator(distinct_cameras),
+]
 Names = Annotated[tuple[str, ...], BeforeValidator(_tuple)]
 Assets = Annotated[Pack | str | Path | None, PlainValidator(_assets)]
 Drawing = Annotated[str, _known("drawing", DRAWINGS)]
@@ -74,7 +80,8 @@ class EnvConfig:
     """Configuration of an environment, the same for one simulation and for many.
 
     Attributes:
-        cameras: Names of the cameras that are rendered for each observation; empty for none.
+        cameras: Cameras that are rendered for each observation, empty for none: names of those of the scene, and each a
+            `libero_env.Camera`, or its text, that is added to it.
         camera_size: Height and width of the images, pixels; one number is both.
         horizon: Number of control steps after which an episode is truncated, whatever their length.
         observations: Names of observations, see `libero_env.sim.observations`.
@@ -100,7 +107,7 @@ class EnvConfig:
     """
 
     _: KW_ONLY
-    cameras: Names = DEFAULT_CAMERAS
+    cameras: Cameras = DEFAULT_CAMERAS
     camera_size: Size = (128, 128)
     horizon: Annotated[int, BeforeValidator(_number), Field(ge=1, le=10**9)] = 600
     observations: Names = DEFAULT_OBSERVATIONS

@@ -17,6 +17,7 @@ from libero_env.perturbations.starts import RobotJoints
 from libero_env.sim.appearance import Appearance, CameraView
 from libero_env.sim.scene import Scene, build_scene
 from libero_env.tasks import Task, get_task
+from libero_env.tasks.cameras import added_cameras
 from libero_env.tasks.published.plus import camera_pose, joint_pose
 from libero_env.tasks.published.suites import PublishedTask, require_available
 from libero_env.text import shown
@@ -63,6 +64,7 @@ def open_scenes(task: Task | str, config: EnvConfig, num: int) -> TaskScenes:
         drawing=config.drawing,
         robot=config.robot,
         spare_materials=needs_materials(changes),
+        cameras=added_cameras(config.cameras),
     )
     base_scene = compiled(base.problem)
     # In LIBERO-Plus the controller pulls towards the joints of the variant in its null space, and its first goals are

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -17,6 +18,7 @@ from libero_env.parallel import as_finished, progress_bar, spawn_pool
 from libero_env.paths import cache_dir, read_config
 from libero_env.sim.scene import InitialStates, Scene, build_scene
 from libero_env.storage import atomic_write_npz, cached_arrays, read_npz, read_packaged_npz
+from libero_env.tasks import bddl
 from libero_env.tasks.published.suites import PublishedTask
 from libero_env.tasks.task import Task
 
@@ -120,8 +122,9 @@ def cache_init_states(task: Task) -> Path:
 
 
 def _cached_path(task: Task, digest: str) -> Path:
-    # Regions and atoms are part of the text, not of the scene's digest.
-    text_digest = hashlib.sha256(task.bddl_text.encode()).hexdigest()[:16]
+    # Regions and atoms are part of the text, not of the scene's digest; cameras change no state.
+    text = bddl.write(replace(task.problem, cameras=()))
+    text_digest = hashlib.sha256(text.encode()).hexdigest()[:16]
     return cache_dir() / "init_states" / f"{task.name[:80]}-{digest}-{text_digest}.npz"
 
 

@@ -37,6 +37,7 @@ from libero_env.sim.render import Renderer, RenderTarget
 from libero_env.sim.scene import FAITHFUL, Scene
 from libero_env.sim.simulation import Indices, Simulations
 from libero_env.sim.state import StateView
+from libero_env.tasks.cameras import camera_name, image_stem
 
 SEGMENTATIONS = ("instance", "class", "element")
 ARENA, ARM, GRIPPER = "arena", "robot", "gripper"
@@ -84,7 +85,7 @@ class Observer:
         scene: Scene that is simulated.
         simulations: Simulations to observe.
         observations: Names of the table above.
-        cameras: Names of the cameras to render; empty for none.
+        cameras: Cameras to render, empty for none: names, or texts of cameras that were added to the scene.
         camera_size: Height and width of the images, pixels.
 
     Attributes:
@@ -116,7 +117,9 @@ class Observer:
         self.renderer = Renderer(scene.model, *self.camera_size, faithful=scene.drawing == FAITHFUL)
         self.segmentation = kinds[0] if kinds else None
         self._kinds = [k for k in ("rgb", "depth") if k in observations] + (["segmentation"] if kinds else [])
-        self._cameras = {name: self.renderer.camera_id(name) for name in cameras}
+        # those of the scene first: where images share the headlight, it is at the first of them
+        drawn = sorted(cameras, key=lambda text: camera_name(text) in scene.added_cameras)
+        self._cameras = {name: self.renderer.camera_id(name) for name in map(camera_name, drawn)}
         selected = {*observations, *(PROPRIOCEPTION if "proprioception" in observations else ())}
         self._robot = [name for name in _ROBOT if name in selected]
         self._entities = tuple(scene.entities) if "objects" in observations else ()
@@ -318,5 +321,9 @@ def segmentation_labels(scene: Scene, kind: str) -> Labels:
 
 
 def image_name(camera: str, kind: str) -> str:
-    """Return the name of a camera's images in observations: `robot0_eye_in_hand`, `rgb` -> `eye_in_hand_rgb`."""
-    return f"{camera.removeprefix('robot0_')}_{kind}"
+    """Return the name of a camera's images in observations: `robot0_eye_in_hand`, `rgb` -> `eye_in_hand_rgb`.
+
+    Args:
+        camera: Name of the camera, or the text of one that is added.
+    """
+    return f"{image_stem(camera)}_{kind}"

@@ -97,21 +97,38 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
     raise RenderError(f"no OpenGL backend works here ({'; '.join(failures)}). Remedy: {REMEDY}")
 
 
-@lru_cache(maxsize=1)
 def renderer_name() -> tuple[str, str]:
     """Return the names of the OpenGL backend and of the renderer, such as `egl` and `llvmpipe (LLVM 15.0.6)`.
 
     Raises:
         RenderError: No backend works here.
     """
+    backend, name, _ = _opengl()
+    return backend, name
+
+
+def largest_image() -> int:
+    """Return the largest height and width of an image that OpenGL can draw here, pixels.
+
+    Raises:
+        RenderError: No backend works here.
+    """
+    return _opengl()[2]
+
+
+@lru_cache(maxsize=1)
+def _opengl() -> tuple[str, str, int]:
+    """Return the names of OpenGL's backend and renderer, and the largest edge of a picture, pixels."""
     backend, context = open_context(64, 64)
     try:
         context.make_current()
         gl = importlib.import_module("OpenGL.GL")  # after the context, which chooses PyOpenGL's platform
         name = gl.glGetString(gl.GL_RENDERER)
+        limits = [gl.glGetIntegerv(kind) for kind in (gl.GL_MAX_RENDERBUFFER_SIZE, gl.GL_MAX_VIEWPORT_DIMS)]
     finally:
         context.free()
-    return backend, name.decode(errors="replace") if name else "unknown"
+    largest = int(min(np.min(limit) for limit in limits))
+    return backend, name.decode(errors="replace") if name else "unknown", largest
 
 
 @dataclass(frozen=True)
@@ -146,16 +163,19 @@ class Renderer:
         cull: Whether what the camera cannot show is left out; images do not depend on it.
 
     Raises:
-        RenderError: The images are larger than the model's offscreen buffer.
+        RenderError: The images are larger than OpenGL can draw here.
     """
 
     def __init__(
         self, model: mujoco.MjModel, height: int, width: int, *, faithful: bool = False, cull: bool = True
     ):
         largest = min(model.vis.global_.offheight, model.vis.global_.offwidth)
+        if max(height, width) > largest:  # the buffer is made larger
+            largest = largest_image()
         if not (0 < height <= largest and 0 < width <= largest):
             raise RenderError(
-                f"an image of {height}x{width} pixels is not valid; height and width must be between 1 and {largest}"
+                f"an image of {height}x{width} pixels is not valid; OpenGL draws heights and widths from 1 to "
+                f"{largest} here"
             )
         self._model, self._height, self._width, self._faithful = model, height, width, faithful
         self._culling = Culling(model) if cull else None
@@ -326,7 +346,12 @@ class Renderer:
         except mujoco.FatalError as error:
             gl.free()
             raise RenderError(f"{backend} opens, but renders nothing ({error}). Remedy: {REMEDY}") from error
-        mujoco.mjr_resizeOffscreen(self._width, self._height, self._context)
+        try:
+            mujoco.mjr_resizeOffscreen(self._width, self._height, self._context)
+        except mujoco.FatalError as error:
+            gl.free()
+            size = f"{self._height}x{self._width}"
+            raise RenderError(f"OpenGL cannot draw an image of {size} pixels here: {error}") from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._context.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
         self._scene = mujoco.MjvScene(self._model, maxgeom=self._model.ngeom + 100)

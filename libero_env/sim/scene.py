@@ -7,7 +7,7 @@ that states of the original have the same layout. The poses of fixtures belong t
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,6 +24,7 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.mujoco_compat import log_warnings, mujoco, set_damping
 from libero_env.objects.catalog import version_of
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY, ObjectModel
+from libero_env.tasks.cameras import Camera, require_own_names
 from libero_env.tasks.problem import Atom, Problem, ProblemError, Region, Violation
 from libero_env.text import suggest
 from libero_env.timing import TIMESTEP
@@ -32,7 +33,7 @@ from libero_env.timing import TIMESTEP
 InitialStates = np.ndarray
 FAST, FAITHFUL = DRAWINGS = ("fast", "faithful")
 ROBOT = "robot"  # name of arm and gripper in contacts
-_MAX_IMAGE = 1024  # [pixels] largest edge of an image; size of the offscreen buffer
+BUFFER_SIDE = 1024  # [pixels] size of the offscreen buffer, which larger images enlarge
 _FIXTURE_LIFT = 0.01  # [m] height of fixtures over the underside of the table top, as in the original
 _ZONE_HEIGHT = 0.014  # [m] of the box over a flat region
 
@@ -51,6 +52,7 @@ class Scene:
         drawing: How images are drawn, one of `DRAWINGS`.
         robot: Model of the arm, one of `libero_env.assets.robot.ROBOTS`.
         spare_materials: Whether the model has materials that nothing has, see `build_scene`.
+        added_cameras: Names of the cameras that are added to those of workspace and robot.
     """
 
     problem: Problem
@@ -63,6 +65,7 @@ class Scene:
     drawing: str
     robot: str
     spare_materials: bool = False
+    added_cameras: frozenset[str] = frozenset()
 
     @property
     def nq_robot(self) -> int:
@@ -201,6 +204,7 @@ def build_scene(
     drawing: str | None = None,
     robot: str = DEFAULT_ROBOT,
     spare_materials: bool = False,
+    cameras: Sequence[Camera] = (),
 ) -> Scene:
     """Compile a problem; the result is cached for the process.
 
@@ -211,14 +215,18 @@ def build_scene(
         robot: One of `libero_env.assets.robot.ROBOTS`.
         spare_materials: Whether the model also has the styles of all floors, walls and tables as materials, for a
             `libero_env.sim.appearance.Appearance`. Nothing else depends on it.
+        cameras: Cameras that are added, besides those of the problem.
 
     Raises:
         ProblemError: A region is not a site of its target's model, or a goal has a state that the model does not have.
-        UnknownNameError: A category of objects or fixtures has no model.
+        UnknownNameError: A category of objects or fixtures has no model, or the body of a camera does not exist.
+        InvalidInputError: An added camera has the name of another.
         LiberoError: MuJoCo refuses the models, such as those with the same names.
     """
     pack = pack or select_pack()
-    return _build_scene(problem, pack, drawing or default_drawing(pack), robot, spare_materials)
+    return _build_scene(
+        problem, pack, drawing or default_drawing(pack), robot, spare_materials, tuple(cameras)
+    )
 
 
 def default_drawing(pack: Pack) -> str:
@@ -227,11 +235,16 @@ def default_drawing(pack: Pack) -> str:
 
 
 def _compile_scene(
-    problem: Problem, pack: Pack, drawing: str, robot: str, spare_materials: bool = False
+    problem: Problem,
+    pack: Pack,
+    drawing: str,
+    robot: str,
+    spare_materials: bool = False,
+    cameras: Sequence[Camera] = (),
 ) -> Scene:
     name, workspace = workspace_of(problem)
     entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
-    spec = scene_spec(problem, pack, entities, drawing=drawing, robot=robot)
+    spec = scene_spec(problem, pack, entities, drawing=drawing, robot=robot, cameras=cameras)
     if spare_materials:
         add_spare_materials(spec)
     log_warnings()
@@ -245,7 +258,10 @@ def _compile_scene(
         ) from error
     objects = {n: entities[n] for n in problem.objects}
     fixtures = {n: entities[n] for n in problem.fixtures if n != name}
-    scene = Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot, spare_materials)
+    added = frozenset(camera.name for camera in (*problem.cameras, *cameras))
+    scene = Scene(
+        problem, pack, workspace, name, model, objects, fixtures, drawing, robot, spare_materials, added
+    )
     _check_sites(scene)
     _check_states(scene)
     return scene
@@ -315,6 +331,7 @@ def scene_spec(
     *,
     drawing: str | None = None,
     robot: str = DEFAULT_ROBOT,
+    cameras: Sequence[Camera] = (),
 ) -> mujoco.MjSpec:
     """Return a new, editable model of a problem's scene.
 
@@ -324,9 +341,11 @@ def scene_spec(
         entities: Models of objects and fixtures by name; by default those of the pack.
         drawing: One of `DRAWINGS`; by default that of `default_drawing`.
         robot: One of `libero_env.assets.robot.ROBOTS`.
+        cameras: Cameras that are added, besides those of the problem.
 
     Raises:
-        UnknownNameError: A category of objects or fixtures has no model.
+        UnknownNameError: A category of objects or fixtures has no model, or the body of a camera does not exist.
+        InvalidInputError: An added camera has the name of another.
     """
     pack = pack or select_pack()
     name, workspace = workspace_of(problem)
@@ -351,6 +370,7 @@ def scene_spec(
             spec.attach(item.spec, prefix=f"{entity}_", frame=spec.worldbody.add_frame())
     if faithful and isinstance(pack, OriginalPack):
         pack.restore_drawing(spec, workspace, problem.scene_properties)
+    _add_cameras(spec, (*problem.cameras, *cameras))
     return spec
 
 
@@ -433,9 +453,25 @@ def _set_options(spec: mujoco.MjSpec, samples: int) -> None:
     visual.map.znear = 0.001
     visual.quality.offsamples = samples  # four double the cost of an image
     visual.quality.shadowsize = 0  # no light casts a shadow, in the original neither
-    visual.global_.offwidth = visual.global_.offheight = _MAX_IMAGE
+    visual.global_.offwidth = visual.global_.offheight = BUFFER_SIDE
     visual.headlight.ambient, visual.headlight.diffuse = [0.1] * 3, [0.4] * 3
     visual.headlight.specular = [0.5] * 3
+
+
+def _add_cameras(spec: mujoco.MjSpec, cameras: Sequence[Camera]) -> None:
+    """Add cameras to a complete scene; they come last, and change nothing for the others."""
+    require_own_names(cameras, [camera.name for camera in spec.cameras])
+    bodies = {body.name: body for body in spec.bodies}
+    for camera in cameras:
+        body = bodies.get(camera.body) or bodies.get(f"{camera.body}_{ROOT_BODY}")
+        if body is None:
+            valid = [name.removesuffix(f"_{ROOT_BODY}") for name in bodies]
+            raise UnknownNameError(f"body of camera {camera.name}", camera.body, valid)
+        added = body.add_camera(name=camera.name, pos=camera.pos, fovy=camera.fovy)
+        if camera.quat is not None:
+            added.quat = np.array(camera.quat) / np.linalg.norm(camera.quat)
+        else:
+            added.alt.type, added.alt.xyaxes = mujoco.mjtOrientation.mjORIENTATION_XYAXES, camera.axes()
 
 
 def _add_zones(spec: mujoco.MjSpec, problem: Problem, name: str, workspace: Workspace) -> None:

@@ -2,8 +2,9 @@
 
 The dialect is the original LIBERO's: `(define (problem NAME) (:domain ...) (:language ...) (:regions ...)
 (:fixtures ...) (:objects ...) (:obj_of_interest ...) (:scene_properties ...) (:init ...) (:goal ...))`, with
-`;` comments. `:requirements` is ignored. Goals may nest and, or, not and forall. Numbers may be
-arithmetic with `pi`; nothing in a file is ever executed.
+`;` comments. In `(:views ...)`, which the original does not have, each list is the text of a `Camera`. `:requirements`
+is ignored. Goals may nest and, or, not and forall. Numbers may be arithmetic with `pi`; nothing in a file is ever
+executed.
 """
 
 import re
@@ -15,6 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from libero_env.errors import BDDLError, InvalidInputError
+from libero_env.tasks.cameras import Camera
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, ProblemError, Region
 from libero_env.tasks.sexpr import MAX_CHARACTERS, List, Word, number, parse_tree, show, text_of
 
@@ -27,11 +29,13 @@ SECTIONS = (
     ":objects",
     ":obj_of_interest",
     ":scene_properties",
+    ":views",
     ":init",
     ":goal",
 )
 
-_SECTIONS_OF = {"name": ":domain"}  # field of a problem -> section, where its name is another
+# field of a problem -> section, where its name is another
+_SECTIONS_OF = {"name": ":domain", "cameras": ":views"}
 _PREDICATE = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
 
 
@@ -117,6 +121,8 @@ def write(problem: Problem) -> str:
         sections.append(
             _block(":scene_properties", [f"(:{k} {v})" for k, v in problem.scene_properties.items()])
         )
+    if problem.cameras:
+        sections.append(_block(":views", [f"({camera})" for camera in problem.cameras]))
     sections += [
         _block(":init", map(str, problem.init)),
         _block(":goal", [str(problem.goal)]),
@@ -235,6 +241,7 @@ class Reader:
             "objects": self.names(items[":objects"]),
             "obj_of_interest": tuple(map(self.word, items.get(":obj_of_interest", ()))),
             "scene_properties": dict(map(self.scene_property, items.get(":scene_properties", ()))),
+            "cameras": tuple(map(self.camera, items.get(":views", ()))),
             "init": init,
             "unknown_sections": tuple(self.unknown),
             "goal": self.expression(items[":goal"][0]),
@@ -322,6 +329,15 @@ class Reader:
         if not isinstance(node, List) or not node.head.startswith(":"):
             self.fail(node.line, f"not a scene property: {show(node)}", "(:floor STYLE) or (:wall STYLE)")
         return node.head[1:], " ".join(map(self.word, node.items[1:]))
+
+    def camera(self, node: Word | List) -> Camera:
+        """Return the camera of an entry of `:views`."""
+        words = map(self.word, node.items if isinstance(node, List) else [node])
+        try:
+            return Camera.read(" ".join(words))
+        except InvalidInputError as error:
+            what, _, expected = str(error).partition("; expected ")
+            raise BDDLError(what, expected or "a camera", self.file, node.line) from None
 
     def atom(self, node: Word | List) -> Atom:
         """Return the atom of a list."""

@@ -37,6 +37,8 @@ the scene or replaces their values. Keys of both:
     obj_of_interest  names; by default the objects and then the fixtures that the goal refers to, where a region
                      stands for its target
     scene_properties key: value
+    cameras          name: {pos, lookat or quat, fovy, body} of a camera that is added; see
+                     `libero_env.tasks.cameras.Camera`
 
 Regions that are sites of a model, such as `basket_1_contain_region`, need no declaration.
 """
@@ -53,6 +55,7 @@ from typing import Any
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.storage import parse_yaml
 from libero_env.tasks import bddl
+from libero_env.tasks.cameras import Camera
 from libero_env.tasks.problem import WORKSPACES, And, Expression, Problem, ProblemError, Region
 from libero_env.tasks.source import Source, Trace, read_definition, scene_file
 from libero_env.tasks.task import FILE, Task, check_name
@@ -71,7 +74,8 @@ _HALF_EXTENT = {"object": 0.025, "fixture": 0.01}  # [m] default, as in the orig
 _PLACING = ("On", "In")  # predicates of init atoms that give an entity its place
 _TABLE = "main_table"  # name of the fixture `table` in the original's task files
 _NESTED = re.compile(r"\(\s*(and|or|not|forall)\b", re.IGNORECASE)
-_KEYS_OF = {"name": "problem", "domain": "problem"}  # field of a problem, or section of a task file -> key
+# field of a problem, or section of a task file -> key
+_KEYS_OF = {"name": "problem", "domain": "problem", "views": "cameras"}
 
 Values = Mapping[str, Any]
 
@@ -237,6 +241,7 @@ class _Content:
         init: Atoms such as `On a b`.
         goal: Atoms, and expressions in brackets.
         styles: Kind -> style.
+        cameras: Name -> keys of the camera.
         texts: `name`, `language` and `problem`, where they are given.
         interest: Names of interest; None for those of the goal.
     """
@@ -247,6 +252,7 @@ class _Content:
     init: list[str] = field(default_factory=list)
     goal: list[str] = field(default_factory=list)
     styles: dict[str, str] = field(default_factory=dict)
+    cameras: dict[str, Any] = field(default_factory=dict)
     texts: dict[str, str] = field(default_factory=dict)
     interest: list[str] | None = None
 
@@ -314,6 +320,9 @@ class _Merge:
         if keys.get("goal"):
             content.goal, content.interest = self._atoms(keys, "goal", source), None
         content.interest = keys.get("obj_of_interest", content.interest)
+        for name, view in keys.get("cameras", {}).items():
+            content.cameras[name] = view
+            self.trace.note(f"camera {name}", source, "cameras", name)
         content.styles |= keys.get("scene_properties", {})
         content.texts |= {key: keys[key] for key in ("name", "language", "problem") if key in keys}
         if self._check_models:
@@ -445,6 +454,7 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
         for name, keys in named.items()
         if keys is not None
     )
+    cameras = tuple(_camera(name, keys, trace) for name, keys in content.cameras.items())
     parts: tuple[Expression, ...] = ()
     try:
         init = tuple(bddl.parse_atom(atom, *trace.of(atom)) for atom in content.init)
@@ -465,6 +475,7 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
             obj_of_interest=tuple(interest),
             scene_properties=content.styles,
             goal=goal,
+            cameras=cameras,
         )
     except ProblemError as error:
         first = error.violations[0]
@@ -513,6 +524,14 @@ def _region(name: str, target: str, keys: Values, trace: Trace) -> Region:
         return Region(name, target, tuple(ranges), yaw, tuple(keys.get("rgba", ())))
     except InvalidInputError as error:
         raise InvalidInputError(f"{where}: {error}") from None
+
+
+def _camera(name: str, keys: Values, trace: Trace) -> Camera:
+    """Return the camera of its keys."""
+    try:
+        return Camera(name, **keys)
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{trace.at(f'camera {name}', 'cameras', name)}: {error}") from None
 
 
 def _with_entries(parameters: Values) -> dict[str, Any]:

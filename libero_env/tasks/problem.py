@@ -9,89 +9,40 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
 from libero_env.errors import InvalidInputError
 from libero_env.parallel import send_to_workers
+from libero_env.tasks.cameras import Camera
+from libero_env.tasks.values import (
+    NAME,
+    Colour,
+    EntityName,
+    Language,
+    Name,
+    Rectangle,
+    Words,
+    YawRange,
+)
 from libero_env.text import suggest
 from libero_env.validation import checked
 
 MAX_DEPTH = 64  # levels of a goal, and of brackets in a task file
 MAX_PARTS = 1000  # regions, init atoms, parts of a goal, rectangles of a region
+MAX_CAMERAS = 50  # of a task's own
 MAX_ENTITIES = 100  # objects and fixtures of a scene
-MAX_NAME = 100  # characters of a name
 _MAX_EVALUATIONS = 10_000  # atoms of a goal, counted for each object that its quantifiers stand for
 
 WORKSPACES = ("table", "kitchen_table", "living_room_table", "study_table", "coffee_table", "floor")
 """Categories of the fixtures that a task takes place on, see `libero_env.assets.arena`."""
 
-_NAME = re.compile(rf"\w[\w.-]{{0,{MAX_NAME - 1}}}")
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
-_NAME_RULE = f"letters, digits, _ . and -, at most {MAX_NAME} characters"
-_UNWRITABLE = re.compile("[();\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-_RESERVED = ("robot", "world", "ee")  # the robot in contacts, MuJoCo's root, the hand in observations
-_RESERVED_PREFIXES = ("robot0", "gripper0", "mount0")
 _VARIABLE = re.compile(r"\??\w[\w.-]*")
 _PLACING = ("On", "In")
 
 Value = TypeVar("Value")
-
-
-def _check_name(text: str) -> str:
-    if not _NAME.fullmatch(text):
-        raise ValueError(f"the name {text!r:.60} is not valid; expected {_NAME_RULE}")
-    return text
-
-
-def _check_entity(name: str) -> str:
-    if name in _RESERVED or name.startswith(_RESERVED_PREFIXES):
-        raise ValueError(
-            f"the name {name} is one of the robot or of MuJoCo; expected another, such as plate_1"
-        )
-    return name
-
-
-def _check_writable(text: str) -> str:
-    if _UNWRITABLE.search(text):
-        raise ValueError(f"{text!r:.60} cannot be written; expected one line without ( ) and ;")
-    return text
-
-
-def check_corners(rectangle: Any) -> Any:
-    """Return a rectangle (x0, y0, x1, y1), whose corners must be in order."""
-    x0, y0, x1, y1 = rectangle
-    if x1 < x0 or y1 < y0:
-        raise ValueError(
-            f"{rectangle} has swapped corners; expected (X0 Y0 X1 Y1) with X0 <= X1 and Y0 <= Y1"
-        )
-    return rectangle
-
-
-def check_order(limits: Any) -> Any:
-    """Return a range (low, high), which must be in order."""
-    low, high = limits
-    if high < low:
-        raise ValueError(f"{limits} is not a range; expected (LOW HIGH) with LOW <= HIGH")
-    return limits
-
-
-def _check_colour(rgba: tuple[float, ...]) -> tuple[float, ...]:
-    if len(rgba) not in (0, 4):
-        raise ValueError(f"{rgba} is not a colour; expected 4 numbers")
-    return rgba
-
-
-Name = Annotated[str, AfterValidator(_check_name)]
-EntityName = Annotated[Name, AfterValidator(_check_entity)]
-Words = Annotated[str, Field(max_length=MAX_NAME), AfterValidator(_check_writable)]
-Language = Annotated[str, Field(max_length=1000), AfterValidator(_check_writable)]
-Metres = Annotated[float, Field(ge=-10, le=10)]  # in the frame of the workspace
-Radians = Annotated[float, Field(ge=-100, le=100)]
-Rectangle = Annotated[tuple[Metres, Metres, Metres, Metres], AfterValidator(check_corners)]
-YawRange = Annotated[tuple[Radians, Radians], AfterValidator(check_order)]
-Colour = Annotated[tuple[float, ...], AfterValidator(_check_colour)]  # none, or red, green, blue, opacity
 
 
 @checked
@@ -253,6 +204,7 @@ class Problem:
         scene_properties: Kind (`floor`, `wall`, `scene`) -> style.
         domain: Name of the planning domain.
         unknown_sections: Texts of sections that only a reader of one's own knows, such as `(:camera ...)`.
+        cameras: Cameras that the scene has besides those of its workspace and of the robot.
 
     Raises:
         ProblemError: No scene can be built from it.
@@ -270,6 +222,7 @@ class Problem:
     scene_properties: Mapping[Name, Words] = field(default_factory=dict, hash=False)
     domain: Words = "robosuite"
     unknown_sections: tuple[str, ...] = ()
+    cameras: Annotated[tuple[Camera, ...], Field(max_length=MAX_CAMERAS)] = ()
 
     def __post_init__(self) -> None:
         if violations := tuple(_violations(self)):
@@ -379,6 +332,9 @@ def _violations(problem: Problem) -> Iterator[Violation]:
         return
     for name in sorted(problem.fixtures.keys() & problem.objects.keys()):
         yield Violation("name", f"{name} is a fixture too", "each name declared once", ":objects", name)
+    for camera, count in Counter(camera.name for camera in problem.cameras).items():
+        if count > 1:
+            yield Violation("name", f"{count} cameras {camera}", "each name once", ":views", camera)
     for kind in problem.scene_properties:
         if kind != kind.casefold():
             yield Violation("name", f"the scene property {kind}", "floor, wall or scene", ":scene_properties")
@@ -438,7 +394,7 @@ def _atom(
                 {*problem.fixtures, *problem.objects, *(r.address for r in problem.regions), *bound}
             )
             near = suggest(name, declared)
-            if is_own and not near and _NAME.fullmatch(name):
+            if is_own and not near and NAME.fullmatch(name):
                 continue  # a word
             valid = f"one of {', '.join(declared)}" if declared else "a declared name"
             yield "unknown-name", f": {name} is not declared{near and '.'}{near}", valid
@@ -536,6 +492,7 @@ def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
         "fixtures": (list(a.fixtures.items()), list(b.fixtures.items())),
         "objects": (list(a.objects.items()), list(b.objects.items())),
         "obj_of_interest": (set(a.obj_of_interest), set(b.obj_of_interest)),
+        "cameras": (set(a.cameras), set(b.cameras)),
         "scene_properties": (dict(a.scene_properties), dict(b.scene_properties)),
         "init": (set(a.init), set(b.init)),
         "goal": (a.goal.fold(_meaning), b.goal.fold(_meaning)),

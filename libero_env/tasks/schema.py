@@ -4,24 +4,17 @@ Values are checked after parameters are filled in. What comes back is in one for
 numbers are numbers (`pi/2` is 1.57), a single object is a list of one.
 """
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Required
 
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 from typing_extensions import TypedDict
 
 from libero_env.errors import LiberoError
-from libero_env.tasks.problem import (
-    MAX_ENTITIES,
-    MAX_PARTS,
-    Language,
-    Name,
-    Words,
-    check_corners,
-    check_order,
-)
+from libero_env.tasks.problem import MAX_ENTITIES, MAX_PARTS
 from libero_env.tasks.sexpr import number, parse_tree
 from libero_env.tasks.source import Source
 from libero_env.tasks.task import check_name
+from libero_env.tasks.values import Language, Name, Words, check_corners, check_order
 from libero_env.validation import validate
 
 
@@ -97,9 +90,10 @@ def _form(value: Any) -> str | None:
     return "text" if isinstance(value, str) else "fields" if isinstance(value, dict) else None
 
 
-_TWO, _FOUR = (Field(min_length=n, max_length=n) for n in (2, 4))
+_TWO, _THREE, _FOUR = (Field(min_length=n, max_length=n) for n in (2, 3, 4))
 _Number = Annotated[float, BeforeValidator(_number)]
 _Metres = Annotated[float, Field(ge=-10, le=10), BeforeValidator(_number)]
+_Point = Annotated[list[_Metres], _THREE]
 _Half = Annotated[float, Field(ge=0, le=10), BeforeValidator(_number)]
 _Radians = Annotated[float, Field(ge=-100, le=100), BeforeValidator(_number)]
 _Row = Annotated[list[_Metres], _FOUR, AfterValidator(check_corners)]
@@ -151,6 +145,16 @@ _Place = Annotated[
 ]
 
 
+class View(TypedDict, total=False):
+    """A camera; see `libero_env.tasks.cameras.Camera`."""
+
+    pos: Required[_Point]
+    quat: Annotated[list[_Number], _FOUR]
+    lookat: _Point
+    fovy: _Number
+    body: Name
+
+
 class Definition(TypedDict, total=False):
     """Keys of a task, without `scene` and `with`."""
 
@@ -165,6 +169,7 @@ class Definition(TypedDict, total=False):
     regions: dict[Name, Annotated[dict[Name, Rectangle | None], BeforeValidator(_sites)]]
     init: _Atoms
     init_also: _Atoms
+    cameras: dict[Name, View]
     obj_of_interest: Annotated[list[Name], Field(max_length=MAX_PARTS)]
     scene_properties: dict[Name, Annotated[Words, AfterValidator(lambda text: " ".join(text.split()))]]
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from libero_env.sim.observations import image_name
 from libero_env.tasks import Task
 from libero_eval.protocols.preprocessing import preprocess
 from libero_eval.protocols.protocol import EvalProtocol
@@ -96,7 +97,7 @@ class ProtocolAdapter:
 
 def view_of(camera: str) -> str:
     """Return the name of the observed image of a camera."""
-    return f"{camera.removeprefix('robot0_')}_rgb"
+    return image_name(camera, "rgb")
 
 
 def axis_angle(quat_xyzw: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero
 _AtLeastOne = Annotated[int, Field(ge=1)]
 _Steps = Annotated[int, Field(ge=1, le=1_000_000)]
 _EnvSeed = Annotated[int, Field(ge=0, le=2**32 - 1)]
-_RenderSide = Annotated[int, Field(ge=1, le=1024)]  # pixels
+_RenderSide = Annotated[int, Field(ge=1, le=16384)]  # pixels
 _Side = Annotated[int, Field(ge=1, le=4096)]
 _Action = Annotated[tuple[float, ...], Field(min_length=7, max_length=7)]
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import given
@@ -11,6 +12,7 @@ from libero_env.assets.pack import chosen_assets
 from libero_env.objects import folder
 from libero_env.paths import objects_dir
 from libero_env.tasks import bddl, make_task, read_suite
+from libero_env.tasks.cameras import Camera
 from libero_env.tasks.problem import differences
 from libero_eval.protocols.files import load_protocol
 from tests.harness.fuzz import examples, survive
@@ -160,3 +162,27 @@ def test_a_changed_configuration_of_the_user_is_read_or_refused(place, config):
         for name in ("LIBERO_OBJECTS", "LIBERO_ASSETS"):
             patch.delenv(name, raising=False)
         survive("config.yaml", lambda: (objects_dir(), chosen_assets()))
+
+
+PARTS = (
+    "top",
+    "pos=0 0 1",
+    "lookat=0 0 0",
+    "quat=1 0 0 0",
+    "fovy=30",
+    "body=plate_1",
+    "pos=0 0 1e-300",
+    "pos=nan 0 0",
+)
+
+
+@given(
+    st.lists(st.sampled_from(PARTS), max_size=6).map(",".join).flatmap(changed_text) | st.text(max_size=60)
+)
+@examples(200, 4000)
+def test_the_text_of_a_camera_is_a_camera_or_one_line(text):
+    camera = survive("cameras", lambda: Camera.read(text))
+    if camera is not None:
+        assert Camera.read(str(camera)) == camera
+        if camera.quat is None:
+            assert np.isfinite(camera.axes()).all()

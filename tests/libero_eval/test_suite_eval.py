@@ -14,6 +14,8 @@ import pytest
 
 from libero_env import memory
 from libero_env.cli import main as cli
+from libero_env.sim.scene import build_scene
+from libero_env.tasks import get_task
 from libero_eval.evaluation_file import EvaluationResult, overall
 from libero_eval.plan import choose_init_states, plan_evaluation
 from libero_eval.plan import evaluate as evaluate_request
@@ -334,6 +336,49 @@ def test_several_workers_of_the_command_line_have_the_result_of_one(module, tmp_
     monkeypatch.setattr(memory, "host_memory", lambda: (10**9, 10**10))
     assert cli.main([*command, "--out", "three", "--workers", "3"]) == 2
     assert "by 3 processes needs about 1.8 GB" in capsys.readouterr().err and not Path("three").exists()
+
+
+WATCHING = """
+import numpy as np
+from libero_env import Camera
+
+class Policy:
+    cameras = (Camera("agent", pos=(0.658613, 0, 1.61035), quat={quat}), "agentview")
+    observations, camera_size = ("rgb",), (32, 32)
+
+    def predict(self, observations):
+        assert np.array_equal(observations["agent_rgb"], observations["agentview_rgb"])
+        return np.zeros((len(observations["agent_rgb"]), 7))
+
+def make():
+    return Policy()
+"""
+
+
+@pytest.mark.sim
+def test_a_policy_sees_a_camera_that_it_adds(tmp_path, monkeypatch, capsys):
+    quat = tuple(build_scene(get_task("libero_goal/0").problem).model.camera("agentview").quat)
+    (tmp_path / "watching_policy.py").write_text(WATCHING.replace("{quat}", str([*map(float, quat)])))
+    monkeypatch.chdir(tmp_path)
+    command = [
+        "eval",
+        "watching_policy:make",
+        "--suite",
+        "libero_goal/0",
+        "--episodes",
+        "2",
+        "--horizon",
+        "2",
+    ]
+    assert cli.main([*command, "--threads", "1", "--videos", "1"]) == 0
+    assert EvaluationResult.read(next(tmp_path.glob("eval/*"))).tasks[0].successes == (False, False)
+    card = tmp_path / "mine.yaml"
+    card.write_text("extends: libero\ntitle: t\npixels: {cameras: ['top,pos=0 0 2,lookat=0 0 1']}\n")
+    assert cli.main([*command, "--protocol", str(card)]) == 2
+    assert (
+        "pixels.cameras.0 is 'top,pos=0 0 2,lookat=0 0 1'; expected one of 'agentview'"
+        in capsys.readouterr().err
+    )
 
 
 FEELING = """
