@@ -1,5 +1,8 @@
 """Observations: images agree with each other and with the state, and are rendered only on request."""
 
+import re
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -45,6 +48,20 @@ def turned_on(env):
     state, model = env.get_state(), env.scene.model
     state[1 + model.joint("flat_stove_1_button").qposadr[0]] = 1.5
     return state
+
+
+def test_the_page_on_state_and_action_has_the_limits_of_the_model(kitchen):
+    """Rows such as | | 5 | `robot0_joint6` | | rad | -0.0175 ... 3.7525 |, in the order of qpos."""
+    page = (Path(__file__).parents[2] / "docs" / "state-and-action.md").read_text()
+    rows = re.findall(
+        r"\| (\d) \| `(\w+joint\d)` \|.*\| (\S+)(?: \(\w+\))? \.\.\. (\S+)(?: \(\w+\))? \|", page
+    )
+    model = kitchen.scene.model
+    assert [name for _, name, _, _ in rows] == [model.joint(i).name for i in range(9)]
+    assert [int(index) for index, _, _, _ in rows] == [*range(7), 0, 1]
+    np.testing.assert_allclose(
+        [sorted((float(low), float(high))) for _, _, low, high in rows], model.jnt_range[:9]
+    )
 
 
 def test_each_name_gives_the_documented_entries(closing, kitchen):
