@@ -28,7 +28,7 @@ from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interva
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
-UNMEASURED = ("actions", "limits_reached")  # columns that are not part of `outcomes`
+UNMEASURED = ("actions", "limits_reached", "failures")  # columns that are not part of `outcomes`
 
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
 _Id = Annotated[
@@ -60,7 +60,7 @@ class TaskResult(Episodes):
     actions: tuple[str, ...] = ()
     attempts: tuple[tuple[Count, ...], ...] = ()
 
-    OPTIONAL: ClassVar[tuple[str, ...]] = ("errors", "actions", "attempts")
+    OPTIONAL: ClassVar[tuple[str, ...]] = (*Episodes.OPTIONAL, "errors", "actions", "attempts")
 
     def __post_init__(self) -> None:
         errors = self.shape_errors()

@@ -1,7 +1,7 @@
 """Contrast of evaluated policies, start by start: differences, tests, a control arm, and what could be shown."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -21,6 +21,7 @@ from libero_eval.judging.comparability import (
 )
 from libero_eval.judging.group_scores import GroupScores, group_scores
 from lifelong.errors import ConfigError, writing
+from lifelong.results.failures import count_causes
 from lifelong.stats.episodes import (
     ALPHA,
     Difference,
@@ -80,7 +81,7 @@ class Contrast:
 
 @dataclass(frozen=True)
 class Rate:
-    """A policy in a table: its runs, episodes and success with Wilson's interval over the episodes."""
+    """A policy in a table: its runs, episodes, success with Wilson's interval, and causes of failures."""
 
     label: str
     paths: tuple[str, ...]
@@ -88,6 +89,7 @@ class Rate:
     episodes: int
     errors: int
     success: Estimate
+    causes: Mapping[str, int]
 
 
 @dataclass(frozen=True)
@@ -312,6 +314,7 @@ def _rate(group: Group) -> Rate:
         episodes=episodes,
         errors=sum(sum(e is not None for e in t.errors) for r in group.results for t in r.tasks),
         success=Estimate(wins / episodes, float(low), float(high)),
+        causes=count_causes(t for r in group.results for t in r.tasks),
     )
 
 

@@ -9,6 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from libero_env.sim.causes import CAUSES
 from libero_env.storage import atomic_write_text
 from libero_env.text import text_table
 from libero_eval.judging.comparison import Comparison, Contrast, Gate, Row
@@ -125,7 +126,16 @@ def _rates(comparison: Comparison) -> str:
         [r.label, r.runs, r.episodes, r.errors, f"{100 * r.success.value:.1f}", interval_text(r.success)]
         for r in comparison.rates
     ]
-    return text_table(rows)
+    text = text_table(rows)
+    if heads := _causes(comparison):
+        counts = [[r.label, *(r.causes.get(cause, 0) for cause in heads)] for r in comparison.rates]
+        text += "\n\n" + text_table([["failed because", *heads], *counts])
+    return text
+
+
+def _causes(comparison: Comparison) -> list[str]:
+    """Return the causes of failures that occur, in the order of the decision tree."""
+    return [cause for cause in CAUSES if any(cause in r.causes for r in comparison.rates)]
 
 
 def _contrast_text(c: Contrast, alpha: float, all_tasks: bool) -> str:
@@ -194,6 +204,7 @@ def write_page(comparison: Comparison, path: Path) -> Path:
     page = page_template("page.html", "libero_eval.judging").render(
         title=_title(comparison),
         rates=comparison.rates,
+        causes=_causes(comparison),
         comparisons=[_contrast_content(c, comparison) for c in comparison.comparisons],
         controls=[
             {"comparison": c, "rows": (c.total, *c.suites), "verdict": chance_text(c)}

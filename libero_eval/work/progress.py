@@ -9,6 +9,7 @@ from libero_env.tasks.published import parse_plus_id
 from libero_env.text import duration, shorten
 from libero_eval.evaluation_file import FILE_NAME, TaskResult, overall
 from libero_eval.work.store import UnitResult, WorkStore, read_plan, read_unit
+from lifelong.results.failures import causes_text
 from lifelong.stats.intervals import Estimate
 
 PLUS = "libero_plus_"  # beginning of the names of suites of LIBERO-Plus
@@ -143,7 +144,8 @@ def total_rows(results: Sequence[TaskResult]) -> list[str]:
             f"  ({failed} of {episodes + failed} ended by a simulation error, not counted)" if failed else ""
         )
         lines.append(f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(overall(tasks))}{note}")
-    return lines
+    causes = causes_text(results)
+    return [*lines, f"failed because     {causes}"] if causes else lines
 
 
 def _percent(e: Estimate) -> str:

@@ -15,6 +15,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from libero_env.errors import SimulationError
+from libero_env.sim.causes import Failure
+from libero_env.sim.watch import Watch
 from libero_env.storage import atomic_path
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, PolicyActor, TakesNote
@@ -39,6 +41,7 @@ class Episode:
         attempts: Number of draws of each perturbation that were not valid; empty without perturbations.
         simulation_error: Why the simulation failed and ended the episode, which is neither a success nor a failure;
             empty otherwise.
+        failure: Why the goal was not reached; None where it was, or where the environment does not show its state.
     """
 
     init_state: int
@@ -50,6 +53,7 @@ class Episode:
     actions: str = ""
     attempts: tuple[int, ...] = ()
     simulation_error: str = ""
+    failure: Failure | None = None
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,7 @@ class Rollouts:
                 (e.init_state, e.simulation_error) for e in self.episodes if e.simulation_error
             ),
             "limits_reached": self.limits_reached,
+            "failures": tuple(e.failure for e in self.counted),
         }
 
 
@@ -240,7 +245,7 @@ def run_episodes(
     _tell(actor, tracker)
     done = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
     episodes = tuple(
-        replace(one, attempts=tries, simulation_error=tracker.errors.get(i, ""))
+        replace(one, attempts=tries, simulation_error=tracker.errors.get(i, ""), failure=tracker.failure(i))
         for i, (one, tries) in enumerate(zip(done, attempts, strict=True))
     )
     return Rollouts(
@@ -283,20 +288,34 @@ class EpisodeTracker:
         self.errors: dict[int, str] = {}
         self._now = self._progress(info)
         self._start = self._ever = self._now
+        views, goals = getattr(env, "views", None), getattr(env, "goals", None)
+        self._watch = Watch(views, goals.atoms) if views and goals else None
 
     def start(self) -> None:
         """Take the present state as that before the actor acts."""
         self._start = self._ever = self._now
+        if self._watch is not None:
+            for i in range(self._env.num_envs):
+                self._watch.begin(i)
 
     def step(self, actions: np.ndarray) -> Obs:
         """Step all simulations with (B, A) actions and return their observations."""
         obs, _, terminated, truncated, info = self._env.step(actions)
+        if self._watch is not None:
+            for i in np.flatnonzero(~self.over):
+                self._watch.look(int(i))
         self.success = self.success | (np.asarray(info["success"], bool) & ~self.over)
         self.errors |= {i: why for i, why in info.get("errors", {}).items() if not self.over[i]}
         self._now = np.where(self.over[:, None], self._now, self._progress(info))
         self._ever = self._ever | self._now
         self.over = self.over | terminated | truncated
         return obs
+
+    def failure(self, i: int) -> Failure | None:
+        """Return why an episode that is over, or has run out of time, failed; None where it has not, or for unknown."""
+        if self._watch is None or self.success[i] or i in self.errors:
+            return None
+        return self._watch.failure(i, self._ever[i].tolist(), self._now[i].tolist())
 
     def episodes(
         self, init_states: Sequence[int], lengths: np.ndarray, actions: Sequence[str]

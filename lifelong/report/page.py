@@ -28,6 +28,7 @@ from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
 from lifelong.report.tables import (
     atom_rows,
     cost_table,
+    failure_table,
     mean_heatmap,
     most_forgotten,
     page_template,
@@ -37,6 +38,7 @@ from lifelong.report.tables import (
     task_costs,
     triangle,
 )
+from lifelong.results.failures import failure_score
 from lifelong.results.records import RunRecord
 from lifelong.results.relearning import by_measure, read_relearning, savings_heads, savings_rows
 from lifelong.results.results import Results
@@ -164,6 +166,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
             (savings_heads(part), savings_rows(part)) for part in by_measure(read_relearning(run.path))
         ],
         "shifts": [shift_table(score, labels) for score in shift_scores(run.results)],
+        "failures": failure_table(failure_score(run.results), labels),
         "subgoals": run.results.subgoals().predicates,
         "atoms": atom_rows(run.results.subgoals(), labels),
         "most_forgotten": most_forgotten(run.results.subgoals().atoms),

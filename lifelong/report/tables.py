@@ -11,6 +11,7 @@ from libero_env.text import duration, quantity
 from lifelong.report.comparison import costs_of
 from lifelong.report.figures import cell_colours
 from lifelong.report.runs import Run
+from lifelong.results.failures import FailureScore
 from lifelong.results.results import Results
 from lifelong.results.shifts import ShiftScore
 from lifelong.results.subgoals import AtomRates, Subgoals
@@ -137,6 +138,34 @@ def shift_table(score: ShiftScore, labels: Sequence[str]) -> dict[str, Any]:
     ]
     means = [*map(score.success, names), *(score.forgetting(shifted=shifted) for shifted in (False, True))]
     return {"name": score.shift, "rows": rows, "means": means}
+
+
+def failure_table(score: FailureScore | None, labels: Sequence[str]) -> dict[str, Any] | None:
+    """Return the template's tables of causes and of interference; None without a score.
+
+    Args:
+        score: Why the rollouts of a run failed.
+        labels: Short names of the run's tasks.
+    """
+    if score is None:
+        return None
+
+    def rows(counts: Mapping[int, Mapping[str, int]]) -> list[tuple[int, str, list[int]]]:
+        return [
+            (task, labels[task], [found.get(c, 0) for c in score.causes]) for task, found in counts.items()
+        ]
+
+    tasks = sorted({task for pair in score.interference for task in pair})
+    served = [(task, labels[task], [score.interference.get((task, k), 0) for k in tasks]) for task in tasks]
+    return {
+        "causes": score.causes,
+        "tables": [
+            ("Task, at the end", rows(score.by_task)),
+            ("All tasks, after learning", rows(score.after)),
+        ],
+        "tasks": tasks,
+        "served": served,
+    }
 
 
 def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field, WrapValidator
 
 from libero_env.errors import InvalidInputError
+from libero_env.sim.causes import Failure
 from libero_env.text import json_safe
 from libero_env.validation import validate
 from lifelong.stats.metrics import Transfer
@@ -125,6 +126,7 @@ class Episodes:
         atoms_at_end: Whether each atom held at the end, (episodes, atoms).
         simulation_errors: Initial state and reason of each episode that a simulation error ended.
         limits_reached: How often a simulation reached a limit of the solver and went on, by its name (Warp).
+        failures: Why each episode failed; None of those that did not, or where it was not seen.
     """
 
     init_states: tuple[Count, ...]
@@ -135,8 +137,11 @@ class Episodes:
     atoms_at_end: tuple[tuple[bool, ...], ...] = ()
     simulation_errors: tuple[tuple[Count, str], ...] = ()
     limits_reached: tuple[tuple[str, Count], ...] = ()
+    failures: tuple[Failure | None, ...] = ()
 
-    OPTIONAL: ClassVar[tuple[str, ...]] = ()  # further columns, with an entry for each episode or none at all
+    OPTIONAL: ClassVar[tuple[str, ...]] = (
+        "failures",
+    )  # further columns, with an entry for each episode or none at all
     OF_ATOMS: ClassVar[tuple[str, ...]] = ("atoms_ever", "atoms_at_end")
 
     def shape_errors(self) -> list[str]:

@@ -1,0 +1,116 @@
+"""Why an episode failed: every branch of the decision tree, and what is seen of constructed episodes."""
+
+import numpy as np
+import pytest
+
+from libero_env.envs.batch import BatchEnv
+from libero_env.expert import Expert
+from libero_env.sim.causes import CAUSES, Failure, Missing, Trace, explain
+from libero_env.sim.watch import LIFTED, Watch, over
+
+OWN = ["milk"]
+
+
+@pytest.mark.parametrize(
+    ("trace", "missing", "cause", "what"),
+    [
+        (Trace(), Missing("milk"), "never reached", ""),
+        (Trace(lifted={"soup": None}), Missing("milk"), "wrong object", "soup"),
+        (Trace(touched={"milk"}), Missing("milk"), "missed grasp", ""),
+        (Trace(touched={"milk"}, lifted={"soup": None}), Missing("milk"), "wrong object", "soup"),
+        (Trace(impacts=[(3, "table", 150.0), (4, "shelf", 90.0)]), Missing("milk"), "collided", "table"),
+        (Trace(held={"milk": 9}, touched={"milk"}, impacts=[(3, "table", 150.0)]), Missing("milk"), "missed grasp", ""),
+        (Trace(held={"milk": 9}, impacts=[(12, "table", 150.0)]), Missing("milk"), "collided", "table"),
+        (Trace(touching={"milk"}), Missing("milk"), "out of time", ""),
+        (Trace(slipped={"milk": True}), Missing("milk", place="table"), "dropped", "table"),
+        (Trace(slipped={"milk": False}), Missing("milk", place="plate"), "wrong place", "plate"),
+        (Trace(in_hand="milk"), Missing("milk"), "out of time", ""),
+        (Trace(in_hand="milk"), Missing("milk", is_over=True), "not released", ""),
+        (Trace(slipped={"milk": False}), Missing("milk", has_held=True, place="table"), "undone", "table"),
+    ],
+)  # fmt: skip
+def test_each_branch_of_the_decision_tree(trace, missing, cause, what):
+    found = explain(trace, [missing], OWN)
+    assert (found.cause, found.of, found.what) == (cause, "milk", what)
+    assert found.newtons == (150.0 if cause == "collided" else 0.0)
+
+
+def test_of_several_missing_atoms_the_one_that_came_furthest_is_named():
+    trace = Trace(slipped={"soup": True})
+    assert explain(trace, [Missing("milk"), Missing("soup")], ["milk", "soup"]).of == "soup"
+    assert explain(trace, [], []) == Failure("out of time"), "such as a goal with Not"
+    assert len(set(CAUSES)) == 9
+
+
+@pytest.fixture(scope="module")
+def lifting():
+    """The expert's episode up to where it has lifted the cream cheese, and the state there."""
+    env = BatchEnv("libero_goal/6", 1, cameras=(), horizon=400)  # the cream cheese into the bowl
+    env.reset(options={"init_state": [0]})
+    watch, expert = Watch(env.views, env.goals.atoms), Expert(env.task, np.random.default_rng(0))
+    before = env.get_state(0)
+    while "cream_cheese_1" not in watch.traces[0].lifted:
+        env.step(expert.act(env.views[0])[None])
+        watch.look(0)
+    yield env, watch, env.get_state(0), before
+    env.close()
+
+
+def failed(lifting, actions, state=None):
+    """Return the failure after actions from where the object is in the hand."""
+    from copy import deepcopy
+
+    env, watch, held, _ = lifting
+    kept = deepcopy(watch.traces[0])
+    env.set_state(0, held if state is None else state)
+    for action in actions:
+        env.step(np.array([action], float))
+        watch.look(0)
+    found, watch.traces[0] = watch.failure(0, [False], env.check_goal(0)[1].values()), kept
+    return found
+
+
+HOLD, OPEN = [0, 0, 0, 0, 0, 0, 1], [0, 0, 0, 0, 0, 0, -1]
+
+
+def test_in_the_hand_released_elsewhere_and_slipped(lifting):
+    env, watch, held, _ = lifting
+    assert env.views[0].body_pos("cream_cheese_1")[2] > watch._heights[0]["cream_cheese_1"] + LIFTED
+    found = failed(lifting, [HOLD] * 2)
+    assert (found.cause, found.of, found.handled) == ("out of time", "cream_cheese_1", ("cream_cheese_1",))
+    found = failed(lifting, [OPEN] * 15)
+    assert (found.cause, found.what) == ("wrong place", "main_table")
+    address = 1 + env.scene.pose_address("cream_cheese_1")
+    slipped = held.copy()
+    slipped[address + 2] -= 0.06  # out of the closed fingers
+    assert failed(lifting, [HOLD] * 2, slipped).cause == "dropped"
+
+
+def test_another_goal_that_was_reached_instead_is_named(lifting):
+    env, _, held, _ = lifting
+    address, plate = 1 + env.scene.pose_address("cream_cheese_1"), env.views[0].body_pos("plate_1")
+    moved = held.copy()
+    moved[address : address + 3] = plate + [0, 0, 0.03]
+    found = failed(lifting, [OPEN] * 10, moved)
+    assert "(On cream_cheese_1 plate_1)" in found.instead
+    bowl = env.goals.atoms[0]
+    assert not over(env.views[0], bowl)
+    moved[address : address + 3] = env.views[0].body_pos("akita_black_bowl_1") + [0, 0, 0.1]
+    env.set_state(0, moved)
+    assert over(env.views[0], bowl)
+
+
+def test_a_hard_press_on_the_table_is_a_collision_and_watching_moves_no_bit(lifting):
+    env, watch, _, before = lifting
+    press, ends = [0, 0, -1, 0, 0, 0, 1], []
+    for watched in (False, True):
+        env.set_state(0, before)
+        watch.begin(0)
+        for _ in range(45):
+            env.step(np.array([[0, 0.4, *press[2:]]], float))
+            if watched:
+                watch.look(0)
+        ends.append(env.get_state(0))
+    np.testing.assert_array_equal(*ends)
+    found = watch.failure(0, [False], [False])
+    assert found.cause == "collided" and found.newtons > 100, found

@@ -1,0 +1,55 @@
+"""Causes of failures by task and after each task, and interference between learned tasks."""
+
+from libero_env.sim.causes import Failure
+from lifelong.report.tables import failure_table
+from lifelong.results.failures import causes_text, failure_score
+from lifelong.results.records import from_line, to_line
+from lifelong.results.results import Results
+from tests.harness.records import evaluation, run_start
+
+BOWL, CHEESE, DRAWER = "(On bowl_1 plate_1)", "(In cheese_1 bowl_1)", "(Open cabinet_1_top_region)"
+DROPPED = Failure("dropped", "bowl_1", "table", handled=("bowl_1",))
+ON_CHEESE = Failure("wrong object", "bowl_1", "cheese_1", handled=("cheese_1",))
+OPENED = Failure("never reached", "bowl_1", handled=("cheese_1", "cabinet_1"), instead=(DRAWER,))
+
+
+def cell(learned, task, atom, failures):
+    wins = sum(one is None for one in failures)
+    flags = tuple((one is None,) for one in failures)
+    return evaluation(
+        "matrix", learned, 0, task, wins, len(failures), atoms=(atom,), failures=failures,
+        atoms_at_start=flags, atoms_ever=flags, atoms_at_end=flags,
+    )  # fmt: skip
+
+
+ROWS = [
+    cell(0, 0, BOWL, (None, DROPPED)),
+    cell(1, 0, BOWL, (None, ON_CHEESE)),
+    cell(1, 1, CHEESE, (None, None)),
+    cell(2, 0, BOWL, (ON_CHEESE, OPENED)),
+    cell(2, 1, CHEESE, (None, DROPPED)),
+    cell(2, 2, DRAWER, (None, None)),
+]
+
+
+def test_causes_and_interference_of_a_run():
+    score = failure_score(Results((run_start(["a", "b", "c"]), *ROWS), ()))
+    assert score.causes == ("dropped", "wrong object", "never reached")
+    assert score.by_task == {0: {"wrong object": 1, "never reached": 1}, 1: {"dropped": 1}, 2: {}}
+    assert score.after == {
+        0: {"dropped": 1},
+        1: {"wrong object": 1},
+        2: {"dropped": 1, "wrong object": 1, "never reached": 1},
+    }
+    # the cheese is that of task 1, the open drawer the goal of task 2, and the bowl that was dropped that of task 0
+    assert score.interference == {(0, 1): 1, (0, 2): 1, (1, 0): 1}
+    table = failure_table(score, ["bowl", "cheese", "drawer"])
+    assert table["tables"][0][1][0] == (0, "bowl", [0, 1, 1])
+    assert table["served"] == [(0, "bowl", [0, 1, 1]), (1, "cheese", [1, 0, 0]), (2, "drawer", [0, 0, 0])]
+    assert causes_text(ROWS) == "dropped 2, wrong object 2, never reached 1"
+
+
+def test_records_keep_failures_and_runs_without_them_have_no_score():
+    assert from_line(to_line(ROWS[3])) == ROWS[3]
+    assert failure_score(Results((run_start(["a"]), evaluation("matrix", 0, 0, 0, 2)), ())) is None
+    assert failure_table(None, []) is None
