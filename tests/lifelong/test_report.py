@@ -14,6 +14,7 @@ import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
+from libero_env.sim.causes import Failure
 from libero_env.tasks import get_suite
 from libero_env.text import json_safe
 from lifelong.errors import LifelongError
@@ -52,6 +53,10 @@ GROCERIES = [
     "alphabet soup", "cream cheese", "salad dressing", "bbq sauce", "ketchup", "tomato sauce", "butter", "milk",
     "chocolate pudding", "orange juice"
 ]  # fmt: skip
+DROPPED, AWAY = (
+    Failure("dropped", "thing_0", "floor"),
+    Failure("never reached", "thing_0", handled=("thing_1",)),
+)
 # Algorithm -> success just after learning, and the share of it kept from one task to the next.
 CHARACTERS = {"sequential": (0.82, 0.35), "er": (0.74, 0.86), "ewc": (0.5, 0.6), "packnet": (0.68, 1.0)}
 
@@ -141,6 +146,7 @@ def _evaluation(
         atoms_at_start=((False, False, True),) * 20,
         atoms_ever=tuple((bool(w), bool(u), True) for w, u in zip(wins, lifted, strict=True)),
         atoms_at_end=tuple((bool(w), bool(w), True) for w in wins),
+        failures=tuple(None if w else DROPPED if u else AWAY for w, u in zip(wins, lifted, strict=True)),
     )
 
 
@@ -227,6 +233,7 @@ def test_the_page_describes_the_whole_run(finished: Path):
     assert "pick up the cream cheese and place it in the basket" in text
     assert "task 01 success" in text and "epochs: 10" in text
     assert "not finished" not in text
+    assert "Why rollouts failed" in text and "Never reached" in text and "Interference" in text
 
 
 def test_the_heatmap_shows_the_matrix(finished: Path):
