@@ -196,7 +196,7 @@ class EvaluationResult:
         """
         path = Path(path)
         path = path / FILE_NAME if path.is_dir() else path
-        if not path.is_file():
+        if not path.exists():
             raise EvaluationFileError(f"{path} does not exist; `libero eval` writes {FILE_NAME}")
         values = read_json(path, EvaluationFileError)
         _check_format(values, path)

@@ -1,5 +1,6 @@
 """Results of an evaluation in the formats of vla-eval, of LeRobot, and of the model cards of Hugging Face."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import yaml
 from libero_env.storage import atomic_write_text, write_json
 from libero_eval.evaluation_file import EvaluationResult, TaskResult, overall
 from libero_eval.judging.evaluation_page import facts
-from lifelong.errors import writing
+from lifelong.errors import ConfigError, writing
 
 
 def export_vla_eval(result: EvaluationResult, folder: Path) -> list[Path]:
@@ -61,9 +62,7 @@ def export_lerobot(result: EvaluationResult, folder: Path) -> list[Path]:
     return [_write(folder / "eval_info.json", info)]
 
 
-def export_eval_results(
-    result: EvaluationResult, folder: Path, dataset: str, source: str | None = None
-) -> list[Path]:
+def export_eval_results(result: EvaluationResult, folder: Path, dataset: str, source: str = "") -> list[Path]:
     """Write `.eval_results/SUITE.yaml` for each suite, which the Hugging Face Hub reads in the repository of a model.
 
     Args:
@@ -73,8 +72,13 @@ def export_eval_results(
         source: Address of where this is from, such as a repository with `eval.json`.
 
     Raises:
+        ConfigError: An id or an address is not one.
         ResultsError: A file cannot be written.
     """
+    if not re.fullmatch(r"[\w.-]+/[\w.-]+", dataset):
+        raise ConfigError(f"the data set of the benchmark is {dataset!r}; expected ORG/NAME, as on the Hub")
+    if not re.fullmatch(r"(https?://\S+)?", source):
+        raise ConfigError(f"the source is {source!r}; expected an address that begins with https://")
     paths = []
     for suite, tasks in _by_suite(result).items():
         success, described = overall(tasks), dict(facts(result))

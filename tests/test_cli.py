@@ -2,6 +2,7 @@
 
 import contextlib
 import importlib.util
+import io
 import json
 import re
 import subprocess
@@ -12,6 +13,7 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 
 import pytest
+import tyro
 import yaml
 
 import libero
@@ -141,6 +143,52 @@ def test_unknown_command_lists_the_valid_ones(capsys):
     assert cli.main(["tsaks"]) == 2
     message = capsys.readouterr().err
     assert "Did you mean 'tasks'?" in message and "train" in message
+
+
+@pytest.mark.parametrize("boxes", [True, False])
+def test_an_unknown_option_names_the_nearest(boxes, monkeypatch, capsys):
+    """Also where the terminal cannot show the lines of a box."""
+    monkeypatch.setitem(tyro._settings._experimental_options, "utf8_boxes", boxes)
+    monkeypatch.setattr(tyro._fmtlib, "_FORCE_UTF8_BOXES", boxes)
+    with pytest.raises(SystemExit):
+        cli.main(["eval", "expert", "--episodes", "a"])
+    message = "error parsing --episodes: no type matching INT could be instantiated from ['a']"
+    assert capsys.readouterr().err == f"error: {message}; see libero eval --help\n"
+    for words, near in (("eval expert --suites a", "--suite"), ("tasks list --quite", "--quiet")):
+        with pytest.raises(SystemExit) as ended:
+            cli.main(words.split())
+        assert ended.value.code == 2
+        assert f"Did you mean '{near}'? see libero" in capsys.readouterr().err
+
+
+def test_what_is_missing_has_its_name(capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["board"])
+    assert capsys.readouterr().err == "error: results are missing: name at least 1; see libero board --help\n"
+
+
+@pytest.mark.parametrize(("words", "expected"), [
+    ("bo", {"board"}),
+    ("tasks l", {"list", "lint"}),
+    ("compare a b --g", {"--group", "--gate"}),
+    ("train --con", {"--config-dir"}),
+    ("eval --q", {"--quiet"}),
+    ("eval fi", set()),
+])  # fmt: skip
+def test_bash_completes_commands_and_options(words, expected, completion):
+    listed = " ".join(f"'{word}'" for word in words.split())
+    ask = f'COMP_WORDS=(libero {listed}); COMP_CWORD={len(words.split())}; _libero; echo "${{COMPREPLY[@]}}"'
+    done = subprocess.run(
+        ["bash", "-c", f"{completion}\n{ask}"], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert set(done.stdout.split()) == expected and not done.stderr
+
+
+@pytest.fixture(scope="module")
+def completion() -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as script:
+        assert cli.main(["completion"]) == 0
+    return script.getvalue()
 
 
 def test_runs_as_a_process():

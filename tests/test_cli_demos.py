@@ -1,5 +1,6 @@
 """`libero demos`: options take effect, and every tool runs on a recorded file."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -63,6 +64,10 @@ def test_every_tool_runs(file, tmp_path, capsys):
         "demo_1: no success after 12 steps, largest drift: objects 0.00 mm" in output
     )  # said to be one, and is none
     assert (tmp_path / "replay.gif").stat().st_size > 1000
+    (row,) = json.loads(ran("replay", file, "--demo", 1, "--json", status=1))
+    assert row["demonstration"] == "demo_1" and not row["success"] and row["drift"] < 1e-5
+    (row,) = json.loads(ran("check", file, "--json"))
+    assert row["demonstrations"] == 2 and not row["faults"]
     assert "16x16 pixels" in ran("rerender", file, tmp_path / "new.hdf5", "--size", 16)
     assert set(read_demos(tmp_path / "new.hdf5")[0].obs) >= {"agentview_rgb", "eye_in_hand_rgb"}
     assert "12-12 steps" in ran("filter", file, tmp_path / "kept.hdf5", "--success", "--no-ops")

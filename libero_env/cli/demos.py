@@ -283,7 +283,7 @@ def replay_file(
     size: Size = (256, 256),
     assets: str | None = None,
     bddl: FilePath | None = None,
-) -> int:
+) -> Answer:
     """Replay demonstrations and report success and drift; return 1 if one that succeeded does not any more.
 
     Args:
@@ -311,13 +311,18 @@ def replay_file(
         drift = f"objects {1000 * result.drift.max():.2f} mm, arm {1000 * result.arm_drift.max():.2f} mrad"
         print(f"{result.name}: {outcome} after {result.steps} steps, largest drift: {drift}")
         results.append(result)
-    print(f"{sum(result.success for result in results)} of {len(results)} successful by {by}")
+    lines = [f"{sum(result.success for result in results)} of {len(results)} successful by {by}"]
     if video and results:
         import numpy as np
 
         frames = [result.frames for result in results if result.frames is not None]
-        print(write_video(video, np.concatenate(frames), recorded_frequency(file)))
-    return int(lost > 0)
+        lines.append(str(write_video(video, np.concatenate(frames), recorded_frequency(file))))
+    data = [
+        {"demonstration": one.name, "success": one.success, "recorded": one.recorded, "steps": one.steps}
+        | {"drift": one.drift.max(), "arm_drift": one.arm_drift.max()}
+        for one in results
+    ]
+    return Answer("\n".join(lines), data, status=int(lost > 0))
 
 
 def rerender_file(

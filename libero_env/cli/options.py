@@ -190,6 +190,8 @@ def _checked(target: Callable[..., Any], arguments: dict[str, Any], prog: str) -
             values[name] = TypeAdapter(hints[name]).validate_python(value)
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
+            if first["type"] == "too_short":
+                _fail(f"{name} are missing: name at least {first['ctx']['min_length']}", prog)
             text = first["msg"].removeprefix("Value error, ")
             shown = "" if text.startswith(str(first["input"])) else f" {first['input']}"
             _fail(f"--{name.replace('_', '-')}{shown}: {text[0].lower()}{text[1:]}", prog)
@@ -197,10 +199,10 @@ def _checked(target: Callable[..., Any], arguments: dict[str, Any], prog: str) -
 
 
 def _unboxed(text: str) -> str:
-    """Return what tyro says in the first paragraph of its box."""
-    lines = [line.strip("│ ") for line in text.splitlines() if not line.startswith(("╭", "╰"))]
-    rule = next((i for i, line in enumerate(lines) if line.startswith("───")), len(lines))
-    return " ".join(" ".join(lines[:rule]).split()).removesuffix(".")
+    """Return what tyro says in the first paragraph of its box; where UTF-8 is not shown, its title stands before."""
+    paragraphs = re.split(r"(?m)^[│ ]*[─-]{3,}[│ ]*$", re.sub(r"(?m)^[╭╰].*$", "", text))
+    words = paragraphs["╭" not in text].replace("│", " ").split()
+    return " ".join(words).partition(". Got errors:")[0].removesuffix(".")
 
 
 def _named_near(message: str, captured: Callable[..., Any]) -> str:
@@ -210,8 +212,13 @@ def _named_near(message: str, captured: Callable[..., Any]) -> str:
         return message[:1].lower() + message[1:]
     with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
         tyro.cli(captured, args=["--help"], config=CONFIG)
-    names = re.findall(r"(?<![\w-])--[\w-]+", text.getvalue())
-    return f"unknown option {found[1]}.{suggest(found[1], [*names, *ending.EVERYWHERE])}"
+    names = [*options_in(text.getvalue()), *ending.EVERYWHERE]
+    return f"unknown option {found[1]}.{suggest(found[1], names)}"
+
+
+def options_in(text: str) -> list[str]:
+    """Return the options that a help names, in its order."""
+    return list(dict.fromkeys(re.findall(r"(?<![\w-])--\w[\w-]*", text)))
 
 
 def _fail(message: str, prog: str) -> NoReturn:

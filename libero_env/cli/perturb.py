@@ -1,8 +1,10 @@
 """`libero perturb`: what can be perturbed, what it looks like, and whether the expert solves it."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
+from libero_env.cli.answer import Answer
 from libero_env.cli.options import Field, FilePath, Positional, ProcessesOrAll, Seed, Share, Side, arg
 from libero_env.parallel import cpu_count
 
@@ -61,7 +63,7 @@ def certify(
     out: FilePath = Path("certificates/perturbed"),
     again: bool = False,
     keep: bool = False,
-) -> None:
+) -> Answer:
     """Measure whether the expert solves what is sampled, and sample again what it does not; resumes.
 
     Prints the share that the expert solves of each kind and severity.
@@ -95,11 +97,12 @@ def certify(
         out=out,
         again=again,
     )
-    print(*shares_table(certificates, perturbations), sep="\n")
+    lines = [*shares_table(certificates, perturbations)]
     if keep:
         named = {str(one): one for one in perturbations}
         solved = read_json(attempts_file())
         for certificate in certificates:
             solved |= certificate.attempts(named[certificate.perturbation])
         write_json(attempts_file(), dict(sorted(solved.items())))
-        print(attempts_file())
+        lines.append(str(attempts_file()))
+    return Answer("\n".join(lines), [asdict(one) for one in certificates])

@@ -1,8 +1,9 @@
 """`libero compare`, `libero power` and `libero results`: is a policy better, and what do others read of its results."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -150,8 +151,8 @@ def export(
     format: Annotated[
         Literal["vla-eval", "lerobot", "eval-results", "csv", "latex", "parquet"], arg(name="as")
     ],
-    dataset: Annotated[str, Field(pattern=r"^[\w.-]+/[\w.-]+$")] | None = None,
-    source: Annotated[str, Field(pattern=r"^https?://\S+$")] | None = None,
+    dataset: str = "",
+    source: str = "",
     out: FilePath | None = None,
 ) -> None:
     """Write an evaluation as another tool's result file, or runs as a table, and print the files.
@@ -168,11 +169,8 @@ def export(
     from libero_eval.evaluation_file import EvaluationResult
     from libero_eval.exports import export_eval_results, export_lerobot, export_vla_eval
 
-    for option, value in (("--dataset", dataset), ("--source", source)):
-        if value and format != "eval-results":
-            raise ConfigError(f"{option} is of --as eval-results, not of --as {format}")
-    if format == "eval-results" and dataset is None:
-        raise ConfigError("--as eval-results needs --dataset ORG/NAME: the benchmark's data set on the Hub")
+    if (dataset or source) and format != "eval-results":
+        raise ConfigError(f"--dataset and --source are of --as eval-results, not of --as {format}")
     if format in ("csv", "latex", "parquet"):
         from lifelong.report.export import export_runs
 
@@ -184,11 +182,12 @@ def export(
         raise ConfigError(f"--as {format} takes one evaluation, not {len(results)}")
     content, path = EvaluationResult.read(results[0]), Path(results[0])
     folder = out or (path if path.is_dir() else path.parent)
-    if dataset is not None:
-        print(*export_eval_results(content, folder, dataset, source), sep="\n")
-    else:
-        write = {"vla-eval": export_vla_eval, "lerobot": export_lerobot}[format]
-        print(*write(content, folder), sep="\n")
+    writers: dict[str, Callable[[EvaluationResult, Path], list[Path]]] = {
+        "vla-eval": export_vla_eval,
+        "lerobot": export_lerobot,
+        "eval-results": partial(export_eval_results, dataset=dataset, source=source),
+    }
+    print(*writers[format](content, folder), sep="\n")
 
 
 def _question(options: PowerOptions) -> "Question":

@@ -34,7 +34,7 @@ def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
         versions={**flatten(result.versions), **flatten(result.environment)},
         interval_text=interval_text,
     )
-    with writing(folder, "the page"):
+    with writing(folder / PAGE_NAME, f"the page, unlike {FILE_NAME} beside it,"):
         atomic_write_text(folder / PAGE_NAME, page)
     return folder / PAGE_NAME
 

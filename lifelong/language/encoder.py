@@ -247,10 +247,12 @@ def _load(name: str) -> tuple[Any, Any]:
     """
     try:
         from transformers import AutoConfig, AutoModel, AutoTokenizer, CLIPTextModelWithProjection
+        from transformers.utils.logging import disable_progress_bar
     except ImportError as error:
         raise LanguageError(
             f"{name} needs transformers (pip install transformers), or use language=minilm"
         ) from error
+    disable_progress_bar()  # of the reading of weights
     for local in (True, False):  # local files first: a request to the hub takes long without a network
         try:
             # nothing is executed

@@ -80,7 +80,11 @@ def test_results_are_on_disk_and_are_not_run_again(expert, tmp_path, capsys, mon
     kept = json.loads((tmp_path / "draws.json").read_text())
     assert kept == {ROBOT.sample_name("libero_goal/3", start): 1 for start in (0, 1)}
     count = len(expert.joints)
-    assert main(words) == 0 and len(expert.joints) == count
+    capsys.readouterr()
+    assert main([*words, "--json"]) == 0 and len(expert.joints) == count
+    rows = json.loads(capsys.readouterr().out)
+    assert [row["perturbation"] for row in rows] == ["robot=0.4", "gain=0.4"]
+    assert rows[0]["solved"] == {"0": 1, "1": 1}
     (file,) = tmp_path.glob("*/*/robot*.json")
     file.write_text("{}")
     assert main(words) == 2 and "not a certificate" in capsys.readouterr().err

@@ -47,6 +47,7 @@ def test_options_replace_fields_of_the_configuration(closing):
     assert [env.step([0.0] * 7)[2:4] for _ in range(2)] == [(False, False), (False, True)]
     with pytest.raises(LiberoError, match="reset"):
         env.step([0.0] * 7)
+    assert LiberoEnv(TASK, camera_size=16, cameras=("agentview",)).config.camera_size == (16, 16)
     envs = closing(
         SubprocEnv(
             [{"task": TASK}, {"task": TASK, "observations": ["ee_pos"]}],

@@ -1,5 +1,6 @@
 """Comparison of evaluated policies: what may be compared, what is counted, texts, pages, exports and commands."""
 
+import errno
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -405,8 +406,12 @@ def test_a_gate_judges_a_policy_against_its_own_earlier_result():
     (["compare", "--group", "a"], "--group NAME RESULT"),
     (["power", "--base", "0.9", "--difference", "0.2"], "above 1"),
     (["power", "a"], "takes two results, not 1"),
-    (["results", "export", "a", "--as", "eval-results"], "needs --dataset ORG/NAME"),
-    (["results", "export", "a", "--as", "lerobot", "--dataset", "a/b"], "--dataset is of --as eval-results"),
+    (["compare", "a", "folder"], "folder/eval.json: it is a folder, a pipe or a device"),
+    (["compare", "a", "none"], "none: there are no tasks"),
+    (["results", "export", "pyproject", "--as", "lerobot"], "pyproject is not JSON"),
+    (["results", "export", "a", "--as", "eval-results"], "data set of the benchmark is ''; expected ORG/NAME"),
+    (["results", "export", "a", "--as", "lerobot", "--dataset", "a/b"], "are of --as eval-results, not of --as ler"),
+    (["results", "export", "a", "--as", "eval-results", "--dataset", "a/b", "--source", "x"], "the source is 'x'"),
     (["results", "export", "a", "--as", "vla-eval", "--out", "/dev/full"], "_aggregate.json: the result"),
     (["power", "--difference", "0.05", "--discordance", "0.01"], "is impossible"),
 ])  # fmt: skip
@@ -415,10 +420,39 @@ def test_bad_input_is_one_line(words, message, tmp_path, monkeypatch, capsys):
     written(tmp_path, a=drawn_result(0.9, 1), b=drawn_result(0.8, 2, policy="b:b"))
     values = json.loads(Path("a/eval.json").read_text())
     Path("old").write_text(json.dumps(values | {"format": "libero-evaluation/99"}))
+    Path("none").write_text(json.dumps(values | {"tasks": []}))
+    Path("folder/eval.json").mkdir(parents=True)
+    Path("pyproject").write_text("[project]")
     values["tasks"][0]["successes"][3] = float("nan")
     Path("nan").write_text(json.dumps(values))
     assert main(words) == 2
-    assert message in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert message in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [
+    "results export a --as vla-eval",
+    "results export a --as lerobot",
+    "results export a --as eval-results --dataset org/libero",
+    "compare a b --out a",
+    "board a b --out a",
+])  # fmt: skip
+def test_on_a_full_disk_nothing_is_lost(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path, a=drawn_result(0.9, 1), b=drawn_result(0.8, 2, policy="b:b"))
+    assert main(words.split()) == 0
+    capsys.readouterr()
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    assert len(before) > 2
+
+    def full(path: Path, *rest, **options):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_text", full)
+    assert main(words.split()) == 2
+    said = capsys.readouterr()
+    assert "No space left on device" in said.err and said.err.count("\n") == 1 and not said.out
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
 
 def test_settings_are_flat():

@@ -111,9 +111,12 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize(("name", "size"), [("bert", 8), ("clip", 6), ("gpt2", 8), ("roberta", 8)])
-def test_transformers_encode_each_text_by_itself(models: dict[str, Path], name: str, size: int) -> None:
+def test_transformers_encode_each_text_by_itself(
+    models: dict[str, Path], name: str, size: int, capfd: pytest.CaptureFixture[str]
+) -> None:
     texts = ["turn on the stove", "close"]
     together = embed(texts, str(models[name]))
+    assert "Loading" not in capfd.readouterr().err, "no bar of transformers in a log"
     assert together.shape == (2, size)
     assert not torch.allclose(together[0], together[1])
     for text, row in zip(texts, together, strict=True):  # to the bit, so that it may be kept
