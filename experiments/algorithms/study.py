@@ -47,7 +47,10 @@ RECORDS = HERE / "records"
 REFERENCES = ("er", "sequential", "single_task")  # that each other algorithm is compared with
 SETTINGS = ("policy=bc_mlp_small", "eval.episodes=20", "threads=1", "eval.sim_threads=1", "progress=false")
 # keys that came after the runs, with the values by which nothing changes
-ADDED = {"data.files": [], "eval.cells_share": 0.1}
+ADDED = {
+    **{"data.files": [], "eval.cells_share": 0.1, "eval.unseen": "none"},
+    **{"algo.adapters": "own", "algo.instruction": "earlier"},
+}
 # the rate is constant, so that neither comes nearer in a few hundred steps
 RELEARN = {
     "error": ("--steps", "800", "--every", "20", "--tolerance", "0.5"),

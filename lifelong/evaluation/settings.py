@@ -12,7 +12,7 @@ from libero_env.sim.backend import MUJOCO, Backend
 from libero_env.validation import checked
 from lifelong.data.settings import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
-from lifelong.results.records import MatrixCells, measured_tasks
+from lifelong.results.records import MatrixCells, Phase, measured_tasks
 from lifelong.stats.metrics import Transfer
 from lifelong.types import Count, Natural
 
@@ -34,6 +34,8 @@ class EvalSettings:
             `sampled` adds a random share of the others to both, from which NBT and AUC are estimated without bias, see
             `lifelong.stats.metrics.estimate_cells`.
         cells_share: Share of the earlier tasks that `sampled` measures after each task.
+        unseen: Whether tasks are evaluated before they are learned: the `next` after each task, or `all` that are to
+            come; and all before the first task. Zero-shot success and forward transfer in GEM's sense follow.
         reuse: Whether rollouts that would repeat earlier ones to the bit are copied instead of run: same weights and
             whatever else acts, same starts, nothing random.
         horizon: Maximum number of control steps per episode.
@@ -63,6 +65,7 @@ class EvalSettings:
     curve: Literal["all", "trained", "none"] = "all"
     cells: MatrixCells = "all"
     cells_share: Annotated[float, Field(gt=0, le=1)] = 0.1
+    unseen: Literal["none", "next", "all"] = "none"
     reuse: bool = True
     horizon: Count = 600
     settle_steps: Natural = 5
@@ -114,7 +117,7 @@ class EvalSettings:
         """
         return read_perturbations(self.shift, "eval.shift")
 
-    def init_states(self, phase: Literal["curve", "matrix", "shift"]) -> range:
+    def init_states(self, phase: Phase) -> range:
         """Return the indices of the initial states of a learning curve, or of the success matrix and under a shift."""
         if phase != "curve":
             return range(self.episodes)
@@ -132,6 +135,11 @@ class EvalSettings:
     def row(self, stage: Sequence[int], tasks: int) -> Sequence[int]:
         """Return the tasks that are measured after a stage of a run of so many tasks."""
         return measured_tasks(self.cells, stage, tasks, self.cells_share)
+
+    def unseen_tasks(self, later: Sequence[Sequence[int]]) -> list[int]:
+        """Return the tasks that are evaluated although they are not learned, of the stages that are to come."""
+        counted = {"none": later[:0], "next": later[:1], "all": later}[self.unseen]
+        return [task for stage in counted for task in stage]
 
     def shifted_row(self, stage: Sequence[int], tasks: int) -> Sequence[int]:
         """Return the tasks that are evaluated under the held-out shift after a stage of a run of so many tasks."""

@@ -21,6 +21,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from libero_env.storage import atomic_path
+from libero_env.text import quantity
 from lifelong.stats.intervals import Estimate, mean_and_half_width, wilson_interval
 from lifelong.stats.metrics import Curve
 
@@ -225,7 +226,8 @@ def storage_figure(points: Mapping[str, tuple[float, Estimate]]) -> Figure:
             ends = np.nan_to_num([[auc.value - auc.low], [auc.high - auc.value]])
             look = _look(number) | {"ls": "none"}
             axes.errorbar([size], [100 * auc.value], 100 * ends, **look, elinewidth=0.8, label=shorten(label))
-        axes.set_xlabel("kept from task to task (bytes)")
+        axes.xaxis.set_major_formatter(lambda size, _: quantity(size, "B"))
+        axes.set_xlabel("kept from task to task")
         axes.set_ylabel("AUC (%)")
         axes.grid(lw=0.4, alpha=0.3, color=INK)
         hide_spines(axes)

@@ -21,7 +21,7 @@ _CHECKSUM = "crc32"
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
 MatrixCells = Literal["all", "diagonal", "last_row", "diagonal_and_last_row", "sampled"]
-Phase = Literal["curve", "matrix", "shift"]
+Phase = Literal["curve", "matrix", "unseen", "initial", "shift"]
 Number = Annotated[float, WrapValidator(lambda value, parse: math.nan if value is None else parse(value))]
 
 
@@ -174,6 +174,9 @@ class Episodes:
 class EvalRecord(Episodes):
     """Rollouts on one task: `phase` "curve" while learning it, "matrix" after learning task `learned`.
 
+    Rollouts on a task that is learned later than `learned` have the phase "unseen"; those before the first task,
+    "initial" (`learned` and `epoch` are 0).
+
     Rollouts under a held-out shift (`eval.shift`) after learning task `learned` have the phase "shift"; all others are
     under the perturbations of the run's task, see `RunRecord.perturbed`.
 
@@ -206,7 +209,7 @@ class EvalRecord(Episodes):
         if not self.init_states:
             errors.append("no episode counts")
         if self.phase not in get_args(Phase):
-            errors.append(f"phase of an evaluation is 'curve', 'matrix' or 'shift', not {self.phase!r}")
+            errors.append(f"phase of an evaluation is one of {get_args(Phase)}, not {self.phase!r}")
         if (self.phase == "shift") != bool(self.shift):
             errors.append(f"an evaluation of phase {self.phase!r} has the shift {self.shift!r}")
         if errors:

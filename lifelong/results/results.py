@@ -34,6 +34,7 @@ from lifelong.stats.metrics import (
     estimate_cells,
     lifelong_metrics,
     mean_curve,
+    unseen_transfer,
 )
 
 Diagonal = Literal["matrix", "curve"]
@@ -109,7 +110,11 @@ class Results:
 
     def evaluations(self) -> list[EvalRecord]:
         """Return every evaluation of curves and matrix once, in the order of the run: the episodes behind metrics."""
-        last = {(r.learned, r.phase, r.epoch, r.task): r for r in self.of(EvalRecord) if r.phase != "shift"}
+        last = {
+            (r.learned, r.phase, r.epoch, r.task): r
+            for r in self.of(EvalRecord)
+            if r.phase in ("curve", "matrix")
+        }
         return [last[key] for key in sorted(last)]
 
     def has_loss(self, task: int, epoch: int) -> bool:
@@ -236,6 +241,19 @@ class Results:
             transfer or self.transfer,
             sampled=self.run.cells == "sampled",
         )
+
+    def unseen_transfer(self) -> dict[str, float]:
+        """Return success on tasks before they are learned, see `lifelong.stats.metrics.unseen_transfer`."""
+        size, groups = len(self.run.tasks), self.run.groups
+        before, initial = np.full((size, size), np.nan), np.full(size, np.nan)
+        for r in self.of(EvalRecord):
+            if r.phase == "unseen":
+                before[r.learned, r.task] = r.rate
+            elif r.phase == "initial":
+                initial[r.task] = r.rate
+        rows = [g[-1] for g in groups]
+        columns = [before[rows, g.start : g.stop].mean(1) for g in groups]
+        return unseen_transfer(np.stack(columns, axis=1), [initial[g.start : g.stop].mean() for g in groups])
 
     def costs(self, task: int) -> dict[str, float]:
         """Return the costs of learning a task, by the names of `lifelong.training.costs`; empty if not recorded."""

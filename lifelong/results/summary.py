@@ -78,7 +78,7 @@ def summarize(results: Results) -> dict[str, Any]:
     rates, episodes = results.success_matrix()
     low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
     unseen = np.isnan(rates)
-    others = other_conventions(results.scores().matrix) if size else None
+    others = other_conventions(results.scores().matrix) | results.unseen_transfer() if size else None
     if others and run.cells == "sampled":  # the best of the cells that happen to be measured means nothing
         others["forgetting"] = math.nan
     ends = {r.task: r.best_epoch for r in results.of(TaskEndRecord)}

@@ -103,6 +103,7 @@ class TaskSequence:
             self._bring_to(number - 1)
         elif saved is None:
             self.prepare()
+            context.ranks.broadcast(self._evaluate_untrained)
         dataset = self.data[task]
         title = f"Task {task + 1}/{len(context.tasks)}: {context.instructions[task]}"
         if len(stage) > 1:
@@ -219,6 +220,9 @@ class TaskSequence:
         # there and back, so that a row begins with the environments that the one before ended with
         turn = 1 if self.stages.index(stage) % 2 else -1
         row = [self.evaluator.evaluate("matrix", task, seen, best) for seen in columns[::turn]]
+        later = self.stages[self.stages.index(stage) + 1 :]
+        for unseen in self.context.eval.unseen_tasks(later):
+            self.evaluator.evaluate("unseen", task, unseen, best)
         shifted = self.context.eval.shifted_row(stage, len(self.context.tasks)) if self.context.shift else ()
         under = [self.evaluator.evaluate("shift", task, seen, best) for seen in shifted]
         if results.task_end(task) is None:
@@ -239,6 +243,12 @@ class TaskSequence:
     def _tell(self, progress: str) -> None:
         if not is_quiet():
             say(self.context, progress)
+
+    def _evaluate_untrained(self) -> None:
+        """Evaluate all tasks before the first is learned, where transfer to unseen tasks is measured."""
+        if self.context.eval.unseen != "none":
+            for task in range(len(self.context.tasks)):
+                self.evaluator.evaluate("initial", 0, task, 0)
 
     def _eta(self, task: int) -> str:
         """Return an estimate of the remaining time, from the time that training and evaluation took so far."""

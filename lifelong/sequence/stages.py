@@ -105,6 +105,10 @@ def lacks_row(context: RunContext, stage: Sequence[int], results: Results) -> bo
     """Return whether a stage's row of the success matrix is incomplete, of the cells that are measured; see `eval`."""
     columns = context.eval.row(stage, len(context.tasks))
     row = [results.evaluation("matrix", stage[-1], seen) for seen in columns]
+    later = [
+        other for other in learning_stages(context.algorithm, context.group_sizes) if other[0] > stage[-1]
+    ]
+    row += [results.evaluation("unseen", stage[-1], task) for task in context.eval.unseen_tasks(later)]
     if context.shift is not None:
         for seen in context.eval.shifted_row(stage, len(context.tasks)):
             row.append(results.evaluation("shift", stage[-1], seen, shift=context.shift.text))

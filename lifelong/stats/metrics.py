@@ -245,6 +245,23 @@ def other_conventions(matrix: ArrayLike) -> dict[str, float]:
     }
 
 
+def unseen_transfer(before: ArrayLike, initial: ArrayLike) -> dict[str, float]:
+    """Return what was known of tasks before they were learned; NaN where it was not measured.
+
+    - `fwt_of_gem`: c[k-1,k] - b[k] (Lopez-Paz and Ranzato, NeurIPS 2017, eq. 4), over all tasks but the first.
+    - `zero_shot_next`: c[k-1,k], success on a task just before it is learned.
+    - `zero_shot`: c[i,k] over all i < k.
+
+    Args:
+        before: c, (K, K), of which the cells above the diagonal count.
+        initial: b, (K,), success on each task of the policy that the first task begins with.
+    """
+    c, b = np.asarray(before, dtype=float), np.asarray(initial, dtype=float)
+    ahead, above = np.diag(c, 1), c[np.triu_indices(len(c), 1)]
+    means = {"fwt_of_gem": ahead - b[1:], "zero_shot_next": ahead, "zero_shot": above}
+    return {name: float(values.mean()) if len(values) else float("nan") for name, values in means.items()}
+
+
 def intransigence(matrix: ArrayLike, reference: ArrayLike) -> float:
     """Return the mean of a[k] - c[k,k]: how much worse tasks are learned than by a reference (Chaudhry et al., eq. 4).
 

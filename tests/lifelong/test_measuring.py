@@ -320,3 +320,43 @@ def test_forward_transfer_without_epoch_0_is_the_mean_of_the_others(tmp_path):
     assert {tuple(curve.epochs) for curve in results.curves().values()} == {(1, 2)}
     held = [curve.held().mean() for curve in results.curves().values()]
     assert lifelong_metrics(results.scores(transfer="published")).fwt.value == pytest.approx(np.mean(held))
+
+
+@pytest.mark.parametrize("unseen", ["next", "all"])
+def test_tasks_to_come_are_evaluated_on_request(tmp_path, unseen):
+    context, episodes = learn(tmp_path, Sequential(), unseen=unseen, curve="none", select="last", reuse=False)
+    records = context.directory.log.read()
+    rates = {(r.phase, r.learned, r.task): r.rate for r in records.of(EvalRecord)}
+    expected = {"next": {(0, 1), (1, 2)}, "all": {(0, 1), (0, 2), (1, 2)}}[unseen]
+    assert {key[1:] for key in rates if key[0] == "unseen"} == expected
+    assert {key[1:] for key in rates if key[0] == "initial"} == {(0, task) for task in range(TASKS)}
+    assert len(episodes) == 3 * (TASKS + len(expected) + 6)
+    found = summarize(records)["metrics_of_other_conventions"]
+    gains = [rates["unseen", k - 1, k] - rates["initial", 0, k] for k in (1, 2)]
+    assert found["fwt_of_gem"] == pytest.approx(np.mean(gains))
+    assert found["zero_shot_next"] == pytest.approx(np.mean([rates["unseen", k - 1, k] for k in (1, 2)]))
+    above = [rates[key] for key in rates if key[0] == "unseen"]
+    assert (
+        found["zero_shot"] == pytest.approx(np.mean(above))
+        if unseen == "all"
+        else np.isnan(found["zero_shot"])
+    )
+    assert {r.phase for r in records.evaluations()} == {"matrix"}  # no metric or table has others
+    again, more = learn(tmp_path, Sequential(), unseen=unseen, curve="none", select="last", reuse=False)
+    assert more == [] and again.directory.log.read().records == records.records
+
+
+def test_an_interrupted_row_of_tasks_to_come_is_completed(tmp_path):
+    settings = {"unseen": "all", "curve": "none", "select": "last", "reuse": False}
+    context, _ = learn(tmp_path, Sequential(), **settings)
+    log = tmp_path / "results.jsonl"
+    whole, lines = ResultLog(log).read(), log.read_bytes().splitlines(keepends=True)
+    lost = [line for line in lines if b'"unseen"' in line][1]
+    log.write_bytes(b"".join(line for line in lines if line != lost))
+    assert not is_measured(context, ResultLog(log).read())
+    _, again = learn(tmp_path, Sequential(), **settings)
+    key = ("unseen", 0, 2)
+    assert (
+        again == [2, 2, 2]
+        and ResultLog(log).read().evaluation(*key).outcome == whole.evaluation(*key).outcome
+    )
