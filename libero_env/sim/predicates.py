@@ -7,6 +7,7 @@ box is |R size|, and being on a region of the table needs no contact. `semantics
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -231,8 +232,9 @@ def register_predicate(name: str, predicate: Predicate) -> None:
 
     Args:
         name: Name in task files; upper and lower case are the same.
-        predicate: Function that takes a `StateView` and the names of the atom, and returns a bool. Task files must
-            give it as many names as it takes.
+        predicate: Function that takes a `StateView` and the arguments of the atom, and returns a bool. Task files must
+            give it as many as it takes: names and words, which are texts, and for parameters that are annotated as
+            `float` numbers.
 
     Raises:
         LiberoError: The name is not valid in a task file.
@@ -241,9 +243,15 @@ def register_predicate(name: str, predicate: Predicate) -> None:
         raise LiberoError(
             f"register_predicate: {name!r} is not a valid name; use letters, digits and underscores"
         )
+    if numbers := declare_predicate(name.capitalize(), predicate):
+        predicate = partial(_with_numbers, predicate, numbers)
     for table in SEMANTICS.values():
         table[name.capitalize()] = predicate
-    declare_predicate(name.capitalize(), predicate)
+
+
+def _with_numbers(predicate: Predicate, numbers: tuple[int, ...], view: StateView, *args: str) -> bool:
+    """Return what a predicate says of arguments, some of which are numbers."""
+    return predicate(view, *(float(arg) if i in numbers else arg for i, arg in enumerate(args)))
 
 
 def evaluate(expression: Expression, view: StateView, semantics: str = "original") -> bool:

@@ -152,8 +152,11 @@ class Scene:
     @cached_property
     def goal_atoms(self) -> tuple[Atom, ...]:
         """Atoms of the goal, except those with variables of quantifiers."""
-        names = {*self.entities, *(region.address for region in self.problem.regions)}
-        return tuple(atom for atom in self.problem.goal.atoms() if names.issuperset(atom.args))
+        goal = self.problem.goal
+        variables = goal.fold(
+            lambda node, parts: {name for name, _ in getattr(node, "variables", ())}.union(*parts)
+        )
+        return tuple(atom for atom in goal.atoms() if variables.isdisjoint(atom.args))
 
     @property
     def state_size(self) -> int:

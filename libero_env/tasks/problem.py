@@ -290,6 +290,7 @@ class ProblemError(InvalidInputError):
 _ENTITY = frozenset({"object", "fixture"})
 _PLACE = _ENTITY | {"region"}
 _SOLID = _ENTITY | {"workspace"}
+_ANY, _NUMERIC = _PLACE | _SOLID, frozenset({"number"})
 KINDS: dict[str, tuple[frozenset[str], ...]] = {
     "On": (_ENTITY, _PLACE),
     "In": (_ENTITY, frozenset({"region"})),
@@ -306,23 +307,28 @@ BUILTIN_PREDICATES = frozenset(KINDS) | {"True", "False"}
 send_to_workers(__name__, "KINDS")
 
 
-def declare_predicate(predicate: str, function: Callable[..., bool]) -> None:
-    """Set the number of arguments of a predicate from those of its function, of any kind.
+def declare_predicate(predicate: str, function: Callable[..., bool]) -> tuple[int, ...]:
+    """Set the arguments of a predicate from those of its function: numbers where they are annotated so, or of any kind.
 
     Args:
         predicate: Name of the predicate, capitalised.
         function: Function of a state and of the arguments. One that takes any number of them may have any number.
+
+    Returns:
+        Indices of the arguments that are numbers.
     """
     KINDS.pop(predicate, None)
     try:
         parameters = list(inspect.signature(function).parameters.values())
     except (TypeError, ValueError):  # of some functions in C
-        return
+        return ()
     plain = all(
         p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty for p in parameters
     )
+    numbers = tuple(i for i, p in enumerate(parameters[1:]) if p.annotation in (float, "float"))
     if plain and len(parameters) > 1:
-        KINDS[predicate] = (_PLACE | {"workspace"},) * (len(parameters) - 1)
+        KINDS[predicate] = tuple(_NUMERIC if i in numbers else _ANY for i in range(len(parameters) - 1))
+    return numbers
 
 
 def _violations(problem: Problem) -> Iterator[Violation]:
@@ -387,7 +393,10 @@ def _atom(
         return
     for i, name in enumerate(atom.args):
         kind = "object" if name in bound else problem.kind_of(name)
-        if kind is None:
+        if kinds is not None and kinds[i] == _NUMERIC:
+            if not _NUMBER.fullmatch(name):
+                yield "kind", f": {name} is not a number", "one such as 0.05 there"
+        elif kind is None:
             if is_own and _NUMBER.fullmatch(name):
                 continue
             declared = sorted(

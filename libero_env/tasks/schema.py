@@ -54,8 +54,8 @@ def _listed(value: Any) -> Any:
 
 def _words(atom: Any) -> Any:
     """Return the words of an atom as one text."""
-    if isinstance(atom, list) and atom and all(isinstance(word, str) for word in atom):
-        return " ".join(atom)
+    if isinstance(atom, list) and atom and all(isinstance(word, str | int | float) for word in atom):
+        return " ".join(map(str, atom))
     return atom
 
 
@@ -74,10 +74,8 @@ def _atom(text: str) -> str:
 
 def _goal(goal: Any) -> Any:
     """Return a goal as a list; a list of single words is one atom, since no atom is a single word."""
-    is_one = (
-        isinstance(goal, list) and goal and all(isinstance(w, str) and " " not in w.strip() for w in goal)
-    )
-    return [" ".join(goal)] if is_one else _listed(goal)
+    is_one = isinstance(goal, list) and not any(isinstance(w, str) and " " in w.strip() for w in goal)
+    return _listed(_words(goal) if is_one else goal)
 
 
 def _sites(value: Any) -> Any:

@@ -13,7 +13,7 @@ from libero_env.design.lint.checks import lint_text
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import BDDLError, InvalidInputError, LiberoError, PlacementError
 from libero_env.sim.predicates import register_predicate
-from libero_env.tasks import bddl
+from libero_env.tasks import bddl, make_task
 from libero_env.tasks.problem import (
     MAX_ENTITIES,
     WORKSPACES,
@@ -169,6 +169,37 @@ def test_a_users_predicate_takes_as_many_names_as_its_function():
         bddl.parse(text.replace("(Near bowl_1 kitchen_table)", "(Near bowl_1)"))
     register_predicate("near", lambda view, *names: True)
     assert bddl.parse(text.replace("(Near bowl_1 kitchen_table)", "(Near bowl_1)"))
+
+
+@pytest.mark.sim
+def test_a_predicate_has_numbers_and_words_of_the_task_file(closing):
+    """Two places 0.1 and 0.2 m apart along the axes: their distance is between 0.2 and 0.25 m."""
+
+    def within(view, entity, target, distance: float, where):
+        found = np.linalg.norm((view.body_pos(entity) - view.body_pos(target))[:2]) < distance
+        return bool(found) == (where == "inside")
+
+    register_predicate("within", within)
+    definition = {
+        "scene": "kitchen", "objects": ["plate", "butter"], "language": "x",
+        "place": {"plate_1": {"at": [0, 0], "half": 0}, "butter_1": {"at": [0.1, 0.2], "half": 0}},
+    }  # fmt: skip
+    goals = [("Within", "butter_1", "plate_1", d, w) for d in (0.2, 0.25) for w in ("inside", "outside")]
+    made = make_task(goal=[*goals, "Up plate_1"], **definition)
+    assert make_task(goal=goals[0], **definition).problem.goal.parts == (
+        Atom(*goals[0][:1], tuple(map(str, goals[0][1:]))),
+    )
+    assert bddl.parse(made.bddl_text) == made.problem
+    env = closing(LiberoEnv(made, cameras=()))
+    progress = env.reset(seed=0)[1]["progress"]
+    assert list(progress.values()) == [False, True, True, False, False]
+    assert "(Within butter_1 plate_1 0.2 outside)" in progress
+    for wrong, message in (
+        ("far", "far is not a number; expected one such as 0.05"),
+        ("plate_1", "plate_1 is not a number"),
+    ):
+        with pytest.raises(InvalidInputError, match=message):
+            make_task(goal=("Within", "butter_1", "plate_1", wrong, "inside"), **definition)
 
 
 def task(text: str) -> Task:
