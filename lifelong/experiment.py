@@ -299,6 +299,7 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             benchmark=names["benchmark"],
             policy=names["policy"],
             seed=context.seed,
+            data_seed=context.data.seed,
             preset=names.get("preset", ""),
             tasks=[t.name for t in context.tasks],
             instructions=context.instructions,

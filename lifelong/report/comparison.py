@@ -17,7 +17,7 @@ from lifelong.errors import ComparisonError
 from lifelong.report.runs import Group, Run, check_same_world, unlike
 from lifelong.results.provenance import few_of
 from lifelong.stats.intervals import mean_and_half_width
-from lifelong.stats.methods import MARGIN, MethodRun, statistics
+from lifelong.stats.methods import MARGIN, MethodRun, spreads, statistics
 from lifelong.stats.metrics import METRIC_NAMES, metric_values
 
 MUJOCO = "mujoco"  # back end of results that name none
@@ -48,9 +48,10 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
         plan: Pairs to be compared.
 
     Returns:
-        `groups`: by label, with `runs`, `seeds`, `orders`, `told_task`, `metrics` (mean, standard_error, low, high, the
-        value of each seed or order), `published` (FWT and AUC of eq. 3 as written), `forgetting_by_task` (NBT by task
-        name), `subgoals` and `costs`. `differences` and `statistics`: see `lifelong.stats.methods.statistics`.
+        `groups`: by label, with `runs`, `seeds`, `orders`, `told_task`, `spreads` (between runs that differ in one
+        thing alone), `metrics` (mean, standard_error, low, high, the value of each seed or order), `published` (FWT and
+        AUC of eq. 3 as written), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`.
+        `differences` and `statistics`: see `lifelong.stats.methods.statistics`.
         `after_base_stage`: `metrics` by label and `differences` over the later tasks alone, as if the sequence began
         with them, of the methods whose runs all learned a task after a base stage; None if there are none. `backend`:
         what simulated all rollouts. `conditions`: sentences about all else in which runs differ, see
@@ -91,7 +92,7 @@ def _statistics(methods: Mapping[str, Sequence[MethodRun]], plan: Plan) -> dict[
 
 def runs_of(runs: Sequence[Run]) -> list[MethodRun]:
     """Return runs as what the statistics take."""
-    return [MethodRun(r.results.scores(), r.record.seed, r.record.tasks) for r in runs]
+    return [MethodRun(r.results.scores(), r.record.seed, r.record.tasks, r.record.data_seed) for r in runs]
 
 
 def findings(found: Mapping[str, Any], names: Mapping[str, str], most: int = 12) -> list[str]:
@@ -153,6 +154,7 @@ def _group(group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None)
         "seeds": [r.record.seed for r in group.runs],
         "orders": len({r.record.tasks for r in group.runs}),
         "measured": len(runs),
+        "spreads": spreads(runs_of(runs)),
         "told_task": group.told_task,
         "metrics": metrics or {name: dict(_UNKNOWN) for name in METRIC_NAMES},
         "published": _published(runs),

@@ -218,6 +218,11 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         "groups": _group_rows({label: group["metrics"] for label, group in found["groups"].items()}, found),
         "later_groups": _group_rows(later["metrics"], found) if later else [],
         "metric_texts": _metric_texts(runs),
+        "spreads": [
+            (label, group["spreads"])
+            for label, group in found["groups"].items()
+            if any(np.isfinite(group["spreads"][factor]["auc"]) for factor in ("order", "demonstrations"))
+        ],
         "differences": found["differences"],
         "later_differences": later["differences"] if later else [],
         "findings": _findings(found),

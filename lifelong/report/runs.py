@@ -27,6 +27,7 @@ _IGNORED = (
     "benchmark.horizon",
     "language.cache_dir",
     "data.memory",
+    "data.seed",
     "eval.reuse",
     "eval.transfer",
     "eval.shift",
@@ -59,11 +60,11 @@ class Run:
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that differ only in their seed and the order of their tasks.
+    """Runs that differ only in their seed, the seed of their demonstrations and the order of their tasks.
 
     Attributes:
         label: Name of the method.
-        runs: One run of each seed and order.
+        runs: One run of each.
         repeats: Further runs of these, which add no evidence and are not counted.
     """
 
@@ -160,9 +161,14 @@ def _one_of_each(label: str, members: Sequence[Run]) -> Group:
     """Return the group with one run of each seed and order: that which learned most tasks, of these the latest."""
     kept: dict[tuple[Any, ...], Run] = {}
     for run in sorted(members, key=lambda r: (r.learned, r.record.started)):
-        kept[run.record.seed, run.record.tasks, str(run.config.get("init_from"))] = run
+        kept[*_factors(run), str(run.config.get("init_from"))] = run
     counted = [run for run in members if any(run is k for k in kept.values())]
     return Group(label, tuple(counted), tuple(run for run in members if not any(run is k for k in counted)))
+
+
+def _factors(run: Run) -> tuple[Any, ...]:
+    """Return what runs of one method are samples of: order of tasks, demonstrations, and all else that is drawn."""
+    return run.record.tasks, run.record.data_seed, run.record.seed
 
 
 def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]], *, whole: bool = False) -> str:

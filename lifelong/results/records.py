@@ -73,6 +73,7 @@ class RunRecord:
     # perturbations of each task, in learning and evaluation; () for none at all
     perturbed: tuple[str, ...] = ()
     backend: str = "mujoco"  # of the rollouts: mujoco or warp
+    data_seed: Count | None = None  # of the demonstrations, where the configuration names one
 
     def __post_init__(self) -> None:
         if not len(self.tasks) == len(self.instructions) > 0:

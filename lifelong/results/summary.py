@@ -1,11 +1,11 @@
 """What a run leaves for others: `results.json`, and every episode of one or several runs as a table, and back.
 
 results.json     the success matrix, learning curves, metrics and times of a run
-episodes.csv.gz  one row an episode: the method's label, seed and order of the run, `transfer` (how its forward transfer
-                 is estimated), `together` (numbers of tasks learned together), the evaluation (`phase` curve or matrix,
-                 `row`: position of the task learned last, `epoch` trained on it), the task (`position` in the sequence,
-                 and its name), `start` (initial state), `success` (0 or 1), `length` [control steps]; episodes that a
-                 simulation error ended are left out
+episodes.csv.gz  one row an episode: the method's label, seeds of the run and its demonstrations, its order, `transfer`
+                 (how its forward transfer is estimated), `together` (numbers of tasks learned together), the
+                 evaluation (`phase` curve or matrix, `row`: position of the task learned last, `epoch` trained on it),
+                 the task (`position` in the sequence, and its name), `start` (initial state), `success` (0 or 1),
+                 `length` [control steps]; episodes that a simulation error ended are left out
 """
 
 import csv
@@ -33,8 +33,8 @@ from lifelong.stats.intervals import wilson_interval
 from lifelong.stats.metrics import METRIC_NAMES, Metrics, lifelong_metrics, other_conventions
 
 COLUMNS = (
-    *("method", "seed", "order", "transfer", "together", "phase", "row", "epoch", "position", "task"),
-    *("start", "success", "length"),
+    *("method", "seed", "data_seed", "order", "transfer", "together", "phase", "row", "epoch"),
+    *("position", "task", "start", "success", "length"),
 )
 _OF_EPISODES = (
     "phase",
@@ -171,9 +171,10 @@ def write_episodes(path: Path, runs: Iterable[tuple[str, Results]]) -> Path:
 def _rows(method: str, order: int, results: Results) -> Iterator[tuple[Any, ...]]:
     run = results.run
     together = " ".join(str(len(group)) for group in run.groups)
+    of_run = (method, run.seed, run.data_seed, order, results.transfer, together)
     for record in results.evaluations():
         task = run.tasks[record.task] if record.task < len(run.tasks) else ""
-        key = (method, run.seed, order, results.transfer, together, record.phase, record.learned)
+        key = (*of_run, record.phase, record.learned)
         for start, won, length in zip(record.init_states, record.successes, record.lengths, strict=True):
             yield (*key, record.epoch, record.task, task, start, int(won), length)
 
@@ -192,7 +193,7 @@ def read_episodes(path: Path) -> list[tuple[str, Results]]:
             raise ResultsError(f"{path} is no table of episodes; expected the columns {', '.join(COLUMNS)}")
         runs: dict[tuple[str, ...], list[dict[str, str]]] = {}
         for row in reader:
-            runs.setdefault(tuple(row[c] for c in COLUMNS[:3]), []).append(row)
+            runs.setdefault(tuple(row[c] for c in COLUMNS[:4]), []).append(row)
         return [(key[0], _results(rows)) for key, rows in runs.items()]
     except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
         raise ResultsError(f"{path}: the episodes cannot be read ({error})") from error
@@ -221,6 +222,7 @@ def _run(row: Mapping[str, str], tasks: list[str]) -> RunRecord:
         **dict.fromkeys(("benchmark", "policy", "preset", "config_digest", "started"), ""),
         "algo": row["method"],
         "seed": int(row["seed"]),
+        "data_seed": int(row["data_seed"]) if row["data_seed"] else None,
         "tasks": tasks,
         "instructions": [name.replace("_", " ") for name in tasks],
         "versions": {},

@@ -43,11 +43,13 @@ class MethodRun:
     Attributes:
         scores: Success of the run.
         order: Identifier of its task order.
+        demonstrations: Identifier of the set of demonstrations that it learned from.
     """
 
     scores: Scores
     seed: Hashable = None
     order: Hashable = None
+    demonstrations: Hashable = None
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,7 @@ def statistics(
             for i, (a, b) in enumerate(pairs)
         ],
         "statistics": {
-            "interval": "Student's t over seeds (or orders), not narrower than Wilson's over episodes",
+            "interval": "Student's t over seeds (or orders, demonstrations), not narrower than Wilson's over episodes",
             "tests": "paired by seed, Student's t; Welch's t without common seeds",
             "family": "all pairs" if all_pairs else list(references),
             "correction": "Holm, over the pairs of a metric",
@@ -223,6 +225,26 @@ def statistics(
             **{"confidence": CONFIDENCE, "alpha": ALPHA, "margin": margin, "power": POWER},
         },
     }
+
+
+def spreads(runs: Sequence[MethodRun]) -> dict[str, dict[str, float]]:
+    """Return the standard deviation of each metric between runs that differ in one factor alone; NaN without such.
+
+    Returns:
+        Factor (`order`, `demonstrations`, `seed`) -> metric -> deviation, pooled over the sets of such runs.
+    """
+    names = ("order", "demonstrations", "seed")
+    found: dict[str, dict[str, float]] = {}
+    for factor in names:
+        sets: dict[tuple[Hashable, ...], list[list[float]]] = {}
+        for run in runs:
+            rest = tuple(getattr(run, name) for name in names if name != factor)
+            sets.setdefault(rest, []).append(list(metric_values(run.scores).values()))
+        squares = sum(np.var(rows, axis=0) * len(rows) for rows in sets.values())
+        free = sum(len(rows) - 1 for rows in sets.values())
+        deviations = np.sqrt(squares / free) if free else np.full(len(METRIC_NAMES), np.nan)
+        found[factor] = dict(zip(METRIC_NAMES, map(float, deviations), strict=True))
+    return found
 
 
 def _comparable(methods: Mapping[str, Sequence[MethodRun]]) -> dict[str, list[MethodRun]]:
@@ -241,11 +263,12 @@ def _comparable(methods: Mapping[str, Sequence[MethodRun]]) -> dict[str, list[Me
 
 
 def _by_seed(runs: Sequence[MethodRun]) -> dict[str, dict[Hashable, float]]:
-    """Return each metric by seed; where a method has several orders of tasks, their means over seeds by order."""
-    several = len({m.order for m in runs}) > 1
+    """Return each metric by seed; with several orders or sets of demonstrations, means over seeds by these."""
+    several = len({(m.order, m.demonstrations) for m in runs}) > 1
     units: dict[Hashable, list[dict[str, float]]] = {}
     for m in runs:
-        units.setdefault(m.order if several else m.seed, []).append(metric_values(m.scores))
+        unit = (m.order, m.demonstrations) if several else m.seed
+        units.setdefault(unit, []).append(metric_values(m.scores))
     return {
         name: {unit: float(np.mean([v[name] for v in rows])) for unit, rows in units.items()}
         for name in METRIC_NAMES

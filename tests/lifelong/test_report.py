@@ -69,16 +69,18 @@ def make_run(
     done: int | None = None,
     epochs: tuple[int, ...] = (0, 2, 4, 6, 8, 10),
     order: int = 0,
+    data_seed: int | None = None,
     **settings: object,
 ) -> Path:
     """Write a run directory as an experiment does, with synthetic numbers."""
-    rng = np.random.default_rng([seed, *algo.encode()])
+    rng = np.random.default_rng([seed, data_seed or 0, *algo.encode()])
     names = GROCERIES[:tasks] if tasks <= 10 else [f"thing {i}" for i in range(tasks)]
     names = names[order:] + names[:order]
     sections = {
         "algo": {"name": algo, **settings},
         "train": {"epochs": epochs[-1]},
         "benchmark": {"order": order},
+        "data": {"seed": data_seed},
     }
     config = {"seed": seed, **sections}
     log = ResultLog(folder / "results.jsonl")
@@ -88,6 +90,7 @@ def make_run(
             benchmark="libero_object",
             policy="bc_transformer",
             seed=seed,
+            data_seed=data_seed,
             preset="laptop",
             tasks=[f"pick_up_the_{n.replace(' ', '_')}_and_place_it_in_the_basket" for n in names],
             instructions=[f"pick up the {n} and place it in the basket" for n in names],
@@ -417,6 +420,29 @@ def test_all_pairs_are_a_triangle_and_oracles_and_memory_have_columns(tmp_path: 
     assert triangle(found | {"differences": found["differences"][:2]}, "auc") == []  # not all pairs
 
 
+def test_orders_and_demonstrations_are_factors_apart_from_the_seed(tmp_path: Path):
+    runs = [
+        make_run(tmp_path / f"{seed}{data}{order}", "er", seed, tasks=3, data_seed=data, order=order)
+        for seed in (1, 2)
+        for data in (3, 4)
+        for order in (0, 1)
+    ]
+    (group,) = group_runs([load_run(run) for run in runs])
+    assert len(group.runs) == 8 and not group.repeats
+    out = write_report(runs, tmp_path / "compared")
+    found = json.loads((out.parent / "comparison.json").read_text())["groups"]["er"]
+    auc = {(r.record.seed, r.record.data_seed, r.record.tasks): r.metrics.auc.value for r in group.runs}
+    units = np.reshape(list(auc.values()), (2, 4)).mean(0)  # means over the seeds of each order and set
+    assert found["metrics"]["auc"]["values"] == pytest.approx(units)
+    seeds = np.reshape(list(auc.values()), (2, 4)).var(0, ddof=1).mean()
+    assert found["spreads"]["seed"]["auc"] == pytest.approx(np.sqrt(seeds))
+    data = np.reshape(list(auc.values()), (2, 2, 2)).var(1, ddof=1).mean()
+    assert found["spreads"]["demonstrations"]["auc"] == pytest.approx(np.sqrt(data))
+    assert "Order of tasks" in Page(out.read_text()).text
+    again = [results.run for _, results in read_episodes(out.parent / "episodes.csv.gz")]
+    assert {(run.seed, run.data_seed, run.tasks) for run in again} == set(auc)
+
+
 def test_auc_stands_against_what_is_stored():
     points = {str(n): (1e3 * n, Estimate(0.5, 0.4, 0.6)) for n in range(20)}
     figure = storage_figure(points)
@@ -461,7 +487,7 @@ def test_the_table_of_episodes_gives_the_same_numbers(compared: tuple[Path, dict
     page, found = compared
     methods: dict[str, list[MethodRun]] = {}
     for label, results in read_episodes(page.parent / "episodes.csv.gz"):
-        member = MethodRun(results.scores(), results.run.seed, results.run.tasks)
+        member = MethodRun(results.scores(), results.run.seed, results.run.tasks, results.run.data_seed)
         methods.setdefault(label, []).append(member)
     again = json.loads(json.dumps(json_safe(statistics(methods))))
     assert again["differences"] == found["differences"]
