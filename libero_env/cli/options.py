@@ -107,11 +107,10 @@ def parse(
         raise
     chosen = [flag for flag in flags if arguments.pop(flag)]
     values = _checked(target, arguments, prog)
-    call = (
-        functools.partial(function, **values)
-        if target is function
-        else functools.partial(function, target(**values))
-    )
+    if target is function:
+        call = functools.partial(function, **values)
+    else:
+        call = functools.partial(function, target(**values))
     return functools.partial(tell, call, chosen) if flags else call
 
 

@@ -54,14 +54,14 @@ def evaluate(options: EvalOptions) -> Answer:
             listed = ", ".join(map(str, values))
             print(f"the processes differ in {name} ({listed}): bits may too", file=sys.stderr)
     file = evaluation.out / FILE_NAME
+    print(*total_rows(result.tasks), file, sep="\n")
     data = {
         "success": result.success,
         "suites": result.suites,
         "tasks": {task.task: task.success for task in result.tasks},
         "result": file,
     }
-    text = "\n".join([*total_rows(result.tasks), str(file)])
-    return Answer(text, data, write_evaluation_page(result, evaluation.out))
+    return Answer("", data, write_evaluation_page(result, evaluation.out))
 
 
 def _print_progress(progress: object) -> None:

@@ -10,11 +10,11 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from libero_env.storage import atomic_write_text, write_json
+from libero_env.storage import write_json
 from libero_eval.diagnosis.measure import PARTS, Diagnosis, Swap
 from lifelong.errors import writing
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below
-from lifelong.report.tables import page_template, percent
+from lifelong.report.tables import percent, save_page
 
 MEASURES = {"error": "error", "failures": "share of failed rollouts"}
 
@@ -74,7 +74,9 @@ def write_diagnosis(found: Diagnosis, folder: Path) -> Path:
     Raises:
         ResultsError: The files cannot be written.
     """
-    page = page_template("page.html", "libero_eval.diagnosis").render(
+    page = save_page(
+        folder / "diagnosis.html",
+        "libero_eval.diagnosis",
         title=f"Why {found.algorithm} forgets",
         facts=[("run", found.run), ("tasks learned", str(found.learned))],
         notes=found.notes,
@@ -85,10 +87,9 @@ def write_diagnosis(found: Diagnosis, folder: Path) -> Path:
         parts=[part for part in PARTS if part in found.swaps[0].swapped],
         number=number,
     )
-    with writing(folder, "the page"):
-        atomic_write_text(folder / "diagnosis.html", page)
+    with writing(folder, "the numbers"):
         write_json(folder / "diagnosis.json", asdict(found))
-    return folder / "diagnosis.html"
+    return page
 
 
 @matplotlib.rc_context(STYLE)

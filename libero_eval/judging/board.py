@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from libero_env.storage import atomic_write_text
 from libero_env.text import text_table
 from libero_eval.evaluation_file import again
 from libero_eval.judging.comparability import Group, check_comparable, outcomes, starts_text
 from libero_eval.judging.evaluation_page import facts
 from libero_eval.judging.page import interval_text, p_text
-from lifelong.errors import ComparisonError, writing
-from lifelong.report.tables import page_template, percent
+from lifelong.errors import ComparisonError
+from lifelong.report.tables import percent, save_page
 from lifelong.stats.episodes import ALPHA, Difference, Pairs, difference
 from lifelong.stats.intervals import Estimate, holm, wilson_interval
 
@@ -31,7 +30,7 @@ class Standing:
         label: Its name.
         tier: Number of its tier, from 1.
         success: Success over the episodes that all policies ran, with Wilson's interval.
-        suites: Success over all of its episodes of each suite.
+        suites: Mean success over the tasks of each suite in all of its episodes, as on the page of the evaluation.
         episodes: Number of its episodes.
         finished: Day on which it was evaluated; empty where that is not recorded.
         paths: Files of its results.
@@ -179,23 +178,16 @@ def _tiers(count: int, apart: set[tuple[int, int]]) -> list[int]:
 
 def _standing(group: Group, tier: int, won: NDArray[np.bool_]) -> Standing:
     (result,) = group.results
-    wins: dict[str, list[bool]] = {}
-    for task in result.tasks:
-        wins.setdefault(task.suite, []).extend(task.successes)
+    low, high = wilson_interval(won.sum(), len(won))
     return Standing(
         label=group.label,
         tier=tier,
-        success=_rate(won),
-        suites={suite: _rate(np.array(successes)) for suite, successes in wins.items()},
-        episodes=sum(map(len, wins.values())),
+        success=Estimate(float(won.mean()), float(low), float(high)),
+        suites=result.suites,
+        episodes=sum(len(task.successes) for task in result.tasks),
         finished=str(result.times.get("finished", ""))[:10],
         paths=group.paths,
     )
-
-
-def _rate(won: NDArray[np.bool_]) -> Estimate:
-    low, high = wilson_interval(won.sum(), len(won))
-    return Estimate(float(won.mean()), float(low), float(high))
 
 
 def render_board(board: Board) -> str:
@@ -222,7 +214,10 @@ def write_board(board: Board, entries: Sequence[Group], path: Path) -> Path:
     """
     path = path / "board.html" if path.is_dir() or not path.suffix else path
     results = {entry.paths[0]: entry.results[0] for entry in entries}
-    page = page_template("board.html", "libero_eval.judging").render(
+    return save_page(
+        path,
+        "libero_eval.judging",
+        "board.html",
         title=f"{len(board.rows)} policies on {', '.join(board.suites)}",
         facts=[fact for fact in facts(entries[0].results[0]) if fact[0] not in ("episodes", "finished")],
         notes=board.notes,
@@ -232,6 +227,3 @@ def write_board(board: Board, entries: Sequence[Group], path: Path) -> Path:
         interval_text=interval_text,
         p_text=p_text,
     )
-    with writing(path, "the page"):
-        atomic_write_text(path, page)
-    return path

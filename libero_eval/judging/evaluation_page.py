@@ -5,14 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from libero_env.storage import atomic_write_text
 from libero_env.text import flatten
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, again, overall
 from libero_eval.judging.page import interval_text
 from libero_eval.work.store import PAGE_NAME
-from lifelong.errors import writing
 from lifelong.report.page import media
-from lifelong.report.tables import page_template
+from lifelong.report.tables import save_page
 
 
 def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
@@ -23,7 +21,10 @@ def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
     """
     suites = {name: [task for task in result.tasks if task.suite == name] for name in result.suites}
     means = {"mean over tasks": result.tasks, **(suites if len(suites) > 1 else {})}
-    page = page_template("evaluation.html", "libero_eval.judging").render(
+    return save_page(
+        folder / PAGE_NAME,
+        "libero_eval.judging",
+        "evaluation.html",
         title=f"{name_of(result)} on {', '.join(suites)}",
         facts=facts(result),
         notes=[f"{task.task}: {task.error_note}" for task in result.tasks if task.error_note],
@@ -34,9 +35,6 @@ def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
         versions={**flatten(result.versions), **flatten(result.environment)},
         interval_text=interval_text,
     )
-    with writing(folder / PAGE_NAME, f"the page, unlike {FILE_NAME} beside it,"):
-        atomic_write_text(folder / PAGE_NAME, page)
-    return folder / PAGE_NAME
 
 
 def name_of(result: EvaluationResult) -> str:

@@ -10,13 +10,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from libero_env.sim.causes import CAUSES
-from libero_env.storage import atomic_write_text
 from libero_env.text import text_table
 from libero_eval.judging.comparison import Comparison, Contrast, Gate, Row
 from libero_eval.judging.group_scores import Profile
-from lifelong.errors import writing
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below, shorten
-from lifelong.report.tables import page_template
+from lifelong.report.tables import save_page
 from lifelong.stats.episodes import Difference, SequentialTest
 from lifelong.stats.intervals import Estimate
 
@@ -201,7 +199,9 @@ def write_page(comparison: Comparison, path: Path) -> Path:
         ResultsError: The file cannot be written.
     """
     tests = {f"{c.first} − {c.second}": c.sequential for c in comparison.comparisons if c.sequential}
-    page = page_template("page.html", "libero_eval.judging").render(
+    return save_page(
+        path,
+        "libero_eval.judging",
         title=_title(comparison),
         rates=comparison.rates,
         causes=_causes(comparison),
@@ -218,9 +218,6 @@ def write_page(comparison: Comparison, path: Path) -> Path:
         p_text=p_text,
         interval_text=interval_text,
     )
-    with writing(path, "the page"):
-        atomic_write_text(path, page)
-    return path
 
 
 def _title(comparison: Comparison) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from libero_env.perturbations import KINDS
-from libero_env.storage import atomic_write_text, write_json
+from libero_env.storage import write_json
 from libero_env.text import text_table
 from libero_eval.judging.page import interval_text, p_text
 from libero_eval.robustness.results import Axis, Outcomes, Robustness, name_of
@@ -27,7 +27,7 @@ from lifelong.report.figures import (
     legend_below,
     shorten,
 )
-from lifelong.report.tables import page_template
+from lifelong.report.tables import save_page
 from lifelong.stats.intervals import Estimate
 
 ALPHA = 0.05  # of the kinds together
@@ -100,7 +100,9 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
     outcomes = first.outcomes
     suites = ", ".join(dict.fromkeys(task.partition("/")[0] for task in outcomes.tasks))
     episodes = len(outcomes.tasks) * len(outcomes.starts)
-    page = page_template("page.html", "libero_eval.robustness").render(
+    page = save_page(
+        folder / "robustness.html",
+        "libero_eval.robustness",
         title=f"Robustness of {first.label}",
         facts=[
             ("tasks", f"{len(outcomes.tasks)} of {suites}"),
@@ -125,10 +127,9 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         severity=severity_text,
         severities=_severities_text,
     )
-    with writing(folder, "the page"):
-        atomic_write_text(folder / "robustness.html", page)
+    with writing(folder, "the numbers"):
         write_json(folder / "robustness.json", {"policies": [_content(policy) for policy in policies]})
-    return folder / "robustness.html"
+    return page
 
 
 def severity_text(severity: float) -> str:

@@ -2,12 +2,15 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
 
+from libero_env.storage import atomic_write_text
 from libero_env.text import duration, quantity
+from lifelong.errors import writing
 from lifelong.report.comparison import costs_of
 from lifelong.report.figures import cell_colours
 from lifelong.report.runs import Run
@@ -49,6 +52,18 @@ def page_template(name: str, package: str = "lifelong.report") -> jinja2.Templat
     )
     environment.filters["percent"] = percent
     return environment.get_template(name)
+
+
+def save_page(path: Path, package: str, template: str = "page.html", **values: Any) -> Path:
+    """Write a page that needs no other file and no network, and return its path.
+
+    Raises:
+        ResultsError: The page cannot be written.
+    """
+    page = page_template(template, package).render(values)
+    with writing(path, "the page"):
+        atomic_write_text(path, page)
+    return path
 
 
 def percent(value: float | None, digits: int = 1) -> str:
