@@ -18,7 +18,7 @@ from lifelong.report.runs import Group, Run, check_same_world, unlike
 from lifelong.results.provenance import few_of
 from lifelong.stats.intervals import mean_and_half_width
 from lifelong.stats.methods import MARGIN, MethodRun, spreads, statistics
-from lifelong.stats.metrics import METRIC_NAMES, metric_values
+from lifelong.stats.metrics import METRIC_NAMES, intransigence, metric_values
 
 MUJOCO = "mujoco"  # back end of results that name none
 
@@ -49,8 +49,9 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
 
     Returns:
         `groups`: by label, with `runs`, `seeds`, `orders`, `told_task`, `spreads` (between runs that differ in one
-        thing alone), `metrics` (mean, standard_error, low, high, the value of each seed or order), `published` (FWT and
-        AUC of eq. 3 as written), `forgetting_by_task` (NBT by task name), `subgoals` and `costs`.
+        thing alone), `metrics` (mean, standard_error, low, high, the value of each seed or order), `other_conventions`
+        (of other papers), `published` (FWT and AUC of eq. 3 as written), `forgetting_by_task` (NBT by task name),
+        `subgoals` and `costs`.
         `differences` and `statistics`: see `lifelong.stats.methods.statistics`.
         `after_base_stage`: `metrics` by label and `differences` over the later tasks alone, as if the sequence began
         with them, of the methods whose runs all learned a task after a base stage; None if there are none. `backend`:
@@ -75,7 +76,10 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
     plan_later = replace(plan, references=tuple(r for r in plan.references if r in later))
     return {
         "backend": next((r.record.backend for runs in measured.values() for r in runs), MUJOCO),
-        "groups": {g.label: _group(g, measured[g.label], found["metrics"].get(g.label)) for g in groups},
+        "groups": {
+            g.label: _group(g, measured[g.label], found["metrics"].get(g.label), _reference(measured))
+            for g in groups
+        },
         "differences": found["differences"],
         "statistics": found["statistics"],
         "after_base_stage": _statistics(later, plan_later) if later else None,
@@ -148,7 +152,35 @@ def write_comparison(found: Mapping[str, Any], path: Path) -> None:
     )
 
 
-def _group(group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None) -> dict[str, Any]:
+def _reference(measured: Mapping[str, Sequence[Run]]) -> dict[str, float]:
+    """Return the mean success on each task of policies that learned it alone, or with all others; {} without such."""
+    for algo in ("single_task", "multitask"):
+        found: dict[str, list[float]] = {}
+        for run in (run for runs in measured.values() for run in runs if run.record.algo == algo):
+            rates = run.results.success_matrix()[0]
+            for name, rate in zip(
+                run.record.tasks, rates[-1] if algo == "multitask" else np.diag(rates), strict=True
+            ):
+                found.setdefault(name, []).append(float(rate))
+        if found:
+            return {name: float(np.mean(rates)) for name, rates in found.items()}
+    return {}
+
+
+def _conventions(runs: Sequence[Run], reference: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """Return what other papers print, by its name in `lifelong.stats.metrics`, over the runs."""
+    rows = []
+    for run in runs:
+        alone = [reference.get(name, np.nan) for name in run.record.tasks[: run.learned]]
+        whole = run.results.success_matrix()[0][: run.learned, : run.learned]
+        rows.append(run.results.other_conventions() | {"intransigence": intransigence(whole, alone)})
+    means = {name: _mean([row[name] for row in rows]) for name in (rows[0] if rows else {})}
+    return {name: mean for name, mean in means.items() if np.isfinite(mean["mean"])}
+
+
+def _group(
+    group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None, reference: Mapping[str, float]
+) -> dict[str, Any]:
     return {
         "runs": [str(r.path) for r in group.runs],
         "seeds": [r.record.seed for r in group.runs],
@@ -157,6 +189,7 @@ def _group(group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None)
         "spreads": spreads(runs_of(runs)),
         "told_task": group.told_task,
         "metrics": metrics or {name: dict(_UNKNOWN) for name in METRIC_NAMES},
+        "other_conventions": _conventions(runs, reference),
         "published": _published(runs),
         "forgetting_by_task": _forgetting(runs),
         "subgoals": _subgoals(runs),

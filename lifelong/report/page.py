@@ -218,6 +218,7 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         "groups": _group_rows({label: group["metrics"] for label, group in found["groups"].items()}, found),
         "later_groups": _group_rows(later["metrics"], found) if later else [],
         "metric_texts": _metric_texts(runs),
+        "other_conventions": _forgotten(found, "other_conventions"),
         "spreads": [
             (label, group["spreads"])
             for label, group in found["groups"].items()

@@ -34,6 +34,7 @@ from lifelong.stats.metrics import (
     estimate_cells,
     lifelong_metrics,
     mean_curve,
+    other_conventions,
     unseen_transfer,
 )
 
@@ -254,6 +255,13 @@ class Results:
         rows = [g[-1] for g in groups]
         columns = [before[rows, g.start : g.stop].mean(1) for g in groups]
         return unseen_transfer(np.stack(columns, axis=1), [initial[g.start : g.stop].mean() for g in groups])
+
+    def other_conventions(self) -> dict[str, float]:
+        """Return what other papers print of the success matrix, see `lifelong.stats.metrics`."""
+        found = other_conventions(self.scores().matrix) | self.unseen_transfer()
+        if self.run.cells == "sampled":  # the best of the cells that happen to be measured means nothing
+            found["forgetting"] = float("nan")
+        return found
 
     def costs(self, task: int) -> dict[str, float]:
         """Return the costs of learning a task, by the names of `lifelong.training.costs`; empty if not recorded."""

@@ -11,7 +11,6 @@ episodes.csv.gz  one row an episode: the method's label, seeds of the run and it
 import csv
 import gzip
 import io
-import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
@@ -30,7 +29,7 @@ from lifelong.results.records import DemonstrationsRecord, EvalRecord, Record, R
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_summary
 from lifelong.stats.intervals import wilson_interval
-from lifelong.stats.metrics import METRIC_NAMES, Metrics, lifelong_metrics, other_conventions
+from lifelong.stats.metrics import METRIC_NAMES, Metrics, lifelong_metrics
 
 COLUMNS = (
     *("method", "seed", "data_seed", "order", "transfer", "together", "phase", "row", "epoch"),
@@ -78,9 +77,6 @@ def summarize(results: Results) -> dict[str, Any]:
     rates, episodes = results.success_matrix()
     low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
     unseen = np.isnan(rates)
-    others = other_conventions(results.scores().matrix) | results.unseen_transfer() if size else None
-    if others and run.cells == "sampled":  # the best of the cells that happen to be measured means nothing
-        others["forgetting"] = math.nan
     ends = {r.task: r.best_epoch for r in results.of(TaskEndRecord)}
     return {
         "run": _without_kind(run),
@@ -97,7 +93,7 @@ def summarize(results: Results) -> dict[str, Any]:
         "metrics_diagonal_from_curve": (
             _as_data(lifelong_metrics(results.scores("curve", "published"))) if size else None
         ),
-        "metrics_of_other_conventions": others,
+        "metrics_of_other_conventions": results.other_conventions() if size else None,
         "success_matrix": {
             "rates": rates.tolist(),
             "episodes": episodes.tolist(),

@@ -443,6 +443,28 @@ def test_orders_and_demonstrations_are_factors_apart_from_the_seed(tmp_path: Pat
     assert {(run.seed, run.data_seed, run.tasks) for run in again} == set(auc)
 
 
+def test_conventions_of_other_papers_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(CHARACTERS, "single_task", (0.8, 1.0))
+    runs = [make_run(tmp_path / f"{a}{s}", a, s, tasks=3) for a in ("er", "single_task") for s in (1, 2, 3)]
+    out = write_report(runs, tmp_path / "compared")
+    groups = json.loads((out.parent / "comparison.json").read_text())["groups"]
+    er = [load_run(run).results for run in runs[:3]]
+    found = groups["er"]["other_conventions"]
+    assert set(found) == {
+        "bwt",
+        "forgetting",
+        "nbt_of_followed",
+        "relative_nbt",
+        "intransigence",
+    }  # none unseen
+    assert found["bwt"]["mean"] == pytest.approx(np.mean([r.other_conventions()["bwt"] for r in er]))
+    alone = np.mean([np.diag(load_run(run).results.success_matrix()[0]) for run in runs[3:]], axis=0)
+    learned = np.mean([np.diag(r.success_matrix()[0]) for r in er], axis=0)
+    assert found["intransigence"]["mean"] == pytest.approx((alone - learned).mean())
+    assert groups["single_task"]["other_conventions"]["intransigence"]["mean"] == pytest.approx(0)
+    assert "relative nbt" in Page(out.read_text()).text
+
+
 def test_auc_stands_against_what_is_stored():
     points = {str(n): (1e3 * n, Estimate(0.5, 0.4, 0.6)) for n in range(20)}
     figure = storage_figure(points)
