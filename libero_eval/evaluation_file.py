@@ -28,7 +28,7 @@ from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interva
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
-UNMEASURED = ("actions", "limits_reached", "failures")  # columns that are not part of `outcomes`
+UNMEASURED = ("actions", "limits_reached", "failures", "began")  # columns that are not part of `outcomes`
 
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
 _Id = Annotated[
@@ -48,6 +48,8 @@ class TaskResult(Episodes):
             were not recorded.
         attempts: Number of samples that were not valid of each perturbation of the protocol, (episodes, perturbations);
             empty without perturbations.
+        began: Number of control steps from the reset before each event began, -1 where it never did, (episodes,
+            events); empty without events.
 
     Raises:
         EvaluationFileError: The columns have different lengths.
@@ -59,8 +61,9 @@ class TaskResult(Episodes):
     errors: tuple[str | None, ...] = ()
     actions: tuple[str, ...] = ()
     attempts: tuple[tuple[Count, ...], ...] = ()
+    began: tuple[tuple[Annotated[int, Field(ge=-1)], ...], ...] = ()
 
-    OPTIONAL: ClassVar[tuple[str, ...]] = (*Episodes.OPTIONAL, "errors", "actions", "attempts")
+    OPTIONAL: ClassVar[tuple[str, ...]] = (*Episodes.OPTIONAL, "errors", "actions", "attempts", "began")
 
     def __post_init__(self) -> None:
         errors = self.shape_errors()

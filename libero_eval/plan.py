@@ -251,11 +251,20 @@ def resolve_protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[T
     """Return the protocol on this machine, with what the request changes; what was chosen is printed."""
     protocol, notes = resolve_world(base, tasks, request.assets)
     changes: dict[str, object] = {}
+    perturb = protocol.world.perturb
     if request.horizon:
         changes["episode.horizon"] = request.horizon
     if request.perturb is not None:
-        perturbations = parse_perturbations(request.perturb, request.perturb_seed)
-        changes["world.perturb"] = format_perturbations(perturbations)
+        perturb = format_perturbations(parse_perturbations(request.perturb, request.perturb_seed))
+        changes["world.perturb"] = perturb
+    if request.event:
+        known = parse_perturbations(perturb, events=True)
+        events = parse_perturbations(",".join(request.event), request.perturb_seed, events=True)
+        if at_start := [str(one) for one in events if not one.trigger]:
+            raise ConfigError(
+                f"--event {at_start[0]}: expected KIND=SEVERITY@TRIGGER, such as camera=0.5@lifted"
+            )
+        changes["world.perturb"] = format_perturbations((*known, *events))
     if request.control_freq:
         changes["world.control_freq"] = request.control_freq
     if request.robot:
@@ -342,6 +351,7 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
         control_freq=None,
         robot=None,
         perturb=None,
+        event=(),
         size=None,
         out=request.out or (path if path.is_dir() else path.parent) / "again",
     )

@@ -131,10 +131,13 @@ class EvalRequest(Request):
 
     Attributes:
         perturb: Perturbations, such as camera=0.3,light=0.5, see `libero perturb list` (default: the protocol's, none).
+        event: Perturbations that begin during an episode, KIND=SEVERITY@TRIGGER, such as camera=0.5@lifted; triggers:
+            step40, 25%, touched, lifted, over_goal.
         despite: Of a result that is run again: what may differ from then, such as mujoco (default: nothing).
     """
 
     perturb: str | None = None
+    event: tuple[str, ...] = ()
     despite: tuple[str, ...] = ()
 
 

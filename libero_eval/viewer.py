@@ -153,7 +153,7 @@ class Stage:
         )
         if self.env.perturbed is not None:
             self.env.perturbed.open(0, episode.name)
-            self.env.observer.set_appearance(0, self.env.perturbed.appearance(episode.name))
+            self.env.observer.set_appearance(0, self.env.perturbed.appearance(0))
         for state in episode.states:
             self._add(state)
 

@@ -53,7 +53,7 @@ def rendered_perturbations(perturb: str | Sequence[Perturbation]) -> tuple[Pertu
     """
     rendered = []
     for one in checked_perturbations(perturb):
-        if not isinstance(one, Perturbation) or not one.definition.is_rendered:
+        if not isinstance(one, Perturbation) or one.trigger or not one.definition.is_rendered:
             valid = ", ".join(kind.name for kind in KINDS.values() if kind.is_rendered)
             raise InvalidInputError(
                 f"{one} changes what happens, and recorded demonstrations show what happened without it; valid: {valid}"

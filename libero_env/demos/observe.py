@@ -228,7 +228,7 @@ class StateRenderer:
             yield from map(self.env.set_state, states)
             return
         perturbed.open(0, name)
-        batch.observer.set_appearance(0, perturbed.appearance(name))
+        batch.observer.set_appearance(0, perturbed.appearance(0))
         for step, state in enumerate(states):
             self.env.simulations.set_physics_state(0, state)
             perturbed.steps[0] = step

@@ -27,12 +27,14 @@ from libero_env.init_states.store import load_init_states
 from libero_env.memory import require_memory
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.episodes import TRIES
+from libero_env.perturbations.events import NEVER, has_begun
 from libero_env.perturbations.sampling import start_name
 from libero_env.sim.engine import Goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward
 from libero_env.sim.scene import BUFFER_SIDE, InitialStates
 from libero_env.sim.simulation import Indices, Watch
+from libero_env.sim.watch import EpisodeWatch
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ, PHYSICS_HZ
 from libero_env.validation import validate
@@ -169,6 +171,8 @@ class BatchEnv(LiberoVectorEnv):
         self._steps, self._errors = np.zeros(num, np.int64), dict[int, str]()
         self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
         self._progress = np.zeros((num, len(self.atoms)), bool)
+        has_events = self.perturbed is not None and self.perturbed.events
+        self._watch = EpisodeWatch(self.views, self.goals.atoms) if has_events else None
 
     @property
     def atoms(self) -> tuple[str, ...]:
@@ -252,6 +256,7 @@ class BatchEnv(LiberoVectorEnv):
         reached, rewards = np.zeros(self.num_envs, bool), np.zeros(self.num_envs)
         entries = None
         if ids.size:
+            self._begin_events(ids)
             entries = self._step_and_observe(ids, actions)
             reached[ids], rewards[ids] = self._check_goals(ids)
             self._steps[ids] += 1
@@ -355,7 +360,9 @@ class BatchEnv(LiberoVectorEnv):
                 raise PlacementError(
                     f"{self.base_task.id}, start {name}: the perturbed goal holds at the start"
                 )
-        self.observer.set_appearance(i, perturbed.appearance(name))
+        self.observer.set_appearance(i, perturbed.appearance(i))
+        if self._watch is not None:
+            self._watch.begin(i)
 
     def _stored_states(self, indices: np.ndarray) -> InitialStates:
         """Return stored initial states by index, (k,)."""
@@ -411,6 +418,33 @@ class BatchEnv(LiberoVectorEnv):
             for i, won, row in zip(ids, reached, held, strict=True)
         ]
         return reached, np.array(rewards, np.float64)
+
+    def _begin_events(self, ids: np.ndarray) -> None:
+        """Let the events begin whose moment has come, before a control step."""
+        perturbed, watch = self.perturbed, self._watch
+        if perturbed is None or watch is None:
+            return
+        for i in map(int, ids):
+            if perturbed.steps[i]:
+                watch.look(i)
+            for event, k in enumerate(perturbed.events):
+                trigger, steps = perturbed.perturbations[k].trigger, int(perturbed.steps[i])
+                waits = perturbed.began[i, event] == NEVER and perturbed.attempts[i, k] < TRIES
+                if waits and has_begun(trigger, steps, self.config.horizon, watch, i):
+                    self._begin_event(i, event)
+
+    def _begin_event(self, i: int, event: int) -> None:
+        """Let an event begin in simulation i; one that finds no valid place does not happen."""
+        perturbed, simulations = self.perturbed, self.simulations
+        assert perturbed is not None
+        state, size = simulations.get_state(i), self.scene.state_size
+        try:
+            row = perturbed.begin_event(i, event, state[:size])
+        except PlacementError:
+            return
+        if not np.array_equal(row, state[:size]):
+            simulations.set_state(i, np.concatenate([row, state[size:]]))
+        self.observer.set_appearance(i, perturbed.appearance(i))
 
     def _step_and_observe(self, ids: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
         """Advance simulations by one control period, and observe them when `config.observed` says."""
@@ -471,6 +505,7 @@ class BatchEnv(LiberoVectorEnv):
         info = {"success": self._success.copy(), "progress": self._progress.copy()}
         if self.perturbed is not None:
             info["attempts"] = self.perturbed.attempts.copy()
+            info["began"] = self.perturbed.began.copy()
         return {**info, "errors": dict(self._errors)} if self._errors else info
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.errors import InvalidInputError, PlacementError
+from libero_env.perturbations.events import NEVER
 from libero_env.perturbations.kinds import Change, Episode, Layer, layer_of
 from libero_env.perturbations.pairing import Pairing
 from libero_env.perturbations.perturbation import Perturbation, in_order, parse_perturbations
@@ -32,7 +33,7 @@ def checked_perturbations(value: object) -> tuple[Perturbation | Change, ...]:
         InvalidInputError: A value is of another kind, out of range, or given twice.
     """
     if isinstance(value, str):
-        return tuple(one for one in parse_perturbations(value) if one.severity)
+        return tuple(one for one in parse_perturbations(value, events=True) if one.severity)
     if not isinstance(value, Iterable) or isinstance(value, Mapping | bytes):
         raise InvalidInputError(f"perturb is {shown(value)}; expected a text such as camera=0.3,light=0.5")
     sampled: list[Perturbation] = []
@@ -73,6 +74,8 @@ class PerturbedEpisodes:
         attempts: Number of the sample that is used, from 0, of each simulation and perturbation, (num, n): how many
             before it were not valid, or not solved.
         steps: Number of control steps of each episode, (num,).
+        events: Positions of the perturbations that begin during an episode.
+        began: Number of control steps before each of them, (num, events); `NEVER` until then.
     """
 
     def __init__(
@@ -83,12 +86,15 @@ class PerturbedEpisodes:
         self._task, self._scene, self._pairing = task, scene, Pairing(base, scene)
         self.attempts = np.zeros((num, len(self.perturbations)), np.int64)
         self.steps = np.zeros(num, np.int64)
+        self.events = [k for k, one in enumerate(self.perturbations) if one.trigger]
+        self.began = np.full((num, len(self.events)), NEVER)
         self._filters: dict[Layer, list[list[tuple[Any, Episode]]]] = {
             "observation": [[] for _ in range(num)],
             "action": [[] for _ in range(num)],
         }
         self._starts: list[object] = [""] * num
-        filters = (*self._fixed_of("observation"), *(self._sample(k, "") for k in self._of("observation")))
+        sampled = [k for k, one in enumerate(self.perturbations) if one.layer == "observation"]
+        filters = (*self._fixed_of("observation"), *(self._sample(k, "") for k in sampled))
         self.has_memory = any(one.has_memory for one in filters)
 
     @property
@@ -147,19 +153,42 @@ class PerturbedEpisodes:
     def open(self, i: int, start: object) -> None:
         """Begin the observations and actions of the episode of a start in simulation i."""
         self._starts[i] = start
+        self.began[i] = NEVER
         self.resume(i, 0)
 
     def resume(self, i: int, steps: int) -> None:
         """Go on with the episode of simulation i after so many steps; filters with a memory begin a new one."""
         self.steps[i] = steps
         for layer, filters in self._filters.items():
-            filters[i] = self._opened(layer, self._starts[i])
+            filters[i] = self._opened(layer, self._starts[i], i)
 
-    def appearance(self, start: object) -> Appearance:
-        """Return the appearance of a start's episode; what is sampled for it goes before absolute changes."""
-        return joined(
-            [*self._fixed_of("appearance"), *(self._sample(k, start) for k in self._of("appearance"))]
-        )
+    def appearance(self, i: int) -> Appearance:
+        """Return the appearance of simulation i; what is sampled for its start goes before absolute changes."""
+        sampled = (self._sample(k, self._starts[i]) for k in self._of("appearance", i))
+        return joined([*self._fixed_of("appearance"), *sampled])
+
+    def begin_event(self, i: int, event: int, row: np.ndarray) -> np.ndarray:
+        """Let an event begin in simulation i, and return the state that it leaves; the same unless it moves something.
+
+        Args:
+            i: Index of the simulation.
+            event: Position in `events`.
+            row: State [time, qpos, qvel, poses of the fixtures].
+
+        Raises:
+            PlacementError: No sample of what it moves is valid; it does not happen.
+        """
+        k, start = self.events[event], self._starts[i]
+        one = self.perturbations[k]
+        self.attempts[i, k] = TRIES  # unless one is valid
+        if one.layer == "start":
+            row = self._sampled_start(i, k, start, row, 0)
+        self.began[i, event] = self.steps[i]
+        if one.layer != "start":
+            self.attempts[i, k] = self._first(k, start) if one.layer == "action" else 0
+        if one.layer in self._filters:
+            self._filters[one.layer][i].append(self._open_filter(k, start))
+        return row
 
     def act(self, ids: Sequence[int] | np.ndarray, actions: np.ndarray) -> np.ndarray:
         """Return the actions that are executed, for those that were chosen, (num, A), and count the step."""
@@ -188,9 +217,13 @@ class PerturbedEpisodes:
                     arrived[name][i] = values
         return arrived
 
-    def _of(self, layer: Layer) -> list[int]:
-        """Return the positions of the perturbations of a layer."""
-        return [k for k, one in enumerate(self.perturbations) if one.layer == layer]
+    def _of(self, layer: Layer, i: int | None = None) -> list[int]:
+        """Return the positions of the perturbations of a layer; of events those that have begun in simulation i."""
+        begun = (
+            [] if i is None else [k for k, at in zip(self.events, self.began[i], strict=True) if at != NEVER]
+        )
+        found = [k for k, one in enumerate(self.perturbations) if one.layer == layer]
+        return [k for k in found if k not in self.events or k in begun]
 
     def _fixed_of(self, layer: Layer) -> list[Any]:
         """Return the absolute changes of a layer."""
@@ -219,16 +252,17 @@ class PerturbedEpisodes:
             f"{self._task.id}, start {start}: none of {TRIES} samples of {self.perturbations[k]} is valid"
         )
 
-    def _opened(self, layer: Layer, start: object) -> list[tuple[Any, Episode]]:
+    def _opened(self, layer: Layer, start: object, i: int) -> list[tuple[Any, Episode]]:
         """Return the filters of a layer, each with its episode: fixed ones, then those that are sampled."""
         task, opened = self._task.id, []
         for j, one in enumerate(self._fixed_of(layer)):
             opened.append((one, Episode(sample_key(f"fixed {j}", 0, task, start))))
-        for k in self._of(layer):
-            attempt = self._first(k, start) if layer == "action" else 0
-            key = self.perturbations[k].key(task, start, attempt)
-            opened.append((self._sample(k, start), Episode(key)))
-        return opened
+        return [*opened, *(self._open_filter(k, start) for k in self._of(layer, i))]
+
+    def _open_filter(self, k: int, start: object) -> tuple[Any, Episode]:
+        one = self.perturbations[k]
+        attempt = self._first(k, start) if one.layer == "action" else 0
+        return self._sample(k, start), Episode(one.key(self._task.id, start, attempt))
 
     def _at_step(self, layer: Layer, i: int) -> list[tuple[Any, Episode]]:
         """Return the filters of simulation i, whose episodes are at its step."""

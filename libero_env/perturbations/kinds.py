@@ -133,6 +133,11 @@ class Kind:
         """Whether only what is seen or said changes, so that recorded states can be rendered with it."""
         return self.layer in ("appearance", "observation") or (self.layer == "problem" and not self.physical)
 
+    @property
+    def can_begin(self) -> bool:
+        """Whether it can begin during an episode: without another scene, and without moving the arm."""
+        return self.layer != "problem" and self.name not in ("robot", "object_pose")
+
     def amount(self, severity: float) -> float:
         """Return the amount at a severity in [0, 1], in `unit`."""
         if self.scale == "ratio":

@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field
 
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.perturbations import appearance, filters, problem, starts
+from libero_env.perturbations.events import checked_trigger
 from libero_env.perturbations.instructions import reword
 from libero_env.perturbations.kinds import Kind, Layer
 from libero_env.perturbations.sampling import SampleKey, first_attempt, sample_key
@@ -55,15 +56,20 @@ class Perturbation:
         kind: Name of the kind, see `libero_env.perturbations.KINDS`.
         severity: Severity in [0, 1]; 0 changes nothing, and the kind says what 1 is.
         seed: Seed of what is sampled.
+        trigger: When it begins, see `libero_env.perturbations.events`; empty for the whole episode.
 
     Raises:
-        UnknownNameError: The kind does not exist.
-        InvalidInputError: Severity or seed are out of range.
+        UnknownNameError: The kind or the trigger do not exist.
+        InvalidInputError: Severity or seed are out of range, or such a kind cannot begin during an episode.
     """
 
     kind: Annotated[str, AfterValidator(lambda name: get_kind(name).name)]
     severity: Annotated[float, Field(ge=0, le=1)]
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 0
+    trigger: str = ""
+
+    def __post_init__(self) -> None:
+        _check_event(self.kind, self.trigger)
 
     @property
     def definition(self) -> Kind:
@@ -98,28 +104,32 @@ class Perturbation:
         return sample_key(self.kind, self.seed, task, start, attempt)
 
     def __str__(self) -> str:
-        seed = f"@{self.seed}" if self.seed else ""
-        return f"{self.kind}={self.severity:g}{seed}"
+        marks = [self.trigger] * bool(self.trigger) + [str(self.seed)] * bool(self.seed)
+        return "@".join([f"{self.kind}={self.severity:g}", *marks])
 
 
-def parse_perturbations(text: str, seed: int = 0) -> tuple[Perturbation, ...]:
+def parse_perturbations(text: str, seed: int = 0, *, events: bool = False) -> tuple[Perturbation, ...]:
     """Return the perturbations of a text, in the order in which they are applied.
 
     Args:
         text: `KIND=SEVERITY` with commas between; `camera=0.3@7` has the seed 7.
         seed: Seed of those that name none.
+        events: Whether some may begin during an episode: `camera=0.3@lifted`, `camera=0.3@lifted@7`.
 
     Raises:
-        UnknownNameError: A kind does not exist.
+        UnknownNameError: A kind or a trigger does not exist.
         InvalidInputError: A part has another form, a severity is out of range, or kinds exclude each other.
     """
     perturbations = []
     for part in filter(None, map(str.strip, text.split(","))):
         kind, _, rest = part.partition("=")
-        severity, at, own_seed = rest.partition("@")
+        severity, *marks = rest.split("@")
         get_kind(kind.strip())
+        trigger = marks.pop(0) if events and marks and not marks[0].isdecimal() else ""
+        _check_event(kind.strip(), trigger)
         try:
-            perturbations.append(Perturbation(kind.strip(), float(severity), int(own_seed) if at else seed))
+            own_seed = int("@".join(marks)) if marks else seed
+            perturbations.append(Perturbation(kind.strip(), float(severity), own_seed, trigger))
         except ValueError:  # those of `Perturbation` too
             raise InvalidInputError(f"perturbation {shown(part)}: {EXPECTED}") from None
     return in_order(perturbations)
@@ -132,9 +142,9 @@ def in_order(perturbations: Iterable[Perturbation]) -> tuple[Perturbation, ...]:
         InvalidInputError: A kind is named twice, or kinds exclude each other.
     """
     names = list(KINDS)
-    ordered = sorted(perturbations, key=lambda one: names.index(one.kind))
+    ordered = sorted(perturbations, key=lambda one: (names.index(one.kind), one.trigger))
     for first, second in zip(ordered, ordered[1:], strict=False):
-        if first.kind == second.kind:
+        if (first.kind, first.trigger) == (second.kind, second.trigger):
             raise InvalidInputError(f"perturbation {first.kind} is named twice: {first} and {second}")
     active = [one for one in ordered if one.severity]
     for one in active:
@@ -152,13 +162,22 @@ def replace_perturbations(
     Raises:
         InvalidInputError: Kinds exclude each other.
     """
-    by_kind = {one.kind: one for one in (*perturbations, *others)}
+    by_kind = {(one.kind, one.trigger): one for one in (*perturbations, *others)}
     return in_order(by_kind.values())
 
 
 def format_perturbations(perturbations: Iterable[Perturbation]) -> str:
     """Return the text of perturbations, in the order in which they are applied; without those of severity 0."""
     return ",".join(str(one) for one in in_order(perturbations) if one.severity)
+
+
+def _check_event(kind: str, trigger: str) -> None:
+    """Raise unless a kind can begin at a trigger."""
+    if checked_trigger(trigger) and not KINDS[kind].can_begin:
+        valid = ", ".join(name for name, one in KINDS.items() if one.can_begin)
+        raise InvalidInputError(
+            f"event {kind}@{trigger}: {kind} cannot begin during an episode; can: {valid}"
+        )
 
 
 def perturb_task(task: Task, perturbations: Iterable[Perturbation], scene: Scene) -> Task:

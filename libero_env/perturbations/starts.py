@@ -1,8 +1,9 @@
 """Kinds that change the start of an episode: the joints of the arm, the poses of objects."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -12,10 +13,11 @@ from libero_env.geometry import quat_from_axis_angle, quat_multiply
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import StartChange
 from libero_env.perturbations.sampling import direction, sign
-from libero_env.sim.scene import Scene
+from libero_env.sim.scene import ROBOT, Scene
 from libero_env.tasks.problem import Problem
 
 _DIRECTIONS = 60  # tries for each object
+_BESIDE = 0.12  # [m] between the middles of two objects that stand beside each other
 _FULL_STEP, _FULL_TURN = 0.05, np.deg2rad(30.0)  # [m], [rad] at severity 1
 _LIMIT_MARGIN = 0.02  # [rad] between a sampled joint and the end of its range
 
@@ -81,6 +83,68 @@ class ScatteredObjects(StartChange):
             else:
                 return None
         return moved
+
+
+@dataclass(frozen=True)
+class PutAside(StartChange):
+    """Objects of the goal are moved by the same distance, with what stands on them, without new contacts.
+
+    Attributes:
+        distance: Distance, [m].
+        receptacle: Whether those that others are put on or in are moved, instead of those that are put there.
+        seed: Seed of the directions.
+    """
+
+    distance: float
+    receptacle: bool
+    seed: int
+
+    def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
+        rng, loads, moved = np.random.default_rng(self.seed), carried(scene.problem), row
+        before = contacts(scene, row)
+        names = [name for name in _of_goal(scene)[self.receptacle] if not _in_hand(scene, name, before)]
+        for name in names:
+            moved = shifted(scene, moved, (name, *loads.get(name, ())), self.distance * direction(rng, 2))
+        return moved if names and contacts(scene, moved) <= before else None
+
+
+@dataclass(frozen=True)
+class Gathered(StartChange):
+    """Objects that the goal is not about stand beside one that it is about, without new contacts.
+
+    Attributes:
+        count: Number of objects.
+        seed: Seed of their choice and of their places.
+    """
+
+    count: int
+    seed: int
+
+    def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
+        rng, before, moved = np.random.default_rng(self.seed), contacts(scene, row), row
+        wanted, receptacles = _of_goal(scene)
+        used = {*wanted, *receptacles}
+        idle = [name for name, load in carried(scene.problem).items() if not used & {name, *load}]
+        if not wanted or not idle:
+            return None
+        for k in rng.permutation(len(idle))[: self.count]:
+            here, there = (1 + scene.pose_address(name) for name in (idle[k], wanted[0]))
+            step = row[there : there + 2] + _BESIDE * direction(rng, 2) - row[here : here + 2]
+            moved = shifted(scene, moved, (idle[k], *carried(scene.problem)[idle[k]]), step)
+        return moved if contacts(scene, moved) <= before else None
+
+
+def _of_goal(scene: Scene) -> tuple[list[str], list[str]]:
+    """Return the objects that a goal wants somewhere, and those that it wants them on or in."""
+    atoms, objects = scene.problem.goal.atoms(), scene.problem.objects
+    wanted = dict.fromkeys(atom.args[0] for atom in atoms if atom.args[0] in objects)
+    owners = (scene.owner(name) for atom in atoms for name in atom.args[1:])
+    return list(wanted), list(dict.fromkeys(name for name in owners if name and name in objects))
+
+
+def _in_hand(scene: Scene, name: str, touching: set[tuple[int, int]]) -> bool:
+    robot, own = set(scene.bodies[ROBOT].tolist()), set(scene.bodies[name].tolist())
+    return any(robot & set(pair) and own & set(pair) for pair in touching)
 
 
 def carried(problem: Problem) -> dict[str, list[str]]:
@@ -158,4 +222,18 @@ def _object_pose(metres: float, rng: np.random.Generator, scene: Scene) -> Scatt
     return ScatteredObjects(metres, _FULL_TURN * metres / _FULL_STEP, int(rng.integers(2**63)))
 
 
-SAMPLERS = {"robot": _robot, "object_pose": _object_pose}
+def _put_aside(metres: float, rng: np.random.Generator, scene: Scene, *, receptacle: bool) -> PutAside:
+    return PutAside(metres, receptacle, int(rng.integers(2**63)))
+
+
+def _gathered(count: float, rng: np.random.Generator, scene: Scene) -> Gathered:
+    return Gathered(int(count), int(rng.integers(2**63)))
+
+
+SAMPLERS: dict[str, Callable[..., StartChange]] = {
+    "robot": _robot,
+    "object_pose": _object_pose,
+    "object": partial(_put_aside, receptacle=False),
+    "receptacle": partial(_put_aside, receptacle=True),
+    "distractor": _gathered,
+}

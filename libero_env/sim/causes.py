@@ -1,6 +1,6 @@
 """Why an episode failed: what it has shown of each object, and the decision tree that names one cause.
 
-A `Trace` is filled by `libero_env.sim.watch.Watch` after each control step. Its names are objects and fixtures.
+A `Trace` is filled by `libero_env.sim.watch.EpisodeWatch` after each control step. Its names are objects and fixtures.
 """
 
 from collections.abc import Sequence

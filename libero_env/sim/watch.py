@@ -22,16 +22,20 @@ _MOVED = 0.02  # [rad] or [m] that a joint of a fixture was moved
 _LEFT, _RIGHT, _HAND, _ARM = "left finger", "right finger", "hand", "arm"
 
 
-class Watch:
+class EpisodeWatch:
     """Traces of the episodes of several simulations of one scene.
 
     Args:
         views: State view of each simulation.
         atoms: Atoms of the goal.
+
+    Attributes:
+        traces: What the present episode of each simulation has shown.
+        wanted: Objects and fixtures that the goal is about.
     """
 
     def __init__(self, views: Sequence[StateView], atoms: Sequence[Atom]):
-        self._views, self._scene, self._atoms = views, views[0].scene, tuple(atoms)
+        self.views, self._scene, self.atoms = views, views[0].scene, tuple(atoms)
         scene, model = self._scene, self._scene.model
         self._names = [*scene.bodies, _LEFT, _RIGHT, _HAND, _ARM]
         self._codes = np.zeros(model.nbody, np.int64)  # of each body, the index of its name
@@ -43,7 +47,7 @@ class Watch:
             part = _LEFT if first in _ancestors(model, body) else part
             part = _RIGHT if second in _ancestors(model, body) else part
             self._codes[body] = self._names.index(part)
-        self._wanted = [name for atom in atoms if (name := scene.owner(atom.args[0]))]
+        self.wanted = [name for atom in atoms if (name := scene.owner(atom.args[0]))]
         self._owned = {j: name for name in scene.entities for j in scene.joints[name]}
         self._joints = model.jnt_qposadr[list(self._owned)]
         self._scratch: mujoco.MjData | None = None
@@ -56,14 +60,14 @@ class Watch:
 
     def begin(self, i: int) -> None:
         """Begin the trace of an episode in the present state of simulation i."""
-        view = self._views[i]
+        view = self.views[i]
         self.traces[i] = Trace()
         self._heights[i] = {name: float(view.body_pos(name)[2]) for name in self._scene.objects}
         self._rest[i] = view.simulations.fields["qpos"][i, self._joints]
 
     def look(self, i: int) -> Trace:
         """Take note of the present state of simulation i, after a control step, and return its trace."""
-        trace, view = self.traces[i], self._views[i]
+        trace, view = self.traces[i], self.views[i]
         trace.steps += 1
         touching = self._touching(view.simulations.contact_geoms(i))
         trace.touching = {b for a, b in touching if a in (_LEFT, _RIGHT, _HAND)}
@@ -93,13 +97,13 @@ class Watch:
             ever: Whether each atom of the goal held at any time.
             now: Whether each holds at the end.
         """
-        trace, view = self.traces[i], self._views[i]
+        trace, view = self.traces[i], self.views[i]
         missing = [
             Missing(name, bool(before), over(view, atom), self._place(i, name))
-            for atom, before, holds in zip(self._atoms, ever, now, strict=True)
+            for atom, before, holds in zip(self.atoms, ever, now, strict=True)
             if not holds and (name := self._scene.owner(atom.args[0]))
         ]
-        found = explain(trace, missing, self._wanted)
+        found = explain(trace, missing, self.wanted)
         moved = np.abs(view.simulations.fields["qpos"][i, self._joints] - self._rest[i]) > _MOVED
         opened = [name for name, far in zip(self._owned.values(), moved, strict=True) if far]
         handled = tuple(dict.fromkeys([*trace.lifted, *(name for name in opened if name in trace.touched)]))
@@ -116,7 +120,7 @@ class Watch:
 
     def _blows(self, i: int) -> Iterator[tuple[str, float]]:
         """Yield what the robot hits, with the sum of the normal forces: of a solver that runs on a copy."""
-        simulations, total = self._views[i].simulations, dict[str, float]()
+        simulations, total = self.views[i].simulations, dict[str, float]()
         model, force = simulations.model, np.zeros(6)
         simulations.pose_fixtures(i)
         self._scratch = self._scratch or mujoco.MjData(model)
@@ -130,7 +134,7 @@ class Watch:
 
     def _place(self, i: int, name: str) -> str:
         """Return what an object touches, rather something on the workspace than that; empty if nothing."""
-        view, scene = self._views[i], self._scene
+        view, scene = self.views[i], self._scene
         there = [*(n for n in scene.entities if n != name), scene.workspace_name]
         return next((other for other in there if view.in_contact(name, other)), "")
 
@@ -152,10 +156,10 @@ class Watch:
                 ]
                 parts = [name, *(r for r in regions if scene.owner(r) == name and scene.joints.get(r))]
                 candidates = [Atom(word, (part,)) for word in words for part in parts]
-            yield from (atom for atom in candidates if atom not in self._atoms)
+            yield from (atom for atom in candidates if atom not in self.atoms)
 
     def _has_boxes(self, address: str) -> bool:
-        region = region_of(self._views[0], address)
+        region = region_of(self.views[0], address)
         return (
             bool(region.ranges)
             or mujoco.mj_name2id(self._scene.model, mujoco.mjtObj.mjOBJ_SITE, address) >= 0

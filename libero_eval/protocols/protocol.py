@@ -477,7 +477,7 @@ def _perturbation_problems(text: str) -> Iterator[str]:
     )
 
     try:
-        if text != (ordered := format_perturbations(parse_perturbations(text))):
+        if text != (ordered := format_perturbations(parse_perturbations(text, events=True))):
             yield f"world.perturb is {text!r}; in the order of application it is {ordered!r}"
     except LiberoError as error:
         yield f"world.perturb: {error}"

@@ -216,7 +216,7 @@ class Evaluation:
     def _unit_result(
         self, unit: Unit, done: Rollouts, env: VectorEnv, started: float, errors: tuple[str | None, ...] = ()
     ) -> UnitResult:
-        attempts = tuple(e.attempts for e in done.counted)
+        attempts, began = tuple(e.attempts for e in done.counted), tuple(e.began for e in done.counted)
         kept = tuple(e for e, ran in zip(errors, done.episodes, strict=False) if not ran.simulation_error)
         result = TaskResult(
             task=unit.task.id,
@@ -225,6 +225,7 @@ class Evaluation:
             errors=kept if any(kept) else (),
             actions=tuple(e.actions for e in done.counted),
             attempts=attempts if any(attempts) else (),
+            began=began if any(began) else (),
             **done.columns(),
         )
         environment, versions = describe_environment(env), dict(self.versions)

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from libero_env.errors import SimulationError
 from libero_env.sim.causes import Failure
-from libero_env.sim.watch import Watch
+from libero_env.sim.watch import EpisodeWatch
 from libero_env.storage import atomic_path
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, PolicyActor, TakesNote
@@ -42,6 +42,7 @@ class Episode:
         simulation_error: Why the simulation failed and ended the episode, which is neither a success nor a failure;
             empty otherwise.
         failure: Why the goal was not reached; None where it was, or where the environment does not show its state.
+        began: Number of control steps of the environment before each event began, -1 where it never did.
     """
 
     init_state: int
@@ -54,6 +55,7 @@ class Episode:
     attempts: tuple[int, ...] = ()
     simulation_error: str = ""
     failure: Failure | None = None
+    began: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -214,7 +216,6 @@ def run_episodes(
     actor.reset(env.num_envs)
     _draw(env, not settle_steps)
     obs, info = env.reset(options={"init_state": np.asarray(init_states)})
-    attempts = [tuple(map(int, row)) for row in info.get("attempts", [()] * env.num_envs)]
     tracker = EpisodeTracker(env, info)
     settling = np.zeros(actor.action_dim) if settle_action is None else np.asarray(settle_action, float)
     for left in reversed(range(settle_steps)):
@@ -245,8 +246,14 @@ def run_episodes(
     _tell(actor, tracker)
     done = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
     episodes = tuple(
-        replace(one, attempts=tries, simulation_error=tracker.errors.get(i, ""), failure=tracker.failure(i))
-        for i, (one, tries) in enumerate(zip(done, attempts, strict=True))
+        replace(
+            one,
+            attempts=tuple(map(int, tracker.attempts[i])),
+            simulation_error=tracker.errors.get(i, ""),
+            failure=tracker.failure(i),
+            began=tuple(map(int, tracker.began[i])),
+        )
+        for i, one in enumerate(done)
     )
     return Rollouts(
         episodes,
@@ -279,6 +286,8 @@ class EpisodeTracker:
         over: (B,) whether each episode is over.
         success: (B,) whether each episode has succeeded.
         errors: Why simulations have failed, by index.
+        attempts: (B, perturbations) number of draws that were not valid.
+        began: (B, events) number of control steps before each event, -1 where it has not begun.
     """
 
     def __init__(self, env: VectorEnv, info: Mapping[str, Any]):
@@ -286,10 +295,12 @@ class EpisodeTracker:
         self.atoms: tuple[str, ...] = tuple(getattr(env, "atoms", ()))
         self.over, self.success = np.zeros(env.num_envs, bool), np.zeros(env.num_envs, bool)
         self.errors: dict[int, str] = {}
+        none = np.zeros((env.num_envs, 0), int)
+        self.attempts, self.began = info.get("attempts", none), info.get("began", none)
         self._now = self._progress(info)
         self._start = self._ever = self._now
         views, goals = getattr(env, "views", None), getattr(env, "goals", None)
-        self._watch = Watch(views, goals.atoms) if views and goals else None
+        self._watch = EpisodeWatch(views, goals.atoms) if views and goals else None
 
     def start(self) -> None:
         """Take the present state as that before the actor acts."""
@@ -305,6 +316,7 @@ class EpisodeTracker:
             for i in np.flatnonzero(~self.over):
                 self._watch.look(int(i))
         self.success = self.success | (np.asarray(info["success"], bool) & ~self.over)
+        self.attempts, self.began = info.get("attempts", self.attempts), info.get("began", self.began)
         self.errors |= {i: why for i, why in info.get("errors", {}).items() if not self.over[i]}
         self._now = np.where(self.over[:, None], self._now, self._progress(info))
         self._ever = self._ever | self._now

@@ -6,7 +6,7 @@ import pytest
 from libero_env.envs.batch import BatchEnv
 from libero_env.expert import Expert
 from libero_env.sim.causes import CAUSES, Failure, Missing, Trace, explain
-from libero_env.sim.watch import LIFTED, Watch, over
+from libero_env.sim.watch import LIFTED, EpisodeWatch, over
 
 OWN = ["milk"]
 
@@ -47,7 +47,7 @@ def lifting():
     """The expert's episode up to where it has lifted the cream cheese, and the state there."""
     env = BatchEnv("libero_goal/6", 1, cameras=(), horizon=400)  # the cream cheese into the bowl
     env.reset(options={"init_state": [0]})
-    watch, expert = Watch(env.views, env.goals.atoms), Expert(env.task, np.random.default_rng(0))
+    watch, expert = EpisodeWatch(env.views, env.goals.atoms), Expert(env.task, np.random.default_rng(0))
     before = env.get_state(0)
     while "cream_cheese_1" not in watch.traces[0].lifted:
         env.step(expert.act(env.views[0])[None])

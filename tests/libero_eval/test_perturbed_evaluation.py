@@ -104,3 +104,23 @@ def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypat
     assert np.array_equal(found[0][0], found[1][0])
     moved = np.linalg.norm(found[1][1] - found[0][1], axis=1)
     assert moved == pytest.approx(KINDS["layout"].amount(0.3))  # the same for all starts
+
+
+def test_an_evaluation_with_events_says_where_they_began(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "told_policy.py").write_text(POLICY)
+    words = ["--perturb", "noise=0.2", "--event", "camera=0.5@step6", "light=1@touched", "--unit-starts"]
+    assert main([*EVAL, "--out", "events", *words, "2"]) == 0
+    assert "(event began in 3 of 3)  (event began in 0 of 3)" in capsys.readouterr().out
+    found = EvaluationResult.read(tmp_path / "events")
+    assert found.protocol["world"]["perturb"] == "camera=0.5@step6,light=1@touched,noise=0.2"
+    assert found.tasks[0].began == ((6, -1),) * 3
+    assert main([*EVAL, "--out", "apart", *words, "1", "--workers", "2"]) == 0
+    again = EvaluationResult.read(tmp_path / "apart")
+    assert again.tasks == found.tasks and again.actions == found.actions
+    assert main([*EVAL, "--out", "none", "--event", "camera=0.5"]) == 2
+    assert main([*EVAL, "--out", "none", "--event", "camera=0.5@lift"]) == 2
+    errors = [
+        line for line in capsys.readouterr().err.splitlines() if "expected" in line or "trigger" in line
+    ]
+    assert "expected KIND=SEVERITY@TRIGGER" in errors[0] and "unknown trigger 'lift'" in errors[1]

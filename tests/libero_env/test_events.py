@@ -1,0 +1,114 @@
+"""Perturbations that begin during an episode: bits before them, their moments, what they move, what is refused."""
+
+import numpy as np
+import pytest
+
+from libero_env.demos.config import RenderConfig
+from libero_env.envs.batch import BatchEnv
+from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.expert import Expert
+from libero_env.perturbations import Perturbation, format_perturbations, parse_perturbations
+
+TASK = "libero_goal/6"  # the cream cheese into the bowl
+
+
+def episode(perturb, starts=(0, 1), steps=14):
+    """Return the pictures and the positions after each step, and the last infos."""
+    action = np.tile([0.0, 0.2, -0.5, 0.0, 0.0, 0.0, 1.0], (len(starts), 1))
+    options = {"cameras": ("agentview",), "camera_size": (32, 32), "horizon": 100, "perturb": perturb}
+    with BatchEnv(TASK, len(starts), **options) as env:
+        env.reset(options={"init_state": list(starts)})
+        seen = []
+        for _ in range(steps):
+            obs, *_, info = env.step(action)
+            seen.append((obs["agentview_rgb"], env.simulations.fields["qpos"].copy()))
+        return [np.stack(part) for part in zip(*seen, strict=True)], info, env
+
+
+@pytest.fixture(scope="module")
+def matched():
+    return episode("")[0]
+
+
+@pytest.mark.parametrize(
+    "kind", ["camera=0.5", "noise=1", "gain=1", "object=1", "receptacle=1", "distractor=1"]
+)
+@pytest.mark.parametrize("trigger", ["step10", "10%"])
+def test_all_before_an_event_is_the_matched_episode_to_the_bit_and_nothing_after_it(matched, kind, trigger):
+    (pictures, positions), info, env = episode(f"{kind}@{trigger}")
+    np.testing.assert_array_equal(pictures[:10], matched[0][:10])
+    np.testing.assert_array_equal(positions[:10], matched[1][:10])
+    assert info["began"].tolist() == [[10], [10]]
+    is_physical = env.config.perturb[0].definition.physical
+    assert (positions[10] != matched[1][10]).any(axis=-1).all() == is_physical
+    assert (pictures[10] != matched[0][10]).any()
+    (alone, where), _, _ = episode(f"{kind}@{trigger}", starts=(1,))
+    np.testing.assert_array_equal(alone[:, 0], pictures[:, 1])  # whatever runs beside it
+    np.testing.assert_array_equal(where[:, 0], positions[:, 1])
+
+
+def test_an_object_is_moved_so_far_and_draws_that_are_not_valid_are_counted(matched):
+    (_, positions), info, env = episode("object=1@step10", steps=11)
+    address = env.scene.pose_address("cream_cheese_1")
+    moved = positions[10, :, address : address + 2] - matched[1][10, :, address : address + 2]
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=-1), 0.1, atol=2e-3)
+    assert info["attempts"].tolist() == [[1], [0]], (
+        "the first draw of start 0 would stand inside another object"
+    )
+
+
+def test_an_event_whose_moment_never_comes_changes_nothing(matched):
+    seen, info, _ = episode("object=1@touched,noise=1@lifted")
+    assert info["began"].tolist() == [[-1, -1]] * 2
+    for part, same in zip(seen, matched, strict=True):
+        np.testing.assert_array_equal(part, same)
+
+
+def test_events_add_to_what_acts_from_the_start():
+    (pictures, _), info, _ = episode("noise=0.2,noise=1@step5,camera=0.3", starts=(0,), steps=8)
+    (without, _), _, _ = episode("noise=0.2,camera=0.3", starts=(0,), steps=8)
+    assert info["began"].tolist() == [[5]]
+    np.testing.assert_array_equal(pictures[:5], without[:5])
+    assert (pictures[5:] != without[5:]).any(axis=(1, 2, 3, 4)).all()
+
+
+def test_phases_come_one_after_the_other_and_another_episode_waits_again():
+    perturb = "fov=0.2@touched,light=0.2@lifted,camera=0.2@over_goal"
+    with BatchEnv(TASK, 1, cameras=(), horizon=300, perturb=perturb) as env:
+        env.reset(options={"init_state": [0]})
+        expert, done = Expert(env.task, np.random.default_rng(0)), False
+        while not done:
+            _, _, terminated, truncated, info = env.step(expert.act(env.views[0])[None])
+            done = bool((terminated | truncated).all())
+        by_kind = dict(zip([one.kind for one in env.perturbed.perturbations], info["began"][0], strict=True))
+        assert 0 < by_kind["fov"] < by_kind["light"] < by_kind["camera"] and info["success"].all()
+        _, info = env.reset(options={"init_state": [0]})
+        assert info["began"].tolist() == [[-1, -1, -1]]
+
+
+def test_the_text_of_events():
+    found = parse_perturbations("noise=1@25%,camera=0.5@lifted@7,camera=0.1@3", events=True)
+    assert found[1] == Perturbation("camera", 0.5, 7, "lifted") and found[0] == Perturbation("camera", 0.1, 3)
+    assert format_perturbations(found) == "camera=0.1@3,camera=0.5@lifted@7,noise=1@25%"
+
+
+@pytest.mark.parametrize(
+    ("text", "error", "message"),
+    [
+        ("camera=0.5@lift", UnknownNameError, "unknown trigger 'lift'. Did you mean 'lifted'?"),
+        ("camera=0.5@101%", UnknownNameError, "unknown trigger '101%'"),
+        ("camera=0.5@step", UnknownNameError, "unknown trigger 'step'"),
+        ("goal=1@step4", InvalidInputError, "goal cannot begin during an episode"),
+        ("robot=1@lifted", InvalidInputError, "robot cannot begin during an episode"),
+        ("light=1@lifted,light=0.5@lifted", InvalidInputError, "light is named twice"),
+        ("light=1@lifted@x", InvalidInputError, "expected KIND=SEVERITY"),
+    ],
+)
+def test_what_is_no_event_is_refused_in_one_line(text, error, message):
+    with pytest.raises(error) as found:
+        parse_perturbations(text, events=True)
+    assert message in str(found.value) and "\n" not in str(found.value)
+    with pytest.raises(InvalidInputError, match="expected KIND=SEVERITY"):
+        parse_perturbations("camera=0.5@lifted")  # where there are no episodes, such as in certifying
+    with pytest.raises(InvalidInputError, match="camera=0.5@lifted"):
+        RenderConfig(perturb="camera=0.5@lifted")
