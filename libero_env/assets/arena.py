@@ -1,9 +1,11 @@
 """Where a task happens: floor or table, cameras, lights, walls, and the builtin pack's furniture around them."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
+
+import numpy as np
 
 from libero_env.assets.furnishing import (
     add_material,
@@ -13,14 +15,14 @@ from libero_env.assets.furnishing import (
     load_styles,
     solid_mesh,
 )
+from libero_env.assets.own_arena import read_own, read_room
 from libero_env.assets.robot import load_robosuite
 from libero_env.errors import UnknownNameError
 from libero_env.mujoco_compat import delete, mujoco
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.storage import read_yaml
+from libero_env.workspaces import BUILTIN_WORKSPACES, WORKSPACES, find_workspace
 
-# Fixture categories of workspaces, each with a file in `libero_env/assets/workspaces`.
-WORKSPACES = ("table", "kitchen_table", "living_room_table", "study_table", "coffee_table", "floor")
 SPARE = "spare_"  # prefix of materials that nothing has
 _ROOM = "room"  # file with the parameters that all workspaces share
 _MOUNT_LIFT = 0.01  # [m] height of the mount's origin above the arm's
@@ -30,7 +32,9 @@ _SHARED = ("cameras", "lights", "walls", "floor")
 
 @dataclass(frozen=True)
 class Workspace:
-    """Table or floor that a task takes place on, from a file in `libero_env/assets/workspaces`. World frame.
+    """Table or floor that a task takes place on. World frame.
+
+    It is from a file in `libero_env/assets/workspaces`, or a user's own, see `libero_env.assets.own_arena`.
 
     Attributes:
         name: Fixture category, such as `kitchen_table`.
@@ -57,16 +61,42 @@ class Workspace:
         """World z of the surface that objects stand on, [m]."""
         return self.offset[2] + self.region_height
 
+    @property
+    def own(self) -> str | None:
+        """Digest of the files of a user's workspace; None for those of the benchmark."""
+        return self.parameters.get("own")
 
-@cache
+
 def load_workspace(category: str) -> Workspace:
     """Return the workspace that a fixture category stands for.
 
     Raises:
         UnknownNameError: The workspace does not exist; the message lists the valid ones.
+        InvalidInputError: A file of a user's workspace is not valid.
     """
-    if category not in WORKSPACES:
+    if category in BUILTIN_WORKSPACES:
+        return _builtin(category)
+    if (directory := find_workspace(category)) is None:
         raise UnknownNameError("workspace", category, WORKSPACES)
+    given, origin, changes = read_own(directory)
+    base = load_workspace(given["extends"])
+    shift = np.zeros(3) if origin is None else origin - (*base.offset[:2], base.surface_height)
+    x, y, z = base.robot_base_pos
+    cameras = base.parameters["cameras"].items()
+    moved = {name: {**camera, "pos": list(camera["pos"] + shift)} for name, camera in cameras}
+    return replace(
+        base,
+        name=category,
+        problem=_own_problem(category),
+        offset=tuple(base.offset + shift),
+        zone_origin=tuple(base.zone_origin + shift),
+        robot_base_pos=tuple(given.get("robot", (x + shift[0], y + shift[1], z))),
+        parameters={**base.parameters, "cameras": moved, **changes},
+    )
+
+
+@cache
+def _builtin(category: str) -> Workspace:
     room, specific = _read(_ROOM), _read(category)
     parameters = dict(specific)
     for key in _SHARED:  # entries that are null in the specific file are left out
@@ -90,11 +120,16 @@ def workspace_of_problem(problem: str) -> Workspace:
     Raises:
         UnknownNameError: The problem class does not exist; the message lists the valid ones.
     """
-    workspaces = {load_workspace(category).problem: load_workspace(category) for category in WORKSPACES}
-    for name, workspace in workspaces.items():
+    categories = {_builtin(name).problem: name for name in BUILTIN_WORKSPACES}
+    categories |= {_own_problem(name): name for name in WORKSPACES if name not in BUILTIN_WORKSPACES}
+    for name, category in categories.items():
         if name.casefold() == problem.casefold():
-            return workspace
-    raise UnknownNameError("problem", problem, workspaces)
+            return load_workspace(category)
+    raise UnknownNameError("problem", problem, categories)
+
+
+def _own_problem(workspace: str) -> str:
+    return f"LIBERO_{workspace.title()}_Manipulation"
 
 
 def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]) -> None:
@@ -111,6 +146,10 @@ def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mappi
     parameters, valid, world = workspace.parameters, load_styles(), spec.worldbody
     styles = chosen_styles(parameters["styles"], scene_properties)
     add_cameras_and_lights(spec, workspace)
+    if "model" in parameters:
+        room, _ = read_room(parameters["model"])
+        spec.attach(room, prefix="room_", frame=world.add_frame())
+        return
     ground = world.add_body(name=parameters["floor_body"]) if parameters["floor_body"] else world
     add_material(spec, "floor", valid["floor"][styles["floor"]])
     plane, size = mujoco.mjtGeom.mjGEOM_PLANE, parameters["floor"]["size"]
@@ -118,7 +157,7 @@ def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mappi
     add_material(spec, "wall", valid["wall"][styles["wall"]], *parameters["wall_gloss"])
     for name, wall in parameters["walls"].items():
         world.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, material="wall", **_SEEN, **wall)
-    if "table" in parameters:
+    if parameters.get("table"):
         _add_table(spec, parameters["table"])
     more = valid["scene"][styles["scene"]].get("furniture", ())
     if sets := tuple(dict.fromkeys([*parameters.get("furniture", ()), *more])):
@@ -147,7 +186,7 @@ def surface_styles() -> dict[str, Mapping[str, Any]]:
     styles = {
         f"{kind}_{name}": style for kind in ("floor", "wall") for name, style in load_styles()[kind].items()
     }
-    tables = {name: load_workspace(name).parameters.get("table") for name in WORKSPACES}
+    tables = {name: _builtin(name).parameters.get("table") for name in BUILTIN_WORKSPACES}
     return styles | {f"table_{name}": table["style"] for name, table in tables.items() if table is not None}
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from libero_env.assets.arena import Workspace, add_cameras_and_lights
+from libero_env.assets.arena import Workspace, add_arena, add_cameras_and_lights
 from libero_env.assets.original_arena import arena_spec, restore_drawing, scene_file
 from libero_env.assets.original_mjcf import object_xml, read_spec
 from libero_env.assets.published import check_folder
@@ -107,12 +107,15 @@ class OriginalPack:
     def add_arena(
         self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]
     ) -> None:
-        """Attach the original's room, with its cameras and lights.
+        """Attach the original's room, with its cameras and lights; or that of a user's workspace.
 
         Raises:
             UnknownNameError: A property names a style that does not exist.
             LiberoError: Files are missing.
         """
+        if workspace.own:
+            add_arena(spec, workspace, scene_properties)
+            return
         room = arena_spec(Path(self.root), workspace, scene_properties)
         self._simplify(room)
         spec.attach(room, prefix=_ROOM, frame=spec.worldbody.add_frame())
@@ -134,7 +137,8 @@ class OriginalPack:
                 f"drawing: a pack whose meshes are simplified to {self.lod} triangles cannot be drawn faithfully; "
                 "leave out lod, or draw it fast"
             )
-        scene = scene_file(Path(self.root), workspace.name, scene_properties.get("scene", "base"))
+        style = scene_properties.get("scene", "base")
+        scene = None if workspace.own else scene_file(Path(self.root), workspace.name, style)
         restore_drawing(spec, Path(self.root), workspace, scene)
 
     def _simplify(self, spec: mujoco.MjSpec) -> None:

@@ -94,18 +94,19 @@ def _fit_table(world: ET.Element, table: Mapping[str, Any]) -> None:
                 element.set(key, " ".join(map(repr, part[key])))
 
 
-def restore_drawing(spec: mujoco.MjSpec, root: Path, workspace: Workspace, scene_file: Path) -> None:
+def restore_drawing(spec: mujoco.MjSpec, root: Path, workspace: Workspace, scene_file: Path | None) -> None:
     """Make a scene of the original's files look as the original's own, in place.
 
     Args:
         spec: Complete scene.
         root: Asset folder.
-        scene_file: File of its room.
+        scene_file: File of its room; None for that of a user's workspace.
 
     Raises:
         LiberoError: The file is missing.
     """
-    _restore_cameras_and_lights(spec, workspace, read_file(scene_file)[1])
+    if scene_file is not None:
+        _restore_cameras_and_lights(spec, workspace, read_file(scene_file)[1])
     solid = {g.meshname for g in spec.geoms if g.contype or g.conaffinity or g.group == 0}
     for mesh in spec.meshes:  # their vertices are rounded in the frame that MuJoCo gives them by default
         if mesh.name not in solid and mesh.file and Path(mesh.file).is_relative_to(root):

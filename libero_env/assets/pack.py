@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from libero_env.assets.arena import WORKSPACES, Workspace, add_arena, load_workspace
+from libero_env.assets.arena import Workspace, add_arena, load_workspace
 from libero_env.assets.downloads import broken_files, default_folder, read_manifest
 from libero_env.assets.original import LIBERO_PRO, OriginalPack, is_original
 from libero_env.assets.published import (
@@ -24,6 +24,7 @@ from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects import ObjectModel, get_object, object_names
 from libero_env.paths import config_file, read_config
+from libero_env.workspaces import WORKSPACES
 
 BUILTIN = "builtin"
 ORIGINAL = "original"  # the original's models, wherever they are installed

@@ -6,6 +6,7 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects import builtin, folder
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.parallel import send_to_workers
+from libero_env.workspaces import find_workspace
 
 Builder = Callable[[], ObjectModel]
 
@@ -39,10 +40,10 @@ def get_object(category: str) -> ObjectModel:
 
 
 def version_of(category: str) -> Hashable:
-    """Return what tells models of a user-defined category apart: its builder, or the times of its files; else None."""
+    """Return what tells versions of a user-defined category or workspace apart: builder, or times of files; or None."""
     if category in _registered or category in builtin.builtin_names():
         return _registered.get(category)
-    directory = folder.find(category)
+    directory = folder.find(category) or find_workspace(category)
     return directory and tuple((path, path.lstat().st_mtime_ns) for path in sorted(directory.iterdir()))
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.assets.arena import WORKSPACES
 from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.init_states.store import load_init_states
 from libero_env.perturbations.instructions import reword
@@ -20,6 +19,7 @@ from libero_env.tasks.builder import entities_in_goal
 from libero_env.tasks.problem import And, Atom, Problem, Region
 from libero_env.tasks.suites import get_suite, suite_names
 from libero_env.tasks.task import Task
+from libero_env.workspaces import WORKSPACES
 
 _REACH = (-0.2, -0.25, 0.1, 0.25)  # [m] rectangle that the arm reaches easily on every workspace
 _MARGIN = 0.05  # [m] by which the distractors' region is larger than that of the task's own objects

@@ -8,13 +8,13 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from libero_env.assets.arena import WORKSPACES
 from libero_env.geometry import quat_from_axis_angle, quat_multiply
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import StartChange
 from libero_env.perturbations.sampling import direction, sign
 from libero_env.sim.scene import ROBOT, Scene
 from libero_env.tasks.problem import Problem
+from libero_env.workspaces import WORKSPACES
 
 _DIRECTIONS = 60  # tries for each object
 _BESIDE = 0.12  # [m] between the middles of two objects that stand beside each other

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.assets.arena import WORKSPACES, Workspace, add_mount, add_spare_materials, load_workspace
+from libero_env.assets.arena import Workspace, add_mount, add_spare_materials, load_workspace
 from libero_env.assets.original import OriginalPack
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
@@ -28,6 +28,7 @@ from libero_env.tasks.cameras import Camera, require_own_names
 from libero_env.tasks.problem import Atom, Problem, ProblemError, Region, Violation
 from libero_env.text import suggest
 from libero_env.timing import TIMESTEP
+from libero_env.workspaces import WORKSPACES
 
 # (k, state_size) rows [time, qpos, qvel, position and quaternion (wxyz) of each fixture]
 InitialStates = np.ndarray
@@ -138,6 +139,8 @@ class Scene:
         """Digest, 16 hex digits, of what initial states depend on: joints, shapes and masses of entities."""
         model = self.model
         parts: list[tuple] = [(model.joint(j).name, int(model.jnt_type[j])) for j in range(model.njnt)]
+        if self.workspace.own:
+            parts.append((self.workspace.name, self.workspace.own))
         for name, item in self.entities.items():
             if item.digest:
                 parts.append((name, item.digest))

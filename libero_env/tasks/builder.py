@@ -56,11 +56,12 @@ from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.storage import parse_yaml
 from libero_env.tasks import bddl
 from libero_env.tasks.cameras import Camera
-from libero_env.tasks.problem import WORKSPACES, And, Expression, Problem, ProblemError, Region
+from libero_env.tasks.problem import And, Expression, Problem, ProblemError, Region
 from libero_env.tasks.source import Source, Trace, read_definition, scene_file
 from libero_env.tasks.task import FILE, Task, check_name
 from libero_env.text import shown, suggest
 from libero_env.validation import validate
+from libero_env.workspaces import WORKSPACES
 
 EMPTY: Mapping[str, str] = {
     "kitchen": "kitchen_table",

@@ -28,15 +28,13 @@ from libero_env.tasks.values import (
 )
 from libero_env.text import suggest
 from libero_env.validation import checked
+from libero_env.workspaces import WORKSPACES
 
 MAX_DEPTH = 64  # levels of a goal, and of brackets in a task file
 MAX_PARTS = 1000  # regions, init atoms, parts of a goal, rectangles of a region
 MAX_CAMERAS = 50  # of a task's own
 MAX_ENTITIES = 100  # objects and fixtures of a scene
 _MAX_EVALUATIONS = 10_000  # atoms of a goal, counted for each object that its quantifiers stand for
-
-WORKSPACES = ("table", "kitchen_table", "living_room_table", "study_table", "coffee_table", "floor")
-"""Categories of the fixtures that a task takes place on, see `libero_env.assets.arena`."""
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 _VARIABLE = re.compile(r"\??\w[\w.-]*")

@@ -8,7 +8,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from libero_env.assets.arena import add_arena, load_workspace
 from libero_env.assets.pack import chosen_assets
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects import folder
 from libero_env.paths import objects_dir
 from libero_env.tasks import bddl, make_task, read_suite
@@ -37,6 +39,8 @@ DEFINITIONS = [
      "place": {"plate_2": [0.1, 0.1], "butter_1": "plate_2", "butter_2": "In wooden_cabinet_1_top_region"},
      "goal": "(Or (Open wooden_cabinet_1_top_region) (Not (ForAll (?x - butter) (On ?x plate_2))))",
      "init_also": ["Open wooden_cabinet_1_top_region"], "language": "open it", "name": "one",
+     "cameras": {"top": {"pos": [0, 0, 2], "lookat": [0, 0, 1], "fovy": 60},
+     "side": {"pos": [0, 1, 1], "quat": [1, 1, 0, 0]}},
      "scene_properties": {"floor": "rustic_floor"}},
     {"fixtures": {"floor": "floor"}, "objects": ["$first", "basket"], "with": {"first": "milk", "at": [0.1, 0.2]},
      "regions": {"floor": {"middle": {"at": "$at", "half": 0.02, "yaw": ["-pi/4", 1.5], "rgba": [0, 0, 1, 0.5]},
@@ -162,6 +166,38 @@ def test_a_changed_configuration_of_the_user_is_read_or_refused(place, config):
         for name in ("LIBERO_OBJECTS", "LIBERO_ASSETS"):
             patch.delenv(name, raising=False)
         survive("config.yaml", lambda: (objects_dir(), chosen_assets()))
+
+
+ROOM = """<mujoco><worldbody><geom name="floor" type="plane" size="2 2 0.1"/>
+<body pos="0 0 0.5"><geom type="box" size="0.4 0.4 0.1"/><site name="table_top" pos="0 0 0.1"/></body>
+</worldbody></mujoco>
+"""
+
+
+@given(
+    definition=mutated(
+        [
+            {"extends": "table", "table": {"pos": [0, 0.1, 0.8], "size": [1, 1]}},
+            {"extends": "floor", "model": "room.xml", "robot": [-0.6, 0, 0]},
+        ]
+    ),
+    room=changed_text(ROOM),
+)
+@examples(short=60, long=2000)
+def test_a_changed_workspace_is_built_or_refused(place, definition, room):
+    own = place / "workspaces" / "bench"
+    own.mkdir(parents=True, exist_ok=True)
+    (own / "room.xml").write_text(room, "utf-8", "replace")
+    write(own / "workspace.yaml", definition)
+
+    def build():
+        spec = mujoco.MjSpec()
+        add_arena(spec, load_workspace("bench"), {})
+        return spec.compile()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("LIBERO_OBJECTS", str(own.parent))
+        survive("workspaces", build)
 
 
 PARTS = (

@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env.assets.arena import WORKSPACES, add_arena, add_mount, load_workspace, workspace_of_problem
+from libero_env.assets.arena import add_arena, add_mount, load_workspace, workspace_of_problem
 from libero_env.assets.furnishing import load_styles, make_texture
 from libero_env.errors import UnknownNameError
 from libero_env.tasks import bddl
+from libero_env.workspaces import WORKSPACES
 
 pytestmark = pytest.mark.sim
 

@@ -10,7 +10,6 @@ import pytest
 import yaml
 from PIL import Image
 
-from libero_env.assets.arena import WORKSPACES
 from libero_env.cli.main import main
 from libero_env.design.preview import contact_sheet
 from libero_env.design.template import task_template
@@ -30,6 +29,7 @@ from libero_env.tasks import (
 )
 from libero_env.tasks.builder import EMPTY, load_data, model_regions
 from libero_env.tasks.problem import Atom, Not, Or, differences
+from libero_env.workspaces import WORKSPACES
 from lifelong.errors import ConfigError
 from lifelong.settings import BenchmarkSettings
 

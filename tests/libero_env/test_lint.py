@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env.assets.arena import WORKSPACES, load_workspace
+from libero_env.assets.arena import load_workspace
 from libero_env.cli import main as cli
 from libero_env.design.lint.checks import Finding, lint_file, lint_task, lint_text
 from libero_env.design.lint.scene import furthest_reach, reach
@@ -18,6 +18,7 @@ from libero_env.sim.predicates import PREDICATES
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, suite_names
 from libero_env.tasks.problem import KINDS
+from libero_env.workspaces import WORKSPACES
 
 SOUND = get_task("libero_goal/3").bddl_text  # open the top layer of the drawer and put the bowl inside
 GOAL = "(And (In akita_black_bowl_1 wooden_cabinet_1_top_region))"

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from libero_env.assets.arena import WORKSPACES, load_workspace
+from libero_env.assets.arena import load_workspace
 from libero_env.assets.original import OriginalPack, is_original
 from libero_env.assets.original_arena import TEXTURES
 from libero_env.assets.pack import BuiltinPack, problems
@@ -18,6 +18,7 @@ from libero_env.objects import ObjectModel, register_object
 from libero_env.objects.catalog import _registered
 from libero_env.sim.scene import scene_spec
 from libero_env.tasks import get_task
+from libero_env.workspaces import WORKSPACES
 from tests.harness.models import bounds
 
 pytestmark = pytest.mark.sim

@@ -7,7 +7,6 @@ import pickle
 import numpy as np
 import pytest
 
-from libero_env.assets import arena
 from libero_env.design.certify import certify
 from libero_env.design.lint.checks import lint_text
 from libero_env.envs.env import LiberoEnv
@@ -16,7 +15,6 @@ from libero_env.sim.predicates import register_predicate
 from libero_env.tasks import bddl, make_task
 from libero_env.tasks.problem import (
     MAX_ENTITIES,
-    WORKSPACES,
     And,
     Atom,
     ForAll,
@@ -90,10 +88,6 @@ def test_the_parser_and_the_linter_name_the_line(old, new, line, message):
         bddl.parse(text, "mine.bddl")
     assert str(caught.value).startswith(f"mine.bddl:{line}: ") and message in str(caught.value)
     assert any(f.line == line and f.level == "error" for f in lint_text(text, "mine.bddl", starts=0))
-
-
-def test_workspaces_are_those_that_have_an_arena():
-    assert set(WORKSPACES) == set(arena.WORKSPACES)
 
 
 @pytest.mark.parametrize("name", NAMES)

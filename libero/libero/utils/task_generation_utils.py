@@ -17,10 +17,10 @@ from libero.libero.utils.bddl_generation_utils import (
     save_to_file,
 )
 from libero.libero.utils.mu_utils import InitialSceneTemplates, get_scene_class, scene_key
-from libero_env.assets.arena import WORKSPACES
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.tasks.bddl import parse
 from libero_env.tasks.builder import entities_in_goal
+from libero_env.workspaces import WORKSPACES
 
 # Errors in user-defined scenes and tasks; each is reported for its task alone.
 _FAULTS: tuple[type[Exception], ...] = (LiberoError, ArithmeticError, AttributeError, LookupError)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from libero_env.assets.arena import WORKSPACES, workspace_of_problem
+from libero_env.assets.arena import workspace_of_problem
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.design.lint.report import Finding, Level, Report
 from libero_env.design.lint.scene import check_scene
@@ -17,6 +17,7 @@ from libero_env.tasks import Task, bddl
 from libero_env.tasks.builder import FILE, language_from_name
 from libero_env.tasks.problem import Problem, ProblemError
 from libero_env.tasks.sexpr import parse_tree
+from libero_env.workspaces import WORKSPACES
 
 __all__ = ["Finding", "lint_file", "lint_task", "lint_text"]
 

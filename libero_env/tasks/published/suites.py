@@ -27,9 +27,10 @@ from libero_env.objects import object_names
 from libero_env.paths import read_config
 from libero_env.tasks import bddl
 from libero_env.tasks.benchmark import benchmark_suite
-from libero_env.tasks.problem import WORKSPACES, Problem
+from libero_env.tasks.problem import Problem
 from libero_env.tasks.published.plus import KINDS, PlusVariant, parse_plus_id
 from libero_env.tasks.task import Suite, Task
+from libero_env.workspaces import WORKSPACES
 
 AVAILABLE = "available"
 PRO_KINDS = {"swap": "swap", "object": "object", "language": "lan", "task": "task"}  # kind -> their ending
