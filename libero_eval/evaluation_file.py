@@ -95,6 +95,14 @@ class TaskResult(Episodes):
         return (*self.init_states, *(start for start, _ in self.simulation_errors))
 
     @property
+    def event_note(self) -> str:
+        """In how many episodes each event began, as text; empty without events."""
+        counts = [
+            f"{sum(at >= 0 for at in event)} of {len(event)}" for event in zip(*self.began, strict=True)
+        ]
+        return f"events began in {', '.join(counts)}" if counts else ""
+
+    @property
     def suite(self) -> str:
         """Name of the task's suite."""
         return self.task.partition("/")[0]

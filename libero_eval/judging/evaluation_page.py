@@ -11,6 +11,7 @@ from libero_eval.judging.page import interval_text
 from libero_eval.work.store import PAGE_NAME
 from lifelong.report.page import media
 from lifelong.report.tables import save_page
+from lifelong.results.failures import causes_text
 
 
 def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
@@ -50,6 +51,7 @@ def facts(result: EvaluationResult) -> list[tuple[str, str]]:
         "protocol": " ".join(str(protocol[key]) for key in ("name", "digest") if key in protocol),
         "models": " ".join(str(value) for value in models if value),
         "robot": environment.get("robot"),
+        "perturbed by": protocol.get("world", {}).get("perturb"),
         "MuJoCo": result.versions.get("mujoco"),
         "episodes": sum(len(task.init_states) for task in result.tasks),
         "finished": str(result.times.get("finished", "")).replace("T", " ").replace("+00:00", " UTC"),
@@ -58,12 +60,16 @@ def facts(result: EvaluationResult) -> list[tuple[str, str]]:
 
 
 def _row(name: str, tasks: Sequence[TaskResult], text: str = "") -> dict[str, Any]:
-    errors = [error for task in tasks for error in task.errors if error]
+    errors, causes = [error for task in tasks for error in task.errors if error], causes_text(tasks)
+    notes = [f"failed because {causes}"] if causes else []
+    if text:  # of one task
+        notes += [tasks[0].event_note] if tasks[0].event_note else []
+        notes += [f"{len(errors)} ended with an error, such as: {errors[0]}"] if errors else []
     return {
         "name": name,
         "text": text,
         "wins": sum(sum(task.successes) for task in tasks),
         "episodes": sum(len(task.successes) for task in tasks),
         "success": overall(tasks),
-        "notes": [f"{len(errors)} ended with an error, such as: {errors[0]}"] if errors and text else [],
+        "notes": notes,
     }

@@ -124,8 +124,7 @@ def table_row(result: TaskResult) -> str:
     raised = sum(error is not None for error in result.errors)
     note = f"  ({raised} ended with an error)" if raised else ""
     note += f"  ({result.error_note})" if result.error_note else ""
-    for event in zip(*result.began, strict=True):
-        note += f"  (event began in {sum(at >= 0 for at in event)} of {len(event)})"
+    note += f"  ({result.event_note})" if result.event_note else ""
     return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}{note}"
 
 
