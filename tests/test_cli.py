@@ -225,11 +225,14 @@ def test_doctor_renders_a_frame(monkeypatch):
 
 
 def test_doctor_survives_a_machine_without_gl(monkeypatch):
-    monkeypatch.setenv("MUJOCO_GL", "vulkan")
-    finding = doctor.check_gl()
-    assert not finding.ok and "MUJOCO_GL=vulkan is not a backend; valid: egl, osmesa, glfw" in finding.detail
-    assert finding.remedy == "unset MUJOCO_GL"
-    monkeypatch.delenv("MUJOCO_GL")
+    for name, said in (
+        ("MUJOCO_GL", "MUJOCO_GL=vulkan is not a backend; valid: egl, osmesa, glfw"),
+        ("PYOPENGL_PLATFORM", "PYOPENGL_PLATFORM=vulkan excludes egl; valid: egl"),
+    ):
+        with monkeypatch.context() as environment:
+            environment.setenv(name, "vulkan")
+            finding = doctor.check_gl()
+        assert not finding.ok and said in finding.detail and finding.remedy == f"unset {name}"
     for probe in ("import os; os.abort()", "raise SystemExit(3)", "raise OSError('no libGL')"):
         monkeypatch.setattr(doctor, "_PROBE", probe)
         finding = doctor.check_gl()

@@ -94,6 +94,9 @@ def open_context(width: int, height: int) -> tuple[str, GLContext]:
             f"MUJOCO_EGL_DEVICE_ID={device} is not a GPU that EGL can draw on; valid: whole numbers "
             f"{valid[0] if valid else 'from 0'}. Or unset it"
         )
+    if any("PYOPENGL_PLATFORM" in failure for failure in failures):
+        expected = chosen or BACKENDS[0]
+        raise RenderError(f"PYOPENGL_PLATFORM={platform} excludes {expected}; valid: {expected}. Or unset it")
     raise RenderError(f"no OpenGL backend works here ({'; '.join(failures)}). Remedy: {REMEDY}")
 
 
