@@ -95,7 +95,7 @@ def explain(trace: Trace, missing: Sequence[Missing], wanted: Sequence[str]) -> 
     Of each missing atom the first that is true: the atom held before (undone); the object is in the hand, over its
     place (not released) or elsewhere (out of time); it was lifted, and has left fingers that had not opened (dropped)
     or had (wrong place); the gripper still touches the object, or moves the fixture (out of time); the robot has hit
-    something since it last held the object (collided); it has lifted an object that the goal is not about (wrong
+    something else since it last held the object (collided); it has lifted an object that the goal is not about (wrong
     object); it has touched the object (missed grasp); or it has not (never reached). Of several missing atoms, the one
     whose cause is first in `CAUSES` is named.
 
@@ -110,7 +110,7 @@ def explain(trace: Trace, missing: Sequence[Missing], wanted: Sequence[str]) -> 
 
 def _explain(trace: Trace, one: Missing, wanted: Sequence[str]) -> Failure:
     of, since = one.of, trace.held.get(one.of, -1)
-    hits = [(newtons, what) for step, what, newtons in trace.impacts if step > since]
+    hits = [(newtons, what) for step, what, newtons in trace.impacts if step > since and what != of]
     others = [name for name in trace.lifted if name not in wanted]
     if one.has_held:
         return Failure("undone", of, one.place)

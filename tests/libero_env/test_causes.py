@@ -22,6 +22,7 @@ OWN = ["milk"]
         (Trace(held={"milk": 9}, touched={"milk"}, impacts=[(3, "table", 150.0)]), Missing("milk"), "missed grasp", ""),
         (Trace(held={"milk": 9}, impacts=[(12, "table", 150.0)]), Missing("milk"), "collided", "table"),
         (Trace(touching={"milk"}), Missing("milk"), "out of time", ""),
+        (Trace(touched={"milk"}, impacts=[(3, "milk", 150.0)]), Missing("milk"), "missed grasp", ""),  # a hard push
         (Trace(slipped={"milk": True}), Missing("milk", place="table"), "dropped", "table"),
         (Trace(slipped={"milk": False}), Missing("milk", place="plate"), "wrong place", "plate"),
         (Trace(in_hand="milk"), Missing("milk"), "out of time", ""),
