@@ -18,6 +18,7 @@ from libero_env.workspaces import FILE, BuiltinWorkspace
 
 FLOOR, TABLE_TOP = "floor", "table_top"
 _HALF_THICKNESS, _LEG_RADIUS = 0.025, 0.025  # [m] of a table
+_SMALLEST = 0.3  # [m] length of a table, whose legs stand 0.1 m from its edges
 _SEEN_GROUP = 1  # as `libero_env.sim.render.Renderer` draws
 
 
@@ -25,7 +26,7 @@ class Table(TypedDict):
     """A plain table; see `OwnWorkspace`."""
 
     pos: Point
-    size: Annotated[list[Length], Field(min_length=2, max_length=2)]
+    size: Annotated[list[Annotated[Length, Field(ge=_SMALLEST)]], Field(min_length=2, max_length=2)]
 
 
 class OwnWorkspace(TypedDict, total=False):

@@ -140,6 +140,7 @@ def test_commands_know_own_workspaces(bench, tmp_path, capsys):
     (TABLE + "model: room.xml\n", ROOM, "workspace.yaml:3: it has table and model; expected one of them"),
     (TABLE.replace("0.8]", "0]"), ROOM, "its top is 0 m over the floor"),
     (TABLE.replace("0.8]", "up]"), ROOM, "workspace.yaml:2: table.pos.2 is 'up'; expected a number"),
+    (TABLE.replace("[0.8, 1.2]", "[0, 1.2]"), ROOM, "workspace.yaml:2: table.size.0 is 0; expected at least 0.3"),
     (MODEL.replace("room", "hall"), ROOM, "hall.xml is missing"),
     (MODEL.replace("room", "../room"), ROOM, "is outside of the folder"),
     (MODEL, ROOM.replace('"floor"', '"ground"'), "it has no geom 'floor', which a workspace needs"),
