@@ -236,7 +236,8 @@ def test_predicates(env, capsys):
     assert capsys.readouterr().out.startswith("[")
     for name in ("in", "on", "stack"):
         fn = predicates.get_predicate_fn(name.upper())
-        assert fn(states["plate_1"], states["wooden_cabinet_1_top_region"]) is False
+        for other in ("wooden_cabinet_1_top_region", "wine_bottle_1", "wooden_cabinet_1"):
+            assert fn(states["plate_1"], states[other]) is False
     assert predicates.eval_predicate_fn("up", states["plate_1"]) is False
     assert predicates.InContactPredicateFn()(states["plate_1"], states["akita_black_bowl_1"]) in (True, False)
     predicates.update_predicate_fn_dict("Level", lambda state: bool(state.get_geom_state()["pos"][2] > 0))
