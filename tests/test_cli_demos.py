@@ -74,6 +74,8 @@ def test_every_tool_runs(file, tmp_path, capsys):
     pytest.importorskip("av")
     pytest.importorskip("pyarrow")
     assert "2 episodes, 24 frames" in ran("export", file, "--out", tmp_path / "set")
+    assert "2 episodes" in ran("export", file, "--out", tmp_path / "joints", "--actions", "joint")
+    assert "0 of 1 successful" in ran("replay", file, "--demo", 0, "--actions", "absolute", status=1)
 
 
 def test_failures_are_counted_by_kind():
@@ -112,6 +114,9 @@ def test_sizes_are_one_number_or_two():
     (["replay", "nowhere.hdf5"], "nowhere.hdf5"),
     (["filter", "nowhere.hdf5", "b.hdf5"], "nowhere.hdf5"),
     (["export", "nowhere.hdf5", "--out", "set"], "nowhere.hdf5"),
+    (["export", "a.hdf5", "--out", "set", "--as", "rlsd"], "Did you mean 'rlds'?"),
+    (["export", "a.hdf5", "--out", "set", "--settle", "3"], "--settle cannot be used with --as lerobot"),
+    (["export", "a.hdf5", "--out", "set", "--as", "lerobot/libero", "--actions", "joint"], "--actions cannot"),
 ])  # fmt: skip
 def test_invalid_input_gives_one_line_and_a_status(argv, hint, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

@@ -192,12 +192,7 @@ def test_every_command_and_argument_is_in_the_reference():
         assert f"## libero {name}\n" in page
         if not command.reads_words:
             section = page.split(f"## libero {name}\n")[1].split("\n## ")[0]
-            section = (
-                section.replace("--as SET", "--published")
-                .replace("--for OVERRIDE", "--training")
-                .replace("--as {", "--format {")
-                .lower()
-            )
+            section = section.replace("--for OVERRIDE", "--training").replace("--as {", "--format {").lower()
             for option in inspect.signature(options_of(load(command))).parameters:
                 assert option.replace("_", "-") in section, (name, option)
 

@@ -1,4 +1,4 @@
-"""`libero demos`: record demonstrations; describe, check, replay, render again, filter and convert files."""
+"""`libero demos`: record demonstrations; describe, check, replay, show, render again, filter and convert files."""
 
 import importlib
 import re
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from libero_env.tasks import Task
 
 Drawing = Literal["fast", "faithful"]
+ActionKind = Literal["delta", "absolute", "joint"]
 Files = Positional[tuple[FilePath, ...]]
 SHOWN_REASONS = 3  # most frequent reasons of failure that are listed for a task
 
@@ -277,6 +278,7 @@ def replay_file(
     file: Positional[FilePath],
     *,
     by: Literal["action", "state"] = "action",
+    actions: ActionKind = "delta",
     demo: tuple[Natural, ...] = (),
     video: FilePath | None = None,
     cameras: tuple[str, ...] = ("agentview",),
@@ -289,6 +291,7 @@ def replay_file(
     Args:
         file: Demonstration file.
         by: What is replayed.
+        actions: As recorded: delta, or goals of the hand, absolute, or of the joints, joint, by their controllers.
         demo: Numbers of demonstrations (default: all).
         video: Video to write, .mp4, .webp or .gif.
         cameras: Cameras of the video, as of `demos generate`.
@@ -305,7 +308,8 @@ def replay_file(
     demos = [f"demo_{number}" for number in demo] if demo else None
     results, lost = [], 0
     task, shown = task_of(bddl), cameras if video else ()
-    for result in replay(file, by=by, demos=demos, cameras=shown, size=size, assets=assets, task=task):
+    how: dict[str, Any] = {"by": by, "actions": actions, "demos": demos, "cameras": shown, "size": size}
+    for result in replay(file, **how, assets=assets, task=task):
         lost += result.recorded and not result.success
         outcome = "success" if result.success else "no success"
         drift = f"objects {1000 * result.drift.max():.2f} mm, arm {1000 * result.arm_drift.max():.2f} mrad"
@@ -323,6 +327,28 @@ def replay_file(
         for one in results
     ]
     return Answer("\n".join(lines), data, status=int(lost > 0))
+
+
+def show_file(
+    file: Positional[FilePath],
+    *,
+    rerun: FilePath,
+    demo: tuple[Natural, ...] = (),
+    bddl: FilePath | None = None,
+) -> None:
+    """Write cameras, states, actions and the atoms of the goal on one timeline, for Rerun's viewer.
+
+    Args:
+        file: Demonstration file.
+        rerun: File to write, .rrd.
+        demo: Numbers of demonstrations (default: all).
+        bddl: Task file of what was recorded (default: the task that the file states).
+    """
+    from libero_env.demos.rerun import write_rerun
+
+    demos = [f"demo_{number}" for number in demo] if demo else None
+    written = write_rerun(file, rerun, demos=demos, task=task_of(bddl))
+    print(f"{rerun}: {written} demonstrations; open it with: rerun {rerun}")
 
 
 def rerender_file(
@@ -404,12 +430,12 @@ def export(
     files: Positional[Annotated[tuple[FilePath, ...], Field(min_length=1)]],
     *,
     out: FilePath,
-    format: Literal["lerobot"] = "lerobot",
+    form: Annotated[str, arg(name="as", metavar="FORM")] = "lerobot",
     labels: Literal["expert", "executed"] = "expert",
-    published: Annotated[str | None, arg(name="as", metavar="SET")] = None,
-    settle: Annotated[int, Field(ge=0, le=1000)] = 10,
+    actions: ActionKind | None = None,
+    settle: Annotated[int, Field(ge=0, le=1000)] | None = None,
     assets: str | None = None,
-    drawing: Drawing = "faithful",
+    drawing: Drawing | None = None,
     bddl: FilePath | None = None,
 ) -> None:
     """Write files as one data set in another format, and print its size.
@@ -417,27 +443,38 @@ def export(
     Args:
         files: Files or folders.
         out: A new folder.
-        format: LeRobotDataset v3.0.
+        form: As recorded for lerobot, gr00t or rlds; or what a published set is, lerobot/libero,
+            physical-intelligence/libero, IPEC-COMMUNITY/libero or openvla/modified_libero_rlds: demonstrations are run
+            again without no-ops, successes kept, images of 256 pixels turned as there.
         labels: Actions that the expert asked for, or those that were executed.
-        published: Write what this published set is, lerobot/libero or physical-intelligence/libero: demonstrations
-            are run again without no-ops, successes kept, images of 256 pixels turned as there.
-        settle: With --as: waiting steps before the first action.
-        assets: With --as: where models come from (default: the original's where they are installed).
-        drawing: With --as: how images are drawn.
+        actions: As recorded: delta, or goals of the hand, absolute, or of the joints, joint (default: delta).
+        settle: As a published set: waiting steps before the first action (default: 10).
+        assets: As a published set: where models come from (default: the original's where they are installed).
+        drawing: As a published set: how images are drawn (default: faithful).
         bddl: Task file of what was recorded (default: the tasks that the files state).
     """
     from libero_env.demos.curate import find_demo_files
-    from libero_env.demos.lerobot import export_lerobot, export_published
+    from libero_env.demos.export import export_demos, export_published
+    from libero_env.demos.layouts import PUBLISHED
     from libero_env.demos.replay import Regeneration
 
+    again = {"--settle": settle, "--assets": assets, "--drawing": drawing}
+    refused = {"--actions": actions} if form in PUBLISHED else again
+    if given := [option for option, value in refused.items() if value is not None]:
+        forms = "what was recorded" if form in PUBLISHED else f"published sets: {', '.join(PUBLISHED)}"
+        raise InvalidInputError(f"{', '.join(given)} cannot be used with --as {form}; only with {forms}")
     found = find_demo_files(files)
-    if published is None:
-        episodes, frames = export_lerobot(found, out, labels=labels, task=task_of(bddl))
+    if form not in PUBLISHED:
+        task = task_of(bddl)
+        episodes, frames = export_demos(
+            found, out, form, labels=labels, actions=actions or "delta", task=task
+        )
         print(f"{out}: {episodes} episodes, {frames} frames")
         return
-    config = Regeneration(settle_steps=settle, labels=labels, assets=assets, drawing=drawing)
-    episodes, frames, failed = export_published(found, out, published, config, task=task_of(bddl))
-    print(f"{out}: {episodes} episodes, {frames} frames, as {published}")
+    chosen: dict[str, Any] = {"settle_steps": settle, "assets": assets, "drawing": drawing}
+    config = Regeneration(labels=labels, **{key: value for key, value in chosen.items() if value is not None})
+    episodes, frames, failed = export_published(found, out, form, config, task=task_of(bddl))
+    print(f"{out}: {episodes} episodes, {frames} frames, as {form}")
     print(f"models: {config.pack().name}, drawing: {config.drawing}")
     for where in failed:
         print(f"left out, does not reach the goal when it is run again: {where}")

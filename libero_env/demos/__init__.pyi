@@ -1,6 +1,6 @@
 from .config import DemoConfig, RenderConfig, Variation
+from .export import export_demos
 from .generate import RecordingJob, ensure_demos, make_demos
-from .lerobot import export_lerobot
 from .read import DemoOrigin, Episode, demo_lengths, demo_origin, iter_demos, read_demos
 from .rendering import rerender
 from .write import DemoWriter
@@ -16,7 +16,7 @@ __all__ = [
     "demo_lengths",
     "demo_origin",
     "ensure_demos",
-    "export_lerobot",
+    "export_demos",
     "iter_demos",
     "make_demos",
     "read_demos",

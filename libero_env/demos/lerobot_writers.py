@@ -1,4 +1,4 @@
-"""Writers of LeRobot data sets: v3.0 with many episodes to a Parquet or MP4 file, v2.0 with a file for each.
+"""Writers of LeRobot data sets: v3.0 with many episodes to a Parquet or MP4 file, v2 with a file for each.
 
 Statistics of images follow from the histograms of their channels.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image
 
 from libero_env.demos.contents import EXPORTED_STATE
-from libero_env.demos.lerobot_layout import FILES_PER_CHUNK, INDICES, ROBOT_TYPE, Layout
+from libero_env.demos.layouts import FILES_PER_CHUNK, ROBOT_TYPE, Layout
 from libero_env.demos.read import Episode
 from libero_env.demos.video import H264, Mp4Writer, import_av
 from libero_env.errors import DemoError, LiberoError
@@ -60,8 +60,8 @@ def colour_statistics(counts: np.ndarray, frames: int) -> dict[str, list]:
     return {**{key: value.reshape(3, 1, 1).tolist() for key, value in summary.items()}, "count": [frames]}
 
 
-class _Writer:
-    """Base of the writers: what they count, and the statistics of the data set.
+class DatasetWriter:
+    """Base of the writers: the images that all episodes of a data set have.
 
     Args:
         root: Folder to write into.
@@ -69,11 +69,41 @@ class _Writer:
     """
 
     def __init__(self, root: Path, layout: Layout):
+        self.root, self.layout = root, layout
+        self._shapes: dict[str, tuple[int, ...]] = {}
+
+    def _images(self, episode: Episode, where: str) -> dict[str, np.ndarray]:
+        """Return the colour images of an episode by feature; DemoError where they are not those of the first."""
+        images = {
+            self.layout.image_feature(key): frames
+            for key, frames in episode.obs.items()
+            if key.endswith("_rgb")
+        }
+        lacking = [camera for camera, key in self.layout.cameras.items() if key not in images]
+        if lacking and self.layout.version != "v3.0":
+            raise DemoError(
+                f"{where} has no images of {', '.join(lacking)}, which this form needs; libero demos rerender "
+                "draws them"
+            )
+        shapes = {key: frames.shape[1:] for key, frames in images.items()}
+        if self._shapes and shapes != self._shapes:
+            raise DemoError(f"{where} has images {shapes}; expected {self._shapes} as in the first")
+        self._shapes = shapes
+        return images
+
+    def close(self) -> None:
+        """Close all files."""
+
+
+class _LeRobotWriter(DatasetWriter):
+    """Base of LeRobot's writers: what they count, and the statistics of the data set."""
+
+    def __init__(self, root: Path, layout: Layout):
+        super().__init__(root, layout)
         self._pa, self._pq = import_arrow()
-        self.root, self.layout, self._frames = root, layout, 0
+        self._frames = 0
         self._tasks: dict[str, int] = {}
         self._episodes: list[dict[str, Any]] = []
-        self._shapes: dict[str, tuple[int, ...]] = {}
         self._numbers: dict[str, list[np.ndarray]] = {}  # of all episodes, by column
         self._colours: dict[str, np.ndarray] = {}  # see `colour_counts`
 
@@ -88,15 +118,7 @@ class _Writer:
         Raises:
             DemoError: It has other images than the episodes before.
         """
-        images = {
-            self.layout.image_feature(key): frames
-            for key, frames in episode.obs.items()
-            if key.endswith("_rgb")
-        }
-        shapes = {key: frames.shape[1:] for key, frames in images.items()}
-        if self._shapes and shapes != self._shapes:
-            raise DemoError(f"{where} has images {shapes}; expected {self._shapes} as in the first")
-        self._shapes = shapes
+        images = self._images(episode, where)
         columns = self._columns(episode, self._tasks.setdefault(language, len(self._tasks)))
         stats = {}
         for key, values in columns.items():
@@ -123,9 +145,12 @@ class _Writer:
         """Return the columns of the next episode, without images."""
         steps, layout = len(episode), self.layout
         state = np.concatenate([episode.obs[key] for key in EXPORTED_STATE], axis=1)
+        actions = episode.actions.astype(np.float32)
+        if layout.open_gripper:
+            actions[:, -1] = 1.0 - np.clip(actions[:, -1], 0.0, 1.0)
         columns = {
             layout.state: state.astype(np.float32),
-            layout.action: episode.actions.astype(np.float32),
+            layout.action: actions,
             "timestamp": (np.arange(steps) / layout.fps).astype(np.float32),
         }
         if layout.outcome:
@@ -161,45 +186,74 @@ class _Writer:
     def _write_metadata(self, meta: Path, summaries: Mapping[str, Mapping[str, Any]]) -> None:
         raise NotImplementedError
 
-    def close(self) -> None:
-        """Close all files."""
 
+class EpisodeDatasetWriter(_LeRobotWriter):
+    """Writes a data set v2.0 or v2.1: a Parquet file for each episode, its images as PNG therein or as MP4 beside it.
 
-class ImageDatasetWriter(_Writer):
-    """Writes a data set v2.0: a Parquet file for each episode, with its images as PNG."""
+    Version 2.1 has statistics of each episode, too, and GR00T's meta/modality.json.
+
+    Args:
+        root: Folder to write into.
+        layout: Names and numbers of the data set.
+    """
+
+    def __init__(self, root: Path, layout: Layout):
+        super().__init__(root, layout)
+        self._statistics: list[dict[str, Any]] = []  # of each episode
 
     def _write(
-        self, columns: Mapping[str, np.ndarray], images: Mapping[str, np.ndarray], _: Mapping[str, Any]
+        self, columns: Mapping[str, np.ndarray], images: Mapping[str, np.ndarray], stats: Mapping[str, Any]
     ) -> dict[str, Any]:
         number, pa, arrays = len(self._episodes), self._pa, {}
+        place = {"episode_chunk": number // FILES_PER_CHUNK, "episode_index": number}
         for key, frames in images.items():
-            rows = [{"bytes": _png(frame), "path": f"frame_{t:06d}.png"} for t, frame in enumerate(frames)]
-            arrays[key] = pa.array(rows, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+            if self.layout.codec is None:
+                rows = [
+                    {"bytes": _png(frame), "path": f"frame_{t:06d}.png"} for t, frame in enumerate(frames)
+                ]
+                arrays[key] = pa.array(rows, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
+            else:
+                path = self._folder(_V2_VIDEO_PATH.format(video_key=key, **place))
+                with Mp4Writer(path, self.layout.fps, self.layout.codec) as video:
+                    video.add(frames)
         arrays |= _arrays(pa, columns)
-        schema = {"info": {"features": self._hub_features()}}  # by which `datasets` decodes the images
+        schema = {"info": {"features": self._hub_features(arrays)}}  # by which `datasets` decodes the images
         table = pa.table(arrays).replace_schema_metadata({"huggingface": json.dumps(schema)})
-        path = self.root / _V2_DATA_PATH.format(episode_chunk=number // FILES_PER_CHUNK, episode_index=number)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._pq.write_table(table, path)
+        self._pq.write_table(table, self._folder(_V2_DATA_PATH.format(**place)))
+        self._statistics.append({"episode_index": number, "stats": dict(stats)})
         return {}
 
-    def _hub_features(self) -> dict[str, Any]:
-        layout = self.layout
-        features: dict[str, Any] = {key: {"_type": "Image"} for key in self._shapes}
-        number = {"dtype": "float32", "_type": "Value"}
-        for key, length in ((layout.state, 8), (layout.action, 7)):
-            features[key] = {"feature": number, "length": length, "_type": "Sequence"}
-        features["timestamp"] = number
-        return features | {key: {"dtype": "int64", "_type": "Value"} for key in INDICES}
+    def _folder(self, name: str) -> Path:
+        """Return the path of a file in the data set; its folder exists."""
+        path = self.root / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def _hub_features(self, columns: Iterable[str]) -> dict[str, Any]:
+        features: dict[str, Any] = {}
+        for key, feature in self.layout.features(self._shapes).items():
+            value = {"dtype": feature["dtype"], "_type": "Value"}
+            if feature["dtype"] == "image":
+                features[key] = {"_type": "Image"}
+            elif feature["shape"] == [1]:
+                features[key] = value
+            elif key in columns:  # videos are no columns
+                features[key] = {"feature": value, "length": feature["shape"][0], "_type": "Sequence"}
+        return features
 
     def _write_metadata(self, meta: Path, summaries: Mapping[str, Mapping[str, Any]]) -> None:
         tasks = ({"task_index": index, "task": task} for task, index in self._tasks.items())
         _write_lines(meta / "episodes.jsonl", self._episodes)
         _write_lines(meta / "tasks.jsonl", tasks)
-        stats = {key: {name: one[name] for name in _V2_STATISTICS} for key, one in summaries.items()}
+        stats, has_videos = summaries, self.layout.codec is not None
+        if self.layout.version == "v2.0":
+            stats = {key: {name: one[name] for name in _V2_STATISTICS} for key, one in summaries.items()}
+        else:
+            _write_lines(meta / "episodes_stats.jsonl", self._statistics)
+            write_json(meta / "modality.json", self.layout.modality(self._shapes))
         write_json(meta / "stats.json", stats)
         info = self._info(
-            total_videos=0,
+            total_videos=len(self._episodes) * len(self._shapes) * has_videos,
             total_chunks=-(-len(self._episodes) // FILES_PER_CHUNK),
             data_path=_V2_DATA_PATH,
             video_path=_V2_VIDEO_PATH,
@@ -207,7 +261,7 @@ class ImageDatasetWriter(_Writer):
         write_json(meta / "info.json", info)
 
 
-class VideoDatasetWriter(_Writer):
+class VideoDatasetWriter(_LeRobotWriter):
     """Writes a data set v3.0: numbers in Parquet, images in MP4, many episodes to a file.
 
     Args:

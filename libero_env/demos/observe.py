@@ -140,6 +140,7 @@ class StateRenderer:
         assets: Where models come from, as for `LiberoEnv`.
         robot: Model of the arm, see `libero_env.assets.robot`.
         control_freq: Control steps per second, [Hz].
+        control: Name of the controller, and whether its actions are relative.
     """
 
     def __init__(
@@ -150,6 +151,7 @@ class StateRenderer:
         *,
         robot: str = DEFAULT_ROBOT,
         control_freq: int = CONTROL_HZ,
+        control: tuple[str, bool] = ("osc_pose", True),
     ):
         self.task = task
         self.env = LiberoEnv(
@@ -160,6 +162,8 @@ class StateRenderer:
             drawing=config.drawing,
             robot=robot,
             control_freq=control_freq,
+            controller=control[0],
+            control_delta=control[1],
             observations=(*config.modalities, "proprioception", "ee_quat"),
             perturb=config.perturb,
         )
@@ -172,18 +176,20 @@ class StateRenderer:
         assets: Pack | str | Path | None = None,
         *,
         task: Task | None = None,
+        control: tuple[str, bool] = ("osc_pose", True),
     ) -> "StateRenderer":
         """Return a renderer in the scene of a file's demonstrations.
 
         Args:
             assets: Where models come from, as for `LiberoEnv`.
             task: Task that was recorded; None for the one that the file names.
+            control: Name of the controller, and whether its actions are relative.
 
         Raises:
             DemoError: It is not a demonstration file, or names no task.
         """
         arm, hz = recorded_robot(file), recorded_frequency(file)
-        return cls(task or recorded_task(file), config, assets, robot=arm, control_freq=hz)
+        return cls(task or recorded_task(file), config, assets, robot=arm, control_freq=hz, control=control)
 
     @property
     def scene(self) -> Scene:

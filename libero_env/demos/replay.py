@@ -11,6 +11,7 @@ again they may be a step short, so the expert's last action is repeated a few ti
 """
 
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,6 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from libero_env.assets.pack import Pack, facade_assets, pack_of, select_pack
+from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import EXPORTED_STATE, demo_number, read_header
 from libero_env.demos.observe import StateRenderer
@@ -34,6 +36,7 @@ from libero_env.validation import checked
 
 Steps = Annotated[int, Field(ge=0)]
 REPLAY_MODES = ("state", "action")
+EXTRA_STEPS = 10  # largest number of repetitions of the last action until the goal is reached
 _WAIT = np.array([[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0]])  # the action of the waiting steps
 
 
@@ -69,6 +72,7 @@ def replay(
     size: tuple[int, int] = (256, 256),
     assets: Pack | str | Path | None = None,
     task: Task | None = None,
+    actions: str = "delta",
 ) -> Iterator[ReplayResult]:
     """Replay demonstrations from their first state, with the fixtures at their recorded poses.
 
@@ -80,29 +84,37 @@ def replay(
         size: (height, width) of the images, pixels.
         assets: Where models come from, as for `LiberoEnv`.
         task: Task that was recorded; None for the one that the file states.
+        actions: Kind of the actions that are executed, by the controller of this kind; see `libero_env.demos.actions`.
+            Of other kinds than `delta` the last is repeated up to ten times until the goal is reached.
 
     Raises:
+        UnknownNameError: No such kind of actions is known.
         DemoError: The file is broken, does not fit its task's scene, or has no such demonstration.
     """
     if by not in REPLAY_MODES:
         raise DemoError(f"replay by {by!r}; valid: {', '.join(REPLAY_MODES)}")
+    if by == "state" and actions != "delta":
+        raise DemoError(f"a replay by state executes no {actions} actions; replay by action")
     config = RenderConfig(tuple(cameras), size, drawing=read_header(file).get("drawing"))
-    renderer = StateRenderer.of_file(file, config, assets, task=task)
     keys = [image_name(camera, "rgb") for camera in cameras]
     replayed = set()
-    try:
+    with ExitStack() as stack:
+        converter = stack.enter_context(closing(ActionConverter(file, actions, task)))
+        renderer = StateRenderer.of_file(file, config, assets, task=task, control=KINDS[actions])
+        stack.callback(renderer.close)
         for episode in read_episodes(file):
             if demos is None or episode.name in demos:
                 replayed.add(episode.name)
                 renderer.prepare(episode, f"{file}: {episode.name}")
-                yield _replay_episode(renderer, episode, by, keys)
-    finally:
-        renderer.close()
+                extra = 0 if actions == "delta" else EXTRA_STEPS
+                yield _replay_episode(renderer, converter.convert(episode), by, keys, extra)
     if absent := set(demos or ()) - replayed:
         raise DemoError(f"{file}: no demonstration {', '.join(sorted(absent))}")
 
 
-def _replay_episode(renderer: StateRenderer, episode: Episode, by: str, keys: list[str]) -> ReplayResult:
+def _replay_episode(
+    renderer: StateRenderer, episode: Episode, by: str, keys: list[str], extra: int
+) -> ReplayResult:
     env, states, nq = renderer.env, episode.states, renderer.scene.model.nq
     free = renderer.scene.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
     objects = renderer.scene.model.jnt_qposadr[free][:, None] + np.arange(3)  # addresses of positions, (n, 3)
@@ -120,6 +132,10 @@ def _replay_episode(renderer: StateRenderer, episode: Episode, by: str, keys: li
             obs, _, terminated, _, _ = env.step(action)
             if terminated:
                 break
+    for _ in range(0 if terminated else extra):
+        *_, terminated, _, _ = env.step(episode.actions[-1])
+        if terminated:
+            break
     return ReplayResult(
         name=episode.name,
         recorded=episode.success,
@@ -177,7 +193,7 @@ class Regeneration:
 
     size: Size = (256, 256)
     settle_steps: Steps = 10
-    extra_steps: Steps = 10
+    extra_steps: Steps = EXTRA_STEPS
     labels: Labels = "expert"
     assets: Assets = None
     drawing: Drawing = "faithful"
@@ -229,7 +245,7 @@ def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regen
     for _ in range(config.settle_steps):
         env.simulations.step([0], _WAIT)
     stored: dict[str, list[np.ndarray]] = {
-        key: [] for key in (*env.observer.empty_images(0), *EXPORTED_STATE)
+        key: [] for key in (*env.observer.empty_images(0), *EXPORTED_STATE, "joint_states")
     }
     states, actions, success = [], [], False
     recorded = list(zip(episode.actions[moving], labels[moving], strict=True))
@@ -240,7 +256,7 @@ def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regen
         for key, rows in env.render_cameras().items():
             stored[key].append(rows[0, :, ::-1].copy())  # here images are upright: mirrored is half a turn
         obs = env.proprioception()
-        for key in EXPORTED_STATE:
+        for key in (*EXPORTED_STATE, "joint_states"):
             stored[key].append(obs[key][0].copy())
         states.append(env.simulations.physics_state(0))
         actions.append(label)

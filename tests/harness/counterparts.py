@@ -39,7 +39,8 @@ def counterpart(
                 pytest.skip(f"there is no environment with {requirements[0]}, and it is made on demand only")
             _run(python, "-m", "venv", "--clear", str(folder))
             pip = [str(folder / "bin" / "python"), "-m", "pip", "install", "--quiet"]
-            _run(*pip, *requirements)
+            if requirements:
+                _run(*pip, *requirements)
             if no_deps:
                 _run(*pip, "--no-deps", *no_deps)
             (folder / "complete").write_text(wanted + "\n")

@@ -67,6 +67,12 @@ def vla_eval() -> Peer:
     return Peer(python, (str(ROOT), sysconfig.get_path("purelib")))
 
 
+def inspect_robots() -> Peer:
+    """Return the environment of inspect-robots and Rerun, 530 MB; the rest comes from that of the tests."""
+    python = counterpart(no_deps=("inspect-robots==0.60.0", "rerun-sdk==0.41.0"))
+    return Peer(python, (str(ROOT), sysconfig.get_path("purelib")))
+
+
 def lerobot() -> Peer:
     """Return LeRobot's environment with the plug-in; 5.4 GB, so it is made only where LIBERO_BUILD_LEROBOT is set."""
     python = os.environ.get("LIBERO_PYTHON312") or shutil.which("python3.12")

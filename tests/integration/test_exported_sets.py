@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from libero_env.demos.export import export_demos, export_published
 from libero_env.demos.generate import generate
-from libero_env.demos.lerobot import export_lerobot, export_published
 from libero_env.demos.replay import Regeneration
 from tests.harness.peers import lerobot
 
@@ -75,7 +75,7 @@ def test_lerobot_merges_ours_with_the_published_metadata(file, tmp_path):
 
 def test_lerobot_refuses_to_merge_the_unturned_export(file, tmp_path):
     python = _lerobot()
-    export_lerobot([file], tmp_path / "own", progress=False)
+    export_demos([file], tmp_path / "own", progress=False)
     with pytest.raises(AssertionError, match="ValueError: Same f"):
         _run(python, tmp_path / "hf", "merge", tmp_path / "own", tmp_path)
 

@@ -11,8 +11,8 @@ from libero_env import memory
 from libero_env.demos import hdf5
 from libero_env.demos.contents import read_header
 from libero_env.demos.curate import describe, examine, filter_demos
+from libero_env.demos.export import export_demos
 from libero_env.demos.generate import generate, make_demos
-from libero_env.demos.lerobot import export_lerobot
 from libero_env.demos.observe import recorded_robot, recorded_task
 from libero_env.demos.read import demo_lengths, iter_demos, read_demos, read_episodes
 from libero_env.demos.replay import rerun_actions
@@ -260,7 +260,7 @@ def test_attributes_of_other_types_are_named(path, key, value, words):
 def test_attributes_of_json_are_checked(path, text, tmp_path):
     pytest.importorskip("pyarrow"), pytest.importorskip("av")
     damaged(path, attribute("problem_info", text))
-    refused(path, "problem_info", "JSON", read=lambda p: export_lerobot([p], tmp_path / "out"))
+    refused(path, "problem_info", "JSON", read=lambda p: export_demos([p], tmp_path / "out"))
     assert not (tmp_path / "out").exists()
     damaged(path, attribute("models", text))
     refused(path, "models", "JSON", read=describe)

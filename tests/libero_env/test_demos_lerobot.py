@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from libero_env.demos.lerobot import export_lerobot
+from libero_env.demos.export import export_demos
 from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, LiberoError
 from tests.harness.demos import episode, write
@@ -36,7 +36,7 @@ def files(tmp_path_factory):
 @pytest.fixture(scope="module")
 def root(files, tmp_path_factory):
     out = tmp_path_factory.mktemp("lerobot") / "set"
-    assert export_lerobot(files, out, progress=False) == (3, sum(STEPS))
+    assert export_demos(files, out, progress=False) == (3, sum(STEPS))
     return out
 
 
@@ -105,7 +105,7 @@ def test_frames_are_where_the_episode_table_says(root, info, episodes, files):
 
 
 def test_a_full_video_is_continued_in_the_next_file(files, tmp_path):
-    export_lerobot(files, tmp_path / "set", video_mb=0.0, progress=False)
+    export_demos(files, tmp_path / "set", video_mb=0.0, progress=False)
     videos = sorted(p.name for p in (tmp_path / "set/videos/observation.images.image/chunk-000").iterdir())
     rows = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     indices = [row["videos/observation.images.image/file_index"] for row in rows]
@@ -138,9 +138,44 @@ def test_pandas_sees_tasks_as_the_index(root):
     assert tasks.loc["do something else"].task_index == 1 and tasks.index.name == "task"
 
 
+def test_groots_form_says_where_the_parts_are(files, tmp_path):
+    root = tmp_path / "set"
+    assert export_demos(files, root, "gr00t", progress=False) == (3, sum(STEPS))
+    info = json.loads((root / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["total_videos"], info["fps"]) == ("v2.1", 6, 20)
+    modality = json.loads((root / "meta/modality.json").read_text())
+    demos = [demo for file in files for demo in read_demos(file)]
+    lines = [json.loads(line) for line in (root / "meta/episodes_stats.jsonl").read_text().splitlines()]
+    for number, demo in enumerate(demos):
+        place = {"episode_chunk": 0, "episode_index": number}
+        table = parquet.read_table(root / info["data_path"].format(**place))
+        state = np.array(table["observation.state"].to_pylist())
+        action = np.array(table["action"].to_pylist())
+
+        def part(of, key, array):
+            return array[:, modality[of][key]["start"] : modality[of][key]["end"]]
+
+        np.testing.assert_allclose(part("state", "z", state), demo.obs["ee_pos"][:, 2:], atol=1e-6)
+        np.testing.assert_allclose(part("state", "yaw", state), demo.obs["ee_ori"][:, 2:], atol=1e-6)
+        np.testing.assert_allclose(part("state", "gripper", state), demo.obs["gripper_states"], atol=1e-6)
+        np.testing.assert_allclose(part("action", "roll", action), demo.actions[:, 3:4], atol=1e-6)
+        opens = 1.0 - np.clip(demo.actions[:, 6:], 0.0, 1.0)  # 1 opens, 0 closes
+        np.testing.assert_allclose(part("action", "gripper", action), opens, atol=1e-6)
+        key = modality["annotation"]["human.action.task_description"]["original_key"]
+        assert table[key].to_pylist() == [int(number == 2)] * len(demo)
+        for name, feature in (("agentview_rgb", "image"), ("eye_in_hand_rgb", "wrist_image")):
+            video = info["video_path"].format(video_key=modality["video"][feature]["original_key"], **place)
+            with av.open(str(root / video)) as opened:
+                frames = [frame.to_ndarray(format="rgb24") for frame in opened.decode(video=0)]
+            assert np.abs(np.array(frames, int) - demo.obs[name]).mean() < 4.0
+        assert lines[number]["episode_index"] == number
+        np.testing.assert_allclose(lines[number]["stats"]["action"]["max"], action.max(axis=0), atol=1e-6)
+    assert json.loads((root / "meta/stats.json").read_text()).keys() == info["features"].keys()
+
+
 def test_the_original_pairing_is_shifted(tmp_path):
     file = write(tmp_path / "c.hdf5", [smooth(0, 9)], pairing="libero")
-    assert export_lerobot([file], tmp_path / "set", labels="executed", progress=False) == (1, 8)
+    assert export_demos([file], tmp_path / "set", labels="executed", progress=False) == (1, 8)
     table = parquet.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
     one = episode(0, 9, SIZE)
     np.testing.assert_allclose(table["action"].to_pylist(), one.actions[1:], atol=1e-6)
@@ -152,11 +187,11 @@ def test_the_original_pairing_is_shifted(tmp_path):
 def test_files_that_do_not_fit_leave_no_data_set(files, tmp_path):
     other = write(tmp_path / "other.hdf5", [smooth(0, 5, 16)])
     with pytest.raises(DemoError, match=r"other.hdf5: demo_0 has images .*16"):
-        export_lerobot([files[0], other], tmp_path / "set", progress=False)
+        export_demos([files[0], other], tmp_path / "set", progress=False)
     assert not (tmp_path / "set").exists()
     odd = write(tmp_path / "odd.hdf5", [smooth(0, 5, 15)])
     with pytest.raises(LiberoError, match="15x15"):
-        export_lerobot([odd], tmp_path / "set", progress=False)
+        export_demos([odd], tmp_path / "set", progress=False)
     (tmp_path / "set").mkdir()
     with pytest.raises(DemoError, match="exists"):
-        export_lerobot(files, tmp_path / "set", progress=False)
+        export_demos(files, tmp_path / "set", progress=False)

@@ -14,8 +14,8 @@ from PIL import Image
 
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import read_header
+from libero_env.demos.export import ORIGIN, export_demos, export_published
 from libero_env.demos.generate import generate
-from libero_env.demos.lerobot import ORIGIN, export_lerobot, export_published
 from libero_env.demos.observe import StateRenderer, recorded_task
 from libero_env.demos.read import published_noop_steps, read_episodes
 from libero_env.demos.replay import Regeneration, regenerate
@@ -211,7 +211,7 @@ def test_failures_are_left_out_and_named(file, tmp_path):
 
 
 def test_each_set_says_which_way_round_its_images_are(file, exported, tmp_path):
-    export_lerobot([file], tmp_path / "own", progress=False)
+    export_demos([file], tmp_path / "own", progress=False)
     info = json.loads((tmp_path / "own/meta/info.json").read_text())
     stated = info["features"]["observation.images.image"]["info"]
     assert (stated["image.first_row"], stated["image.mirrored"]) == ("top", False)

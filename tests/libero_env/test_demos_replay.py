@@ -11,8 +11,8 @@ import pytest
 from libero_env.demos.config import DemoConfig, RenderConfig, Variation
 from libero_env.demos.contents import read_header
 from libero_env.demos.curate import examine
+from libero_env.demos.export import export_demos
 from libero_env.demos.generate import RecordingJob, generate, make_demos
-from libero_env.demos.lerobot import export_lerobot
 from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
 from libero_env.demos.read import Episode, read_demos, read_episodes
 from libero_env.demos.rendering import rerender
@@ -71,8 +71,8 @@ def test_a_recording_of_another_frequency_is_replayed_at_it_and_not_exported(pat
         file["data"].attrs["env_args"] = json.dumps(made)
     (first, *_), (same, *_) = replay(slow), replay(path)
     assert first.arm_drift[1] > 1e-3 > same.arm_drift[1]  # each action is held for 100 ms
-    with pytest.raises(DemoError, match="was recorded at 10 Hz; export to LeRobot's format is for 20 Hz"):
-        export_lerobot([slow], tmp_path / "set")
+    with pytest.raises(DemoError, match="was recorded at 10 Hz; the layout lerobot is for 20 Hz"):
+        export_demos([slow], tmp_path / "set")
     settings = SimpleNamespace(robot="libero", image_size=32)
     assert demonstrations._misfit(slow, 1, settings) == "was recorded at 10 Hz; runs act at 20 Hz"
     with h5py.File(slow, "a") as file:
@@ -198,7 +198,7 @@ def test_files_of_the_original_work_with_every_tool(path, tmp_path):
     np.testing.assert_array_equal(rendered.obs["agentview_rgb"], ours.obs["agentview_rgb"][:-1])
     pytest.importorskip("av")
     pytest.importorskip("pyarrow")
-    assert export_lerobot([file], tmp_path / "set", progress=False) == (1, STEPS - 2)
+    assert export_demos([file], tmp_path / "set", progress=False) == (1, STEPS - 2)
 
 
 def test_recorded_models_have_the_joints_of_the_states(path):

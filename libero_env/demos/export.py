@@ -1,27 +1,30 @@
-"""Demonstrations as LeRobot data sets: in this package's own layout, or in that of a published set of LIBERO.
+"""Demonstrations as data sets for other tools: LeRobot's, GR00T's, RLDS, and those in the form of published sets.
 
-Needs the extra `export` (PyArrow and PyAV). Both store 8 numbers of state (position of the grip site, rotation vector,
-fingers), 7 of action, images of agentview and of the hand, and the observation on which an action was chosen.
+All store 8 numbers of state (position of the grip site, rotation vector, fingers), 7 of action (8 of goals of the
+joints), images of agentview and of the hand, and the observation on which an action was chosen. LeRobot's and GR00T's
+need the extra `export` (PyArrow and PyAV).
 
-The own layout is a LeRobotDataset v3.0 at 20 frames per second with upright images, as recorded. The published sets
-have images that are upright and mirrored left to right, 10 as frames per second, other names, and no no-ops; a policy
-that is trained on them has to be evaluated on mirrored images, as the clients of openpi, OpenVLA-OFT and LeRobot do.
+The own forms have recordings as they are: 20 frames per second, upright images. The published sets have images that are
+upright and mirrored left to right, other names, and no no-ops; a policy that is trained on them has to be evaluated on
+mirrored images, as the clients of openpi, OpenVLA-OFT, GR00T and LeRobot do.
 """
 
 import json
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.contents import EXPORTED_STATE, json_attribute, read_header
 from libero_env.demos.hdf5 import BrokenDemoError
-from libero_env.demos.lerobot_layout import OWN, PUBLISHED, Layout
-from libero_env.demos.lerobot_writers import ImageDatasetWriter, VideoDatasetWriter, write_json
+from libero_env.demos.layouts import PUBLISHED, RECORDED, Layout
+from libero_env.demos.lerobot_writers import EpisodeDatasetWriter, VideoDatasetWriter, write_json
 from libero_env.demos.observe import recorded_robot, recorded_task, require_default_frequency
 from libero_env.demos.read import Episode, Labels, read_episodes
 from libero_env.demos.replay import Regeneration, regenerate
+from libero_env.demos.rlds import RldsWriter
 from libero_env.demos.write import require_absent
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.parallel import progress_bar
@@ -30,24 +33,29 @@ from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ
 
 ORIGIN = "meta/libero.json"  # how a data set was made
+Writer = VideoDatasetWriter | EpisodeDatasetWriter | RldsWriter
 
 
-def export_lerobot(
+def export_demos(
     files: Sequence[Path],
     root: Path,
+    form: str = "lerobot",
     *,
     labels: Labels = "expert",
+    actions: str = "delta",
     video_mb: float | None = None,
     task: Task | None = None,
     progress: bool | None = None,
 ) -> tuple[int, int]:
-    """Write demonstration files as one data set in this package's layout.
+    """Write demonstration files, as they were recorded, as one data set.
 
     Args:
         files: Files to read, in this order; all have the same cameras and image size.
-        root: Folder to write; it must not exist.
+        root: Folder to write; it must not exist. RLDS takes its name from it.
+        form: One of `libero_env.demos.layouts.RECORDED`.
         labels: As for `read_demos`.
-        video_mb: Size from which a video is continued in another file, [MiB].
+        actions: Kind of the actions, one of `libero_env.demos.actions.KINDS`.
+        video_mb: Size from which a video of LeRobot's form is continued in another file, [MiB].
         task: Task that all files recorded; None for those that they state.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.
 
@@ -55,21 +63,25 @@ def export_lerobot(
         Number of episodes and number of frames.
 
     Raises:
+        UnknownNameError: No such form or kind of actions is known.
         DemoError: A file is broken or has other images than the first, or the folder exists.
         LiberoError: PyArrow or PyAV is not installed.
     """
-    require_absent(root)
-    with atomic_folder(root) as folder, closing(VideoDatasetWriter(folder, OWN, video_mb)) as dataset:
+    if form not in RECORDED:
+        raise UnknownNameError("form of a data set", form, (*RECORDED, *PUBLISHED))
+    layout = RECORDED[form].of_joints() if actions == "joint" else RECORDED[form]
+    with _data_set(root, layout, video_mb) as (folder, dataset):
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
-            require_default_frequency(file, "export to LeRobot's format")
+            require_default_frequency(file, f"the layout {form}")
             language = _language(file, task)
-            for episode in read_episodes(file):
-                where = f"{file}: {episode.name}"
-                dataset.add(_exported(episode, where, labels), language, where)
-        dataset.close()
-        size = dataset.finish()
-        _write_origin(folder, OWN, {"labels": labels, "models": _recorded_models(files)})
-        return size
+            with closing(ActionConverter(file, actions, task)) as converter:
+                for episode in read_episodes(file):
+                    where = f"{file}: {episode.name}"
+                    dataset.add(converter.convert(_exported(episode, where, labels)), language, where)
+        controller, relative = KINDS[actions]
+        control = {"actions": actions, "controller": controller, "control_delta": relative}
+        how = {"labels": labels, **control, "models": _recorded_models(files)}
+        return _finish(folder, dataset, how)
 
 
 def export_published(
@@ -81,12 +93,12 @@ def export_published(
     task: Task | None = None,
     progress: bool | None = None,
 ) -> tuple[int, int, list[str]]:
-    """Run demonstrations again and write them as one data set in the layout of a published one.
+    """Run demonstrations again and write them as one data set in the form of a published one.
 
     Args:
         files: Files to read, in this order; their images are not used.
-        root: Folder to write; it must not exist.
-        name: Published set, one of `libero_env.demos.lerobot_layout.PUBLISHED`.
+        root: Folder to write; it must not exist. RLDS takes its name from it.
+        name: Published set, one of `libero_env.demos.layouts.PUBLISHED`.
         config: How the demonstrations are run.
         task: Task that all files recorded; None for those that they state.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.
@@ -102,11 +114,8 @@ def export_published(
     """
     if name not in PUBLISHED:
         raise UnknownNameError("published data set", name, PUBLISHED)
-    require_absent(root)
-    layout, config = PUBLISHED[name], config or Regeneration()
-    writer = ImageDatasetWriter if layout.codec is None else VideoDatasetWriter
-    exported, failed = 0, []
-    with atomic_folder(root) as folder, closing(writer(folder, layout)) as dataset:
+    config, exported, failed = config or Regeneration(), 0, []
+    with _data_set(root, PUBLISHED[name]) as (folder, dataset):
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
             require_default_frequency(file, f"the layout {name}")
             recorded = task or recorded_task(file)
@@ -119,12 +128,45 @@ def export_published(
                     failed.append(where)
         if failed and not exported:
             raise DemoError(f"{failed[0]}: neither this demonstration nor any other reaches its goal again")
-        dataset.close()
-        episodes, frames = dataset.finish()
         robots = ", ".join(sorted(set(map(recorded_robot, files))))
         how = {"robot": robots, "as": name, "left_out": len(failed)}
-        _write_origin(folder, layout, config.record() | how)
-    return episodes, frames, failed
+        return *_finish(folder, dataset, config.record() | how), failed
+
+
+@contextmanager
+def _data_set(root: Path, layout: Layout, video_mb: float | None = None) -> Iterator[tuple[Path, Writer]]:
+    """Yield a temporary folder, which becomes `root` where nothing fails, and a writer into it."""
+    require_absent(root)
+    with atomic_folder(root) as folder:
+        writer: Writer
+        if layout.version == "rlds":
+            writer = RldsWriter(folder, layout, root.name)
+        elif layout.version == "v3.0":
+            writer = VideoDatasetWriter(folder, layout, video_mb)
+        else:
+            writer = EpisodeDatasetWriter(folder, layout)
+        with closing(writer):
+            yield folder, writer
+
+
+def _finish(folder: Path, dataset: Writer, how: dict[str, Any]) -> tuple[int, int]:
+    """Complete a data set; return its number of episodes and of frames."""
+    dataset.close()
+    size, layout = dataset.finish(), dataset.layout
+    images = {"first_row": "top", "mirrored": layout.mirrored}
+    mirrored = "seen as through a mirror: the original's pictures after half a turn, as in the published sets"
+    images["meaning"] = mirrored if layout.mirrored else "as the camera sees the scene"
+    origin = {
+        "generator": "libero-lifelong",
+        "images": images,
+        "gripper": "1 opens, 0 closes" if layout.open_gripper else "-1 opens, +1 closes",
+        "control_hz": CONTROL_HZ,
+        "fps_is": "a label; time between frames is 1 / control_hz"
+        if layout.fps != CONTROL_HZ
+        else "control_hz",
+    }
+    write_json(folder / ORIGIN, origin | how)
+    return size
 
 
 def _language(file: Path, task: Task | None) -> str:
@@ -152,18 +194,3 @@ def _recorded_models(files: Sequence[Path]) -> list[Any]:
     stated = [json_attribute(read_header(file), "models", file) for file in files]
     texts = {json.dumps(models, sort_keys=True): models for models in stated if models}
     return [texts[text] for text in sorted(texts)]
-
-
-def _write_origin(root: Path, layout: Layout, how: dict[str, Any]) -> None:
-    images = {"first_row": "top", "mirrored": layout.mirrored}
-    mirrored = "seen as through a mirror: the original's pictures after half a turn, as in the published sets"
-    images["meaning"] = mirrored if layout.mirrored else "as the camera sees the scene"
-    origin = {
-        "generator": "libero-lifelong",
-        "images": images,
-        "control_hz": CONTROL_HZ,
-        "fps_is": "a label; time between frames is 1 / control_hz"
-        if layout.fps != CONTROL_HZ
-        else "control_hz",
-    }
-    write_json(root / ORIGIN, origin | how)
