@@ -227,7 +227,8 @@ def storage_figure(points: Mapping[str, tuple[float, Estimate]]) -> Figure:
             look = _look(number) | {"ls": "none"}
             axes.errorbar([size], [100 * auc.value], 100 * ends, **look, elinewidth=0.8, label=shorten(label))
         axes.xaxis.set_major_formatter(lambda size, _: quantity(size, "B"))
-        axes.set_xlabel("kept from task to task")
+        axes.set_xlim(-0.3 * least, 2 * max(least, *(size for size, _ in points.values())))
+        axes.set_xlabel("kept from one task to the next")
         axes.set_ylabel("AUC (%)")
         axes.grid(lw=0.4, alpha=0.3, color=INK)
         hide_spines(axes)

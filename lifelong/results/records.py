@@ -210,7 +210,9 @@ class EvalRecord(Episodes):
         if not self.init_states:
             errors.append("no episode counts")
         if self.phase not in get_args(Phase):
-            errors.append(f"phase of an evaluation is one of {get_args(Phase)}, not {self.phase!r}")
+            errors.append(
+                f"phase of an evaluation is one of {', '.join(get_args(Phase))}, not {self.phase!r}"
+            )
         if (self.phase == "shift") != bool(self.shift):
             errors.append(f"an evaluation of phase {self.phase!r} has the shift {self.shift!r}")
         if errors:

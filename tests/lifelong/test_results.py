@@ -294,5 +294,5 @@ def test_the_summary_is_strict_json_and_complete(log: ResultLog, tmp_path: Path)
 def test_evaluations_without_episodes_are_refused():
     with pytest.raises(ValueError, match="no episodes"):
         evaluation("curve", 0, 0, 0, 0, episodes=0)
-    with pytest.raises(ValueError, match="'curve', 'matrix' or 'shift'"):
+    with pytest.raises(ValueError, match="is one of curve, matrix, unseen, initial, shift, not 'test'"):
         evaluation("test", 0, 0, 0, 0)
