@@ -102,7 +102,7 @@ class PutAside(StartChange):
     def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
         rng, loads, moved = np.random.default_rng(self.seed), carried(scene.problem), row
         before = contacts(scene, row)
-        names = [name for name in _of_goal(scene)[self.receptacle] if not _in_hand(scene, name, before)]
+        names = [name for name in _of_goal(scene)[self.receptacle] if not _touched(scene, name, before)]
         for name in names:
             moved = shifted(scene, moved, (name, *loads.get(name, ())), self.distance * direction(rng, 2))
         return moved if names and contacts(scene, moved) <= before else None
@@ -142,7 +142,7 @@ def _of_goal(scene: Scene) -> tuple[list[str], list[str]]:
     return list(wanted), list(dict.fromkeys(name for name in owners if name and name in objects))
 
 
-def _in_hand(scene: Scene, name: str, touching: set[tuple[int, int]]) -> bool:
+def _touched(scene: Scene, name: str, touching: set[tuple[int, int]]) -> bool:
     robot, own = set(scene.bodies[ROBOT].tolist()), set(scene.bodies[name].tolist())
     return any(robot & set(pair) and own & set(pair) for pair in touching)
 
