@@ -1,8 +1,9 @@
-"""LeRobot and openpi read what is exported in the layout of the published sets, and merge it with their metadata.
+"""LeRobot, openpi and TensorFlow Datasets read what is exported; LeRobot merges it with the metadata of published sets.
 
 They need environments of their own, which variables name. `LIBERO_LEROBOT`: a Python with lerobot 0.4 or newer, by
 default that of tests/harness/peers.py. `LIBERO_LEROBOT_V2`: one with lerobot 0.3, the last that reads version 2.0.
-`LIBERO_OPENPI`: openpi's file src/openpi/policies/libero_policy.py. experiments/lerobot/exports.md states how they are
+`LIBERO_OPENPI`: openpi's file src/openpi/policies/libero_policy.py. `LIBERO_TFDS`: a Python with tensorflow-cpu and
+tensorflow-datasets. experiments/lerobot/exports.md states how they are
 made and what came out.
 """
 
@@ -16,12 +17,14 @@ import pytest
 
 from libero_env.demos.export import export_demos, export_published
 from libero_env.demos.generate import generate
+from libero_env.demos.read import read_episodes
 from libero_env.demos.replay import Regeneration
-from tests.harness.peers import lerobot
+from tests.harness.peers import ROOT, lerobot
 
 pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
+READ_RLDS = ROOT / "tests/harness/peer_scripts/read_rlds.py"
 DRIVER = Path(__file__).with_name("lerobot_driver.py")
 HOW = Regeneration(settle_steps=0, assets="builtin", drawing="fast")
 LANGUAGE = "pick up the milk and place it in the basket"
@@ -46,9 +49,9 @@ def _lerobot():
     return _named("LIBERO_LEROBOT") if "LIBERO_LEROBOT" in os.environ else str(lerobot().python)
 
 
-def _run(python, home, *arguments):
+def _run(python, home, *arguments, script=DRIVER):
     env = os.environ | {"HF_HUB_OFFLINE": "1", "HF_HOME": str(home)}
-    command = [python, str(DRIVER), *map(str, arguments)]
+    command = [python, str(script), *map(str, arguments)]
     done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=600)
     result = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     assert done.returncode == 0 and result, done.stderr[-4000:]
@@ -101,3 +104,17 @@ def test_the_inputs_of_openpi_read_it(file, tmp_path):
         shape, kind, largest = found["images"][camera]
         assert (shape, kind) == ([256, 256, 3], "uint8") and largest > 100
     assert (found["state"], found["actions"], found["prompt"]) == ([8], [7], LANGUAGE)
+
+
+def test_tensorflow_datasets_reads_ours(file, tmp_path):
+    root = tmp_path / "milk_no_noops"
+    export_demos([file], root, "rlds", labels="executed", progress=False)
+    found = _run(_named("LIBERO_TFDS"), tmp_path, root / "1.0.0", script=READ_RLDS)
+    assert (found["name"], found["episodes"]) == ("milk_no_noops/1.0.0", 1)
+    (one,), recorded = found["read"], next(read_episodes(file)).aligned()
+    assert one["language"] == [LANGUAGE] and one["file"] == f"{file.name}: {recorded.name}"
+    np.testing.assert_array_equal(np.float32(one["actions"]), recorded.actions.astype(np.float32))
+    images, drawn = np.array(one["images"], float), recorded.obs["agentview_rgb"]
+    assert images.shape == drawn.shape and abs(images - drawn).mean() < 5.0  # JPEG
+    last = [False] * (len(recorded) - 1) + [True]
+    assert one["ends"] == last and one["rewards"] == [float(end) for end in last]
