@@ -17,6 +17,7 @@ import pytest
 from libero_env import memory, mujoco_compat
 from libero_env.cli import ending
 from libero_env.cli import main as cli
+from libero_env.demos.video import Mp4Writer
 from libero_env.errors import DEBUG_VARIABLE, LiberoError, code_of
 from libero_env.parallel import spawn_pool
 from libero_env.tasks import get_task
@@ -102,6 +103,17 @@ def test_what_the_system_refuses_is_one_line(number, monkeypatch, capsys):
     error = OSError(number, os.strerror(number), "some/file")
     assert ending.report(error) == ending.MISTAKE
     assert capsys.readouterr().err == f"error: some/file: {os.strerror(number)}\n"
+
+
+def test_a_full_disk_is_one_line_for_videos_too(capsys):
+    """PyAV is compiled, and its tracebacks name files that are not there; closing again raises nothing else."""
+    pytest.importorskip("av")
+    writer = Mp4Writer(Path("/dev/full"), 20)
+    with pytest.raises(OSError, match="No space left") as caught, writer:
+        writer.add(np.zeros((3, 16, 16, 3), np.uint8))
+    writer.close()
+    assert ending.report(caught.value) == ending.MISTAKE
+    assert capsys.readouterr().err == f"error: /dev/full: {os.strerror(errno.ENOSPC)}\n"
 
 
 def test_errors_by_kind(capsys):

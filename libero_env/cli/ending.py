@@ -191,7 +191,9 @@ def _raised_by_user(error: BaseException) -> str | None:
 
 def _is_user_file(name: str) -> bool:
     """Return whether a file belongs to neither this package, nor Python, nor an installed package."""
-    if name.startswith("<") or {"site-packages", "dist-packages"} & set(Path(name).parts):
+    if {"site-packages", "dist-packages"} & set(Path(name).parts):
+        return False
+    if not os.path.exists(name):  # text that was executed, or what a compiled package calls its source
         return False
     return not _is_below(name, [*_ROOTS, *_INSTALLED])
 

@@ -85,11 +85,11 @@ class Mp4Writer:
 
     def close(self) -> None:
         """Write the pending frames and close the file. Idempotent."""
-        if self._container is not None:
+        container, self._container = self._container, None
+        if container is not None:
             if self._stream is not None:
-                self._container.mux(self._stream.encode(None))
-            self._container.close()
-            self._container = None
+                container.mux(self._stream.encode(None))
+            container.close()
 
     def __enter__(self) -> "Mp4Writer":
         return self
