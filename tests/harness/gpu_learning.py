@@ -55,7 +55,7 @@ POLICIES: dict[str, tuple[Callable[..., Policy], str]] = {
     "bc_transformer_flow": (partial(small_transformer, head="flow"), "shift_jitter"),
     "bc_vilt": (partial(small_vilt, head="deterministic"), "shift"),
 }
-_SHORT = {  # what algorithms compute between tasks
+SHORT = {  # what algorithms compute between tasks
     "dmpel": ["algo.recall_steps=3"],
     "clare": ["algo.discriminator_steps=3", "algo.windows=8"],
     "iscil": ["algo.bases=3"],
@@ -174,7 +174,7 @@ def _save_and_die(
 def _sequence(folder: Path, algorithm: str, policy: str, device: torch.device) -> sequences.TaskSequence:
     """Return the tasks, of which the windows of the first are on the device and those of the others are not."""
     make, augmentation = POLICIES[policy]
-    config = composed(f"algo={algorithm}", f"augmentation={augmentation}", *_SHORT.get(algorithm, []))
+    config = composed(f"algo={algorithm}", f"augmentation={augmentation}", *SHORT.get(algorithm, []))
     with seeded(1):
         built = make(spec=sequences.SPEC).to(device)
     context = sequences.run_context(folder, "sequential")

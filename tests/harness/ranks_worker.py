@@ -20,15 +20,16 @@ from lifelong.training.distributed import Ranks, process_group
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences
 from tests.harness.configs import CONFIGS, composed
+from tests.harness.gpu_learning import SHORT
 from tests.harness.policies import small_transformer
 
 ALGORITHMS = sorted(file.stem for file in CONFIGS.glob("algo/*.yaml"))
-STEPS, TASKS = 12, 2
+STEPS, TASKS = 6, 2
 # Seven windows: two processes get three and four. One step is an epoch, so that records hold every step's loss.
 FIT = FitSettings(
     epochs=STEPS, steps_per_epoch=1, batch_size=7, lr=3e-3, warmup_steps=2, grad_clip=1.0, precision="fp32"
 )
-EVAL = EvalSettings(episodes=2, curve_episodes=2, every=4, horizon=4, settle_steps=0, precision="fp32")
+EVAL = EvalSettings(episodes=2, curve_episodes=2, every=3, horizon=3, settle_steps=0, precision="fp32")
 
 
 def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float], dict[str, torch.Tensor]]:
@@ -36,7 +37,7 @@ def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float]
 
     Without dropout: its masks are each rank's own.
     """
-    sequences.ALGORITHMS[algo] = lambda: build(composed(f"algo={algo}").algo)
+    sequences.ALGORITHMS[algo] = lambda: build(composed(f"algo={algo}", *SHORT.get(algo, [])).algo)
     with seeded(7):
         policy = small_transformer(sequences.SPEC, dropout=0.0)
     context = replace(

@@ -19,8 +19,8 @@ TINY = (
 )
 
 
-def test_from_the_command_line(tmp_path):
-    env = os.environ | {"LIBERO_CACHE": str(tmp_path / "cache"), "LIBERO_DEMOS": str(tmp_path / "demos")}
+def test_from_the_command_line(tmp_path, demos):
+    env = os.environ | {"LIBERO_CACHE": str(tmp_path / "cache"), "LIBERO_DEMOS": str(demos)}
 
     def call(*words: str) -> str:
         done = subprocess.run(

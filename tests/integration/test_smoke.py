@@ -2,17 +2,13 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from libero_env.demos.config import GENERATOR
-from lifelong import checkpoints
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -26,8 +22,10 @@ TINY = (
 
 
 @pytest.fixture(scope="module")
-def home(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("home")
+def home(tmp_path_factory, demos) -> Path:
+    folder = tmp_path_factory.mktemp("home")
+    (folder / "demos").symlink_to(demos)
+    return folder
 
 
 def start(home: Path, runs: Path, *overrides: str) -> subprocess.Popen:
@@ -76,43 +74,6 @@ def test_smoke_from_the_command_line_to_a_report(home, tmp_path):
     assert "is finished" in again
 
 
-def wait_for_lines(process: subprocess.Popen, runs: Path, count: int) -> None:
-    deadline = time.monotonic() + 600
-    while time.monotonic() < deadline and process.poll() is None:
-        logs = list(runs.rglob("results.jsonl"))
-        if logs and logs[0].read_bytes().count(b"\n") >= count:
-            return
-        time.sleep(0.02)
-    raise AssertionError(f"never wrote {count} records: {process.stdout.read()}")
-
-
-def test_killed_twice_and_resumed_gives_the_same_results(home, tmp_path):
-    whole, killed = tmp_path / "whole", tmp_path / "killed"
-    finish(start(home, whole, *TINY))
-    for count in (5, 15):
-        process = start(home, killed, *TINY)
-        wait_for_lines(process, killed, count)
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-    finish(start(home, killed, *TINY))
-
-    def outcome(path):
-        """Return records by key, without times; a record that was written twice must be the same both times."""
-        found = {}
-        for record in records(path):
-            if record["kind"] in ("loss", "eval", "task_end"):
-                record.pop("seconds"), record.pop("crc32")
-                key = tuple(record.get(k) for k in ("kind", "phase", "learned", "task", "epoch"))
-                assert found.setdefault(key, record) == record
-        return found
-
-    assert outcome(run_dir(killed)) == outcome(run_dir(whole))
-    last = [checkpoints.load(run_dir(p) / "checkpoints" / "task_1.safetensors") for p in (whole, killed)]
-    assert last[0]["policy"].keys() == last[1]["policy"].keys()
-    for name, value in last[0]["policy"].items():
-        assert torch.equal(value, last[1]["policy"][name]), name
-
-
 def test_another_configuration_in_the_same_directory_is_refused(home, tmp_path):
     finish(start(home, tmp_path, *TINY, "benchmark.tasks=1"))
     process = start(home, tmp_path, *TINY, "benchmark.tasks=1", "train.lr=0.5")
@@ -129,30 +90,22 @@ def test_a_sweep_ends_with_a_comparison_report(home, tmp_path):
     assert len(list(tmp_path.rglob("results.json"))) == 2
 
 
-@pytest.mark.parametrize("policy", ["bc_mlp_small", "bc_transformer_small", "bc_rnn_small", "bc_vilt_small"])
-def test_every_algorithm_trains_every_policy(home, tmp_path, policy):
-    """Run preset=smoke with fewer and shorter steps and episodes."""
-    tiny = (*(t for t in TINY if not t.startswith("algo")), "eval.episodes=1", f"policy={policy}")
+def test_every_algorithm_runs(home, tmp_path):
+    few = ("train.epochs=1", "eval.horizon=4", "eval.episodes=1", "eval.curve=none", "eval.select=last")
+    tiny = (*(t for t in TINY if not t.startswith("algo")), *few)
     output = finish(start(home, tmp_path, "-m", f"algo={','.join(ALGORITHMS)}", *tiny))
     assert f"{len(ALGORITHMS)} runs compared" in output
     for algo in ALGORITHMS:
-        found = json.loads(
-            (tmp_path / "libero_object" / algo / f"{policy}_seed1" / "results.json").read_text()
-        )
+        (path,) = (tmp_path / "libero_object" / algo).glob("*/results.json")
+        found = json.loads(path.read_text())
         assert found["finished"] and found["tasks_learned"] == 2, algo
 
 
-@pytest.mark.parametrize(("override", "message"), [
-    ("algo=evc", "unknown algo 'evc'. Did you mean 'ewc'? Valid: agem, "),
-    ("benchmark.tasks=[butter]", "unknown task of libero_object 'butter'"),
-    ("eval.select=first", "eval.select is 'first'; expected one of 'best', 'first_best' or 'last'"),
-    ("device=tpu", "valid: auto, cpu, cuda"),
-])  # fmt: skip
-def test_errors_of_the_command_line_are_one_line(home, tmp_path, override, message):
-    process = start(home, tmp_path, "preset=smoke", "benchmark=libero_object", override)
+def test_errors_of_the_command_line_are_one_line(home, tmp_path):
+    process = start(home, tmp_path, "preset=smoke", "benchmark=libero_object", "benchmark.tasks=[butter]")
     output, _ = process.communicate(timeout=300)
     assert process.returncode == 2
-    assert message in output and "Traceback" not in output
+    assert "unknown task of libero_object 'butter'" in output and "Traceback" not in output
     assert len(output.strip().splitlines()) == 1, output
     assert not list(tmp_path.rglob("config.yaml")), "nothing stands in the way of the mended command"
 

@@ -28,7 +28,8 @@ def train(home: Path, *overrides: str) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
-def test_streams_from_the_command_line(tmp_path):
+def test_streams_from_the_command_line(tmp_path, demos):
+    (tmp_path / "demos").symlink_to(demos)
     stream = (
         "algo=er", "benchmark.tasks=2", "benchmark.group_size=2", "pretrain.suite=libero_object",
         "pretrain.tasks=[1]", "stream.demos_later=1", "stream.blur=0.2"

@@ -49,9 +49,10 @@ def outcomes(runs: Path) -> dict[str, list]:
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory) -> tuple[Path, Path]:
+def plain(tmp_path_factory, demos) -> tuple[Path, Path]:
     """A sweep of Hydra's basic launcher: one job cannot be run. Return the home and its runs."""
     home = tmp_path_factory.mktemp("home")
+    (home / "demos").symlink_to(demos)
     runs = home / "plain"
     process = start(home, runs, "algo=sequential,er", "train.lr=1e-3,-1")
     output, _ = process.communicate(timeout=600)

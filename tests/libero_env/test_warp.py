@@ -29,6 +29,7 @@ EVERYTHING = os.environ.get("LIBERO_WARP") == "all"  # twenty minutes more on a 
 TASK = "libero_10/3"  # a bowl into a drawer that is then closed: fixtures, joints, contacts
 WARP = "warp,device=cpu"
 NUM = 3
+FREE_STEPS = 50 if EVERYTHING else 15
 EXPERT_TASKS, EXPERT_STARTS = ["libero_object/3", "libero_spatial/0", "libero_goal/5", "libero_90/1"], 25
 TEN_TASKS = ["libero_spatial/0", "libero_object/3", "libero_object/7", "libero_goal/0", "libero_goal/5"]
 TEN_TASKS += ["libero_10/3", "libero_10/9", "libero_90/1", "libero_90/20", "libero_90/60"]
@@ -361,11 +362,11 @@ def test_demonstrations_name_it(tmp_path):
 
 @pytest.mark.slow
 def test_demonstrations_are_recorded(tmp_path, monkeypatch):
-    monkeypatch.setattr(DemoConfig, "batch", 2)
-    config = DemoConfig("libero_object/3", (32, 32), backend=WARP)
+    monkeypatch.setattr(DemoConfig, "batch", 1)
+    config = DemoConfig("libero_90/20", (32, 32), backend=WARP)
     job = RecordingJob(config, tmp_path / "demo.hdf5")
-    report = make_demos([job], 2, workers=1, progress=False)[job.path]
-    assert report.recorded == 2 and read_header(job.path)["backend"] == "warp"
+    report = make_demos([job], 1, workers=1, progress=False)[job.path]
+    assert report.recorded == 1 and read_header(job.path)["backend"] == "warp"
 
 
 @pytest.mark.slow
@@ -391,10 +392,10 @@ def test_pictures_show_the_same():
 
 
 def free_actions(env, seed):
-    """Actions of 50 control steps; None where the robot touches something."""
+    """Actions of some control steps; None where the robot touches something."""
     env.reset(options={"init_state": list(range(NUM))})
     actions, bodies, robot = (
-        smooth_actions(50, seed),
+        smooth_actions(FREE_STEPS, seed),
         env.scene.model.geom_bodyid,
         env.scene.bodies["robot"],
     )
@@ -407,9 +408,9 @@ def free_actions(env, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", TEN_TASKS if EVERYTHING else TEN_TASKS[:2])
+@pytest.mark.parametrize("task", TEN_TASKS if EVERYTHING else TEN_TASKS[:1])
 def test_free_motion_is_that_of_mujoco(task):
-    """50 control steps within 1e-5 rad and m."""
+    """Within 1e-5 rad and m."""
     env = BatchEnv(task, NUM, cameras=(), num_threads=1)
     fixtures = env.scene.fixture_bodies
     ours = make_simulations(env.scene.model, NUM, fixture_bodies=fixtures, backend=Backend.read(WARP))
@@ -442,16 +443,18 @@ def won_by_the_expert(task, starts, backend):
     return won
 
 
-@pytest.mark.slow
-def test_the_expert_succeeds_as_often():
-    """Within 2 points; with LIBERO_WARP=all over 100 starts of tasks of four suites, ten minutes on a processor."""
-    tasks, starts = (EXPERT_TASKS, EXPERT_STARTS) if EVERYTHING else (EXPERT_TASKS[:1], 2)
-    won = {
-        backend: np.concatenate([won_by_the_expert(task, starts, backend) for task in tasks])
-        for backend in ("mujoco", WARP)
-    }
-    assert won["mujoco"].mean() > 0.9
-    assert abs(won[WARP].mean() - won["mujoco"].mean()) <= 0.02
+if EVERYTHING:  # otherwise `test_demonstrations_are_recorded` shows it on one start
+
+    def test_the_expert_succeeds_as_often():
+        """Within 2 points over 100 starts of tasks of four suites."""
+        won = {
+            backend: np.concatenate(
+                [won_by_the_expert(task, EXPERT_STARTS, backend) for task in EXPERT_TASKS]
+            )
+            for backend in ("mujoco", WARP)
+        }
+        assert won["mujoco"].mean() > 0.9
+        assert abs(won[WARP].mean() - won["mujoco"].mean()) <= 0.02
 
 
 MESH = np.random.default_rng(0).normal(size=(12, 3))  # twelve corners of a convex body of a few centimetres

@@ -429,3 +429,22 @@ def test_a_policy_without_predict_is_named() -> None:
 
     with pytest.raises(PolicyError, match="Silent has no predict"):
         Silent(SPEC).predict(fake_batch(SPEC, 2, generator()))
+
+
+def test_gradients_of_an_lstm_in_evaluation_mode_do_not_ask_cudnn(monkeypatch):
+    """Which has them in training mode only; importances of weights are computed in evaluation mode."""
+    asked = []
+    forward = torch.nn.LSTM.forward
+
+    def watched(self, *args):
+        asked.append(torch.backends.cudnn.enabled)
+        return forward(self, *args)
+
+    monkeypatch.setattr(torch.nn.LSTM, "forward", watched)
+    lstm, before = LSTM(in_dim=3), torch.backends.cudnn.enabled
+    x = torch.ones(2, 4, 3)
+    lstm(x)[0].sum().backward()
+    lstm.eval()(x)[0].sum().backward()
+    with torch.no_grad():
+        lstm(x)
+    assert asked == [before, False, before] and torch.backends.cudnn.enabled == before

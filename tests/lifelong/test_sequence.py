@@ -1,8 +1,10 @@
 """The task sequence with every algorithm: killed anywhere and resumed, it comes to the same records and weights."""
 
 import copy
+import math
 
 import pytest
+import torch
 
 from lifelong import algorithms as algos
 from lifelong.data.memory import PhaseMemory, ReplayMemory
@@ -18,6 +20,7 @@ from tests.harness.algorithms import (
     predict,
 )
 from tests.harness.configs import CONFIGS, composed
+from tests.harness.gpu_learning import POLICIES, learn
 from tests.harness.sequences import ALGORITHMS, TASKS, assert_same, dataset, run_context, sequence
 
 EVERY = ALGORITHMS | {
@@ -80,6 +83,13 @@ def test_acting_leaves_the_policy_as_it_was(make):
         predict(algorithm, policy, dataset(task).batch(range(20)), task)
     assert_same(dict(policy.state_dict()), before)
     assert set(vars(policy)) == names and not any(m._forward_hooks for m in policy.modules())
+
+
+@pytest.mark.parametrize("policy", sorted(POLICIES.keys() - {"bc_transformer"}))  # which the others have
+def test_every_algorithm_learns_with_every_policy(policy):
+    for name in EVERY:
+        learned = learn(name, policy, torch.device("cpu"))
+        assert learned.losses and all(map(math.isfinite, learned.losses)), name
 
 
 @pytest.mark.parametrize("quiet", ["0", "1"])
