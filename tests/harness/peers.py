@@ -1,4 +1,4 @@
-"""vla-eval and LeRobot in environments of their own, from which this checkout can be imported too."""
+"""vla-eval, Inspect Robots and LeRobot in environments of their own, from which this checkout can be imported too."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from tests.harness.counterparts import counterpart
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = Path(__file__).parent / "peer_scripts"
-PLUGIN = ROOT / "integrations" / "lerobot_env_libero_lifelong"
+INTEGRATIONS = ROOT / "integrations"
 # Starts a script with the folders of a variable after those of its own environment
 _START = (
     "import os, runpy, sys; sys.path += os.environ['PEER_PATH'].split(os.pathsep); "
@@ -68,9 +68,10 @@ def vla_eval() -> Peer:
 
 
 def inspect_robots() -> Peer:
-    """Return the environment of inspect-robots and Rerun, 530 MB; the rest comes from that of the tests."""
-    python = counterpart(no_deps=("inspect-robots==0.60.0", "rerun-sdk==0.41.0"))
-    return Peer(python, (str(ROOT), sysconfig.get_path("purelib")))
+    """Return the environment of Inspect Robots with our distribution, and Rerun, 530 MB, beside that of the tests."""
+    python = counterpart("hatchling", no_deps=("inspect-robots==0.60.0", "rerun-sdk==0.41.0"))
+    installed = _installed(python, "inspect_robots_libero_lifelong")
+    return Peer(python, (str(ROOT), installed, sysconfig.get_path("purelib")))
 
 
 def lerobot() -> Peer:
@@ -90,15 +91,17 @@ def lerobot() -> Peer:
         python=python,
         build="LIBERO_BUILD_LEROBOT" in os.environ,
     )
-    return Peer(found, (str(ROOT), str(_installed_plugin(found))))
+    return Peer(found, (str(ROOT), _installed(found, "lerobot_env_libero_lifelong")))
 
 
-def _installed_plugin(python: Path) -> Path:
-    """Return a folder with the plug-in as pip installs it: LeRobot asks the metadata of distributions."""
-    folder = python.parents[1] / "plugin"
+def _installed(python: Path, name: str) -> str:
+    """Return a folder with one of our distributions as pip installs it: its metadata are what others look for."""
+    folder = python.parents[1] / "integrations"
     command = [
         str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--upgrade"
     ]  # fmt: skip
-    done = subprocess.run([*command, "--target", str(folder), str(PLUGIN)], capture_output=True, text=True)
+    done = subprocess.run(
+        [*command, "--target", str(folder), str(INTEGRATIONS / name)], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
-    return folder
+    return str(folder)

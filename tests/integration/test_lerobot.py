@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from libero_env.envs.env import LiberoEnv
-from tests.harness.peers import lerobot
+from tests.harness.peers import INTEGRATIONS, lerobot
 from tests.harness.recorded import OPEN, write_actions
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
@@ -15,7 +15,9 @@ SIZE = 64
 def test_lerobot_finds_the_plugin_and_its_rollout_succeeds(tmp_path):
     peer = lerobot()
     file = write_actions(tmp_path / "actions.npz", "libero_object/0", 0)
-    found = peer.run("lerobot_rollout.py", file, cwd=tmp_path, LIBERO_ASSETS="builtin")
+    env_file = INTEGRATIONS / "lerobot_env_libero_lifelong" / "env.py"
+    found = peer.run("lerobot_rollout.py", file, env_file, cwd=tmp_path, LIBERO_ASSETS="builtin")
+    assert found["hub_same"] and sum(found["hub_tasks"].values()) == 130
     assert found["type"] == "libero_lifelong" and found["same_features"]
     assert found["success"][0] and found["steps"][0] == len(np.load(file)["actions"])
     assert found["task"] == ["pick up the alphabet soup and place it in the basket"] * 2

@@ -1,10 +1,9 @@
 """The environment type `libero_lifelong` of LeRobot: its options, features and processors."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from lerobot.configs import FeatureType, PolicyFeature
-from lerobot.envs.configs import EnvConfig
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot.processor import LiberoProcessorStep, PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
@@ -16,7 +15,7 @@ DEFAULT_NAMES = {"agentview_image": "image", "robot0_eye_in_hand_image": "image2
 
 @EnvConfig.register_subclass("libero_lifelong")
 @dataclass
-class LiberoLifelongEnv(EnvConfig):
+class LiberoLifelongEnv(HubEnvConfig):
     """LIBERO's tasks, with the options of LeRobot's own type `libero` and four of libero-lifelong.
 
     Attributes:
@@ -38,6 +37,7 @@ class LiberoLifelongEnv(EnvConfig):
         drawing: `faithful` as the original, or `fast`; None for the default of the models.
         robot: Model of the arm: `libero`, or `robosuite-1.4.1`.
         assets: Models: `builtin`, a folder of the original's, or None for the user's choice.
+        hub_path: Repository of the Hugging Face Hub whose `env.py` makes the environments; None for this package.
     """
 
     task: str = "libero_10"
@@ -75,11 +75,6 @@ class LiberoLifelongEnv(EnvConfig):
                 self.features[key] = PolicyFeature(type=FeatureType.STATE, shape=shape)
                 prefix = "joint" if group == "joints" else group
                 self.features_map[key] = f"{OBS_STATE}.{prefix}_{name}"
-
-    @property
-    def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `gymnasium.make`: none, because `create_envs` does not use it."""
-        return {}
 
     def settings(self) -> Settings:
         """Return the options of the environments without those of LeRobot; see `Settings` for what is refused."""

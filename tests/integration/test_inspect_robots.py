@@ -1,0 +1,92 @@
+"""Inspect Robots itself, in an environment of its own: it finds our distribution, and its episodes are ours."""
+
+import hashlib
+import json
+
+import numpy as np
+import pytest
+
+from libero_env.cli import main as cli
+from libero_env.envs.env import LiberoEnv
+from tests.harness.peers import inspect_robots
+from tests.harness.recorded import OPEN, solve
+from tests.harness.runs import make_run
+
+pytestmark = [pytest.mark.sim, pytest.mark.slow]
+
+STATE = {
+    "joint_pos": "joint_states",
+    "joint_vel": "joint_velocities",
+    "eef_pos": "ee_pos",
+    "eef_quat": "ee_quat",
+    "eef_axis_angle": "ee_ori",
+    "gripper_qpos": "gripper_states",
+}
+
+
+def evaluate(policy, folder, settle_steps=5, **task) -> tuple[dict, dict]:
+    """What Inspect Robots says of an evaluation, and what its policy saw and answered."""
+    embodiment = {"camera_size": 32, "assets": "builtin", "settle_steps": settle_steps}
+    arguments = (json.dumps(task), json.dumps(embodiment), policy, folder / "seen.npz")
+    found = inspect_robots().run("inspect_robots_run.py", *arguments, cwd=folder, LIBERO_ASSETS="builtin")
+    if not (folder / "seen.npz").exists():
+        return found, {}
+    with np.load(folder / "seen.npz") as seen:
+        return found, dict(seen)
+
+
+def test_its_episodes_are_those_of_our_environment(tmp_path):
+    actions = np.concatenate([[OPEN] * 10, solve("libero_object/0", 0)])
+    file = tmp_path / "actions.npz"
+    np.savez(file, actions=actions)
+    found, seen = evaluate(
+        file, tmp_path, suite="libero_object", task_ids=0, num_starts=2, max_steps=len(actions)
+    )
+    assert all("libero" in found["registered"][kind] for kind in ("task", "embodiment"))
+    assert found["scenes"] == ["libero_object-0-start0", "libero_object-0-start1"]
+    assert found["instructions"] == ["pick up the alphabet soup and place it in the basket"] * 2
+    env = LiberoEnv(
+        "libero_object/0",
+        camera_size=(32, 32),
+        assets="builtin",
+        observations=("rgb", *STATE.values()),
+    )
+    at, successes = 0, []
+    for start in range(2):
+        obs, _ = env.reset(options={"init_state": start})
+        for _ in range(5):
+            obs, *_ = env.step(np.zeros(7))
+        for t, action in enumerate(actions):
+            assert seen["t"][at] == t
+            for name in ("agentview_rgb", "eye_in_hand_rgb"):
+                np.testing.assert_array_equal(seen[name][at], obs[name])
+            for theirs, ours in STATE.items():
+                np.testing.assert_array_equal(seen[theirs][at], obs[ours])
+            at += 1
+            obs, _, terminated, *_ = env.step(action)
+            if terminated:
+                break
+        successes.append(terminated)
+    env.close()
+    assert at == len(seen["t"]) and successes[0]
+    assert found["metrics"] == {"success_at_end": np.mean(successes)}
+
+
+def test_a_run_acts_as_in_process(tmp_path):
+    make_run(tmp_path / "run", "algo=packnet", "policy/head=gmm_small", "policy.stochastic=true")
+    out = tmp_path / "local"
+    options = ["--episodes", "2", "--unit-starts", "1", "--horizon", "8", "--threads", "1"]
+    assert cli.main(["eval", str(tmp_path / "run"), "--out", str(out), *options]) == 0
+    local = json.loads((out / "eval.json").read_text())["tasks"][0]
+    suite, _, index = local["task"].partition("/")
+    task = {"suite": suite, "task_ids": int(index), "num_starts": 2, "max_steps": 8}
+    refused, _ = evaluate(tmp_path / "run", tmp_path, **task)  # the run's smoke settings do not wait
+    assert all("-E settle_steps=0" in error for error in refused["errors"]) and len(refused["errors"]) == 2
+    found, seen = evaluate(tmp_path / "run", tmp_path, settle_steps=0, **task)
+    assert not found["errors"]
+    assert "libero_run" in found["registered"]["policy"]
+    assert len(seen["t"]) == sum(local["lengths"])
+    assert found["metrics"] == {"success_at_end": np.mean(local["successes"])}
+    episodes = np.split(seen["action"], np.cumsum(local["lengths"])[:-1])
+    digests = [hashlib.sha256(np.asarray(one, "<f8").tobytes()).hexdigest()[:16] for one in episodes]
+    assert digests == local["actions"]
