@@ -90,3 +90,14 @@ def test_a_run_acts_as_in_process(tmp_path):
     episodes = np.split(seen["action"], np.cumsum(local["lengths"])[:-1])
     digests = [hashlib.sha256(np.asarray(one, "<f8").tobytes()).hexdigest()[:16] for one in episodes]
     assert digests == local["actions"]
+
+
+def test_mistakes_are_its_own_errors(tmp_path):
+    found = inspect_robots().run("inspect_robots_mistakes.py", cwd=tmp_path, LIBERO_ASSETS="builtin")
+    assert found == [
+        "unknown robot 'panda'. Valid: libero, robosuite-1.4.1",
+        "task_ids [77] do not exist: libero_goal has 0 to 9",
+        "num_starts is 51; valid: 1 to 50",
+        "nowhere does not exist; give the directory of a run, such as runs/libero_object/er/NAME, or one of its "
+        "checkpoints",
+    ]

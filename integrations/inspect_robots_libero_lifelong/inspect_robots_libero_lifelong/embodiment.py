@@ -17,6 +17,7 @@ from inspect_robots.scene import Scene
 from inspect_robots.spaces import CameraSpec, ObservationSpace, StateField, StateSpec
 from inspect_robots.types import Action, Observation, StepResult
 
+from inspect_robots_libero_lifelong.errors import as_config_error
 from inspect_robots_libero_lifelong.spaces import ACTION, STATE
 from libero_env.envs.config import EnvConfig
 from libero_env.envs.env import LiberoEnv
@@ -61,9 +62,10 @@ class LiberoEmbodiment(EmbodimentBase):
         perturb: Perturbations, such as `camera=0.3,light=0.5`.
 
     Raises:
-        LiberoError: An option is not valid; it is named.
+        ConfigError: An option is not valid; it is named.
     """
 
+    @as_config_error()
     def __init__(
         self,
         task: str | None = None,

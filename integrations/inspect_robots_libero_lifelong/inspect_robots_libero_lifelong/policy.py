@@ -9,6 +9,7 @@ from inspect_robots.scene import Scene
 from inspect_robots.spaces import CameraSpec, ObservationSpace
 from inspect_robots.types import Action, ActionChunk, Observation
 
+from inspect_robots_libero_lifelong.errors import as_config_error
 from inspect_robots_libero_lifelong.spaces import ACTION, STATE
 from libero_env.tasks import get_task
 from libero_env.timing import CONTROL_HZ
@@ -29,9 +30,10 @@ class RunPolicy(PolicyBase):
         allow: Packages whose classes the run's configuration may name besides those of libero-lifelong.
 
     Raises:
-        LifelongError: There is no such run or checkpoint.
+        ConfigError: There is no such run or checkpoint.
     """
 
+    @as_config_error()
     def __init__(
         self,
         run: str,

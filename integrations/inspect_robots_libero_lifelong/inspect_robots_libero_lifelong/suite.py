@@ -5,11 +5,13 @@ from collections.abc import Sequence
 from inspect_robots.scene import Scene
 from inspect_robots.task import Task
 
+from inspect_robots_libero_lifelong.errors import as_config_error
 from libero_env.errors import LiberoError
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.tasks import get_suite
 
 
+@as_config_error()
 def suite_task(
     suite: str = "libero_spatial",
     task_ids: Sequence[int] | int | None = None,
@@ -25,8 +27,7 @@ def suite_task(
         max_steps: Maximum number of steps of the policy.
 
     Raises:
-        UnknownNameError: The suite does not exist.
-        LiberoError: A task or a state does not exist.
+        ConfigError: The suite, a task or a state does not exist.
     """
     tasks = get_suite(suite).tasks
     wanted = range(len(tasks)) if task_ids is None else [task_ids] if isinstance(task_ids, int) else task_ids
