@@ -173,6 +173,17 @@ def test_a_hard_reset_undoes_what_was_changed_and_another_keeps_it(make_env, har
     assert DEFAULTS["OSC_POSE"]["output_max"][0] == 0.05
 
 
+@pytest.mark.parametrize("hard_reset", [True, False])
+def test_a_hard_reset_makes_the_robot_of_its_configuration(make_env, hard_reset):
+    env = make_env(**BLIND, hard_reset=hard_reset)
+    env.reset()
+    env.env.robot_configs[0]["controller_config"]["kp"] = 50
+    with pytest.raises(TypeError):
+        env.env.robot_configs[0]["control_freq"] = 10
+    env.reset()
+    assert env.robots[0].controller.kp.tolist() == [50.0 if hard_reset else 150.0] * 6
+
+
 @pytest.mark.parametrize("name", DEFAULTS)
 def test_torques_are_clipped_at_the_limits_of_the_model(make_env, name):
     """As in robosuite: at once, but by the controller of joint velocities at those of the last reset."""

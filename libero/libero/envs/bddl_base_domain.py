@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from inspect import signature
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from libero._adapters.arguments import (
     substeps_of,
     with_room,
 )
+from libero._adapters.controllers import controller_of
 from libero._adapters.lookup import lookup
 from libero._adapters.models import facade_pack
 from libero._adapters.observations import Observer, RobosuiteMethods, cameras, quat_xyzw
@@ -65,7 +67,7 @@ _KEPT: dict[str, Any] = {
 }
 _FLOOR_OFFSET = (0.0, 0.0, -0.035)  # the original's origin of regions on the floor, m
 
-_CONFIGURED = ("controller_config", "mount_type", "initialization_noise", "control_freq", "gripper_type")
+_CONFIGURED = ("mount_type", "initialization_noise", "control_freq", "gripper_type")
 _NAMES: dict[str, Callable[[Any], Any]] = {
     "camera_heights": lambda env: [camera.height for camera in env.camera_list],
     "camera_widths": lambda env: [camera.width for camera in env.camera_list],
@@ -74,8 +76,11 @@ _NAMES: dict[str, Callable[[Any], Any]] = {
     "num_cameras": lambda env: len(env.camera_list),
     "num_robots": lambda env: len(env.robots),
     "robot_names": lambda env: [robot.name for robot in env.robots],
-    "robot_configs": lambda env: [
-        {name: getattr(robot, name) for name in _CONFIGURED} for robot in env.robots
+    "robot_configs": lambda env: [  # a hard reset makes the robot of the controller's configuration
+        MappingProxyType(
+            {name: getattr(env.robots[0], name) for name in _CONFIGURED}
+            | {"controller_config": env._controller_configs}
+        )
     ],
     "model_timestep": lambda env: env.sim.model.opt.timestep,
     "control_timestep": lambda env: 1.0 / env.control_freq,
@@ -201,7 +206,7 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         self._is_sampled = self._closed = False
         self._observations: OrderedDict[str, np.ndarray] = OrderedDict()
         self._observables: OrderedDict[str, Any] = OrderedDict()
-        self._controller_configs, self._robots, self._xml = controller_configs, robots, ""
+        self._controller_configs, self._robots, self._xml = controller_of(controller_configs), robots, ""
         self._load_model()
         self._setup_references()
 
