@@ -93,7 +93,8 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         tensors |= _tensors_of(path.parent, head.get("elsewhere", {}))
         text = json.dumps(head["tree"], separators=(",", ":"))
         if _digest(text, tensors) != head["sha256"]:
-            raise ValueError("its content does not have the checksum that it was written with")
+            parts = ", or that of ".join(["its content", *sorted(set(head.get("elsewhere", {}).values()))])
+            raise ValueError(f"{parts} does not have the checksum that it was written with")
         placed = {name: tensor.to(device) for name, tensor in tensors.items()}
         tree = _decode(head["tree"], placed, 0)
         if not isinstance(tree, dict):

@@ -7,7 +7,7 @@ Shape legend: B batch, T time, V views, C H W image, D dimension of a propriocep
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, default_collate
 
 from lifelong.errors import PolicyError
-from lifelong.types import Observation, PolicySpec
+from lifelong.types import Observation, PolicySpec, to_device
 
 # key of `data` -> proprioceptive input and its dimension
 PROPRIO = {"use_joint": ("joint_states", 7), "use_gripper": ("gripper_states", 2), "use_ee": ("ee_pos", 3)}
@@ -24,9 +24,10 @@ PROPRIO = {"use_joint": ("joint_states", 7), "use_gripper": ("gripper_states", 2
 
 @dataclass(frozen=True)
 class DictBatch:
-    """Nested dictionary of tensors with a common batch axis."""
+    """Nested dictionary of tensors with a common batch axis, and the indices of windows of a dataset."""
 
     data: Any
+    window_ids: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
 
     def __len__(self) -> int:
         if isinstance(self.data, dict):
@@ -35,11 +36,14 @@ class DictBatch:
 
     def to(self, device: torch.device | str) -> "DictBatch":
         """Return the batch on another device."""
-        return DictBatch(map_tensors(self.data, lambda x: x.to(device, non_blocking=True)))
+        return DictBatch(
+            map_tensors(self.data, lambda x: to_device(x, device)), to_device(self.window_ids, device)
+        )
 
     def join(self, other: "DictBatch") -> "DictBatch":
         """Return this batch followed by another, with the entries that both have."""
-        return DictBatch(join_tensors(self.data, other.data))
+        ids = torch.cat([self.window_ids, other.window_ids])
+        return DictBatch(join_tensors(self.data, other.data), ids)
 
 
 class DictWindows:
@@ -53,7 +57,7 @@ class DictWindows:
 
     def batch(self, indices: Tensor) -> DictBatch:
         """Return the windows of the given indices, (B,) int64."""
-        return DictBatch(default_collate([self.dataset[int(i)] for i in indices]))
+        return DictBatch(default_collate([self.dataset[int(i)] for i in indices]), indices)
 
     def load(self, batches: Iterable[Tensor]) -> Iterator[DictBatch]:
         """Return the windows of each tensor of indices, read ahead by worker processes."""

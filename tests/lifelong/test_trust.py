@@ -129,7 +129,7 @@ def test_a_saved_policy_that_no_memory_holds_is_refused(changed):
 
 def test_code_named_by_a_result_needs_permission(tmp_path, monkeypatch):
     result = argparse.Namespace(
-        evaluated={"policy": "evil:make"}, tasks=[], unit_starts=1, environment={}, protocol={}
+        evaluated={}, policy="evil.part:make", tasks=[], unit_starts=1, environment={}, protocol={}
     )
     request = EvalRequest(policy=str(tmp_path))
     for kind in ("policy", "run", "server"):
