@@ -1,5 +1,6 @@
 """Names of workspaces, what tasks take place on: those of the benchmark, and those in the user's folder of objects."""
 
+import os
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Literal, get_args
@@ -34,5 +35,5 @@ WORKSPACES = _Workspaces()
 def find_workspace(name: str) -> Path | None:
     """Return the folder of a user's workspace; None where there is none of this name."""
     directory = objects_dir() / name
-    own = name.isidentifier() and name not in BUILTIN_WORKSPACES and (directory / FILE).is_file()
+    own = name.isidentifier() and name not in BUILTIN_WORKSPACES and os.path.isfile(directory / FILE)
     return directory if own else None

@@ -4,6 +4,7 @@ Files are read when a scene requests the object, so that they may be edited by h
 """
 
 import hashlib
+import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -101,7 +102,7 @@ def names() -> tuple[str, ...]:
 def find(name: str) -> Path | None:
     """Return the folder of a user-defined object; None where it does not exist."""
     directory = objects_dir() / name
-    return directory if name.isidentifier() and (directory / PROPERTIES).is_file() else None
+    return directory if name.isidentifier() and os.path.isfile(directory / PROPERTIES) else None
 
 
 def remove(name: str) -> Path:

@@ -1,5 +1,6 @@
 """Cameras that a task, or whoever makes an environment, adds to a scene."""
 
+import math
 from collections import Counter
 from collections.abc import Iterable
 from typing import Annotated, Any
@@ -59,7 +60,7 @@ class Camera:
             raise InvalidInputError(f"camera {self.name}: give one of quat and lookat")
         if self.quat is not None and not any(self.quat):
             raise InvalidInputError(f"camera {self.name}: its quat is zero; expected a rotation, wxyz")
-        if self.lookat == self.pos:
+        if self.lookat is not None and math.dist(self.lookat, self.pos) < 1e-6:
             raise InvalidInputError(
                 f"camera {self.name} looks at the point where it is; expected another lookat"
             )

@@ -170,7 +170,7 @@ def restore(
         policy=policy.eval(),
         algorithm=algorithm,
         eval=config.build("eval"),
-        seed=config.values["seed"],
+        seed=config.settings().seed,
         device=where,
         language=language,
         instructions=instructions,

@@ -103,7 +103,8 @@ class Configuration:
         try:
             built = _build(self._node(group), (group,), self.allowed, arguments)
             kind = pkgutil.resolve_name(GROUPS[group])
-            if not isinstance(built, kind) and (group in _STRICT or _is_own(type(built))):
+            is_strict = group in _STRICT or isinstance(built, partial) or _is_own(type(built))
+            if not isinstance(built, kind) and is_strict:
                 raise ConfigError(f"{group} builds a {type(built).__name__}; expected a {kind.__name__}")
         except ConfigError as error:
             raise (ConfigError(f"{self.source}: {error}") if self.source else error) from error.__cause__
@@ -209,13 +210,14 @@ def _component(value: Any, hint: Any, at: Path, allowed: Sequence[str] | None) -
         completed = next((note.names for note in notes if isinstance(note, CompletedWith)), ())
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     if isinstance(value, Mapping) and "_target_" in value:
-        built = _build(value, at, allowed, {}, completed)
         kinds = tuple(one for one in options if isclass(one) and one not in (Any, NoneType))
-        if kinds and len(kinds) + (NoneType in options) == len(options) and not isinstance(built, kinds):
-            expected = " or ".join(kind.__name__ for kind in kinds)
-            raise ConfigError(
-                f"{'.'.join(map(str, at))} builds a {type(built).__name__}; expected a {expected}"
-            )
+        if not kinds or len(kinds) + (NoneType in options) != len(options):
+            kinds = (object,)
+        found = _other_class(value, kinds, allowed)
+        built = _build(value, at, allowed, {}, completed) if found is None else None
+        if found is not None or not isinstance(built, kinds):
+            name, expected = (found or type(built)).__name__, " or ".join(kind.__name__ for kind in kinds)
+            raise ConfigError(f"{'.'.join(map(str, at))} builds a {name}; expected a {expected}")
         return built
     if isinstance(value, list | tuple):
         (entry, *_) = [*(get_args(one)[0] for one in options if get_args(one)), Any]
@@ -225,6 +227,17 @@ def _component(value: Any, hint: Any, at: Path, allowed: Sequence[str] | None) -
     if (value is None and NoneType in options) or any(one is Any or is_plain(one) for one in options):
         return value
     return _build(value, at, allowed, {})  # which says what a component is
+
+
+def _other_class(node: Mapping[str, Any], kinds: tuple[type, ...], allowed: Sequence[str] | None) -> Any:
+    """Return the class that a node builds where it is not one of those expected: building it may take any memory."""
+    try:
+        target = find_target(node["_target_"], allowed)
+        if isclass(target) and not node.get("_partial_", False) and not issubclass(target, kinds):
+            return target
+    except (ConfigError, TypeError):  # which `_build` says, or a protocol with attributes
+        pass
+    return None
 
 
 def _is_nested(value: Any, hint: Any, own: bool) -> bool:
