@@ -157,6 +157,7 @@ TEXT = "pos=0 0 1,lookat=0 0 0"
         ([f"agentview,{TEXT}"], "camera agentview: the scene has a camera of this name"),
         (["agentveiw"], "unknown camera 'agentveiw'. Did you mean 'agentview'"),
         (["top,pos=0 0 1,lookat=0 0 1"], "camera top looks at the point where it is"),
+        (["top,pos=0 0 1e-300,lookat=0 0 0"], "camera top looks at the point where it is"),
         ([f"top,{TEXT},quat=1 0 0 0"], "camera top: give one of quat and lookat"),
         ([f"top,{TEXT},body=plate_2"], "unknown body of camera top 'plate_2'"),
         (["top,lookat=0 0 0"], "it has no pos; expected NAME,pos=X Y Z"),

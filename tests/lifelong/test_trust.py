@@ -127,6 +127,20 @@ def test_a_saved_policy_that_no_memory_holds_is_refused(changed):
         restore(changed(policy__embed_dim=1_000_000, policy__temporal__mlp_dim=1_000_000), device="cpu")
 
 
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"data": {"_target_": "lifelong.nn.GMMHead", "_partial_": True}}, "data builds a partial; expected"),
+    ({"algo": {"_target_": "lifelong.algorithms.ER",
+               "memory": {"_target_": "lifelong.nn.TemporalLSTM", "in_dim": 10**6, "hidden": 10**6}}},
+     "algo.memory builds a TemporalLSTM; expected a"),
+    ({"seed": "one"}, "seed is 'one'; expected a whole number"),
+])  # fmt: skip
+def test_a_part_of_another_kind_is_refused_before_it_is_built(run, changed, changes, message):
+    path = changed() / "config.yaml"
+    path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), **changes}))
+    with pytest.raises(ConfigError, match=message):
+        restore(run, device="cpu")
+
+
 def test_code_named_by_a_result_needs_permission(tmp_path, monkeypatch):
     result = argparse.Namespace(
         evaluated={}, policy="evil.part:make", tasks=[], unit_starts=1, environment={}, protocol={}
