@@ -101,11 +101,13 @@ class Configuration:
                 builds something else than it is for.
         """
         try:
-            built = _build(self._node(group), (group,), self.allowed, arguments)
-            kind = pkgutil.resolve_name(GROUPS[group])
-            is_strict = group in _STRICT or isinstance(built, partial) or _is_own(type(built))
-            if not isinstance(built, kind) and is_strict:
-                raise ConfigError(f"{group} builds a {type(built).__name__}; expected a {kind.__name__}")
+            node, kind = self._node(group), pkgutil.resolve_name(GROUPS[group])
+            found = _other_class(node, (kind,), self.allowed)
+            if found is None or not (group in _STRICT or _is_own(found)):
+                built = _build(node, (group,), self.allowed, arguments)
+                found = None if isinstance(built, kind) else type(built)
+            if found is not None and (group in _STRICT or found is partial or _is_own(found)):
+                raise ConfigError(f"{group} builds a {found.__name__}; expected a {kind.__name__}")
         except ConfigError as error:
             raise (ConfigError(f"{self.source}: {error}") if self.source else error) from error.__cause__
         return built
@@ -235,7 +237,7 @@ def _other_class(node: Mapping[str, Any], kinds: tuple[type, ...], allowed: Sequ
         target = find_target(node["_target_"], allowed)
         if isclass(target) and not node.get("_partial_", False) and not issubclass(target, kinds):
             return target
-    except (ConfigError, TypeError):  # which `_build` says, or a protocol with attributes
+    except (ConfigError, KeyError, TypeError):  # which `_build` says, or a protocol with attributes
         pass
     return None
 

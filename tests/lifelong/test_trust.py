@@ -129,6 +129,8 @@ def test_a_saved_policy_that_no_memory_holds_is_refused(changed):
 
 @pytest.mark.parametrize(("changes", "message"), [
     ({"data": {"_target_": "lifelong.nn.GMMHead", "_partial_": True}}, "data builds a partial; expected"),
+    ({"data": {"_target_": "lifelong.nn.TemporalLSTM", "in_dim": 10**6, "hidden": 10**6}},
+     "data builds a TemporalLSTM; expected a"),
     ({"algo": {"_target_": "lifelong.algorithms.ER",
                "memory": {"_target_": "lifelong.nn.TemporalLSTM", "in_dim": 10**6, "hidden": 10**6}}},
      "algo.memory builds a TemporalLSTM; expected a"),
