@@ -42,7 +42,7 @@ from lifelong.errors import PolicyError, ServerError
 from lifelong.evaluation.actors import PolicyActor
 from lifelong.evaluation.restore import LoadedRun
 from lifelong.results.provenance import installed_versions
-from lifelong.seeding import generator
+from lifelong.seeding import EVALUATION, generator
 
 SERVER, FORMAT = "libero-lifelong", 1  # the first entries of what is announced
 PREFIX = "observation/"
@@ -176,6 +176,11 @@ class ServedPolicy:
     def session(self) -> "Session":
         """Return the episodes of a new client."""
         return Session(self, next(self._sessions))
+
+    def beginning(self, task: Task, init_state: int) -> dict[str, Any]:
+        """Return the entries of a request with which an episode begins that has the random numbers of `libero eval`."""
+        words = [self.seed, EVALUATION, task.index, init_state]
+        return {"reset": True, "task": task.id, "prompt": task.language, "seed": words}
 
     def own_copy(self) -> LoadedRun:
         """Return the run with a policy that acts by itself; weights are shared where the algorithm changes none."""

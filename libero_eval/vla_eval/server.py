@@ -16,7 +16,6 @@ from libero_eval.servers.serving import PREFIX, ServedPolicy, Session
 from libero_eval.vla_eval.benchmark import require
 from lifelong.errors import PolicyError
 from lifelong.evaluation.restore import restore
-from lifelong.seeding import EVALUATION
 
 try:
     from vla_eval.model_servers.predict import PredictModelServer
@@ -50,7 +49,6 @@ class RunServer(PredictModelServer):
         require()
         super().__init__()
         self.served = ServedPolicy(restore(Path(run), after=after, device=device, allow=allow), seed=seed)
-        self.seed = seed
         self._sessions: dict[str, Session] = {}
         self._begins: dict[str, dict[str, Any]] = {}
 
@@ -90,13 +88,7 @@ class RunServer(PredictModelServer):
                 f"an episode has a task with suite, task_id and episode_idx; got {sorted(about) or 'nothing'}"
             )
         task: Task = get_suite(about["suite"]).tasks[int(about["task_id"])]
-        words = [self.seed, EVALUATION, task.index, int(about["episode_idx"])]
-        self._begins[ctx.session_id] = {
-            "reset": True,
-            "task": task.id,
-            "prompt": task.language,
-            "seed": words,
-        }
+        self._begins[ctx.session_id] = self.served.beginning(task, int(about["episode_idx"]))
         if ctx.session_id not in self._sessions:
             self._sessions[ctx.session_id] = self.served.session()
 

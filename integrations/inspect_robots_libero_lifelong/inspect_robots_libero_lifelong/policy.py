@@ -16,7 +16,6 @@ from libero_env.timing import CONTROL_HZ
 from libero_eval.servers.serving import PREFIX, ServedPolicy
 from lifelong.errors import PolicyError
 from lifelong.evaluation.restore import restore
-from lifelong.seeding import EVALUATION
 
 
 class RunPolicy(PolicyBase):
@@ -43,7 +42,8 @@ class RunPolicy(PolicyBase):
         allow: Sequence[str] = (),
     ):
         loaded = restore(Path(run), after=after, device=device, allow=allow)
-        self._session, self.seed = ServedPolicy(loaded, seed=seed).session(), seed
+        self._served = ServedPolicy(loaded, seed=seed)
+        self._session = self._served.session()
         spec = loaded.policy.spec
         self._images = spec.views
         self._state = {key: name for key, name in STATE.items() if name in spec.proprio}
@@ -69,8 +69,7 @@ class RunPolicy(PolicyBase):
         self._begin = {"reset": True, "prompt": scene.instruction}
         if {"task", "init_state"} <= set(scene.metadata):
             task = get_task(scene.metadata["task"])
-            words = [self.seed, EVALUATION, task.index, scene.metadata["init_state"]]
-            self._begin |= {"task": task.id, "seed": words}
+            self._begin = {**self._served.beginning(task, scene.metadata["init_state"]), **self._begin}
 
     def act(self, observation: Observation) -> ActionChunk:
         """Return the action of one step.
