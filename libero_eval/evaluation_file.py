@@ -9,8 +9,9 @@ import hashlib
 import json
 import shlex
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from itertools import compress
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -25,6 +26,7 @@ from lifelong.errors import EvaluationFileError, writing
 from lifelong.results.records import Count, Episodes
 from lifelong.results.subgoals import predicate_of
 from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
+from lifelong.stats.sequential import anytime_interval
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
@@ -89,6 +91,14 @@ class TaskResult(Episodes):
         first = parts[0]
         return cls(first.task, first.name, first.instruction, atoms=first.atoms, **rows)
 
+    def of_starts(self, starts: Collection[int]) -> "TaskResult":
+        """Return the results of the episodes from some of the starts."""
+        kept = [start in starts for start in self.init_states]
+        rows = ("init_states", "successes", "lengths", *self.OPTIONAL, *self.OF_ATOMS)
+        changes: dict[str, Any] = {name: tuple(compress(getattr(self, name), kept)) for name in rows}
+        errors = tuple(one for one in self.simulation_errors if one[0] in starts)
+        return replace(self, **changes, simulation_errors=errors)
+
     @property
     def starts(self) -> tuple[int, ...]:
         """Initial states of all episodes, also of those that do not count; these are the last."""
@@ -122,6 +132,21 @@ class TaskResult(Episodes):
 
 
 @dataclass(frozen=True)
+class Stopped:
+    """Until when an evaluation was to go on; what was not run by then is not counted.
+
+    Attributes:
+        until: What was to be known, `--until`.
+        verdict: `known` or `not known`, or `above` or `below` the other result, less the margin.
+        planned: Number of episodes without it.
+    """
+
+    until: str
+    verdict: str
+    planned: Annotated[int, Field(ge=1)]
+
+
+@dataclass(frozen=True)
 class EvaluationResult:
     """The result of an evaluation.
 
@@ -134,6 +159,7 @@ class EvaluationResult:
             the processes of an evaluation differ, a value is the list of the different ones.
         unit_starts: Number of episodes that were run in one batch; the bits of a policy may depend on it. None: all
             episodes of a task.
+        stopped: Until when it was to go on; None for all episodes.
         times: When and how long it was run; not part of `outcomes`.
 
     Raises:
@@ -147,6 +173,7 @@ class EvaluationResult:
     tasks: tuple[TaskResult, ...]
     environment: Mapping[str, Any] = field(default_factory=dict)
     unit_starts: Annotated[int, Field(ge=1)] | None = None
+    stopped: Stopped | None = None
     times: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
@@ -168,8 +195,24 @@ class EvaluationResult:
 
     @property
     def success(self) -> Estimate:
-        """Mean success over tasks; see `overall`."""
-        return overall(self.tasks)
+        """Mean success over tasks; see `overall`. Where it could be stopped, the interval is an always-valid one."""
+        if self.stopped is None:
+            return overall(self.tasks)
+        wins, count = (
+            sum(sum(task.successes) for task in self.tasks),
+            sum(len(t.successes) for t in self.tasks),
+        )
+        return replace(anytime_interval(wins, count), value=overall(self.tasks).value)
+
+    @property
+    def stop_note(self) -> str:
+        """After how many episodes it was stopped, and what was known, as text; empty where it could not be."""
+        if self.stopped is None:
+            return ""
+        count = sum(len(task.starts) for task in self.tasks)
+        return (
+            f"stopped after {count} of {self.stopped.planned}; {self.stopped.until}: {self.stopped.verdict}"
+        )
 
     @property
     def suites(self) -> dict[str, Estimate]:
@@ -245,6 +288,7 @@ class EvaluationResult:
             "protocol": dict(self.protocol),
             "init_states": self.init_states,
             "unit_starts": self.unit_starts,
+            "stopped": self.stopped and asdict(self.stopped),
             "versions": dict(self.versions),
             "environment": dict(self.environment),
             "outcomes": self.outcomes,
@@ -256,6 +300,15 @@ class EvaluationResult:
             "times": dict(self.times),
         }
         return json_safe(values)
+
+
+def by_start(tasks: Sequence[TaskResult]) -> dict[tuple[str, int], bool]:
+    """Return whether each episode succeeded, by task and initial state; those that do not count are left out."""
+    return {
+        (task.task, start): won
+        for task in tasks
+        for start, won in zip(task.init_states, task.successes, strict=True)
+    }
 
 
 def overall(results: Sequence[TaskResult]) -> Estimate:

@@ -29,6 +29,7 @@ from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import EvalRequest, Request
 from libero_eval.work.evaluation import Evaluation, iso_time
 from libero_eval.work.progress import Progress
+from libero_eval.work.stopping import StoppingRule
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError, ResultsError
 from lifelong.results.provenance import installed_versions, source_digest
@@ -73,7 +74,7 @@ def evaluate(
             f"here {here}), as the result will say; --again repeats them",
             file=sys.stderr,
         )
-    if len(done) == len(units):
+    if evaluation.starts_needed(done):
         count, when = 1, iso_time(max(one.finished for one in done.values()))
         print(f"note: {store.path}: finished {when}, nothing was run; --again repeats it", file=sys.stderr)
     try:
@@ -151,9 +152,13 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
     else:
         init_states = earlier.init_states
         check_same(earlier, evaluated=identity, protocol=protocol, versions=versions, despite=request.despite)
+    tasks = tuple(dict.fromkeys(tasks))
+    ids = [task.id for task in tasks]
+    until = StoppingRule.read(request.until, protocol, ids, init_states) if request.until else None
     return Evaluation(
         identity=identity,
-        tasks=tuple(dict.fromkeys(tasks)),
+        tasks=tasks,
+        until=until,
         init_states=init_states,
         protocol=protocol,
         out=request.out or policy.out,
@@ -353,6 +358,7 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
         perturb=None,
         event=(),
         size=None,
+        until=None,
         out=request.out or (path if path.is_dir() else path.parent) / "again",
     )
 

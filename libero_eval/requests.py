@@ -133,11 +133,14 @@ class EvalRequest(Request):
         perturb: Perturbations, such as camera=0.3,light=0.5, see `libero perturb list` (default: the protocol's, none).
         event: Perturbations that begin during an episode, KIND=SEVERITY@TRIGGER, such as camera=0.5@lifted; triggers:
             step40, 25%, touched, lifted, over_goal.
+        until: Stop as soon as this is known: width=0.05, the mean success within an interval of this width; or
+            against=RESULT,margin=0.05, whether it is above or below that of a result less a margin (default: never).
         despite: Of a result that is run again: what may differ from then, such as mujoco (default: nothing).
     """
 
     perturb: str | None = None
     event: tuple[str, ...] = ()
+    until: str | None = None
     despite: tuple[str, ...] = ()
 
 

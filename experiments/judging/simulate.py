@@ -19,10 +19,10 @@ from lifelong.stats.episodes import (
     bootstrap_starts,
     mcnemar_exact,
     score_interval,
-    sequential_test,
     sign_flip_test,
 )
-from lifelong.stats.intervals import holm
+from lifelong.stats.intervals import holm, wilson_interval
+from lifelong.stats.sequential import anytime_interval, log_evidence, rounds, sequential_test
 
 TASKS = 10
 
@@ -156,6 +156,71 @@ def coverage(rng, simulations: int) -> None:
         )
 
 
+def stopping(rng, simulations: int) -> None:
+    """Stop after the round in which an interval is narrow enough, of at most 50 starts of ten tasks."""
+    print(
+        "\n| | | always-valid | | Wilson's, looked at after each round | | |\n|---|---:|---:|---:|---:|---:|---:|"
+    )
+    print(
+        "| success | width | covers at the stop | episodes of 500 | covers at the stop | at every look | episodes |"
+    )
+    counts = TASKS * np.arange(1, 51)
+    for name, rate, spread in (("99 %", 0.99, 1e6), ("95 %", 0.95, 1e6), ("90 %, tasks differ", 0.9, 2)):
+        for width in (0.05, 0.1, 0.2):
+            found = np.zeros((2, 3))  # of each interval
+            for _ in range(simulations):
+                rates = rng.beta(rate * spread, (1 - rate) * spread, size=TASKS)
+                won = (rng.random((50, TASKS)) < rates).sum(1).cumsum()
+                for k, (low, high) in enumerate((anytime(won), wilson_interval(won, counts))):
+                    covers, narrow = (low <= rates.mean()) & (rates.mean() <= high), high - low < width
+                    at = int(narrow.argmax()) if narrow.any() else 49
+                    found[k] += (covers[at], covers.all(), counts[at])
+            (stop, _, count), (wilson, every, short) = found / simulations
+            cells = (
+                f"{100 * stop:.1f} % | {count:.0f} | {100 * wilson:.1f} % | {100 * every:.0f} % | {short:.0f}"
+            )
+            print(f"| {name} | {width} | {cells} |")
+
+
+@cache
+def sequence(won: int, episodes: int):
+    return anytime_interval(won, episodes)
+
+
+def anytime(won):
+    ends = [sequence(int(w), TASKS * k) for k, w in enumerate(won, 1)]
+    return np.array([e.low for e in ends]), np.array([e.high for e in ends])
+
+
+def decisions(rng, simulations: int) -> None:
+    """Stop when a policy is known to be above or below another one, less a margin."""
+    print("\n| other | difference | margin | above | below | pairs of 500 |\n|---|---|---|---|---|---|")
+    for rate, gap, margin in (
+        (0.9, 0.0, 0.0),
+        (0.9, 0.05, 0.0),
+        (0.9, 0.1, 0.0),
+        (0.9, -0.05, 0.05),
+        (0.9, 0.0, 0.05),
+        (0.9, -0.1, 0.05),
+    ):
+        found = np.zeros(3)
+        for _ in range(simulations):
+            pairs = evaluate(rng, rate=rate, spread=2, gap=gap)
+            order = rounds(pairs)
+            d = (pairs.first[order, 0].astype(int) - pairs.second[order, 0]).reshape(-1, TASKS)
+            won, lost = (d > 0).sum(1).cumsum(), (d < 0).sum(1).cumsum()
+            counts = TASKS * np.arange(1, len(d) + 1)
+            known = log_evidence(won, lost, counts - won - lost, margin) >= np.log(20)
+            at = int(known.argmax()) if known.any() else len(d) - 1
+            above = won[at] - lost[at] > -margin * counts[at]
+            found += (known.any() and above, known.any() and not above, counts[at])
+        above, below, count = found / simulations
+        print(
+            f"| {100 * rate:.0f} % | {100 * gap:+.0f} points | {margin} | {100 * above:.1f} % | {100 * below:.1f} % | "
+            f"{count:.0f} |"
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--simulations", type=int, default=4000)
@@ -166,6 +231,8 @@ def main() -> None:
     families(rng, args.simulations)
     several_runs(rng, args.simulations // 4)
     coverage(rng, args.simulations)
+    stopping(rng, args.simulations)
+    decisions(rng, args.simulations // 4)
 
 
 if __name__ == "__main__":

@@ -48,13 +48,17 @@ def evaluate(options: EvalOptions) -> Answer:
         print(*heads, table_row(result), sep="\n", flush=True)
         heads.clear()
 
-    result = run(options, evaluation, on_task=print_row, on_progress=_print_progress)
+    early = evaluation.until is not None  # rows are known at the end only
+    on_task = (lambda _: None) if early else print_row
+    result = run(options, evaluation, on_task=on_task, on_progress=_print_progress)
+    for task in result.tasks if early else ():
+        print_row(task)
     for name in ("renderer", "instruction_set"):
         if isinstance(values := result.environment.get(name), list):
             listed = ", ".join(map(str, values))
             print(f"the processes differ in {name} ({listed}): bits may too", file=sys.stderr)
     file = evaluation.out / FILE_NAME
-    print(*total_rows(result.tasks), file, sep="\n")
+    print(*total_rows(result), file, sep="\n")
     data = {
         "success": result.success,
         "suites": result.suites,

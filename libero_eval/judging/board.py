@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from libero_env.text import text_table
-from libero_eval.evaluation_file import again
-from libero_eval.judging.comparability import Group, check_comparable, outcomes, starts_text
+from libero_eval.evaluation_file import again, by_start
+from libero_eval.judging.comparability import Group, check_comparable, starts_text
 from libero_eval.judging.evaluation_page import facts
 from libero_eval.judging.page import interval_text, p_text
 from lifelong.errors import ComparisonError
@@ -90,7 +90,7 @@ def make_board(entries: Sequence[Group], allow: Iterable[str] = (), alpha: float
     notes = check_comparable(entries, allow)
     groups = _joined(entries)
     notes += _check_starts(groups, STARTS in allow)
-    tables = [outcomes(group.results[0]) for group in groups]
+    tables = [by_start(group.results[0].tasks) for group in groups]
     keys = sorted(set.intersection(*map(set, tables)))
     if not keys:
         raise ComparisonError(f"no episode is common to {', '.join(group.label for group in groups)}")

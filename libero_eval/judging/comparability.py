@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.text import flatten, plain, shorten
-from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.evaluation_file import EvaluationResult, by_start
 from lifelong.errors import ComparisonError
 from lifelong.report.comparison import check_same_back_end
 from lifelong.stats.episodes import Pairs
@@ -108,7 +108,7 @@ def match(first: Group, second: Group) -> Matched:
     Raises:
         ComparisonError: They have no start in common.
     """
-    tables = [[outcomes(r) for r in group.results] for group in (first, second)]
+    tables = [[by_start(r.tasks) for r in group.results] for group in (first, second)]
     shared = set.intersection(*(set(t) for group in tables for t in group))
     if not shared:
         raise ComparisonError(
@@ -134,15 +134,6 @@ def same_policy(first: EvaluationResult, second: EvaluationResult) -> bool:
     other = ("seed", *(("run", "after") if known else ()))
     a, b = ({k: v for k, v in r.evaluated.items() if k not in other} for r in (first, second))
     return a == b
-
-
-def outcomes(result: EvaluationResult) -> dict[tuple[str, int], bool]:
-    """Return whether each episode succeeded, by task and initial state; those that do not count are left out."""
-    return {
-        (task.task, start): won
-        for task in result.tasks
-        for start, won in zip(task.init_states, task.successes, strict=True)
-    }
 
 
 def _lesser_differences(first: EvaluationResult, second: EvaluationResult) -> dict[str, tuple[Any, Any]]:

@@ -22,16 +22,10 @@ from libero_eval.judging.comparability import (
 from libero_eval.judging.group_scores import GroupScores, group_scores
 from lifelong.errors import ConfigError, writing
 from lifelong.results.failures import count_causes
-from lifelong.stats.episodes import (
-    ALPHA,
-    Difference,
-    SequentialTest,
-    difference,
-    score_interval,
-    sequential_test,
-)
+from lifelong.stats.episodes import ALPHA, Difference, difference, score_interval
 from lifelong.stats.intervals import Estimate, holm, wilson_interval
 from lifelong.stats.power import Question, shown_difference
+from lifelong.stats.sequential import SequentialTest, sequential_test
 
 FORMAT = "libero-comparison/1"
 
@@ -201,6 +195,12 @@ def compare_groups(
         for result in group.results
         for task in result.tasks
         if task.error_note
+    ]
+    notes += [
+        f"{group.label}: {result.stop_note}; of what follows only the sequential test allows for that"
+        for group in groups
+        for result in group.results
+        if result.stopped
     ]
     rivals: list[tuple[Group, Group]] = []
     controls = [control] if control else []

@@ -28,8 +28,12 @@ def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
         "evaluation.html",
         title=f"{name_of(result)} on {', '.join(suites)}",
         facts=facts(result),
-        notes=[f"{task.task}: {task.error_note}" for task in result.tasks if task.error_note],
-        means=[_row(name, tasks) for name, tasks in means.items()],
+        notes=[f"{task.task}: {task.error_note}" for task in result.tasks if task.error_note]
+        + ([f"{result.stop_note}. The interval of the mean is always valid."] if result.stopped else []),
+        means=[
+            _row(name, tasks) | ({"success": result.success} if tasks is result.tasks else {})
+            for name, tasks in means.items()
+        ],
         tasks=[_row(task.task, [task], task.instruction) for task in result.tasks],
         media=media(folder / "videos", "*_failure.*"),
         command=again(result, os.path.relpath(folder / FILE_NAME)),

@@ -15,8 +15,9 @@ from libero_eval.judging.comparison import Comparison, Contrast, Gate, Row
 from libero_eval.judging.group_scores import Profile
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below, shorten
 from lifelong.report.tables import save_page
-from lifelong.stats.episodes import Difference, SequentialTest
+from lifelong.stats.episodes import Difference
 from lifelong.stats.intervals import Estimate
+from lifelong.stats.sequential import SequentialTest
 
 WORST = 5  # tasks in the table of a terminal
 MOST_ROWS = 60  # of a forest plot

@@ -10,16 +10,18 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
 from libero_env.errors import LiberoError
 from libero_env.tasks import Task
 from libero_env.text import json_safe
-from libero_eval.evaluation_file import EvaluationResult, TaskResult
+from libero_eval.evaluation_file import EvaluationResult, Stopped, TaskResult
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.work.claims import LEASE
 from libero_eval.work.progress import busy_seconds
+from libero_eval.work.stopping import StoppingRule
 from libero_eval.work.store import PLAN_FORMAT, Unit, UnitResult, WorkStore, describe, partition, this_process
 from lifelong.errors import ConfigError, EvaluationIncompleteError
 from lifelong.evaluation.actors import Actor, WatchesWorld
@@ -55,6 +57,7 @@ class Evaluation:
         policy_threads: Number of threads of the policy on the CPU, on which its bits depend; None where the policy is
             not one of this package, or runs elsewhere. Whoever runs the evaluation sets it.
         lease: Time after which a unit of a silent process is given to another, [s].
+        until: When it may stop before all episodes are run.
     """
 
     identity: Mapping[str, Any]
@@ -74,11 +77,20 @@ class Evaluation:
     probe: Sequence[float] | None = None
     policy_threads: int | None = None
     lease: float = LEASE
+    until: StoppingRule | None = None
 
     @cached_property
     def units(self) -> tuple[Unit, ...]:
         """Units in order."""
         return partition(self.tasks, self.init_states, self.unit_starts)
+
+    @cached_property
+    def _rounds(self) -> list[tuple[Unit, ...]]:
+        """Units with the same starts of all tasks."""
+        parts: dict[str, list[Unit]] = {}
+        for unit in self.units:
+            parts.setdefault(unit.task.id, []).append(unit)
+        return list(zip(*parts.values(), strict=True))
 
     @cached_property
     def store(self) -> WorkStore:
@@ -165,34 +177,60 @@ class Evaluation:
             return None
         return TaskResult.joined([done[name].result for name in names])
 
+    def starts_needed(self, done: Mapping[str, UnitResult]) -> tuple[int, ...] | None:
+        """Return the starts that the result is of; None where more units have to be run.
+
+        The rule that may stop it sees the starts that all tasks have been run from, whatever else is done.
+        """
+        rounds = list(takewhile(lambda units: all(unit.name in done for unit in units), self._rounds))
+        known = tuple(start for units in rounds for start in units[0].init_states)
+        if self.until is not None and known:
+            tasks = [
+                TaskResult.joined([done[unit.name].result for unit in units])
+                for units in zip(*rounds, strict=True)
+            ]
+            if count := self.until.starts_needed(tasks, known):
+                return known[:count]
+        return known if len(known) == len(self.init_states) else None
+
     def result(self, done: Mapping[str, UnitResult]) -> EvaluationResult:
         """Return the results of all tasks with all that they depend on; it depends on the units' files only.
 
         Args:
-            done: Results of all units by name.
+            done: Results of the units that are done by name.
 
         Raises:
             ConfigError: A unit is missing.
             EvaluationIncompleteError: Simulation errors ended all episodes of a task.
         """
-        tasks = [self.task_result(task, done) for task in self.tasks]
-        units = [done[unit.name] for unit in self.units if unit.name in done]
-        if len(units) != len(self.units):
-            raise ConfigError(f"{len(units)} of {len(self.units)} units are done: there is no result yet")
-        if lost := next((task for task in tasks if task is not None and not task.init_states), None):
+        starts = self.starts_needed(done)
+        if starts is None:
+            raise ConfigError(f"{len(done)} of {len(self.units)} units are done: there is no result yet")
+        rounds = [units for units in self._rounds if units[0].init_states[0] in starts]
+        units = {unit.name: done[unit.name] for part in rounds for unit in part}
+        tasks = [
+            TaskResult.joined([units[unit.name].result for unit in part]).of_starts(starts)
+            for part in zip(*rounds, strict=True)
+        ]
+        if lost := next((task for task in tasks if not task.init_states), None):
             raise EvaluationIncompleteError(
                 f"simulation errors ended all episodes of {lost.task}, which has no success: "
                 f"{lost.simulation_errors[0][1]}"
             )
+        stopped = None
+        if self.until is not None:
+            planned = len(self.tasks) * len(self.init_states)
+            stopped = Stopped(self.until.text, self.until.verdict(tasks, starts), planned)
         return EvaluationResult(
             evaluated=self.identity,
             protocol=self._resolved_protocol,
-            init_states=self.init_states,
-            versions=common_environment([one.versions for one in units]),
-            environment=common_environment([one.environment for one in units]),
+            init_states=starts,
+            versions=common_environment([one.versions for one in units.values()]),
+            environment=common_environment([one.environment for one in units.values()]),
             unit_starts=self.unit_starts,
-            tasks=tuple(task for task in tasks if task is not None),
-            times=self._times(done),
+            stopped=stopped,
+            tasks=tuple(tasks),
+            times=self._times(units),
         )
 
     def _run(self, unit: Unit, env: VectorEnv, label: str = "") -> Rollouts:
@@ -232,7 +270,7 @@ class Evaluation:
         return UnitResult(result, environment, versions, this_process(), started, time.time())
 
     def _times(self, done: Mapping[str, UnitResult]) -> dict[str, Any]:
-        spans = {unit: done[unit.name] for unit in self.units}
+        spans = {unit: done[unit.name] for unit in self.units if unit.name in done}
         results = spans.values()
         return {
             "started": iso_time(min(r.started for r in results)),

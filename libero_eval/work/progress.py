@@ -1,13 +1,13 @@
 """How far an evaluation is that several processes share, and its results as lines of a table."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from libero_env.tasks.published import parse_plus_id
 from libero_env.text import duration, shorten
-from libero_eval.evaluation_file import FILE_NAME, TaskResult, overall
+from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, overall
 from libero_eval.work.store import UnitResult, WorkStore, read_plan, read_unit
 from lifelong.results.failures import causes_text
 from lifelong.stats.intervals import Estimate
@@ -128,14 +128,15 @@ def table_row(result: TaskResult) -> str:
     return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}{note}"
 
 
-def total_rows(results: Sequence[TaskResult]) -> list[str]:
+def total_rows(result: EvaluationResult) -> list[str]:
     """Format the rows of each suite and of each kind of LIBERO-Plus, where there are several, and of all together."""
+    results = result.tasks
     suites: dict[str, list[TaskResult]] = {}
     kinds: dict[str, list[TaskResult]] = {}
-    for result in results:
-        suites.setdefault(suite := result.suite, []).append(result)
+    for task in results:
+        suites.setdefault(suite := task.suite, []).append(task)
         if suite.startswith(PLUS):
-            kinds.setdefault(f"  {parse_plus_id(result.name).kind}", []).append(result)
+            kinds.setdefault(f"  {parse_plus_id(task.name).kind}", []).append(task)
     rows = {**(suites if len(suites) > 1 else {}), **(kinds if len(kinds) > 1 else {})}
     lines = []
     for name, tasks in {**rows, "mean over tasks": results}.items():
@@ -144,7 +145,9 @@ def total_rows(results: Sequence[TaskResult]) -> list[str]:
         note = (
             f"  ({failed} of {episodes + failed} ended by a simulation error, not counted)" if failed else ""
         )
-        lines.append(f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(overall(tasks))}{note}")
+        note += f"  ({result.stop_note})" if tasks is results and result.stopped else ""
+        success = result.success if tasks is results else overall(tasks)
+        lines.append(f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(success)}{note}")
     causes = causes_text(results)
     return [*lines, f"failed because     {causes}"] if causes else lines
 

@@ -79,7 +79,7 @@ class Worker:
         if done := self._look():  # somebody has begun
             self._say(done)
         with evaluation.pool() as self._pool:
-            while len(done := self._look()) < len(evaluation.units):
+            while evaluation.starts_needed(done := self._look()) is None:
                 self._on_wait(len(done))
                 errors, held = self._errors(), set(store.claims.held())
                 choice = self._order(done, errors, held)
@@ -124,7 +124,10 @@ class Worker:
         def preference(unit: Unit) -> tuple:
             task = unit.task.id
             tried, others = self._tries(unit, errors) > 0, task in busy
-            return tried, task != self._task, others, -counts[task] if others else 0
+            turn = (
+                unit.init_states[0] if self._evaluation.until else 0
+            )  # rounds over all tasks, to stop after one
+            return tried, turn, task != self._task, others, -counts[task] if others else 0
 
         return sorted(left, key=preference)
 

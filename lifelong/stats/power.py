@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 from lifelong.errors import ConfigError
-from lifelong.stats.episodes import log_evidence
+from lifelong.stats.sequential import log_evidence
 
 MOST = 2_000_000  # episodes of each policy
 

@@ -363,7 +363,7 @@ def test_an_episode_that_a_simulation_error_ended_is_told_and_is_no_failure(tmp_
         assert task.simulation_errors == ((9, "it has diverged"),) and task.errors == ()
         assert replace(task, simulation_errors=()) == other and task.success.value == 2 / 3
         assert table_row(task).endswith("(1 of 4 ended by a simulation error, not counted)")
-    assert total_rows(result.tasks)[0].endswith("(2 of 8 ended by a simulation error, not counted)")
+    assert total_rows(result)[0].endswith("(2 of 8 ended by a simulation error, not counted)")
     assert result.outcomes != without.outcomes and EvaluationResult.read(tmp_path / "it") == result
     kept = evaluate(tmp_path / "it", env=None, **changes)  # nothing is run again
     assert kept == result and not (tmp_path / "it" / "errors").exists()

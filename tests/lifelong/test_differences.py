@@ -16,11 +16,8 @@ from lifelong.stats.episodes import (
     bootstrap_tasks,
     chance_difference,
     difference,
-    log_evidence,
     mcnemar_exact,
-    rounds,
     score_interval,
-    sequential_test,
     sign_flip_test,
 )
 from lifelong.stats.power import (
@@ -32,6 +29,7 @@ from lifelong.stats.power import (
     shown_difference,
     unpaired_episodes,
 )
+from lifelong.stats.sequential import log_evidence, rounds, sequential_test
 
 
 def pairs(first, second, tasks: int = 1) -> Pairs:
