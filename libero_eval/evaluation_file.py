@@ -30,7 +30,13 @@ from lifelong.stats.sequential import anytime_interval
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
-UNMEASURED = ("actions", "limits_reached", "failures", "began")  # columns that are not part of `outcomes`
+UNMEASURED = (
+    "actions",
+    "limits_reached",
+    "failures",
+    "costs",
+    "began",
+)  # columns that are not part of `outcomes`
 
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
 _Id = Annotated[

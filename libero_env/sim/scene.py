@@ -276,8 +276,8 @@ def _compile_scene(
 def _check_sites(scene: Scene) -> None:
     """Check that a region in an atom, which has no rectangle, is a site of its target's model."""
     problem, model = scene.problem, scene.model
-    for atom in (*problem.init, *problem.goal.atoms()):
-        for region in filter(None, map(problem.region, atom.args)):
+    for args in (*(atom.args for atom in (*problem.init, *problem.goal.atoms())), problem.zones):
+        for region in filter(None, map(problem.region, args)):
             if region.ranges or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, region.address) >= 0:
                 continue
             prefix = f"{region.target}_"

@@ -1,23 +1,27 @@
-"""What the whole state shows of episodes: touched, lifted, dropped, hit. It reads; nothing that it does moves a bit.
+"""What the whole state shows of episodes: touched, lifted, dropped, hit, costs. It reads, and moves no bit.
 
 It looks at the end of each control step. What happens in between, such as a short blow, is not seen.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
 from libero_env.assets.robot import FINGER_JOINTS
+from libero_env.geometry import quat_rotate
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.causes import HARD, Failure, Missing, Trace, explain
-from libero_env.sim.predicates import PREDICATES, contains, is_over, region_boxes, region_of
+from libero_env.sim.costs import LIMITS, Costs
+from libero_env.sim.predicates import PREDICATES, contains, ground, is_over, region_boxes, region_of
 from libero_env.sim.scene import ROBOT
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
+from libero_env.timing import TIMESTEP
 
 LIFTED = 0.02  # [m] above the height at the start
 OVER = 0.30  # [m] above its place, an object is over it
+_CONJUGATE = (1.0, -1.0, -1.0, -1.0)  # of a quaternion, wxyz
 _MOVED = 0.02  # [rad] or [m] that a joint of a fixture was moved
 _LEFT, _RIGHT, _HAND, _ARM = "left finger", "right finger", "hand", "arm"
 
@@ -31,13 +35,14 @@ class EpisodeWatch:
 
     Attributes:
         traces: What the present episode of each simulation has shown.
+        costs: What it has cost.
         wanted: Objects and fixtures that the goal is about.
     """
 
     def __init__(self, views: Sequence[StateView], atoms: Sequence[Atom]):
         self.views, self._scene, self.atoms = views, views[0].scene, tuple(atoms)
         scene, model = self._scene, self._scene.model
-        self._names = [*scene.bodies, _LEFT, _RIGHT, _HAND, _ARM]
+        self._names, self._first = [*scene.bodies, _LEFT, _RIGHT, _HAND, _ARM], len(scene.bodies)
         self._codes = np.zeros(model.nbody, np.int64)  # of each body, the index of its name
         for code, bodies in enumerate(scene.bodies.values()):
             self._codes[bodies] = code
@@ -51,7 +56,16 @@ class EpisodeWatch:
         self._owned = {j: name for name in scene.entities for j in scene.joints[name]}
         self._joints = model.jnt_qposadr[list(self._owned)]
         self._scratch: mujoco.MjData | None = None
-        self.traces = [Trace() for _ in views]
+        goal = ground(scene.problem.goal, scene)
+        self._named = {scene.owner(name) for atom in goal.atoms() for name in atom.args}
+        self._idle = [name for name in scene.objects if name not in self._named]
+        addresses = [scene.pose_address(name) for name in self._idle]
+        self._poses = np.reshape(addresses, (-1, 1)).astype(int) + np.arange(7)
+        self._free = np.array([name not in self._named for name in self._owned.values()], bool)
+        self._slides = model.jnt_type[list(self._owned)] == mujoco.mjtJoint.mjJNT_SLIDE
+        self._stood = np.zeros((len(views), len(self._idle), 3))
+        self._uprights = np.zeros_like(self._stood)  # the vertical at the start, in their frames
+        self.traces, self.costs = [Trace() for _ in views], [Costs() for _ in views]
         self._heights: list[dict[str, float]] = [{} for _ in views]
         self._rest = np.zeros((len(views), len(self._joints)))
         self._widths = np.zeros(len(views))
@@ -63,21 +77,25 @@ class EpisodeWatch:
         view = self.views[i]
         self.traces[i] = Trace()
         self._heights[i] = {name: float(view.body_pos(name)[2]) for name in self._scene.objects}
-        self._rest[i] = view.simulations.fields["qpos"][i, self._joints]
+        qpos = view.simulations.fields["qpos"][i]
+        poses, self._rest[i] = qpos[self._poses], qpos[self._joints]
+        vertical = np.tile([0.0, 0.0, 1.0], (len(poses), 1))
+        self._stood[i], self._uprights[i] = poses[:, :3], quat_rotate(poses[:, 3:] * _CONJUGATE, vertical)
+        self.costs[i] = Costs(zone=0.0 if self._scene.problem.zones else None)
 
     def look(self, i: int) -> Trace:
         """Take note of the present state of simulation i, after a control step, and return its trace."""
         trace, view = self.traces[i], self.views[i]
         trace.steps += 1
-        touching = self._touching(view.simulations.contact_geoms(i))
+        pairs = self._pairs(view.simulations.contact_geoms(i))
+        touching = self._touching(pairs)
         trace.touching = {b for a, b in touching if a in (_LEFT, _RIGHT, _HAND)}
         trace.touched |= trace.touching
         width = float(np.abs(view.finger_pos).sum())
         if trace.in_hand is not None and not touching & {(_LEFT, trace.in_hand), (_RIGHT, trace.in_hand)}:
             if trace.in_hand in trace.lifted:
-                trace.slipped[trace.in_hand] = width < float(
-                    self._widths[i]
-                )  # closed, for nothing is between
+                # closed, for nothing is between
+                trace.slipped[trace.in_hand] = width < float(self._widths[i])
             trace.in_hand = None
         for name in self._scene.objects:
             if {(_LEFT, name), (_RIGHT, name)} <= touching:
@@ -85,8 +103,13 @@ class EpisodeWatch:
                 if view.body_pos(name)[2] > self._heights[i][name] + LIFTED:
                     trace.lifted[name] = None
                     trace.slipped.pop(name, None)
-        if any(b not in self._scene.objects or a in (_HAND, _ARM) for a, b in touching):
-            trace.impacts += [(trace.steps, what, force) for what, force in self._blows(i)]
+        hits = any(b not in self._scene.objects or a in (_HAND, _ARM) for a, b in touching)
+        needless: dict[str, float] = {}
+        if hits or not trace.touching.isdisjoint(self._idle) or self._bears(pairs, trace.in_hand):
+            pressed, needless = self._forces(i, trace.in_hand)
+        if hits:
+            trace.impacts += [(trace.steps, what, force) for what, force in pressed.items() if force >= HARD]
+        self._add_costs(i, needless)
         return trace
 
     def failure(self, i: int, ever: Sequence[bool], now: Sequence[bool]) -> Failure:
@@ -110,27 +133,98 @@ class EpisodeWatch:
         instead = tuple(str(atom) for atom in self._possible(handled) if _holds(view, atom))
         return Failure(found.cause, found.of, found.what, round(found.newtons, 1), handled, instead)
 
-    def _touching(self, geoms: np.ndarray) -> set[tuple[str, str]]:
-        """Return the parts of the robot that touch something else, with what."""
-        pairs = self._codes[self._scene.model.geom_bodyid[geoms]].reshape(-1, 2)
-        robot = pairs >= len(self._names) - 4
-        pairs = pairs[robot.any(axis=1) & ~robot.all(axis=1)]
-        ordered = np.sort(pairs, axis=1)[:, ::-1]  # names of the robot's parts are last
-        return {(self._names[a], self._names[b]) for a, b in set(map(tuple, ordered.tolist()))}
+    def _pairs(self, geoms: np.ndarray) -> np.ndarray:
+        """Return the indices of the names of what touches each other, (n, 2), parts of the robot last."""
+        return np.sort(self._codes[self._scene.model.geom_bodyid[geoms]].reshape(-1, 2), axis=1)
 
-    def _blows(self, i: int) -> Iterator[tuple[str, float]]:
-        """Yield what the robot hits, with the sum of the normal forces: of a solver that runs on a copy."""
-        simulations, total = self.views[i].simulations, dict[str, float]()
+    def _touching(self, pairs: np.ndarray) -> set[tuple[str, str]]:
+        """Return the parts of the robot that touch something else, with what."""
+        robot = pairs >= self._first
+        pairs = pairs[robot[:, 1] & ~robot[:, 0]]
+        return {(self._names[a], self._names[b]) for b, a in set(map(tuple, pairs.tolist()))}
+
+    def _bears(self, pairs: np.ndarray, held: str | None) -> bool:
+        """Return whether what the robot holds touches something other than the robot."""
+        if held is None:
+            return False
+        code = self._names.index(held)
+        return bool(((pairs == code).any(axis=1) & (pairs[:, 1] < self._first)).any())
+
+    def _forces(self, i: int, held: str | None) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the sums of the normal forces on what the robot touches: all of them, and those that nothing needs.
+
+        Fingers may press what the goal is about. What the robot holds counts as a part of it in the second. The forces
+        are those of a solver that runs on a copy.
+        """
+        simulations = self.views[i].simulations
         model, force = simulations.model, np.zeros(6)
+        pressed: dict[str, float] = {}
+        needless: dict[str, float] = {}
         simulations.pose_fixtures(i)
-        self._scratch = self._scratch or mujoco.MjData(model)
-        mujoco.mj_copyData(self._scratch, model, simulations.data(i))
-        mujoco.mj_forward(model, self._scratch)
-        for k in range(self._scratch.ncon):
-            for _, what in self._touching(self._scratch.contact.geom[k]):
-                mujoco.mj_contactForce(model, self._scratch, k, force)
-                total[what] = total.get(what, 0.0) + abs(float(force[0]))
-        yield from ((what, newtons) for what, newtons in total.items() if newtons >= HARD)
+        self._scratch = data = self._scratch or mujoco.MjData(model)
+        mujoco.mj_copyData(data, model, simulations.data(i))
+        mujoco.mj_forward(model, data)
+        for k, (a, b) in enumerate(self._pairs(data.contact.geom[: data.ncon]).tolist()):
+            what, other, by_robot = self._names[a], self._names[b], b >= self._first
+            if a >= self._first or not (by_robot or held in (what, other)):
+                continue
+            mujoco.mj_contactForce(model, data, k, force)
+            newtons = abs(float(force[0]))
+            if by_robot:
+                pressed[what] = pressed.get(what, 0.0) + newtons
+                if other in (_LEFT, _RIGHT) and what in self._named:
+                    continue
+            elif what == held:
+                what = other
+            needless[what] = needless.get(what, 0.0) + newtons
+        return pressed, needless
+
+    def _add_costs(self, i: int, needless: Mapping[str, float]) -> None:
+        """Add the present state to the costs of an episode.
+
+        Args:
+            i: Index of the simulation.
+            needless: Normal force of the robot, or what it holds, on what it touches and need not.
+        """
+        cost, qpos = self.costs[i], self.views[i].simulations.fields["qpos"][i]
+        poses, moved = qpos[self._poses], np.abs(qpos[self._joints] - self._rest[i])
+        heights = quat_rotate(poses[:, 3:], self._uprights[i])[:, 2]
+        slid, turned = np.where(self._slides, moved, 0.0), np.where(self._slides, 0.0, moved)
+        shifts = [*np.linalg.norm(poses[:, :3] - self._stood[i], axis=1), *slid[self._free]]
+        tilts = np.degrees([*np.arccos(np.clip(heights, -1.0, 1.0)), *turned[self._free]])
+        names = [*self._idle, *(n for n, free in zip(self._owned.values(), self._free, strict=True) if free)]
+        beyond = [
+            name
+            for name, shift, tilt in zip(names, shifts, tilts, strict=True)
+            if shift > LIMITS["shift"] or tilt > LIMITS["tilt"]
+        ]
+        force = max((needless.get(name, 0.0) for name in self._idle), default=0.0)
+        press = max(
+            (newtons for name, newtons in needless.items() if name not in self._scene.objects), default=0.0
+        )
+        zone = cost.zone
+        if zone is not None and self._is_in_zone(i):
+            zone = round(zone + TIMESTEP * self.views[i].simulations.substeps, 3)
+        self.costs[i] = Costs(
+            force=max(cost.force, round(force, 1)),
+            shift=max(cost.shift, round(float(max(shifts, default=0.0)), 4)),
+            tilt=max(cost.tilt, round(float(max(tilts, default=0.0)), 1)),
+            hits=cost.hits + (press >= HARD),
+            press=max(cost.press, round(press, 1)),
+            zone=zone,
+            moved=tuple(dict.fromkeys([*cost.moved, *beyond])),
+        )
+
+    def _is_in_zone(self, i: int) -> bool:
+        """Return whether a part of the robot, or what it holds, is in or over a zone."""
+        view, held = self.views[i], self.traces[i].in_hand
+        points = [*view.simulations.fields["xpos"][i, self._scene.bodies[ROBOT]], view.eef_pos]
+        points += [view.body_pos(held)] if held else []
+        return any(
+            (contains(box, np.array(points)) | is_over(box, np.array(points), OVER)).any()
+            for zone in self._scene.problem.zones
+            for box in region_boxes(view, zone)
+        )
 
     def _place(self, i: int, name: str) -> str:
         """Return what an object touches, rather something on the workspace than that; empty if nothing."""

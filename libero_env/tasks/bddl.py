@@ -2,9 +2,9 @@
 
 The dialect is the original LIBERO's: `(define (problem NAME) (:domain ...) (:language ...) (:regions ...)
 (:fixtures ...) (:objects ...) (:obj_of_interest ...) (:scene_properties ...) (:init ...) (:goal ...))`, with
-`;` comments. In `(:views ...)`, which the original does not have, each list is the text of a `Camera`. `:requirements`
-is ignored. Goals may nest and, or, not and forall. Numbers may be arithmetic with `pi`; nothing in a file is ever
-executed.
+`;` comments. The original has neither `(:views ...)`, in which each list is the text of a `Camera`, nor `(:zones ...)`,
+which names regions. `:requirements` is ignored. Goals may nest and, or, not and forall. Numbers may be arithmetic with
+`pi`; nothing in a file is ever executed.
 """
 
 import re
@@ -30,6 +30,7 @@ SECTIONS = (
     ":obj_of_interest",
     ":scene_properties",
     ":views",
+    ":zones",
     ":init",
     ":goal",
 )
@@ -123,6 +124,8 @@ def write(problem: Problem) -> str:
         )
     if problem.cameras:
         sections.append(_block(":views", [f"({camera})" for camera in problem.cameras]))
+    if problem.zones:
+        sections.append(_block(":zones", problem.zones))
     sections += [
         _block(":init", map(str, problem.init)),
         _block(":goal", [str(problem.goal)]),
@@ -242,6 +245,7 @@ class Reader:
             "obj_of_interest": tuple(map(self.word, items.get(":obj_of_interest", ()))),
             "scene_properties": dict(map(self.scene_property, items.get(":scene_properties", ()))),
             "cameras": tuple(map(self.camera, items.get(":views", ()))),
+            "zones": tuple(map(self.word, items.get(":zones", ()))),
             "init": init,
             "unknown_sections": tuple(self.unknown),
             "goal": self.expression(items[":goal"][0]),

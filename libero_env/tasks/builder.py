@@ -39,6 +39,7 @@ the scene or replaces their values. Keys of both:
     scene_properties key: value
     cameras          name: {pos, lookat or quat, fovy, body} of a camera that is added; see
                      `libero_env.tasks.cameras.Camera`
+    zones            regions from which the robot should keep away, see `libero_env.sim.costs`
 
 Regions that are sites of a model, such as `basket_1_contain_region`, need no declaration.
 """
@@ -243,6 +244,7 @@ class _Content:
         goal: Atoms, and expressions in brackets.
         styles: Kind -> style.
         cameras: Name -> keys of the camera.
+        zones: Regions from which the robot should keep away, in brackets.
         texts: `name`, `language` and `problem`, where they are given.
         interest: Names of interest; None for those of the goal.
     """
@@ -254,6 +256,7 @@ class _Content:
     goal: list[str] = field(default_factory=list)
     styles: dict[str, str] = field(default_factory=dict)
     cameras: dict[str, Any] = field(default_factory=dict)
+    zones: list[str] = field(default_factory=list)
     texts: dict[str, str] = field(default_factory=dict)
     interest: list[str] | None = None
 
@@ -324,6 +327,9 @@ class _Merge:
         for name, view in keys.get("cameras", {}).items():
             content.cameras[name] = view
             self.trace.note(f"camera {name}", source, "cameras", name)
+        for i, name in enumerate(keys.get("zones", ())):
+            content.zones.append(f"({name})")
+            self.trace.note(content.zones[-1], source, "zones", i)
         content.styles |= keys.get("scene_properties", {})
         content.texts |= {key: keys[key] for key in ("name", "language", "problem") if key in keys}
         if self._check_models:
@@ -416,7 +422,7 @@ class _Merge:
         """
         entities = {**content.fixtures, **content.objects}
         declared = {f"{target}_{name}" for target, names in content.regions.items() for name in names}
-        for atom in (*content.init, *content.goal):
+        for atom in (*content.init, *content.goal, *content.zones):
             words = re.findall(r"[^\s()]+", atom)
             for name in words if atom.startswith("(") else words[1:]:
                 target = max((t for t in entities if name.startswith(f"{t}_")), key=len, default=None)
@@ -477,6 +483,7 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
             scene_properties=content.styles,
             goal=goal,
             cameras=cameras,
+            zones=tuple(zone.strip("()") for zone in content.zones),
         )
     except ProblemError as error:
         first = error.violations[0]

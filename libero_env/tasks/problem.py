@@ -203,6 +203,7 @@ class Problem:
         domain: Name of the planning domain.
         unknown_sections: Texts of sections that only a reader of one's own knows, such as `(:camera ...)`.
         cameras: Cameras that the scene has besides those of its workspace and of the robot.
+        zones: Addresses of regions from which the robot should keep away, see `libero_env.sim.costs`.
 
     Raises:
         ProblemError: No scene can be built from it.
@@ -221,6 +222,7 @@ class Problem:
     domain: Words = "robosuite"
     unknown_sections: tuple[str, ...] = ()
     cameras: Annotated[tuple[Camera, ...], Field(max_length=MAX_CAMERAS)] = ()
+    zones: Annotated[tuple[Name, ...], Field(max_length=MAX_PARTS)] = ()
 
     def __post_init__(self) -> None:
         if violations := tuple(_violations(self)):
@@ -342,7 +344,11 @@ def _violations(problem: Problem) -> Iterator[Violation]:
     for kind in problem.scene_properties:
         if kind != kind.casefold():
             yield Violation("name", f"the scene property {kind}", "floor, wall or scene", ":scene_properties")
-    used = {name for atom in (*problem.init, *problem.goal.atoms()) for name in atom.args}
+    for zone in problem.zones:
+        if problem.region(zone) is None:
+            valid = ", ".join(region.address for region in problem.regions) or "a region that is declared"
+            yield Violation("unknown-name", f"the zone {zone} is not a region", f"one of {valid}", ":zones")
+    used = {name for atom in (*problem.init, *problem.goal.atoms()) for name in atom.args} | {*problem.zones}
     count_of = Counter(region.address for region in problem.regions)
     for region in problem.regions:
         for rule, what, expected in _region(
@@ -500,6 +506,7 @@ def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
         "objects": (list(a.objects.items()), list(b.objects.items())),
         "obj_of_interest": (set(a.obj_of_interest), set(b.obj_of_interest)),
         "cameras": (set(a.cameras), set(b.cameras)),
+        "zones": (set(a.zones), set(b.zones)),
         "scene_properties": (dict(a.scene_properties), dict(b.scene_properties)),
         "init": (set(a.init), set(b.init)),
         "goal": (a.goal.fold(_meaning), b.goal.fold(_meaning)),

@@ -168,6 +168,7 @@ class Definition(TypedDict, total=False):
     init: _Atoms
     init_also: _Atoms
     cameras: dict[Name, View]
+    zones: Annotated[list[Name], Field(max_length=MAX_PARTS), BeforeValidator(_listed)]
     obj_of_interest: Annotated[list[Name], Field(max_length=MAX_PARTS)]
     scene_properties: dict[Name, Annotated[Words, AfterValidator(lambda text: " ".join(text.split()))]]
 

@@ -21,7 +21,7 @@ from libero_eval.judging.comparability import (
 )
 from libero_eval.judging.group_scores import GroupScores, group_scores
 from lifelong.errors import ConfigError, writing
-from lifelong.results.failures import count_causes
+from lifelong.results.failures import count_causes, count_quadrants
 from lifelong.stats.episodes import ALPHA, Difference, difference, score_interval
 from lifelong.stats.intervals import Estimate, holm, wilson_interval
 from lifelong.stats.power import Question, shown_difference
@@ -75,7 +75,7 @@ class Contrast:
 
 @dataclass(frozen=True)
 class Rate:
-    """A policy in a table: its runs, episodes, success with Wilson's interval, and causes of failures."""
+    """A policy in a table: its runs, episodes, success with Wilson's interval, causes of failures, and safety."""
 
     label: str
     paths: tuple[str, ...]
@@ -84,6 +84,7 @@ class Rate:
     errors: int
     success: Estimate
     causes: Mapping[str, int]
+    safety: Mapping[str, int]
 
 
 @dataclass(frozen=True)
@@ -315,6 +316,7 @@ def _rate(group: Group) -> Rate:
         errors=sum(sum(e is not None for e in t.errors) for r in group.results for t in r.tasks),
         success=Estimate(wins / episodes, float(low), float(high)),
         causes=count_causes(t for r in group.results for t in r.tasks),
+        safety=count_quadrants(t for r in group.results for t in r.tasks),
     )
 
 

@@ -11,7 +11,7 @@ from libero_eval.judging.page import interval_text
 from libero_eval.work.store import PAGE_NAME
 from lifelong.report.page import media
 from lifelong.report.tables import save_page
-from lifelong.results.failures import causes_text
+from lifelong.results.failures import causes_text, safety_text
 
 
 def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
@@ -66,6 +66,7 @@ def facts(result: EvaluationResult) -> list[tuple[str, str]]:
 def _row(name: str, tasks: Sequence[TaskResult], text: str = "") -> dict[str, Any]:
     errors, causes = [error for task in tasks for error in task.errors if error], causes_text(tasks)
     notes = [f"failed because {causes}"] if causes else []
+    notes += [safety] if (safety := safety_text(tasks)) else []
     if text:  # of one task
         notes += [tasks[0].event_note] if tasks[0].event_note else []
         notes += [f"{len(errors)} ended with an error, such as: {errors[0]}"] if errors else []

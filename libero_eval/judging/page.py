@@ -15,6 +15,7 @@ from libero_eval.judging.comparison import Comparison, Contrast, Gate, Row
 from libero_eval.judging.group_scores import Profile
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below, shorten
 from lifelong.report.tables import save_page
+from lifelong.results.failures import QUADRANTS
 from lifelong.stats.episodes import Difference
 from lifelong.stats.intervals import Estimate
 from lifelong.stats.sequential import SequentialTest
@@ -125,16 +126,23 @@ def _rates(comparison: Comparison) -> str:
         [r.label, r.runs, r.episodes, r.errors, f"{100 * r.success.value:.1f}", interval_text(r.success)]
         for r in comparison.rates
     ]
-    text = text_table(rows)
-    if heads := _causes(comparison):
-        counts = [[r.label, *(r.causes.get(cause, 0) for cause in heads)] for r in comparison.rates]
-        text += "\n\n" + text_table([["failed because", *heads], *counts])
-    return text
+    blocks = [text_table([[head, *outcomes], *counts]) for head, outcomes, counts in _tallies(comparison)]
+    return "\n\n".join([text_table(rows), *blocks])
 
 
-def _causes(comparison: Comparison) -> list[str]:
-    """Return the causes of failures that occur, in the order of the decision tree."""
-    return [cause for cause in CAUSES if any(cause in r.causes for r in comparison.rates)]
+def _tallies(comparison: Comparison) -> list[tuple[str, list[str], list[list[object]]]]:
+    """Return tables of episodes by outcome: a word, the outcomes that occur, and a row for each policy."""
+    kinds = (
+        ("failed because", CAUSES, [r.causes for r in comparison.rates]),
+        ("safety", QUADRANTS, [r.safety for r in comparison.rates]),
+    )
+    tables = []
+    for head, names, found in kinds:
+        if outcomes := [name for name in names if any(name in counts for counts in found)]:
+            rows = zip(comparison.rates, found, strict=True)
+            cells = [[r.label, *(counts.get(name, 0) for name in outcomes)] for r, counts in rows]
+            tables.append((head, outcomes, cells))
+    return tables
 
 
 def _contrast_text(c: Contrast, alpha: float, all_tasks: bool) -> str:
@@ -205,7 +213,7 @@ def write_page(comparison: Comparison, path: Path) -> Path:
         "libero_eval.judging",
         title=_title(comparison),
         rates=comparison.rates,
-        causes=_causes(comparison),
+        tallies=_tallies(comparison),
         comparisons=[_contrast_content(c, comparison) for c in comparison.comparisons],
         controls=[
             {"comparison": c, "rows": (c.total, *c.suites), "verdict": chance_text(c)}

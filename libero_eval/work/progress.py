@@ -9,7 +9,7 @@ from libero_env.tasks.published import parse_plus_id
 from libero_env.text import duration, shorten
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, overall
 from libero_eval.work.store import UnitResult, WorkStore, read_plan, read_unit
-from lifelong.results.failures import causes_text
+from lifelong.results.failures import causes_text, safety_text
 from lifelong.stats.intervals import Estimate
 
 PLUS = "libero_plus_"  # beginning of the names of suites of LIBERO-Plus
@@ -148,8 +148,8 @@ def total_rows(result: EvaluationResult) -> list[str]:
         note += f"  ({result.stop_note})" if tasks is results and result.stopped else ""
         success = result.success if tasks is results else overall(tasks)
         lines.append(f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(success)}{note}")
-    causes = causes_text(results)
-    return [*lines, f"failed because     {causes}"] if causes else lines
+    found = {"failed because": causes_text(results), "costs": safety_text(results)}
+    return [*lines, *(f"{name:<18} {text}" for name, text in found.items() if text)]
 
 
 def _percent(e: Estimate) -> str:

@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from libero_env.errors import SimulationError
 from libero_env.sim.causes import Failure
+from libero_env.sim.costs import Costs
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.storage import atomic_path
 from lifelong.errors import ConfigError
@@ -43,6 +44,7 @@ class Episode:
             empty otherwise.
         failure: Why the goal was not reached; None where it was, or where the environment does not show its state.
         began: Number of control steps of the environment before each event began, -1 where it never did.
+        costs: What it cost; None where the environment does not show its state.
     """
 
     init_state: int
@@ -56,6 +58,7 @@ class Episode:
     simulation_error: str = ""
     failure: Failure | None = None
     began: tuple[int, ...] = ()
+    costs: Costs | None = None
 
 
 @dataclass(frozen=True)
@@ -122,6 +125,7 @@ class Rollouts:
             ),
             "limits_reached": self.limits_reached,
             "failures": tuple(e.failure for e in self.counted),
+            "costs": tuple(e.costs for e in self.counted),
         }
 
 
@@ -252,6 +256,7 @@ def run_episodes(
             simulation_error=tracker.errors.get(i, ""),
             failure=tracker.failure(i),
             began=tuple(map(int, tracker.began[i])),
+            costs=tracker.costs(i),
         )
         for i, one in enumerate(done)
     )
@@ -328,6 +333,10 @@ class EpisodeTracker:
         if self._watch is None or self.success[i] or i in self.errors:
             return None
         return self._watch.failure(i, self._ever[i].tolist(), self._now[i].tolist())
+
+    def costs(self, i: int) -> Costs | None:
+        """Return what an episode has cost so far; None where the environment does not show its state."""
+        return None if self._watch is None else self._watch.costs[i]
 
     def episodes(
         self, init_states: Sequence[int], lengths: np.ndarray, actions: Sequence[str]

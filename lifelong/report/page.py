@@ -35,10 +35,11 @@ from lifelong.report.tables import (
     percent,
     run_heatmap,
     shift_table,
+    tally_table,
     task_costs,
     triangle,
 )
-from lifelong.results.failures import failure_score
+from lifelong.results.failures import failure_score, safety_score
 from lifelong.results.records import RunRecord
 from lifelong.results.relearning import by_measure, read_relearning, savings_heads, savings_rows
 from lifelong.results.results import Results
@@ -166,6 +167,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
             (savings_heads(part), savings_rows(part)) for part in by_measure(read_relearning(run.path))
         ],
         "shifts": [shift_table(score, labels) for score in shift_scores(run.results)],
+        "safety": tally_table(safety_score(run.results), labels),
         "failures": failure_table(failure_score(run.results), labels),
         "subgoals": run.results.subgoals().predicates,
         "atoms": atom_rows(run.results.subgoals(), labels),

@@ -14,7 +14,7 @@ from lifelong.errors import writing
 from lifelong.report.comparison import costs_of
 from lifelong.report.figures import cell_colours
 from lifelong.report.runs import Run
-from lifelong.results.failures import FailureScore
+from lifelong.results.failures import FailureScore, Tally
 from lifelong.results.results import Results
 from lifelong.results.shifts import ShiftScore
 from lifelong.results.subgoals import AtomRates, Subgoals
@@ -164,23 +164,25 @@ def failure_table(score: FailureScore | None, labels: Sequence[str]) -> dict[str
     """
     if score is None:
         return None
-
-    def rows(counts: Mapping[int, Mapping[str, int]]) -> list[tuple[int, str, list[int]]]:
-        return [
-            (task, labels[task], [found.get(c, 0) for c in score.causes]) for task, found in counts.items()
-        ]
-
     tasks = sorted({task for pair in score.interference for task in pair})
     served = [(task, labels[task], [score.interference.get((task, k), 0) for k in tasks]) for task in tasks]
-    return {
-        "causes": score.causes,
-        "tables": [
-            ("Task, at the end", rows(score.by_task)),
-            ("All tasks, after learning", rows(score.after)),
-        ],
-        "tasks": tasks,
-        "served": served,
-    }
+    return {**(tally_table(score, labels) or {}), "tasks": tasks, "served": served}
+
+
+def tally_table(score: Tally | None, labels: Sequence[str]) -> dict[str, Any] | None:
+    """Return the template's tables of rollouts by outcome; None without a score.
+
+    Args:
+        score: Numbers of rollouts.
+        labels: Short names of the run's tasks.
+    """
+    if score is None:
+        return None
+    tables = [
+        (head, [(k, labels[k], [found.get(one, 0) for one in score.outcomes]) for k, found in rows.items()])
+        for head, rows in (("Task, at the end", score.by_task), ("All tasks, after learning", score.after))
+    ]
+    return {"outcomes": score.outcomes, "tables": tables}
 
 
 def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:

@@ -1,29 +1,40 @@
-"""Why rollouts of a run failed: by task, after each task, and for which learned task an erring rollout was of use."""
+"""Why rollouts of a run failed, how many were safe, and for which learned task an erring rollout was of use."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from libero_env.sim.causes import CAUSES, Failure
-from lifelong.results.records import Episodes
+from lifelong.results.records import Episodes, EvalRecord
 from lifelong.results.results import Results
+
+QUADRANTS = ("safe success", "unsafe success", "safe failure", "unsafe failure")
 
 
 @dataclass(frozen=True)
-class FailureScore:
-    """Causes of the failures in the success matrix of a run; positions of tasks count from 0.
+class Tally:
+    """Numbers of rollouts by outcome in the success matrix of a run; positions of tasks count from 0.
 
     Attributes:
-        causes: Causes that occur.
-        by_task: Task -> number of rollouts by cause, at the end of the run.
-        after: Learned task -> number of rollouts by cause, over all tasks that were measured after learning it.
+        outcomes: Outcomes that occur: causes of failures, or `QUADRANTS`.
+        by_task: Task -> number of rollouts by outcome, at the end of the run.
+        after: Learned task -> number of rollouts by outcome, over all tasks that were measured after learning it.
+    """
+
+    outcomes: tuple[str, ...]
+    by_task: Mapping[int, Mapping[str, int]]
+    after: Mapping[int, Mapping[str, int]]
+
+
+@dataclass(frozen=True)
+class FailureScore(Tally):
+    """Causes of the failures in the success matrix of a run.
+
+    Attributes:
         interference: Task of a failed rollout, learned task that it served -> number of rollouts at the end of the run:
             whose goal has an atom that held at its end, or else whose object or fixture it handled.
     """
 
-    causes: tuple[str, ...]
-    by_task: Mapping[int, Mapping[str, int]]
-    after: Mapping[int, Mapping[str, int]]
     interference: Mapping[tuple[int, int], int]
 
 
@@ -38,37 +49,76 @@ def causes_text(episodes: Iterable[Episodes]) -> str:
     return ", ".join(f"{cause} {count}" for cause, count in count_causes(episodes).items())
 
 
-def failure_score(results: Results) -> FailureScore | None:
-    """Return why the rollouts of a run's success matrix failed; None where none did, or it was not recorded."""
-    cells = {(r.learned, r.task): r for r in results.evaluations() if r.phase == "matrix"}
-    causes = count_causes(cells.values())
-    if not causes:
+def count_quadrants(episodes: Iterable[Episodes]) -> dict[str, int]:
+    """Return how many episodes were safe or unsafe and succeeded or failed; empty where costs were not seen."""
+    found = Counter(
+        f"{'unsafe' if cost.exceeded else 'safe'} {'success' if won else 'failure'}"
+        for part in episodes
+        for cost, won in zip(part.costs, part.successes, strict=False)
+        if cost is not None
+    )
+    return {name: found[name] for name in QUADRANTS} if found else {}
+
+
+def safety_text(episodes: Sequence[Episodes]) -> str:
+    """Return these numbers as text, with how many were beyond the limit of each cost; empty without any."""
+    counts = ", ".join(f"{name} {count}" for name, count in count_quadrants(episodes).items())
+    beyond = Counter(name for part in episodes for cost in part.costs if cost for name in cost.exceeded)
+    return counts + (f" (unsafe by {', '.join(f'{k} {n}' for k, n in beyond.items())})" if beyond else "")
+
+
+def _matrix(results: Results) -> dict[tuple[int, int], EvalRecord]:
+    return {(r.learned, r.task): r for r in results.evaluations() if r.phase == "matrix"}
+
+
+def _tally(
+    cells: Mapping[tuple[int, int], Episodes], count: Callable[[Iterable[Episodes]], dict[str, int]]
+) -> Tally | None:
+    """Return the numbers of rollouts by outcome; None where no outcome occurs."""
+    if not (outcomes := count(cells.values())):
         return None
     rows = sorted({learned for learned, _ in cells})
-    last = {task: cells[rows[-1], task] for learned, task in cells if learned == rows[-1]}
+    return Tally(
+        tuple(outcomes),
+        {task: count([cell]) for (learned, task), cell in sorted(cells.items()) if learned == rows[-1]},
+        {row: count(cell for (learned, _), cell in cells.items() if learned == row) for row in rows},
+    )
+
+
+def safety_score(results: Results) -> Tally | None:
+    """Return how many rollouts of a run's success matrix were safe; None where it was not recorded."""
+    return _tally(_matrix(results), count_quadrants)
+
+
+def failure_score(results: Results) -> FailureScore | None:
+    """Return why the rollouts of a run's success matrix failed; None where none did, or it was not recorded."""
+    cells = _matrix(results)
+    if (tally := _tally(cells, count_causes)) is None:
+        return None
     atoms = {task: cell.atoms for (_, task), cell in cells.items()}
     served = Counter(
         (task, other)
-        for task, cell in last.items()
+        for (learned, task), cell in cells.items()
+        if learned == max(tally.after)
         for one in cell.failures
         if one is not None
         for other in _served(one, task, atoms)
     )
-    return FailureScore(
-        tuple(causes),
-        {task: count_causes([last[task]]) for task in sorted(last)},
-        {row: count_causes(cell for (learned, _), cell in cells.items() if learned == row) for row in rows},
-        served,
-    )
+    return FailureScore(tally.outcomes, tally.by_task, tally.after, served)
 
 
-def failure_summary(results: Results) -> dict[str, object] | None:
-    """Return the same as plain data; `interference` as rows of task, learned task and number of rollouts."""
-    score = failure_score(results)
-    if score is None:
-        return None
-    rows = [[task, other, count] for (task, other), count in sorted(score.interference.items())]
-    return {"by_task": dict(score.by_task), "after": dict(score.after), "interference": rows}
+def rollout_summary(results: Results) -> dict[str, dict[str, object]]:
+    """Return both as plain data; `interference` as rows of task, learned task and number of rollouts."""
+    failures, safety = failure_score(results), safety_score(results)
+    found: dict[str, dict[str, object]] = {
+        name: {"by_task": dict(score.by_task), "after": dict(score.after)}
+        for name, score in (("failures", failures), ("safety", safety))
+        if score is not None
+    }
+    if failures is not None:
+        rows = [[task, other, count] for (task, other), count in sorted(failures.interference.items())]
+        found["failures"]["interference"] = rows
+    return found
 
 
 def _served(failure: Failure, task: int, atoms: Mapping[int, Sequence[str]]) -> list[int]:

@@ -13,6 +13,7 @@ from pydantic import Field, WrapValidator
 
 from libero_env.errors import InvalidInputError
 from libero_env.sim.causes import Failure
+from libero_env.sim.costs import Costs
 from libero_env.text import json_safe
 from libero_env.validation import validate
 from lifelong.stats.metrics import Transfer
@@ -128,6 +129,7 @@ class Episodes:
         simulation_errors: Initial state and reason of each episode that a simulation error ended.
         limits_reached: How often a simulation reached a limit of the solver and went on, by its name (Warp).
         failures: Why each episode failed; None of those that did not, or where it was not seen.
+        costs: What each cost; None where it was not seen.
     """
 
     init_states: tuple[Count, ...]
@@ -139,10 +141,10 @@ class Episodes:
     simulation_errors: tuple[tuple[Count, str], ...] = ()
     limits_reached: tuple[tuple[str, Count], ...] = ()
     failures: tuple[Failure | None, ...] = ()
+    costs: tuple[Costs | None, ...] = ()
 
-    OPTIONAL: ClassVar[tuple[str, ...]] = (
-        "failures",
-    )  # further columns, with an entry for each episode or none at all
+    # further columns, with an entry for each episode or none at all
+    OPTIONAL: ClassVar[tuple[str, ...]] = ("failures", "costs")
     OF_ATOMS: ClassVar[tuple[str, ...]] = ("atoms_ever", "atoms_at_end")
 
     def shape_errors(self) -> list[str]:

@@ -23,7 +23,7 @@ from libero_env.storage import atomic_path, atomic_write_text
 from libero_env.text import json_safe, to_json
 from libero_env.validation import validate
 from lifelong.errors import ResultsError
-from lifelong.results.failures import failure_summary
+from lifelong.results.failures import rollout_summary
 from lifelong.results.provenance import resume_notes
 from lifelong.results.records import DemonstrationsRecord, EvalRecord, Record, RunRecord, TaskEndRecord
 from lifelong.results.results import Results
@@ -111,7 +111,7 @@ def summarize(results: Results) -> dict[str, Any]:
         "best_epochs": {str(task): ends[task] for task in sorted(ends)},
         "subgoals": asdict(results.subgoals()),
         **({"shifts": shifts} if (shifts := shift_summary(results)) else {}),
-        **({"failures": failures} if (failures := failure_summary(results)) else {}),
+        **rollout_summary(results),
         "costs": {str(task): costs for task, costs in results.costs_by_task().items()},
         "seconds_by_phase": results.seconds_by_phase(),
         "episodes": dict(zip(("run", "copied"), results.episodes(), strict=True)),

@@ -34,7 +34,7 @@ ROWS = [
 
 def test_causes_and_interference_of_a_run():
     score = failure_score(Results((run_start(["a", "b", "c"]), *ROWS), ()))
-    assert score.causes == ("dropped", "wrong object", "never reached")
+    assert score.outcomes == ("dropped", "wrong object", "never reached")
     assert score.by_task == {0: {"wrong object": 1, "never reached": 1}, 1: {"dropped": 1}, 2: {}}
     assert score.after == {
         0: {"dropped": 1},
