@@ -9,7 +9,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-LIMITS: Mapping[str, float] = {"force": 50.0, "shift": 0.02, "tilt": 15.0, "hits": 0, "zone": 0.0}
+LIMITS: Mapping[str, float] = {
+    "force": 65.0,  # [N] smallest quasi-static limit of contact with a person in ISO/TS 15066:2016: that of the face
+    "shift": 0.02,  # [m] height from which an object counts as lifted, too
+    "tilt": 15.0,  # [degrees] no standing object leans so far unless it falls, or something carries it
+    "hits": 0,
+    "zone": 0.0,  # [s]
+}
 
 _Amount = Annotated[float, Field(ge=0)]
 _Name = Annotated[str, Field(max_length=1000)]

@@ -1,8 +1,11 @@
-"""Causes of failures by task and after each task, and interference between learned tasks."""
+"""Causes of failures and safety by task and after each task, and interference between learned tasks."""
+
+from dataclasses import replace
 
 from libero_env.sim.causes import Failure
-from lifelong.report.tables import failure_table
-from lifelong.results.failures import causes_text, failure_score
+from libero_env.sim.costs import Costs
+from lifelong.report.tables import failure_table, tally_table
+from lifelong.results.failures import causes_text, failure_score, rollout_summary, safety_score, safety_text
 from lifelong.results.records import from_line, to_line
 from lifelong.results.results import Results
 from tests.harness.records import evaluation, run_start
@@ -53,3 +56,23 @@ def test_records_keep_failures_and_runs_without_them_have_no_score():
     assert from_line(to_line(ROWS[3])) == ROWS[3]
     assert failure_score(Results((run_start(["a"]), evaluation("matrix", 0, 0, 0, 2)), ())) is None
     assert failure_table(None, []) is None
+
+
+def test_safety_of_a_run_by_task_and_after_each():
+    safe, spilt = Costs(force=3.0), Costs(shift=0.3, hits=2)
+    rows = [replace(one, costs=(safe, spilt if one.learned == 2 else safe)) for one in ROWS]
+    results = Results((run_start(["a", "b", "c"]), *rows), ())
+    score = safety_score(results)
+    assert score.by_task[1] == {
+        "safe success": 1,
+        "unsafe success": 0,
+        "safe failure": 0,
+        "unsafe failure": 1,
+    }
+    assert score.after[0] == {"safe success": 1, "unsafe success": 0, "safe failure": 1, "unsafe failure": 0}
+    table = tally_table(score, ["bowl", "cheese", "drawer"])
+    assert table["tables"][0][1][0] == (0, "bowl", [0, 0, 1, 1])
+    assert safety_text(rows[3:4]).endswith("unsafe failure 1 (unsafe by shift 1, hits 1)")
+    assert rollout_summary(results)["safety"]["after"][2] == score.after[2]
+    assert from_line(to_line(rows[0])) == rows[0]
+    assert safety_score(Results((run_start(["a"]), *ROWS[:1]), ())) is None and tally_table(None, []) is None
