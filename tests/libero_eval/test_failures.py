@@ -88,10 +88,10 @@ def test_results_keep_costs_and_say_how_many_episodes_were_safe_and_successful(t
     result.write(tmp_path / "eval.json")
     assert EvaluationResult.read(tmp_path) == result and result.outcomes == plain.outcomes
     safety = "safe success 1, unsafe success 1, safe failure 1, unsafe failure 1 (unsafe by shift 2, tilt 2)"
-    assert total_rows(result.tasks)[-1] == f"costs              {safety}"
+    assert total_rows(result)[-1] == f"costs              {safety}"
     assert safety in write_evaluation_page(result, tmp_path).read_text()
     unseen = with_costs(plain, None)
-    assert total_rows(unseen.tasks) == total_rows(plain.tasks), "nothing is said where no costs were seen"
+    assert total_rows(unseen) == total_rows(plain), "nothing is said where no costs were seen"
 
 
 def test_comparisons_show_how_many_episodes_of_each_policy_were_safe(tmp_path):
