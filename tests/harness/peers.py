@@ -64,7 +64,8 @@ def vla_eval() -> Peer:
     """Return vla-eval's environment; what this package needs comes from the environment of the tests."""
     same = [f"{name}=={version(name)}" for name in ("numpy", "pillow", "omegaconf")]
     python = counterpart("vla-eval==0.8.0", *same)
-    return Peer(python, (str(ROOT), sysconfig.get_path("purelib")))
+    ours = str(INTEGRATIONS / "vla_eval_libero_lifelong")
+    return Peer(python, (str(ROOT), ours, sysconfig.get_path("purelib")))
 
 
 def inspect_robots() -> Peer:

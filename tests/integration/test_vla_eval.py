@@ -13,7 +13,7 @@ from tests.harness.runs import make_run
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 THEIRS = "vla_eval.benchmarks.libero.benchmark:LIBEROBenchmark"
-OURS = "libero_eval.vla_eval:LiberoBenchmark"
+OURS = "vla_eval_libero_lifelong.benchmark:LiberoBenchmark"
 TASK = "libero_object/0"
 
 

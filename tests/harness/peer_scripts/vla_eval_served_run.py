@@ -9,8 +9,7 @@ import sys
 
 import numpy as np
 import vla_eval
-
-from libero_eval.vla_eval import RunServer
+from vla_eval_libero_lifelong.server import RunServer
 
 
 class Recording(RunServer):

@@ -1,8 +1,8 @@
 """A benchmark of vla-eval that is simulated here, under one of our protocols.
 
-`vla-eval run` takes it by its import string, `libero_eval.vla_eval:LiberoBenchmark`, with `docker` off. Its
-observations have the keys of vla-eval's own `LIBEROBenchmark` (0.8.0, vla_eval/benchmarks/libero/benchmark.py), so that
-model servers written for that one serve this one.
+`vla-eval run` takes it by its import string, `vla_eval_libero_lifelong.benchmark:LiberoBenchmark`, with `docker` off.
+Its observations have the keys of vla-eval's own `LIBEROBenchmark` (0.8.0, vla_eval/benchmarks/libero/benchmark.py), so
+that model servers written for that one serve this one.
 """
 
 import logging
@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from vla_eval.benchmarks.base import StepBenchmark, StepResult
 
 from libero_env.envs.checks import checked_numbers
-from libero_env.errors import LiberoError, MissingPackageError, SimulationError
+from libero_env.errors import LiberoError, SimulationError
 from libero_env.tasks import Task, get_suite
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
 from libero_eval.protocols.environment import ProtocolEnv, resolve_world, run_protocol
@@ -22,33 +23,11 @@ from lifelong.errors import PolicyError
 from lifelong.evaluation.environments import Obs
 from lifelong.results.provenance import installed_versions
 
-try:
-    from vla_eval.benchmarks.base import StepBenchmark, StepResult
-
-    INSTALLED = True
-except ImportError:  # the classes can be imported but not made
-    INSTALLED = False
-    StepBenchmark: Any = object  # type: ignore[no-redef]
-    StepResult: Any = object  # type: ignore[no-redef]
-
-VERSION = "0.8.0"  # of vla-eval that the tests run
 ADJUSTABLE = ("vla-eval", "libero")  # protocols that leave some fields to what a policy asks for
 IMAGES = {"agentview": "agentview", "robot0_eye_in_hand": "wrist"}  # camera -> key
 ROTATIONS = {None: None, True: "axis_angle", False: "axis_angle_positive"}  # by quat_no_antipodal
 PREFIX = "observation/"
 logger = logging.getLogger(__name__)
-
-
-def require() -> None:
-    """Check that vla-eval is installed.
-
-    Raises:
-        MissingPackageError: It is not.
-    """
-    if not INSTALLED:
-        raise MissingPackageError(
-            "this class is one of vla-eval's, which is not installed", f"pip install vla-eval=={VERSION}"
-        )
 
 
 class LiberoBenchmark(StepBenchmark):
@@ -77,7 +56,6 @@ class LiberoBenchmark(StepBenchmark):
         assets: Models: `builtin`, a folder, or None for the user's choice.
 
     Raises:
-        MissingPackageError: vla-eval is not installed.
         UnknownNameError: The suite or the protocol does not exist.
         ProtocolMismatchError: The server or the configuration asks for something else than the protocol; both values
             are named.
@@ -112,7 +90,6 @@ class LiberoBenchmark(StepBenchmark):
         camera_size: Sequence[int] | None = None,
         assets: str | None = None,
     ):
-        require()
         super().__init__()
         self.suite, self.assets = suite, assets
         self.send_wrist_image, self.send_state = send_wrist_image, send_state

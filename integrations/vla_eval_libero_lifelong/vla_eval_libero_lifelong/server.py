@@ -1,6 +1,6 @@
 """A model server of vla-eval with the policy of a run.
 
-    from libero_eval.vla_eval import RunServer
+    from vla_eval_libero_lifelong.server import RunServer
     vla_eval.evaluate(RunServer("runs/..."), config, docker=False)
 
 It asks for `LiberoBenchmark` with the run's own observations, which reach it as they are, so that it acts as in
@@ -11,20 +11,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from vla_eval.model_servers.predict import PredictModelServer
+
 from libero_env.tasks import Task, get_suite
 from libero_eval.servers.serving import PREFIX, ServedPolicy, Session
-from libero_eval.vla_eval.benchmark import require
 from lifelong.errors import PolicyError
 from lifelong.evaluation.restore import restore
 
-try:
-    from vla_eval.model_servers.predict import PredictModelServer
-except ImportError:  # the class can be imported but not made
-    PredictModelServer: Any = object  # type: ignore[no-redef]
-
 
 class RunServer(PredictModelServer):
-    """The policy of a run, for `libero_eval.vla_eval:LiberoBenchmark`.
+    """The policy of a run, for `vla_eval_libero_lifelong.benchmark:LiberoBenchmark`.
 
     Args:
         run: Directory of the run, or one of its checkpoints.
@@ -34,7 +30,6 @@ class RunServer(PredictModelServer):
         allow: Packages whose classes the run's configuration may name besides this one's.
 
     Raises:
-        MissingPackageError: vla-eval is not installed.
         LifelongError: There is no such run or checkpoint.
     """
 
@@ -46,7 +41,6 @@ class RunServer(PredictModelServer):
         seed: int = 0,
         allow: Sequence[str] = (),
     ):
-        require()
         super().__init__()
         self.served = ServedPolicy(restore(Path(run), after=after, device=device, allow=allow), seed=seed)
         self._sessions: dict[str, Session] = {}
@@ -104,7 +98,8 @@ class RunServer(PredictModelServer):
         arrays = {key: value for key, value in obs.items() if key.startswith(PREFIX)}
         if not arrays:
             raise PolicyError(
-                "the observations have no names of ours; the benchmark is libero_eval.vla_eval:LiberoBenchmark"
+                "the observations have no names of ours; the benchmark is "
+                "vla_eval_libero_lifelong.benchmark:LiberoBenchmark"
             )
         answer = session.infer({**arrays, **self._begins.pop(ctx.session_id, {})})
         return {"actions": answer["actions"][0]}

@@ -1,4 +1,0 @@
-from .benchmark import LiberoBenchmark
-from .server import RunServer
-
-__all__ = ["LiberoBenchmark", "RunServer"]
