@@ -69,7 +69,7 @@ def files(tmp_path_factory):
 
 def learner(files, group: str = "base", *overrides: str):
     cfg = tiny(
-        f"lifelong={group}", "train.use_augmentation=false", "+policy.native.image_width=8", *overrides
+        f"lifelong={group}", "train.use_augmentation=false", "+policy.native.encoder.width=8", *overrides
     )
     data = [windows(file, cfg, seed) for seed, file in enumerate(files)]
     torch.manual_seed(0)

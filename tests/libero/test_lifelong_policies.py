@@ -44,11 +44,11 @@ def test_sizes_are_the_originals(group, count):
 
 SMALL = {
     "bc_rnn_policy": ("policy.image_embed_size=8", "policy.text_embed_size=8", "policy.rnn_hidden_size=8",
-     "policy.rnn_num_layers=1", "+policy.native.image_width=8"),
-    "bc_transformer_policy": ("+policy.native.image_width=8",),
+     "policy.rnn_num_layers=1", "+policy.native.encoder.width=8"),
+    "bc_transformer_policy": ("+policy.native.encoder.width=8",),
     "bc_vilt_policy": ("policy.spatial_down_sample_embed_size=8", "policy.spatial_transformer_num_layers=1",
      "policy.spatial_transformer_num_heads=2", "policy.spatial_transformer_head_output_size=4",
-     "policy.spatial_transformer_mlp_hidden_size=8", "+policy.native.patch_width=8"),
+     "policy.spatial_transformer_mlp_hidden_size=8", "+policy.native.encoder.width=8"),
 }  # fmt: skip
 
 
@@ -67,7 +67,9 @@ def small(group: str, file, *overrides: str):
 
 @pytest.mark.parametrize("group", SMALL)
 def test_policies_learn_and_act(group, file):
-    policy, batch = small(group, file, "train.use_augmentation=false", "+policy.native.dropout=0.0")
+    without = ["policy.spatial_transformer_dropout=0.0"] if group == "bc_vilt_policy" else []
+    words = ["train.use_augmentation=false", "+policy.native.temporal.dropout=0.0", *without]
+    policy, batch = small(group, file, *words)
     kept = copy.deepcopy(batch)
     each = policy.compute_loss(batch, reduction="none")
     assert each.shape == batch["actions"].shape[:2]

@@ -32,7 +32,7 @@ from tests.harness.facade_learning import (
 pytestmark = pytest.mark.sim
 
 ROOT = Path(__file__).parents[2]
-SMALL = ("train.use_augmentation=false", "+policy.native.image_width=8")
+SMALL = ("train.use_augmentation=false", "+policy.native.encoder.width=8")
 
 
 @pytest.fixture(scope="module")

@@ -26,48 +26,12 @@ from lifelong.policies.history import HistoryPolicy
 from lifelong.settings import build
 
 State = tuple[Tensor, Tensor]  # of an LSTM
-Keys = dict[
-    str, str
-]  # flat key -> key of a component of the network; other flat keys are those of the network
-
-
-def _keys(same: str, **renamed: str) -> Keys:
-    """Return keys that are the same for the component, separated by blanks, and those that have another name there."""
-    return {**{key: key for key in same.split()}, **renamed}
-
-
-_RESNET = _keys(
-    "stage_blocks stem_kernel stem_stride stem_pool keypoints readout norm",
-    image_width="width",
-    keypoint_temperature="temperature",
-)
-_PATCHES = _keys("stem_kernel stem_stride patch norm", patch_width="width")
-_SPATIAL = _keys("dropout", **{f"spatial_{key}": key for key in ("layers", "heads", "head_dim", "mlp_dim")})
-_TRANSFORMER = _keys("layers heads head_dim mlp_dim dropout")
-_LSTM = _keys("dropout", rnn_hidden="hidden", rnn_layers="layers")
-_TRUNK = _keys("", head_hidden="hidden", head_layers="layers")
-_GMM = _keys("modes min_std low_eval_noise", head_norm="norm", **_TRUNK)
-_HEADS = {
-    "deterministic": ("DeterministicHead", _keys("", head_norm="norm", **_TRUNK)),
-    "gmm": ("GMMHead", _GMM),
-    "flow": ("FlowHead", _keys("chunk execute", flow_steps="steps", **_TRUNK)),
-}
-_RESNET_FILM, _TEMPORAL = ("ResNetFiLMEncoder", _RESNET), ("TemporalTransformer", _TRANSFORMER)
-_COMPONENTS: dict[type[HistoryPolicy], dict[str, tuple[str, Keys]]] = {
-    BCTransformer: {"encoder": _RESNET_FILM, "temporal": _TEMPORAL},
-    BCRNN: {"encoder": _RESNET_FILM, "temporal": ("TemporalLSTM", _LSTM)},
-    BCViLT: {
-        "encoder": ("PatchEncoder", _PATCHES),
-        "spatial": ("SpatialTransformer", _SPATIAL),
-        "temporal": _TEMPORAL,
-    },
-}
 
 
 class NativePolicy(BasePolicy):
     """Policy with a `HistoryPolicy` as `network`, whose checkpoints and this policy's weights are interchangeable.
 
-    `cfg.policy.native` holds further arguments of the network, as flat keys. With `norm: batch`,
+    `cfg.policy.native` holds further arguments of the network and its parts. With `encoder: {norm: batch}`,
     `normalise_proprio: false` and `standardise_language: false` the network computes exactly what the original does.
 
     Raises:
@@ -81,9 +45,10 @@ class NativePolicy(BasePolicy):
         policy = cfg.policy
         self.max_seq_len = int(policy.get("transformer_max_seq_len") or cfg.data.seq_len)
         self.spec = policy_spec(cfg, shape_meta, self.max_seq_len)
-        arguments = {**self._arguments(policy), **_head_arguments(policy)}
-        arguments |= plain(policy.get("native") or {})
-        self.network: Any = build(OmegaConf.create(_node(self.kind, arguments)), spec=self.spec)
+        arguments = {**self._arguments(policy), "head": _head(policy)}
+        node = {"_target_": f"{self.kind.__module__}.{self.kind.__name__}", **arguments}
+        more = plain(policy.get("native") or {})
+        self.network: Any = build(OmegaConf.merge(OmegaConf.create(node), more), spec=self.spec)
         self._configure(policy)
         loss = policy.policy_head.get("loss_kwargs") or {}
         head = wrap_head(self.network.head, float(loss.get("loss_coef", 1.0)))
@@ -92,7 +57,7 @@ class NativePolicy(BasePolicy):
 
     @abstractmethod
     def _arguments(self, policy: Any) -> dict[str, Any]:
-        """Return the network's arguments except those of the head, as flat keys."""
+        """Return the network's arguments except the head."""
 
     def _configure(self, policy: Any) -> None:
         """Replace the parts of the network that the configuration changes."""
@@ -159,10 +124,13 @@ class BCRNNPolicy(NativePolicy):
         return {
             "image_embed": policy.image_embed_size,
             "text_embed": policy.text_embed_size,
-            "rnn_hidden": policy.rnn_hidden_size,
-            "rnn_layers": policy.rnn_num_layers,
-            "dropout": policy.rnn_dropout,
-            **resnet_sizes(policy),
+            "encoder": _resnet(policy),
+            "temporal": _part(
+                "TemporalLSTM",
+                hidden=policy.rnn_hidden_size,
+                layers=policy.rnn_num_layers,
+                dropout=policy.rnn_dropout,
+            ),
         }
 
     def forward(
@@ -192,7 +160,7 @@ class BCTransformerPolicy(NativePolicy):
 
     def _arguments(self, policy: Any) -> dict[str, Any]:
         size = policy.embed_size
-        return {"embed_dim": size, **resnet_sizes(policy), **temporal_sizes(policy, size)}
+        return {"embed_dim": size, "encoder": _resnet(policy), "temporal": _temporal(policy, size)}
 
 
 class BCViLTPolicy(NativePolicy):
@@ -204,18 +172,13 @@ class BCViLTPolicy(NativePolicy):
         patches, size = policy.image_encoder, policy.embed_size
         if patches.network != "PatchEncoder":
             raise PolicyError(f"image_encoder is {patches.network}; this policy needs a PatchEncoder")
-        if policy.spatial_transformer_dropout != policy.transformer_dropout:
-            raise PolicyError("spatial_transformer_dropout and transformer_dropout must be equal")
         token = policy.spatial_down_sample_embed_size if policy.spatial_down_sample else size
         return {
             "patch_embed": size,
-            "patch": square(patches.network_kwargs.patch_size),
-            "spatial_layers": policy.spatial_transformer_num_layers,
-            "spatial_heads": policy.spatial_transformer_num_heads,
-            "spatial_head_dim": policy.spatial_transformer_head_output_size,
-            "spatial_mlp_dim": policy.spatial_transformer_mlp_hidden_size,
             "embed_dim": token,
-            **temporal_sizes(policy, token),
+            "encoder": _part("PatchEncoder", patch=square(patches.network_kwargs.patch_size)),
+            "spatial": _transformer("SpatialTransformer", policy, "spatial_transformer"),
+            "temporal": _temporal(policy, token),
         }
 
 
@@ -278,39 +241,36 @@ class ExtraModalityTokens(_ProprioEncoder):
         return torch.stack([encoder(x) for encoder, x in inputs], dim=-2)
 
 
-def _node(kind: type[HistoryPolicy], arguments: dict[str, Any]) -> dict[str, Any]:
-    """Return the configuration of a network from flat keys, such as `image_width` for the width of its encoder."""
-    components = {**_COMPONENTS[kind], "head": _HEADS[arguments.pop("head")]}
-    flat = {key for _, keys in (*components.values(), *_HEADS.values()) for key in keys}
-    node = {key: value for key, value in arguments.items() if key not in flat}
-    for name, (target, keys) in components.items():
-        values = {new: arguments[old] for old, new in keys.items() if old in arguments}
-        node[name] = {"_target_": f"lifelong.nn.{target}", "_partial_": True, **values}
-    return {"_target_": f"{kind.__module__}.{kind.__name__}", **node}
+def _part(name: str, **arguments: Any) -> dict[str, Any]:
+    """Return the configuration of a part of a network, which the network completes."""
+    return {"_target_": f"lifelong.nn.{name}", "_partial_": True, **arguments}
 
 
-def resnet_sizes(policy: Any) -> dict[str, Any]:
-    """Return the arguments of a network with a ResNet for each camera."""
+def _resnet(policy: Any) -> dict[str, Any]:
     node = policy.image_encoder
     if node.network != "ResnetEncoder":
         raise PolicyError(f"image_encoder is {node.network}; this policy needs a ResnetEncoder")
-    return resnet_arguments(**node.network_kwargs)
+    return _part("ResNetFiLMEncoder", **resnet_arguments(**node.network_kwargs))
 
 
-def temporal_sizes(policy: Any, embed_size: int) -> dict[str, Any]:
-    """Return the arguments of the transformer over time, whose tokens have the given size."""
+def _temporal(policy: Any, embed_size: int) -> dict[str, Any]:
     size = policy.get("transformer_input_size")
     if size not in (None, embed_size):
         raise PolicyError(
             f"transformer_input_size is {size}, but tokens have size {embed_size}; set it to null"
         )
-    return {
-        "layers": policy.transformer_num_layers,
-        "heads": policy.transformer_num_heads,
-        "head_dim": policy.transformer_head_output_size,
-        "mlp_dim": policy.transformer_mlp_hidden_size,
-        "dropout": policy.transformer_dropout,
-    }
+    return _transformer("TemporalTransformer", policy, "transformer")
+
+
+def _transformer(name: str, policy: Any, prefix: str) -> dict[str, Any]:
+    return _part(
+        name,
+        layers=policy[f"{prefix}_num_layers"],
+        heads=policy[f"{prefix}_num_heads"],
+        head_dim=policy[f"{prefix}_head_output_size"],
+        mlp_dim=policy[f"{prefix}_mlp_hidden_size"],
+        dropout=policy[f"{prefix}_dropout"],
+    )
 
 
 def _language_encoder(policy: Any, output_size: int) -> nn.Module:
@@ -327,13 +287,12 @@ def _language_encoder(policy: Any, output_size: int) -> nn.Module:
     return lookup(ENCODERS, "language encoder", node.network)(**kwargs)
 
 
-def _head_arguments(policy: Any) -> dict[str, Any]:
-    """Return the network's arguments for the head, as flat keys."""
+def _head(policy: Any) -> dict[str, Any]:
     node = policy.policy_head
     kind, kwargs = lookup(HEADS, "policy head", node.network), node.network_kwargs
-    sizes = {"head_hidden": kwargs.hidden_size, "head_layers": kwargs.num_layers}
+    sizes = {"hidden": kwargs.hidden_size, "layers": kwargs.num_layers}
     if kind is not GMMHead:
-        return {"head": "deterministic", **sizes}
+        return _part("DeterministicHead", **sizes)
     check_activation(kwargs.get("activation", "softplus"))
     noise = {"min_std": kwargs.min_std, "low_eval_noise": kwargs.get("low_eval_noise", False)}
-    return {"head": "gmm", **sizes, "modes": kwargs.num_modes, **noise}
+    return _part("GMMHead", **sizes, modes=kwargs.num_modes, **noise)
