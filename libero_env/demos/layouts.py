@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import Any
 
 from libero_env.demos.video import AV1, H264, PIXEL_FORMAT, Codec
-from libero_env.timing import CONTROL_HZ
+from libero_env.storage import read_yaml
 
 ROBOT_TYPE = "panda"
 FILES_PER_CHUNK = 1000
@@ -51,8 +51,8 @@ class Layout:
     fps: int
     state: str
     action: str
-    state_names: tuple[str, ...]
-    action_names: tuple[str, ...]
+    state_names: Sequence[str]
+    action_names: Sequence[str]
     cameras: Mapping[str, str]
     codec: Codec | None
     mirrored: bool
@@ -128,76 +128,24 @@ class Layout:
         return {"info": info | orientation}
 
 
-OWN = Layout(
-    version="v3.0",
-    fps=CONTROL_HZ,
-    state="observation.state",
-    action="action",
-    state_names=("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "finger1", "finger2"),
-    action_names=("x", "y", "z", "axis_angle1", "axis_angle2", "axis_angle3", "gripper"),
-    cameras=MappingProxyType(
-        {"agentview": "observation.images.image", "eye_in_hand": "observation.images.image2"}
-    ),
-    codec=H264,
-    mirrored=False,
-    outcome=True,
-)
-LEROBOT_LIBERO = replace(
-    OWN,
-    fps=10,
-    state_names=("state",),
-    action_names=("actions",),
-    codec=AV1,
-    mirrored=True,
-    outcome=False,
-    states_fps=True,
-    video_mb=500,
-)
-OPENPI_LIBERO = replace(
-    LEROBOT_LIBERO,
-    version="v2.0",
-    state="state",
-    action="actions",
-    cameras=MappingProxyType({"agentview": "image", "eye_in_hand": "wrist_image"}),
-    codec=None,
-    states_fps=False,
-)
-GROOT_NAMES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
-IPEC_LIBERO = replace(
-    LEROBOT_LIBERO,
-    version="v2.1",
-    fps=CONTROL_HZ,
-    state_names=(*GROOT_NAMES, "gripper"),
-    action_names=GROOT_NAMES,
-    cameras=MappingProxyType(
-        {"agentview": "observation.images.image", "eye_in_hand": "observation.images.wrist_image"}
-    ),
-    states_fps=False,
-    open_gripper=True,
-)
-RLDS_LIBERO = replace(
-    OPENPI_LIBERO,
-    version="rlds",
-    fps=CONTROL_HZ,
-    state="state",
-    action="action",
-    action_names=OWN.action_names,
-)
-PUBLISHED: Mapping[str, Layout] = MappingProxyType(
-    {
-        "lerobot/libero": LEROBOT_LIBERO,
-        "physical-intelligence/libero": OPENPI_LIBERO,
-        "IPEC-COMMUNITY/libero": IPEC_LIBERO,
-        "openvla/modified_libero_rlds": RLDS_LIBERO,
+def _read_layouts() -> dict[str, Mapping[str, Layout]]:
+    """Return the layouts of each section of `layouts.yaml`, by name."""
+    codecs = {codec.name: codec for codec in (AV1, H264)}
+    data = read_yaml("demos/layouts.yaml")
+    return {
+        section: MappingProxyType(
+            {
+                name: Layout(**{**fields, "codec": codecs.get(fields["codec"])})
+                for name, fields in group.items()
+            }
+        )
+        for section, group in data.items()
+        if section != "own"
     }
-)
-RECORDED: Mapping[str, Layout] = MappingProxyType(
-    {
-        "lerobot": OWN,
-        "gr00t": replace(IPEC_LIBERO, codec=H264, mirrored=False, outcome=True),
-        "rlds": replace(RLDS_LIBERO, mirrored=False),
-    }
-)
+
+
+_LAYOUTS = _read_layouts()
+PUBLISHED, RECORDED = _LAYOUTS["published"], _LAYOUTS["recorded"]
 
 
 def _parts(names: Sequence[str]) -> dict[str, dict[str, int]]:

@@ -1,7 +1,7 @@
 """Observations of recorded states, in the scene that a demonstration file names."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from textwrap import shorten
@@ -14,7 +14,7 @@ from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import json_attribute, picture_size, read_header
 from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
-from libero_env.demos.read import Episode
+from libero_env.demos.read import Episode, read_episodes
 from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError, LiberoError, UnknownNameError
@@ -203,6 +203,25 @@ class StateRenderer:
             DemoError: The states or the fixtures do not fit the scene.
         """
         self.env.simulations.fixtures[0] = fixture_poses(episode, self.scene, where)
+
+    def episodes(self, file: Path, names: Sequence[str] | None = None) -> Iterator[Episode]:
+        """Yield the demonstrations of a file, each after its fixtures are placed.
+
+        Args:
+            file: Where they are.
+            names: Which ones; None for all.
+
+        Raises:
+            DemoError: The file is broken, does not fit the scene, or lacks one of the names.
+        """
+        seen = set()
+        for episode in read_episodes(file):
+            if names is None or episode.name in names:
+                seen.add(episode.name)
+                self.prepare(episode, f"{file}: {episode.name}")
+                yield episode
+        if absent := set(names or ()) - seen:
+            raise DemoError(f"{file}: no demonstration {', '.join(sorted(absent))}")
 
     def render_states(
         self, states: np.ndarray, fixtures: np.ndarray, name: str = ""

@@ -3,6 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import islice
@@ -157,8 +158,7 @@ def rerender(
         raise DemoError(f"{target} is the file to read; choose another name")
     config = replace(config, drawing=config.drawing or default_drawing(select_pack(assets)))
     task = task or recorded_task(file)
-    renderer = StateRenderer.of_file(file, config, assets, task=task)
-    try:
+    with closing(StateRenderer.of_file(file, config, assets, task=task)) as renderer:
         header = rendered_header(file, config, task) | config.mask_names(renderer.scene)
         writer = DemoWriter(target, header)
         recorded = writer.recorded_states()
@@ -171,8 +171,6 @@ def rerender(
                 writer.write(number, replace(episode, obs=obs, robot_states=robot_states))
             elif not np.array_equal(recorded[number], episode.states):
                 raise DemoError(f"{target} has another {name} than {file}; choose another name or remove it")
-    finally:
-        renderer.close()
     return writer.finish()
 
 

@@ -11,7 +11,7 @@ again they may be a step short, so the expert's last action is repeated a few ti
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -24,7 +24,7 @@ from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import EXPORTED_STATE, demo_number, read_header
 from libero_env.demos.observe import StateRenderer
-from libero_env.demos.read import PUBLISHED_NOOP_NORM, Episode, Labels, published_noop_steps, read_episodes
+from libero_env.demos.read import PUBLISHED_NOOP_NORM, Episode, Labels, published_noop_steps
 from libero_env.demos.write import DemoWriter, require_absent
 from libero_env.envs.config import Assets, Drawing, Size
 from libero_env.errors import DemoError
@@ -97,19 +97,14 @@ def replay(
         raise DemoError(f"a replay by state executes no {actions} actions; replay by action")
     config = RenderConfig(tuple(cameras), size, drawing=read_header(file).get("drawing"))
     keys = [image_name(camera, "rgb") for camera in cameras]
-    replayed = set()
-    with ExitStack() as stack:
-        converter = stack.enter_context(closing(ActionConverter(file, actions, task)))
-        renderer = StateRenderer.of_file(file, config, assets, task=task, control=KINDS[actions])
-        stack.callback(renderer.close)
-        for episode in read_episodes(file):
-            if demos is None or episode.name in demos:
-                replayed.add(episode.name)
-                renderer.prepare(episode, f"{file}: {episode.name}")
-                extra = 0 if actions == "delta" else EXTRA_STEPS
-                yield _replay_episode(renderer, converter.convert(episode), by, keys, extra)
-    if absent := set(demos or ()) - replayed:
-        raise DemoError(f"{file}: no demonstration {', '.join(sorted(absent))}")
+    extra = 0 if actions == "delta" else EXTRA_STEPS
+    control = KINDS[actions]
+    with (
+        closing(ActionConverter(file, actions, task)) as converter,
+        closing(StateRenderer.of_file(file, config, assets, task=task, control=control)) as renderer,
+    ):
+        for episode in renderer.episodes(file, demos):
+            yield _replay_episode(renderer, converter.convert(episode), by, keys, extra)
 
 
 def _replay_episode(
@@ -157,12 +152,11 @@ def rerun_actions(file: Path, target: Path) -> Path:
         DemoError: The file is broken or does not fit its task's scene, or the target exists.
     """
     require_absent(target)
-    renderer = StateRenderer.of_file(file, RenderConfig(()))
-    writer, env = DemoWriter(target, read_header(file)), renderer.env.batch
+    writer = DemoWriter(target, read_header(file))
     writer.discard_parts()  # of an interrupted call, perhaps with another file
-    try:
-        for episode in progress_bar(read_episodes(file), desc="replay", unit="demo"):
-            renderer.prepare(episode, f"{file}: {episode.name}")
+    with closing(StateRenderer.of_file(file, RenderConfig(()))) as renderer:
+        env = renderer.env.batch
+        for episode in progress_bar(renderer.episodes(file), desc="replay", unit="demo"):
             renderer.env.set_state(episode.states[0])
             states = []
             for action in episode.actions:
@@ -172,8 +166,6 @@ def rerun_actions(file: Path, target: Path) -> Path:
             writer.write(
                 demo_number(episode.name), replace(episode, states=np.array(states), success=success)
             )
-    finally:
-        renderer.close()
     return writer.finish()
 
 
@@ -228,13 +220,9 @@ def regenerate(file: Path, config: Regeneration, task: Task | None = None) -> It
     if "generator" not in read_header(file):  # not of this package's expert
         config = replace(config, extra_steps=0)
     rendering = RenderConfig(size=config.size, drawing=config.drawing)
-    renderer = StateRenderer.of_file(file, rendering, config.pack(), task=task)
-    try:
-        for episode in read_episodes(file):
-            renderer.prepare(episode, f"{file}: {episode.name}")
+    with closing(StateRenderer.of_file(file, rendering, config.pack(), task=task)) as renderer:
+        for episode in renderer.episodes(file):
             yield _regenerate_episode(renderer, episode, config)
-    finally:
-        renderer.close()
 
 
 def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regeneration) -> Episode:

@@ -6,6 +6,7 @@ seconds. An action stands at the step of the observation on which it was chosen.
 """
 
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,10 +15,10 @@ import numpy as np
 
 from libero_env.demos.config import MASK_NAMES, RenderConfig
 from libero_env.demos.contents import is_image, json_attribute, read_header
-from libero_env.demos.layouts import OWN
+from libero_env.demos.layouts import RECORDED
 from libero_env.demos.observe import StateRenderer, recorded_frequency
-from libero_env.demos.read import Episode, read_episodes
-from libero_env.errors import DemoError, LiberoError
+from libero_env.demos.read import Episode
+from libero_env.errors import LiberoError
 from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_path
 from libero_env.tasks import Task
@@ -31,7 +32,6 @@ def write_rerun(
     *,
     demos: Sequence[str] | None = None,
     task: Task | None = None,
-    progress: bool | None = None,
 ) -> int:
     """Write demonstrations as a file of Rerun; return their number.
 
@@ -40,7 +40,6 @@ def write_rerun(
         target: File to write, .rrd; it is replaced in one step.
         demos: Names of the demonstrations; None for all.
         task: Task that was recorded; None for the one that the file states.
-        progress: Whether to show a progress bar. None shows one if stderr is a terminal.
 
     Raises:
         DemoError: The file is broken, does not fit its task's scene, or has no such demonstration.
@@ -51,21 +50,14 @@ def write_rerun(
         raise LiberoError(f"{target}: Rerun opens files that end with .rrd")
     hz = recorded_frequency(file)
     stream = rerun.RecordingStream("libero", recording_id=file.stem)
-    memory, written = stream.memory_recording(), set()
-    renderer = StateRenderer.of_file(file, RenderConfig(()), task=task)
-    try:
-        for episode in progress_bar(read_episodes(file), desc="show", unit="demo", progress=progress):
-            if demos is None or episode.name in demos:
-                written.add(episode.name)
-                renderer.prepare(episode, f"{file}: {episode.name}")
-                _Branch(rerun, stream, episode.aligned(), hz).write(renderer, _mask_names(file))
-    finally:
-        renderer.close()
-    if absent := set(demos or ()) - written:
-        raise DemoError(f"{file}: no demonstration {', '.join(sorted(absent))}")
+    memory, written = stream.memory_recording(), 0
+    with closing(StateRenderer.of_file(file, RenderConfig(()), task=task)) as renderer:
+        for episode in progress_bar(renderer.episodes(file, demos), desc="show", unit="demo"):
+            _Branch(rerun, stream, episode.aligned(), hz).write(renderer, _mask_names(file))
+            written += 1
     with atomic_path(target) as temporary:
         temporary.write_bytes(memory.drain_as_bytes())
-    return len(written)
+    return written
 
 
 def _import_rerun() -> ModuleType:
@@ -104,9 +96,10 @@ class _Branch:
                 self._frames(f"cameras/{key}", values, mask_names)
             else:
                 self._numbers(f"state/{key}", values)
-        self._numbers("action", episode.actions, OWN.action_names)
+        names = RECORDED["lerobot"].action_names
+        self._numbers("action", episode.actions, names)
         if episode.expert_actions is not None:
-            self._numbers("expert_action", episode.expert_actions, OWN.action_names)
+            self._numbers("expert_action", episode.expert_actions, names)
         held = []
         for state in episode.states:
             renderer.env.batch.set_state(0, state)
