@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic.dataclasses import dataclass
 
-from libero_env.cli.answer import Answer
 from libero_env.cli.options import (
+    Answer,
     Field,
     FilePath,
     Natural,

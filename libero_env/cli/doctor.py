@@ -17,7 +17,7 @@ from pathlib import Path
 from libero_env.assets.pack import BUILTIN, VARIABLE, chosen_assets, facade_assets, pack_of
 from libero_env.assets.published import find_distribution
 from libero_env.assets.robot import ROBOSUITE_VERSION, installed_robot, robot_cache
-from libero_env.cli.answer import Answer
+from libero_env.cli.options import Answer
 from libero_env.errors import LiberoError
 from libero_env.paths import cache_dir, config_file, demos_dir, read_config
 from libero_env.storage import check_trusted

@@ -26,7 +26,7 @@ class Command:
         help: What it does, for lists of commands.
         resume: How to go on after an interruption.
         reads_words: Whether the function takes the words as they are, as its only argument.
-        flags: Which of `libero_env.cli.answer.FLAGS` it has; its function returns an `Answer`.
+        flags: Which of `libero_env.cli.options.FLAGS` it has; its function returns an `Answer`.
     """
 
     target: str

@@ -1,7 +1,8 @@
 """From the words of a command line to the call of a function, by tyro; and the types of options that commands share.
 
 The parameters of a command's function are its options, with their types, defaults and bounds; their help is its
-docstring. A function whose only parameter is a dataclass has the fields of that as options.
+docstring. A function whose only parameter is a dataclass has the fields of that as options. Some commands return an
+`Answer`, which is printed as text or as JSON.
 """
 
 import contextlib
@@ -11,7 +12,9 @@ import inspect
 import io
 import re
 import sys
-from collections.abc import Callable, Sequence
+import webbrowser
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, get_type_hints
 
@@ -21,8 +24,8 @@ from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from libero_env.cli import ending
-from libero_env.cli.answer import FLAGS, tell
-from libero_env.text import suggest
+from libero_env.errors import InvalidInputError
+from libero_env.text import suggest, to_json
 
 __all__ = ["Positional", "arg"]
 
@@ -89,7 +92,7 @@ def parse(
         function: Function of a command.
         words: Words of the command line after the command's name.
         prog: The command, such as `libero demos generate`.
-        flags: Which of `libero_env.cli.answer.FLAGS` it has, in addition to its own options.
+        flags: Which of `libero_env.cli.options.FLAGS` it has, in addition to its own options.
 
     Returns:
         The call, to be made without arguments. After `--help`, or after an error told in one line, the process ends.
@@ -223,3 +226,50 @@ def options_in(text: str) -> list[str]:
 def _fail(message: str, prog: str) -> NoReturn:
     print(f"error: {message}{'' if message.endswith('?') else ';'} see {prog} --help", file=sys.stderr)
     raise SystemExit(ending.MISTAKE)
+
+
+FLAGS = {
+    "json": "Print the answer as JSON, and nothing else on the standard output.",
+    "open": "Show the page in the browser.",
+}
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command found.
+
+    Attributes:
+        text: Lines for a terminal.
+        data: The same as plain data.
+        page: Page that was written; its path is printed after the text.
+        status: Exit status.
+    """
+
+    text: str
+    data: Any = None
+    page: Path | None = None
+    status: int = 0
+
+
+def tell(command: Callable[[], Answer], flags: Collection[str]) -> int:
+    """Run a command, and print its answer in the form that the flags ask for; return its exit status.
+
+    What the command itself prints, such as rows of a table as they become known, is left out with `--json`.
+
+    Raises:
+        InvalidInputError: `--open` is given, and no page was written.
+    """
+    with contextlib.redirect_stdout(io.StringIO()) if "json" in flags else contextlib.nullcontext():
+        answer = command()
+    if "json" in flags:
+        print(to_json(answer.data), end="")
+    elif lines := [str(part) for part in (answer.text, answer.page) if part]:
+        print("\n".join(lines))
+    if "open" in flags:
+        if answer.page is None:
+            raise InvalidInputError(
+                "--open shows a page, and none was written: name a folder for it with --out"
+            )
+        if not webbrowser.open(answer.page.resolve().as_uri()):
+            print(f"note: no browser could be started; the page is {answer.page}", file=sys.stderr)
+    return answer.status

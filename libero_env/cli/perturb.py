@@ -4,8 +4,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-from libero_env.cli.answer import Answer
-from libero_env.cli.options import Field, FilePath, Positional, ProcessesOrAll, Seed, Share, Side, arg
+from libero_env.cli.options import Answer, Field, FilePath, Positional, ProcessesOrAll, Seed, Share, Side, arg
 from libero_env.parallel import cpu_count
 
 Perturb = Annotated[str, arg(metavar="KIND=SEVERITY,...")]
@@ -82,7 +81,7 @@ def certify(
     """
     from libero_env.design.certify_perturbed import certify_perturbed, shares_table
     from libero_env.perturbations import KINDS, Perturbation
-    from libero_env.perturbations.sampling import attempts_file
+    from libero_env.perturbations.kinds import attempts_file
     from libero_env.storage import read_json, write_json
     from libero_env.tasks import find_tasks
 

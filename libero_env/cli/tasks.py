@@ -6,8 +6,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from libero_env.cli.answer import Answer
 from libero_env.cli.options import (
+    Answer,
     Field,
     FilePath,
     Natural,

@@ -63,9 +63,8 @@ def teleop(request: TeleopRequest) -> int:
         InvalidInputError: Not exactly one of a task and a task file is given.
     """
     from libero_env.tasks import get_task, read_task
-    from libero_env.teleop.devices import HELP, Keyboard, SpaceMouse
     from libero_env.teleop.screens import MouseReader, open_screen
-    from libero_env.teleop.session import Teleop, record_session
+    from libero_env.teleop.session import HELP, Keyboard, SpaceMouse, Teleop, record_session
 
     if request.task is not None and request.bddl is None:
         task = get_task(request.task)

@@ -28,7 +28,7 @@ from libero_env.memory import require_memory
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.episodes import TRIES
 from libero_env.perturbations.events import NEVER, has_begun
-from libero_env.perturbations.sampling import start_name
+from libero_env.perturbations.kinds import start_name
 from libero_env.sim.engine import Goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward

@@ -1,4 +1,4 @@
-from .kinds import LAYERS, ActionFilter, Episode, Kind, ObservationFilter, StartChange
+from .kinds import LAYERS, ActionFilter, Episode, Kind, ObservationFilter, StartChange, sample_key
 from .perturbation import (
     KINDS,
     Perturbation,
@@ -9,7 +9,6 @@ from .perturbation import (
     replace_perturbations,
     reword_task,
 )
-from .sampling import sample_key
 from .starts import RobotJoints
 
 __all__ = [

@@ -8,7 +8,7 @@ import numpy as np
 from libero_env.assets.arena import SPARE, surface_styles
 from libero_env.geometry import quat_to_mat, rotation_about
 from libero_env.mujoco_compat import mujoco
-from libero_env.perturbations.sampling import direction, sign
+from libero_env.perturbations.kinds import direction, sign
 from libero_env.sim.appearance import HEADLIGHT, Appearance, CameraView, Light
 from libero_env.sim.scene import Scene
 

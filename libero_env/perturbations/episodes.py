@@ -8,10 +8,9 @@ import numpy as np
 
 from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.perturbations.events import NEVER
-from libero_env.perturbations.kinds import Change, Episode, Layer, layer_of
+from libero_env.perturbations.kinds import Change, Episode, Layer, layer_of, sample_key
 from libero_env.perturbations.pairing import Pairing
 from libero_env.perturbations.perturbation import Perturbation, in_order, parse_perturbations
-from libero_env.perturbations.sampling import sample_key
 from libero_env.sim.appearance import Appearance, joined
 from libero_env.sim.scene import Scene
 from libero_env.tasks import Task

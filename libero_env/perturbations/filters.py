@@ -8,8 +8,7 @@ import numpy as np
 from PIL import Image, ImageFilter
 
 from libero_env.geometry import quat_from_axis_angle, quat_multiply, quat_to_axis_angle
-from libero_env.perturbations.kinds import ActionFilter, Episode, ObservationFilter
-from libero_env.perturbations.sampling import direction, sign
+from libero_env.perturbations.kinds import ActionFilter, Episode, ObservationFilter, direction, sign
 
 _BLUR_HEIGHT = 128  # [pixels] height of the image in which blur is measured
 _FINGERS = 0.1  # bias of the fingers over that of positions

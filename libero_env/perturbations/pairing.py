@@ -11,7 +11,7 @@ import numpy as np
 from libero_env.errors import PlacementError
 from libero_env.init_states.placement import collision_boxes, lowest_point, settle
 from libero_env.mujoco_compat import mujoco
-from libero_env.perturbations.sampling import SampleKey
+from libero_env.perturbations.kinds import SampleKey
 from libero_env.perturbations.starts import contacts, posed
 from libero_env.sim.scene import Scene, zone_boxes
 from libero_env.sim.simulation import LoopSimulations

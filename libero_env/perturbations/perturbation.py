@@ -10,8 +10,7 @@ from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.perturbations import appearance, filters, problem, starts
 from libero_env.perturbations.events import checked_trigger
 from libero_env.perturbations.instructions import reword
-from libero_env.perturbations.kinds import Kind, Layer
-from libero_env.perturbations.sampling import SampleKey, first_attempt, sample_key
+from libero_env.perturbations.kinds import Kind, Layer, SampleKey, first_attempt, sample_key
 from libero_env.sim.scene import Scene
 from libero_env.storage import read_yaml
 from libero_env.tasks.task import Task

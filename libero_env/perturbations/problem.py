@@ -11,7 +11,7 @@ import numpy as np
 from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.init_states.store import load_init_states
 from libero_env.perturbations.instructions import reword
-from libero_env.perturbations.sampling import direction
+from libero_env.perturbations.kinds import direction
 from libero_env.perturbations.starts import carried, contacts, shifted
 from libero_env.sim.scene import Scene
 from libero_env.storage import read_yaml

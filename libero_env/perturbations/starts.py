@@ -10,8 +10,7 @@ import numpy as np
 
 from libero_env.geometry import quat_from_axis_angle, quat_multiply
 from libero_env.mujoco_compat import mujoco
-from libero_env.perturbations.kinds import StartChange
-from libero_env.perturbations.sampling import direction, sign
+from libero_env.perturbations.kinds import StartChange, direction, sign
 from libero_env.sim.scene import ROBOT, Scene
 from libero_env.tasks.problem import Problem
 from libero_env.workspaces import WORKSPACES

@@ -58,7 +58,7 @@ from libero_env.storage import parse_yaml
 from libero_env.tasks import bddl
 from libero_env.tasks.cameras import Camera
 from libero_env.tasks.problem import And, Expression, Problem, ProblemError, Region
-from libero_env.tasks.source import Source, Trace, read_definition, scene_file
+from libero_env.tasks.schema import Source, Trace, read_definition, scene_file
 from libero_env.tasks.task import FILE, Task, check_name
 from libero_env.text import shown, suggest
 from libero_env.validation import validate

@@ -9,7 +9,7 @@ from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl
 from libero_env.tasks.benchmark import benchmark_suite, suite_names
 from libero_env.tasks.builder import check_keys, language_from_name, task_from_definition
-from libero_env.tasks.source import read_definition
+from libero_env.tasks.schema import read_definition
 from libero_env.tasks.task import FILE, Suite, Task
 from libero_env.text import closest
 

@@ -17,8 +17,17 @@ from libero_env.errors import LiberoError, RenderError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP
 from libero_env.sim.predicates import glowing_sites
-from libero_env.teleop.devices import GRIPPER, HELP, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse
-from libero_env.teleop.session import Screen, Status
+from libero_env.teleop.session import (
+    GRIPPER,
+    HELP,
+    MOTIONS,
+    QUIT,
+    RESET,
+    Keyboard,
+    Screen,
+    SpaceMouse,
+    Status,
+)
 from libero_env.timing import CONTROL_HZ
 
 SCREENS = ("auto", "window", "terminal")

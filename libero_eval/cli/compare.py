@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from libero_env.cli.answer import Answer
 from libero_env.cli.ending import UNDECIDED
-from libero_env.cli.options import Field, FilePath, Positional, Probability, Share, arg
+from libero_env.cli.options import Answer, Field, FilePath, Positional, Probability, Share, arg
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:

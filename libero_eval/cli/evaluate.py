@@ -7,8 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from libero_env.cli.answer import Answer
-from libero_env.cli.options import FilePath
+from libero_env.cli.options import Answer, FilePath
 from libero_env.storage import read_json
 from libero_eval.requests import EvalRequest, RobustnessRequest
 

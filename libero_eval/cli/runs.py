@@ -1,13 +1,13 @@
-"""Commands about a run: serve its policy, relearn tasks, tell why it forgets, show where it looks, check it."""
+"""Commands about a run: serve its policy, relearn tasks, diagnose, explain, view and check it."""
 
 import asyncio
 import contextlib
+import socket
 from dataclasses import asdict
 from typing import Annotated
 
-from libero_env.cli.answer import Answer
-from libero_env.cli.options import Device, Field, FilePath, Natural, Positional, Processes, Seed
-from libero_eval.requests import DiagnoseRequest, RelearnRequest, SaliencyRequest
+from libero_env.cli.options import Answer, Device, Field, FilePath, Natural, Positional, Processes, Seed
+from libero_eval.requests import DiagnoseRequest, RelearnRequest, SaliencyRequest, ViewRequest
 
 
 def serve(
@@ -103,3 +103,18 @@ def check(
         lines.append(f"{e.path}: {'sound' if e.sound else 'FAULTS'} ({counts})")
         lines += [f"  {finding.level}: {finding.text}" for finding in e.findings]
     return Answer("\n".join(lines), rows, status=int(not all(e.sound for e in examined)))
+
+
+def view(request: ViewRequest) -> None:
+    """Show a scene in the browser until interrupted; print its address."""
+    from libero_eval.viewer import Stage, Viewer
+
+    viewer = Viewer(Stage(request), request.host, request.port)
+    try:
+        viewer.open(viewer.stage.initial)
+        port = viewer.port
+        print(f"showing {request.what} at http://localhost:{port}", flush=True)
+        print(f"from another machine: ssh -L {port}:localhost:{port} {socket.gethostname()}", flush=True)
+        viewer.run()
+    finally:
+        viewer.close()

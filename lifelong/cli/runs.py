@@ -6,8 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from libero_env.cli.answer import Answer
-from libero_env.cli.options import Field, FilePath, Positional
+from libero_env.cli.options import Answer, Field, FilePath, Positional
 from libero_env.storage import read_json
 from lifelong.errors import ConfigError
 

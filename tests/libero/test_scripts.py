@@ -17,7 +17,7 @@ from libero_env.demos.write import DemoWriter, make_header
 from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import bddl, get_task
 from libero_env.teleop import screens as teleop_screens
-from libero_env.teleop.devices import QUIT
+from libero_env.teleop.session import QUIT
 
 ROOT = Path(__file__).parents[2]
 TASK = "libero_goal/1"

@@ -12,7 +12,7 @@ from libero_env.cli.main import main
 from libero_env.design import certify_perturbed
 from libero_env.design.certify_perturbed import REDRAWS, attempt_perturbed, shares_table
 from libero_env.errors import LiberoError
-from libero_env.perturbations import Perturbation, sampling
+from libero_env.perturbations import Perturbation, kinds
 from libero_env.tasks import get_suite, get_task
 
 pytestmark = pytest.mark.sim
@@ -46,7 +46,7 @@ def test_what_the_expert_does_not_solve_is_drawn_again_for_that_start(expert):
     assert found.attempts(ROBOT) == {name: 1}
 
     env = LiberoEnv(TASK, cameras=(), perturb=[ROBOT])
-    with sampling.trying(found.attempts(ROBOT)):
+    with kinds.trying(found.attempts(ROBOT)):
         observation, info = env.reset(options={"init_state": 1})
     assert info["attempts"].tolist() == [1] and not np.array_equal(observation["joint_states"], failing)
     assert np.array_equal(observation["joint_states"], expert.joints[-1][0])
@@ -68,7 +68,7 @@ def test_a_task_that_is_mostly_not_solved_is_drawn_again_as_a_whole(expert):
 
 def test_results_are_on_disk_and_are_not_run_again(expert, tmp_path, capsys, monkeypatch):
     (tmp_path / "draws.json").write_text("{}")
-    monkeypatch.setattr(sampling, "attempts_file", lambda: tmp_path / "draws.json")
+    monkeypatch.setattr(kinds, "attempts_file", lambda: tmp_path / "draws.json")
     words = [
         "perturb", "certify", "libero_goal/3", "--kinds", "robot", "gain", "--severities", "0.4", "--starts", "2"
     ]  # fmt: skip

@@ -15,9 +15,18 @@ from libero_env.errors import LiberoError, RenderError
 from libero_env.sim.render import renderer_name
 from libero_env.tasks import get_task
 from libero_env.teleop import screens as teleop_screens
-from libero_env.teleop.devices import GRIPPER, MOTIONS, QUIT, RESET, Keyboard, SpaceMouse
 from libero_env.teleop.screens import MouseReader, as_text, key_name, open_screen, press_typed
-from libero_env.teleop.session import Status, Teleop, record_session
+from libero_env.teleop.session import (
+    GRIPPER,
+    MOTIONS,
+    QUIT,
+    RESET,
+    Keyboard,
+    SpaceMouse,
+    Status,
+    Teleop,
+    record_session,
+)
 
 TASK = "libero_90/0"  # KITCHEN_SCENE10_close_the_top_drawer_of_the_cabinet
 # (x, y, z) for the gripper, m: before the open drawer, down to its front, and against it

@@ -47,8 +47,8 @@ class NativePolicy(BasePolicy):
         self.spec = policy_spec(cfg, shape_meta, self.max_seq_len)
         arguments = {**self._arguments(policy), "head": _head(policy)}
         node = {"_target_": f"{self.kind.__module__}.{self.kind.__name__}", **arguments}
-        more = plain(policy.get("native") or {})
-        self.network: Any = build(OmegaConf.merge(OmegaConf.create(node), more), spec=self.spec)
+        whole: Any = OmegaConf.merge(node, plain(policy.get("native") or {}))
+        self.network: Any = build(whole, spec=self.spec)
         self._configure(policy)
         loss = policy.policy_head.get("loss_kwargs") or {}
         head = wrap_head(self.network.head, float(loss.get("loss_coef", 1.0)))
