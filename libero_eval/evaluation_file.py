@@ -36,6 +36,7 @@ UNMEASURED = (
     "failures",
     "costs",
     "began",
+    "solved",
 )  # columns that are not part of `outcomes`
 
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -58,6 +59,8 @@ class TaskResult(Episodes):
             empty without perturbations.
         began: Number of control steps from the reset before each event began, -1 where it never did, (episodes,
             events); empty without events.
+        solved: Whether the expert, from the state just after each event, solves what is left: 1 or 0, -1 where it never
+            began.
 
     Raises:
         EvaluationFileError: The columns have different lengths.
@@ -70,8 +73,16 @@ class TaskResult(Episodes):
     actions: tuple[str, ...] = ()
     attempts: tuple[tuple[Count, ...], ...] = ()
     began: tuple[tuple[Annotated[int, Field(ge=-1)], ...], ...] = ()
+    solved: tuple[tuple[Annotated[int, Field(ge=-1, le=1)], ...], ...] = ()
 
-    OPTIONAL: ClassVar[tuple[str, ...]] = (*Episodes.OPTIONAL, "errors", "actions", "attempts", "began")
+    OPTIONAL: ClassVar[tuple[str, ...]] = (
+        *Episodes.OPTIONAL,
+        "errors",
+        "actions",
+        "attempts",
+        "began",
+        "solved",
+    )
 
     def __post_init__(self) -> None:
         errors = self.shape_errors()
@@ -112,9 +123,13 @@ class TaskResult(Episodes):
 
     @property
     def event_note(self) -> str:
-        """In how many episodes each event began, as text; empty without events."""
+        """In how many episodes each event began, and the expert solves the rest, as text; empty without events."""
+        events = list(zip(*self.began, strict=True))
+        solved = list(zip(*self.solved, strict=True)) or [()] * len(events)
         counts = [
-            f"{sum(at >= 0 for at in event)} of {len(event)}" for event in zip(*self.began, strict=True)
+            f"{sum(at >= 0 for at in event)} of {len(event)}"
+            + (f" (the expert solves {rest.count(1)} from there)" if {0, 1} & {*rest} else "")
+            for event, rest in zip(events, solved, strict=True)
         ]
         return f"events began in {', '.join(counts)}" if counts else ""
 

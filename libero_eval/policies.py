@@ -127,7 +127,7 @@ class RunPolicy(PolicyUnderTest):
         run = self.run
         draws = [generator(*words) for words in self.seeds(task, states)]
         with run.acting(task) as policy:
-            yield PolicyActor(policy, run.embed(task), run.device, run.eval.precision, draws)
+            yield PolicyActor(policy, run.embed(task), run.device, run.eval.precision, draws, run.embed)
 
 
 class ExpertPolicy(PolicyUnderTest):
@@ -177,6 +177,10 @@ class ExpertActor:
     def note(self, over: np.ndarray, success: np.ndarray) -> None:
         """Take note of which episodes are over; see `TakesNote`."""
         self._over = over
+
+    def hear(self, i: int, task: Task) -> None:
+        """Let the expert of simulation i plan again, from its state; see `lifelong.evaluation.actors.Hears`."""
+        self._experts[i].replan(task)
 
     def act(self, obs: Obs) -> np.ndarray:
         """Return the experts' actions; those that are done or have given up hold still. See `Actor`."""

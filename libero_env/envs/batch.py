@@ -36,6 +36,7 @@ from libero_env.sim.scene import BUFFER_SIDE, InitialStates
 from libero_env.sim.simulation import Indices, Watch
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.tasks import Task
+from libero_env.tasks.problem import Atom
 from libero_env.timing import CONTROL_HZ, PHYSICS_HZ
 from libero_env.validation import validate
 
@@ -97,6 +98,7 @@ class BatchEnv(LiberoVectorEnv):
         config: Configuration of all simulations.
         task: Task of the simulations, as the perturbations of the configuration change it.
         scene: Compiled scene of the task.
+        later: Task that an event changes it into; None without one.
         base_task: The task without perturbations, to which initial states belong.
         base_scene: Compiled scene of that task.
         perturbed: Samples and filters of the perturbations; None without any.
@@ -105,6 +107,7 @@ class BatchEnv(LiberoVectorEnv):
         observer: Observer of the simulations.
         goals: The goal and its atoms in the simulations.
         generators: Random generator of each simulation.
+        event_states: States just after events have begun, by simulation and event, of the present episodes.
         render_images: Whether images are rendered in each step. If False, observations have the images that were
             rendered last (black before the first); `render_cameras` renders those of the current state.
 
@@ -158,7 +161,11 @@ class BatchEnv(LiberoVectorEnv):
         )
         self.views = self.observer.views
         goal = self.scene.problem.goal
-        self.goals = Goals(goal, self.scene.goal_atoms, self.views, config.semantics)
+        self.later, atoms = scenes.later, self.scene.goal_atoms
+        later = None if scenes.later is None else scenes.later.problem.goal
+        every = tuple(dict.fromkeys([*atoms, *(later.atoms() if later else ())]))
+        self.goals = Goals(goal, every, self.views, config.semantics)
+        self._later_goals = None if later is None else Goals(later, every, self.views, config.semantics)
         controller = self.simulations.controller_state.controller
         self.single_observation_space = self.observer.space()
         self.single_action_space = spaces.Box(
@@ -171,13 +178,25 @@ class BatchEnv(LiberoVectorEnv):
         self._steps, self._errors = np.zeros(num, np.int64), dict[int, str]()
         self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
         self._progress = np.zeros((num, len(self.atoms)), bool)
-        has_events = self.perturbed is not None and self.perturbed.events
-        self._watch = EpisodeWatch(self.views, self.goals.atoms) if has_events else None
+        self._watched = bool(self.perturbed is not None and self.perturbed.events)
+        self._moved = np.zeros(num, bool)
+        self.event_states: dict[tuple[int, int], np.ndarray] = {}
 
     @property
     def atoms(self) -> tuple[str, ...]:
-        """Atoms of the goal, in the order of `progress` in infos, such as `(On plate_1 stove_1)`."""
+        """Atoms of the goal, in the order of `progress` in infos, such as `(On plate_1 stove_1)`.
+
+        Where an event changes the goal, those of the other one follow.
+        """
         return tuple(map(str, self.goals.atoms))
+
+    @cached_property
+    def watch(self) -> EpisodeWatch:
+        """Traces of the episodes; simulations are watched from when it is first asked for, or if there are events."""
+        self._watched, found = True, EpisodeWatch(self.views, self.goals.atoms)
+        for i in range(self.num_envs):
+            found.goals[i] = self._goal_atoms(i)
+        return found
 
     @cached_property
     def init_states(self) -> InitialStates:
@@ -223,6 +242,10 @@ class BatchEnv(LiberoVectorEnv):
             if request.outdated_controller:
                 self.simulations.outdate_controller(ids)
             self._steps[ids], self._running[ids] = 0, True
+            for i in map(int, ids) if self._watched else ():
+                self.event_states = {key: state for key, state in self.event_states.items() if key[0] != i}
+                self.watch.goals[i] = self._goal_atoms(i)
+                self.watch.begin(i)
             self._success[ids] = self._check_goals(ids)[0]
         return self._with_images(self._observe(ids)), self._info()
 
@@ -238,8 +261,9 @@ class BatchEnv(LiberoVectorEnv):
             Observations, rewards (num_envs,), terminations, truncations, and infos: `success` (num_envs,) bool and
             `progress` (num_envs, natoms) bool, whether each of the goal's `atoms` holds. Both keep the outcome of
             episodes that are over. With perturbations also `attempts` (num_envs, n): how many samples of each were not
-            valid at the reset. Where a simulation has diverged, its episode is truncated, and `errors` has the reason
-            by its index until it is reset.
+            valid at the reset. With events `began`, (num_envs, events): control steps before each, -1 until then; and
+            `moved` (num_envs,) bool: whether one has just changed what is to be done. Where a simulation has diverged,
+            its episode is truncated, and `errors` has the reason by its index until it is reset.
 
         Raises:
             ActionError: The shape is wrong, or a value is not a finite number; no state has changed.
@@ -260,6 +284,8 @@ class BatchEnv(LiberoVectorEnv):
             entries = self._step_and_observe(ids, actions)
             reached[ids], rewards[ids] = self._check_goals(ids)
             self._steps[ids] += 1
+            for i in map(int, ids) if self._watched else ():
+                self.watch.look(i)
         failed = np.isin(np.arange(self.num_envs), list(self._errors))
         reached, rewards = reached & ~failed, np.where(failed, 0.0, rewards)
         truncated = running & ~reached & (failed | (self._steps >= self.config.horizon))
@@ -271,7 +297,8 @@ class BatchEnv(LiberoVectorEnv):
         """Return all that the rest of the episode in simulation i depends on, see `LiberoEnv.get_state`."""
         self.require_open()
         i = checked_index(i, self.num_envs)
-        return np.append(self.simulations.get_state(i), float(self._steps[i]))
+        began = [] if self.perturbed is None else self.perturbed.began[i]
+        return np.concatenate([self.simulations.get_state(i), [self._steps[i]], began])
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Restore a state in simulation i; see `LiberoEnv.set_state`.
@@ -283,14 +310,19 @@ class BatchEnv(LiberoVectorEnv):
         i, state = checked_index(i, self.num_envs), self._checked_state(state)
         self._running[i] = False
         self._errors.pop(i, None)
-        if state.size == self.simulations.state_size + 1:
-            self.simulations.set_state(i, state[:-1])
-            self._steps[i] = int(state[-1])
+        size, began = self.simulations.state_size, np.zeros(0)
+        if state.size > size:
+            self.simulations.set_state(i, state[:size])
+            self._steps[i], began = int(state[size]), state[size + 1 :]
         else:
             self.simulations.set_physics_state(i, state)
             self._steps[i] = 0
         if self.perturbed is not None:
-            self.perturbed.resume(i, int(self._steps[i]))
+            self.perturbed.resume(i, int(self._steps[i]), began.astype(int) if began.size else NEVER)
+            self.observer.set_appearance(i, self.perturbed.appearance(i))
+        if self._watched:
+            self.watch.goals[i] = self._goal_atoms(i)
+            self.watch.begin(i)
         self._running[i], self._success[i] = True, False
 
     def observe(self, i: int) -> dict[str, np.ndarray]:
@@ -316,7 +348,7 @@ class BatchEnv(LiberoVectorEnv):
 
     def check_goal(self, i: int) -> tuple[bool, dict[str, bool]]:
         """Return whether the goal is reached in simulation i, and whether each of its atoms holds, by its text."""
-        reached, held = self.goals.check([i])
+        reached, held = self._goals_reached(np.array([i]))
         return bool(reached[0]), dict(zip(self.atoms, map(bool, held[0]), strict=True))
 
     def close_extras(self, **kwargs: Any) -> None:
@@ -361,8 +393,6 @@ class BatchEnv(LiberoVectorEnv):
                     f"{self.base_task.id}, start {name}: the perturbed goal holds at the start"
                 )
         self.observer.set_appearance(i, perturbed.appearance(i))
-        if self._watch is not None:
-            self._watch.begin(i)
 
     def _stored_states(self, indices: np.ndarray) -> InitialStates:
         """Return stored initial states by index, (k,)."""
@@ -385,13 +415,15 @@ class BatchEnv(LiberoVectorEnv):
 
     def _checked_state(self, state: object) -> np.ndarray:
         """Return a vector of `get_state`, or [time, qpos, qvel], as float64."""
-        model, size = self.scene.model, self.simulations.state_size + 1
+        model, steps = self.scene.model, self.simulations.state_size
+        size = steps + 1 + (0 if self.perturbed is None else len(self.perturbed.events))
         name = f"state of {self.task.id} (get_state, or [time, qpos, qvel])"
         array = checked_numbers(state, name, ((size,), (1 + model.nq + model.nv,)))
         _check_range(array, self.task)
-        if array.size == size and not (array[-1] >= 0 and array[-1].is_integer()):
+        counts = array[steps:] if array.size == size else np.zeros(1)
+        if not (counts[0] >= 0 and (counts >= NEVER).all() and (counts % 1 == 0).all()):
             raise InvalidInputError(
-                f"a state ends with its number of steps, a whole number; got {array[-1]:g}"
+                f"a state ends with its number of steps, and those before each event; got {counts.tolist()}"
             )
         return array
 
@@ -411,7 +443,7 @@ class BatchEnv(LiberoVectorEnv):
 
     def _check_goals(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whether the goal is reached in each of the simulations, and its reward; note which atoms hold."""
-        reached, held = self.goals.check(ids)
+        reached, held = self._goals_reached(ids)
         self._progress[ids] = held
         rewards = [
             self.reward(self.views[i], bool(won), self.goals.atoms, list(row))
@@ -419,18 +451,33 @@ class BatchEnv(LiberoVectorEnv):
         ]
         return reached, np.array(rewards, np.float64)
 
+    def _goals_reached(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return whether each simulation has reached its goal, (k,) bool, and which atoms hold, (k, natoms)."""
+        reached, held = self.goals.check(ids)
+        changed = np.array([self.task_of(i) is not self.task for i in ids], bool)
+        if self._later_goals is not None and changed.any():
+            reached[changed] = self._later_goals.check(ids[changed])[0]
+        return reached, held
+
+    def task_of(self, i: int) -> Task:
+        """Return the task of simulation i, whose goal an event may have changed."""
+        changed = self.later is not None and self.perturbed is not None and self.perturbed.has_new_goal(i)
+        return self.later if changed and self.later is not None else self.task
+
+    def _goal_atoms(self, i: int) -> tuple[Atom, ...]:
+        own = self.task_of(i).problem.goal.atoms()
+        return tuple(atom for atom in self.goals.atoms if atom in own)
+
     def _begin_events(self, ids: np.ndarray) -> None:
         """Let the events begin whose moment has come, before a control step."""
-        perturbed, watch = self.perturbed, self._watch
-        if perturbed is None or watch is None:
+        perturbed, self._moved[:] = self.perturbed, False
+        if perturbed is None or not perturbed.events:
             return
         for i in map(int, ids):
-            if perturbed.steps[i]:
-                watch.look(i)
             for event, k in enumerate(perturbed.events):
                 trigger, steps = perturbed.perturbations[k].trigger, int(perturbed.steps[i])
                 waits = perturbed.began[i, event] == NEVER and perturbed.attempts[i, k] < TRIES
-                if waits and has_begun(trigger, steps, self.config.horizon, watch, i):
+                if waits and has_begun(trigger, steps, self.config.horizon, self.watch, i):
                     self._begin_event(i, event)
 
     def _begin_event(self, i: int, event: int) -> None:
@@ -444,7 +491,11 @@ class BatchEnv(LiberoVectorEnv):
             return
         if not np.array_equal(row, state[:size]):
             simulations.set_state(i, np.concatenate([row, state[size:]]))
+            self.watch.measure_from_here(i)
         self.observer.set_appearance(i, perturbed.appearance(i))
+        self.watch.goals[i] = self._goal_atoms(i)
+        self._moved[i] |= perturbed.perturbations[perturbed.events[event]].definition.physical
+        self.event_states[i, event] = self.get_state(i)
 
     def _step_and_observe(self, ids: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
         """Advance simulations by one control period, and observe them when `config.observed` says."""
@@ -506,6 +557,7 @@ class BatchEnv(LiberoVectorEnv):
         if self.perturbed is not None:
             info["attempts"] = self.perturbed.attempts.copy()
             info["began"] = self.perturbed.began.copy()
+            info["moved"] = self._moved.copy()
         return {**info, "errors": dict(self._errors)} if self._errors else info
 
 

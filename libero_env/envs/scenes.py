@@ -1,7 +1,7 @@
 """The scenes of an environment's task, with and without perturbations."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -30,6 +30,7 @@ class TaskScenes:
     Attributes:
         task: Task as the perturbations change it.
         base_task: The task without perturbations.
+        later: Task that an event changes it into; None without one.
         rest: Joints that the controller takes for the arm's rest pose, (7,) [rad].
         perturbed: Samples and filters; None without perturbations.
     """
@@ -40,6 +41,7 @@ class TaskScenes:
     base_scene: Scene
     rest: np.ndarray
     perturbed: PerturbedEpisodes | None = None
+    later: Task | None = None
 
 
 def open_scenes(task: Task | str, config: EnvConfig, num: int) -> TaskScenes:
@@ -73,10 +75,15 @@ def open_scenes(task: Task | str, config: EnvConfig, num: int) -> TaskScenes:
     rest = joint_pose(0 if variant is None else variant.pose)
     if not changes:
         return TaskScenes(base, base_scene, base, base_scene, rest)
-    changed = perturb_task(base, (one for one in changes if isinstance(one, Perturbation)), base_scene)
-    scene = compiled(scene_problem(changed, base))
+    sampled = [one for one in changes if isinstance(one, Perturbation)]
+    changed, later = perturb_task(base, sampled, base_scene), None
+    problem = scene_problem(changed, base)
+    if events := [replace(one, trigger="") for one in sampled if one.layer == "problem" and one.trigger]:
+        later = perturb_task(base, events[:1], base_scene)
+        problem = replace(problem, regions=later.problem.regions)
+    scene = compiled(problem)
     perturbed = PerturbedEpisodes(changes, base, base_scene, scene, num)
-    return TaskScenes(changed, scene, base, base_scene, rest, perturbed)
+    return TaskScenes(changed, scene, base, base_scene, rest, perturbed, later)
 
 
 def published_changes(task: Task) -> tuple[Change, ...]:

@@ -1,6 +1,7 @@
 """The scripted expert: it observes the whole state and acts as a policy does, with seven numbers."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,7 +9,7 @@ import numpy as np
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError
 from libero_env.expert.arm import OPEN, limit_elbow_extension
-from libero_env.expert.planning.goal_plan import Step, plan_goal
+from libero_env.expert.planning.goal_plan import Step, UnsupportedGoalError, plan_goal
 from libero_env.expert.planning.pick_planner import is_graspable
 from libero_env.expert.shapes import Shapes
 from libero_env.expert.skills.drag import Drag
@@ -23,6 +24,7 @@ from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ, SUBSTEPS
 
 MAX_STEPS = 600  # control steps of an attempt
+LET_GO = 10  # control steps in which the hand opens before another plan
 
 
 class Expert:
@@ -66,6 +68,7 @@ class Expert:
         self.style = MotionStyle.sample(rng) if style is None else style
         self.skill: Skill | None = None
         self._finished_retries = 0  # of skills that are over
+        self._letting_go = 0  # control steps that the hand still opens
 
     @property
     def phase(self) -> str:
@@ -87,6 +90,10 @@ class Expert:
         """Why the expert cannot continue, or ""."""
         return "" if self.skill is None or self.skill.fallback() else self.skill.failure_reason
 
+    def replan(self, task: Task) -> None:
+        """Plan again, for a task in the same scene; what is in the hand is let go before."""
+        self.task, self.skill, self._letting_go = task, None, LET_GO
+
     def act(self, view: StateView) -> np.ndarray:
         """Return the next action, (7,) in [-1, 1].
 
@@ -101,6 +108,9 @@ class Expert:
             )
         if self.shapes is None:
             self.shapes = Shapes(view.scene)
+        if self._letting_go:
+            self._letting_go -= 1
+            return np.array([0.0] * 6 + [OPEN])
         if self.skill is None or self.skill.done(view):
             self._finished_retries = self.retries
             steps = plan_goal(self.task.problem.goal, view)
@@ -123,6 +133,34 @@ class Expert:
         if Drag.applies(view, shapes, atom) and not is_graspable(view, shapes, atom.args[0]):
             return Drag(atom, style=style, shapes=shapes)
         return PickPlace(atom, style=style, shapes=shapes, slot=step.slot)
+
+
+def solved_from_events(env: BatchEnv) -> np.ndarray:
+    """Return whether the expert solves what is left of episodes just after events, in the time that is left.
+
+    It plans anew there, for the goal that the episode has from then on. The environment is left somewhere else.
+
+    Args:
+        env: Environment whose episodes are over.
+
+    Returns:
+        (num_envs, events): 1 where it does, 0 where it does not, -1 where the event has not begun.
+    """
+    count = 0 if env.perturbed is None else len(env.perturbed.events)
+    found, states, shapes = np.full((env.num_envs, count), -1), dict(env.event_states), Shapes(env.scene)
+    env.render_images = False
+    for event in range(count):
+        ids = [i for i in range(env.num_envs) if (i, event) in states]
+        for i in ids:
+            env.set_state(i, states[i, event])
+        tasks = [env.task_of(i) for i in range(env.num_envs)]
+        experts = [Expert(task, np.random.default_rng(0), shapes=shapes) for task in tasks]
+        for expert in experts:
+            expert.replan(expert.task)
+        with suppress(UnsupportedGoalError):
+            attempts = run_experts(env, experts, max_steps=env.config.horizon)
+            found[ids, event] = [attempts[i].success for i in ids]
+    return found
 
 
 @dataclass(frozen=True)

@@ -152,12 +152,17 @@ class PerturbedEpisodes:
     def open(self, i: int, start: object) -> None:
         """Begin the observations and actions of the episode of a start in simulation i."""
         self._starts[i] = start
-        self.began[i] = NEVER
         self.resume(i, 0)
 
-    def resume(self, i: int, steps: int) -> None:
-        """Go on with the episode of simulation i after so many steps; filters with a memory begin a new one."""
-        self.steps[i] = steps
+    def resume(self, i: int, steps: int, began: np.ndarray | int = NEVER) -> None:
+        """Go on with the episode of simulation i after so many steps; filters with a memory begin a new one.
+
+        Args:
+            i: Index of the simulation.
+            steps: Number of control steps since the reset.
+            began: Number of control steps before each event, (events,).
+        """
+        self.steps[i], self.began[i] = steps, began
         for layer, filters in self._filters.items():
             filters[i] = self._opened(layer, self._starts[i], i)
 
@@ -165,6 +170,10 @@ class PerturbedEpisodes:
         """Return the appearance of simulation i; what is sampled for its start goes before absolute changes."""
         sampled = (self._sample(k, self._starts[i]) for k in self._of("appearance", i))
         return joined([*self._fixed_of("appearance"), *sampled])
+
+    def has_new_goal(self, i: int) -> bool:
+        """Return whether an event has changed the goal of simulation i."""
+        return any(self.perturbations[k].trigger for k in self._of("problem", i))
 
     def begin_event(self, i: int, event: int, row: np.ndarray) -> np.ndarray:
         """Let an event begin in simulation i, and return the state that it leaves; the same unless it moves something.

@@ -44,9 +44,9 @@ def has_begun(trigger: str, steps: int, horizon: int, watch: EpisodeWatch, i: in
         return 100 * steps >= int(trigger.removesuffix("%")) * horizon
     trace = watch.traces[i]
     if trigger == "over_goal":
-        return _is_over_goal(watch.views[i], watch.atoms, trace.in_hand)
+        return _is_over_goal(watch.views[i], watch.goals[i], trace.in_hand)
     names = trace.touched if trigger == "touched" else trace.lifted
-    return any(name in names for name in watch.wanted)
+    return any(name in names for name in watch.wanted(i))
 
 
 def _is_over_goal(view: StateView, atoms: Sequence[Atom], in_hand: str | None) -> bool:

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field
 
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.perturbations import appearance, filters, problem, starts
-from libero_env.perturbations.events import checked_trigger
+from libero_env.perturbations.events import PHASES, checked_trigger
 from libero_env.perturbations.instructions import reword
 from libero_env.perturbations.kinds import Kind, Layer, SampleKey, first_attempt, sample_key
 from libero_env.sim.scene import Scene
@@ -177,10 +177,15 @@ def _check_event(kind: str, trigger: str) -> None:
         raise InvalidInputError(
             f"event {kind}@{trigger}: {kind} cannot begin during an episode; can: {valid}"
         )
+    if kind == "object" and trigger in PHASES:
+        raise InvalidInputError(
+            f"event object@{trigger}: the robot touches the object then, so that it is not moved; expected "
+            "object@step40 or object@25%"
+        )
 
 
 def perturb_task(task: Task, perturbations: Iterable[Perturbation], scene: Scene) -> Task:
-    """Return a task as perturbations change it; those of other layers are ignored.
+    """Return a task as perturbations change it; those of other layers, and events, are ignored.
 
     Suite, index and name stay, so that its results can be paired with those of the task without perturbations.
 
@@ -191,7 +196,9 @@ def perturb_task(task: Task, perturbations: Iterable[Perturbation], scene: Scene
         InvalidInputError: The task has no other goal.
         PlacementError: Objects cannot be moved so far.
     """
-    active = tuple(one for one in perturbations if one.layer == "problem" and one.severity)
+    active = tuple(
+        one for one in perturbations if one.layer == "problem" and one.severity and not one.trigger
+    )
     attempts = tuple(one.first_attempt(task.id) for one in active)
     cache_key = (task, active, attempts, scene.pack, scene.robot)
     if cache_key not in _cached:

@@ -31,12 +31,12 @@ class EpisodeWatch:
 
     Args:
         views: State view of each simulation.
-        atoms: Atoms of the goal.
+        atoms: Atoms of the goal, or of several goals.
 
     Attributes:
         traces: What the present episode of each simulation has shown.
         costs: What it has cost.
-        wanted: Objects and fixtures that the goal is about.
+        goals: Atoms of the goal of each simulation.
     """
 
     def __init__(self, views: Sequence[StateView], atoms: Sequence[Atom]):
@@ -52,12 +52,12 @@ class EpisodeWatch:
             part = _LEFT if first in _ancestors(model, body) else part
             part = _RIGHT if second in _ancestors(model, body) else part
             self._codes[body] = self._names.index(part)
-        self.wanted = [name for atom in atoms if (name := scene.owner(atom.args[0]))]
+        self.goals = [self.atoms for _ in views]
         self._owned = {j: name for name in scene.entities for j in scene.joints[name]}
         self._joints = model.jnt_qposadr[list(self._owned)]
         self._scratch: mujoco.MjData | None = None
         goal = ground(scene.problem.goal, scene)
-        self._named = {scene.owner(name) for atom in goal.atoms() for name in atom.args}
+        self._named = {scene.owner(name) for atom in (*goal.atoms(), *self.atoms) for name in atom.args}
         self._idle = [name for name in scene.objects if name not in self._named]
         addresses = [scene.pose_address(name) for name in self._idle]
         self._poses = np.reshape(addresses, (-1, 1)).astype(int) + np.arange(7)
@@ -75,13 +75,20 @@ class EpisodeWatch:
     def begin(self, i: int) -> None:
         """Begin the trace of an episode in the present state of simulation i."""
         view = self.views[i]
-        self.traces[i] = Trace()
+        self.traces[i], self.costs[i] = Trace(), Costs(zone=0.0 if self._scene.problem.zones else None)
         self._heights[i] = {name: float(view.body_pos(name)[2]) for name in self._scene.objects}
-        qpos = view.simulations.fields["qpos"][i]
-        poses, self._rest[i] = qpos[self._poses], qpos[self._joints]
+        self._rest[i] = view.simulations.fields["qpos"][i, self._joints]
+        self.measure_from_here(i)
+
+    def measure_from_here(self, i: int) -> None:
+        """Measure the displacement of objects from the present state of simulation i: an event has moved some."""
+        poses = self.views[i].simulations.fields["qpos"][i][self._poses]
         vertical = np.tile([0.0, 0.0, 1.0], (len(poses), 1))
         self._stood[i], self._uprights[i] = poses[:, :3], quat_rotate(poses[:, 3:] * _CONJUGATE, vertical)
-        self.costs[i] = Costs(zone=0.0 if self._scene.problem.zones else None)
+
+    def wanted(self, i: int) -> list[str]:
+        """Return the objects and fixtures that the goal of simulation i is about."""
+        return [name for atom in self.goals[i] if (name := self._scene.owner(atom.args[0]))]
 
     def look(self, i: int) -> Trace:
         """Take note of the present state of simulation i, after a control step, and return its trace."""
@@ -117,20 +124,20 @@ class EpisodeWatch:
 
         Args:
             i: Index of the simulation.
-            ever: Whether each atom of the goal held at any time.
+            ever: Whether each of the atoms held at any time.
             now: Whether each holds at the end.
         """
         trace, view = self.traces[i], self.views[i]
         missing = [
             Missing(name, bool(before), over(view, atom), self._place(i, name))
             for atom, before, holds in zip(self.atoms, ever, now, strict=True)
-            if not holds and (name := self._scene.owner(atom.args[0]))
+            if not holds and atom in self.goals[i] and (name := self._scene.owner(atom.args[0]))
         ]
-        found = explain(trace, missing, self.wanted)
+        found = explain(trace, missing, self.wanted(i))
         moved = np.abs(view.simulations.fields["qpos"][i, self._joints] - self._rest[i]) > _MOVED
         opened = [name for name, far in zip(self._owned.values(), moved, strict=True) if far]
         handled = tuple(dict.fromkeys([*trace.lifted, *(name for name in opened if name in trace.touched)]))
-        instead = tuple(str(atom) for atom in self._possible(handled) if _holds(view, atom))
+        instead = tuple(str(atom) for atom in self._possible(i, handled) if _holds(view, atom))
         return Failure(found.cause, found.of, found.what, round(found.newtons, 1), handled, instead)
 
     def _pairs(self, geoms: np.ndarray) -> np.ndarray:
@@ -232,7 +239,7 @@ class EpisodeWatch:
         there = [*(n for n in scene.entities if n != name), scene.workspace_name]
         return next((other for other in there if view.in_contact(name, other)), "")
 
-    def _possible(self, handled: Sequence[str]) -> Iterator[Atom]:
+    def _possible(self, i: int, handled: Sequence[str]) -> Iterator[Atom]:
         """Yield what a goal could say of the things that were handled, and the goal does not."""
         scene = self._scene
         regions = [region.address for region in scene.problem.regions if self._has_boxes(region.address)]
@@ -250,7 +257,7 @@ class EpisodeWatch:
                 ]
                 parts = [name, *(r for r in regions if scene.owner(r) == name and scene.joints.get(r))]
                 candidates = [Atom(word, (part,)) for word in words for part in parts]
-            yield from (atom for atom in candidates if atom not in self.atoms)
+            yield from (atom for atom in candidates if atom not in self.goals[i])
 
     def _has_boxes(self, address: str) -> bool:
         region = region_of(self.views[0], address)

@@ -7,7 +7,7 @@ a folder they share, see `libero_eval.work.worker`; each may be killed, and the 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from itertools import takewhile
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from libero_env.errors import LiberoError
+from libero_env.expert.expert import solved_from_events
 from libero_env.tasks import Task
 from libero_env.text import json_safe
 from libero_eval.evaluation_file import EvaluationResult, Stopped, TaskResult
@@ -238,7 +239,7 @@ class Evaluation:
         with self.actor(_acted_task(env, unit), unit.init_states) as actor:
             if isinstance(actor, WatchesWorld):
                 actor.watch(env)  # type: ignore[arg-type]  # of every environment of this package
-            return run_episodes(
+            done = run_episodes(
                 actor,
                 env,
                 unit.init_states,
@@ -250,20 +251,28 @@ class Evaluation:
                 label=label or unit.task.id,
                 progress=self.progress,
             )
+        if not any(one.began for one in done.episodes):
+            return done
+        solved = solved_from_events(env)  # type: ignore[arg-type]  # those with events are of this package
+        rows = zip(done.episodes, solved.tolist(), strict=True)
+        return replace(done, episodes=tuple(replace(one, solved=tuple(row)) for one, row in rows))
 
     def _unit_result(
         self, unit: Unit, done: Rollouts, env: VectorEnv, started: float, errors: tuple[str | None, ...] = ()
     ) -> UnitResult:
-        attempts, began = tuple(e.attempts for e in done.counted), tuple(e.began for e in done.counted)
+        attempts, began, solved = (
+            tuple(getattr(e, name) for e in done.counted) for name in ("attempts", "began", "solved")
+        )
         kept = tuple(e for e, ran in zip(errors, done.episodes, strict=False) if not ran.simulation_error)
         result = TaskResult(
             task=unit.task.id,
             name=unit.task.name,
-            instruction=_acted_task(env, unit).language,
+            instruction=_instruction(env, unit),
             errors=kept if any(kept) else (),
             actions=tuple(e.actions for e in done.counted),
             attempts=attempts if any(attempts) else (),
             began=began if any(began) else (),
+            solved=solved if any(solved) else (),
             **done.columns(),
         )
         environment, versions = describe_environment(env), dict(self.versions)
@@ -300,6 +309,12 @@ def _acted_task(env: VectorEnv, unit: Unit) -> Task:
     """Return the task that a policy is told: that of the environment, which perturbations may have changed."""
     task = getattr(env, "task", None)
     return task if isinstance(task, Task) else unit.task
+
+
+def _instruction(env: VectorEnv, unit: Unit) -> str:
+    """Return what a policy is told, with what an event tells it later."""
+    later = getattr(env, "later", None)
+    return _acted_task(env, unit).language + (f", then: {later.language}" if later else "")
 
 
 def iso_time(seconds: float) -> str:

@@ -1,6 +1,6 @@
 """Actors of rollouts: what answers observations with actions, such as a policy of this package."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from libero_env.tasks import Task
 from lifelong.evaluation.environments import Obs
 from lifelong.policies.base import Policy
 from lifelong.training.precision import autocast, float32_products
@@ -51,15 +52,24 @@ class WatchesWorld(Protocol):
         """Receive the simulations of the next episodes."""
 
 
+@runtime_checkable
+class Hears(Protocol):
+    """An actor that is told, before `act`, of events after which something else is to be done."""
+
+    def hear(self, i: int, task: Task) -> None:
+        """Take note that an event has moved simulation i, and of the task that it has from now on."""
+
+
 @dataclass
 class PolicyActor:
     """A policy of this package with one instruction.
 
     Attributes:
         policy: Policy in evaluation mode.
-        language: (L,) embedding of the instruction.
+        language: (L,) embedding of the instruction; (B, L) once some of the simulations have another one.
         precision: Precision of the policy, see `lifelong.training.settings.FitSettings`.
         draws: CPU generator of each simulation, for stochastic policies.
+        embed: Function that returns the embedding of another task's instruction; None where there is no other task.
     """
 
     policy: Policy
@@ -67,6 +77,7 @@ class PolicyActor:
     device: torch.device
     precision: str
     draws: Sequence[torch.Generator]
+    embed: Callable[[Task], Tensor] | None = None
 
     @property
     def action_dim(self) -> int:
@@ -82,6 +93,14 @@ class PolicyActor:
         """Reset the history; see `Actor`."""
         self.policy.reset(num_envs)
 
+    def hear(self, i: int, task: Task) -> None:
+        """Act by the instruction of a task in simulation i from now on; see `Hears`."""
+        assert self.embed is not None, "evaluations with events give it"
+        rows = self.language.expand(len(self.draws), -1).clone()
+        rows[i] = self.embed(task)
+        if not torch.equal(rows, self.language.expand_as(rows)):
+            self.language = rows
+
     def act(self, obs: Obs) -> np.ndarray:
         """Return (B, A) float64 actions; see `Actor`."""
         observation = observe(obs, self.policy.spec, self.language, self.device)
@@ -95,7 +114,7 @@ def observe(obs: Obs, spec: PolicySpec, language: Tensor, device: torch.device) 
     Args:
         obs: (B, ...) arrays by name.
         spec: Inputs of the policy.
-        language: (L,) embedding of the instruction.
+        language: (L,) embedding of the instruction, or (B, L).
     """
     images = np.stack([obs[view] for view in spec.views], axis=1)[:, None]  # (B, 1, V, H, W, C)
     proprio = {name: torch.from_numpy(np.asarray(obs[name], np.float32))[:, None] for name in spec.proprio}

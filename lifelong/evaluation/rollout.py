@@ -20,7 +20,7 @@ from libero_env.sim.costs import Costs
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.storage import atomic_path
 from lifelong.errors import ConfigError
-from lifelong.evaluation.actors import Actor, PolicyActor, TakesNote
+from lifelong.evaluation.actors import Actor, Hears, PolicyActor, TakesNote
 from lifelong.evaluation.environments import Obs, VectorEnv
 from lifelong.policies.base import Policy, in_mode
 from lifelong.seeding import generator
@@ -45,6 +45,8 @@ class Episode:
         failure: Why the goal was not reached; None where it was, or where the environment does not show its state.
         began: Number of control steps of the environment before each event began, -1 where it never did.
         costs: What it cost; None where the environment does not show its state.
+        solved: Whether the expert solves what is left after each event, 1 or 0, -1 where it never began; empty where
+            that was not tried.
     """
 
     init_state: int
@@ -59,6 +61,7 @@ class Episode:
     failure: Failure | None = None
     began: tuple[int, ...] = ()
     costs: Costs | None = None
+    solved: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -237,7 +240,7 @@ def run_episodes(
         if tracker.over.all():
             break
         lengths += ~tracker.over
-        _tell(actor, tracker)
+        _tell(actor, tracker, env)
         actions = actor.act(obs)
         for i in np.flatnonzero(~tracker.over).tolist():
             digests[i].update(np.asarray(actions[i], "<f8").tobytes())
@@ -247,7 +250,7 @@ def run_episodes(
         bar.set_postfix(done=int(tracker.over.sum()), refresh=False)
     bar.close()
     _draw(env, True)
-    _tell(actor, tracker)
+    _tell(actor, tracker, env)
     done = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
     episodes = tuple(
         replace(
@@ -293,6 +296,7 @@ class EpisodeTracker:
         errors: Why simulations have failed, by index.
         attempts: (B, perturbations) number of draws that were not valid.
         began: (B, events) number of control steps before each event, -1 where it has not begun.
+        moved: (B,) whether an event has changed what is to be done, and the actor is not told yet.
     """
 
     def __init__(self, env: VectorEnv, info: Mapping[str, Any]):
@@ -304,8 +308,8 @@ class EpisodeTracker:
         self.attempts, self.began = info.get("attempts", none), info.get("began", none)
         self._now = self._progress(info)
         self._start = self._ever = self._now
-        views, goals = getattr(env, "views", None), getattr(env, "goals", None)
-        self._watch = EpisodeWatch(views, goals.atoms) if views and goals else None
+        self.moved = np.zeros(env.num_envs, bool)
+        self._watch: EpisodeWatch | None = getattr(env, "watch", None)
 
     def start(self) -> None:
         """Take the present state as that before the actor acts."""
@@ -317,15 +321,13 @@ class EpisodeTracker:
     def step(self, actions: np.ndarray) -> Obs:
         """Step all simulations with (B, A) actions and return their observations."""
         obs, _, terminated, truncated, info = self._env.step(actions)
-        if self._watch is not None:
-            for i in np.flatnonzero(~self.over):
-                self._watch.look(int(i))
         self.success = self.success | (np.asarray(info["success"], bool) & ~self.over)
         self.attempts, self.began = info.get("attempts", self.attempts), info.get("began", self.began)
         self.errors |= {i: why for i, why in info.get("errors", {}).items() if not self.over[i]}
         self._now = np.where(self.over[:, None], self._now, self._progress(info))
         self._ever = self._ever | self._now
         self.over = self.over | terminated | truncated
+        self.moved = (self.moved | info.get("moved", False)) & ~self.over
         return obs
 
     def failure(self, i: int) -> Failure | None:
@@ -364,10 +366,23 @@ def _draw(env: VectorEnv, wanted: bool) -> None:
         env.render_images = wanted
 
 
-def _tell(actor: Actor, tracker: EpisodeTracker) -> None:
-    """Tell an actor that wants to know which episodes are over."""
+def _tell(actor: Actor, tracker: EpisodeTracker, env: VectorEnv) -> None:
+    """Tell an actor that wants to know which episodes are over, and what has become of the others.
+
+    Raises:
+        ConfigError: An event has changed a goal, and the actor cannot be told.
+    """
     if isinstance(actor, TakesNote):
         actor.note(tracker.over, tracker.success)
+    for i in map(int, np.flatnonzero(tracker.moved)):
+        if isinstance(actor, Hears):
+            actor.hear(i, env.task_of(i))  # type: ignore[attr-defined]  # events are of those that have it
+        elif env.task_of(i) is not env.task:  # type: ignore[attr-defined]
+            raise ConfigError(
+                "an event has changed the goal, and this policy cannot be told another instruction during an episode: "
+                "runs and the expert can; leave --event goal=... out"
+            )
+        tracker.moved[i] = False
 
 
 def _states(draws: Sequence[torch.Generator]) -> Tensor:

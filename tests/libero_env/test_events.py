@@ -7,6 +7,7 @@ from libero_env.demos.config import RenderConfig
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.expert import Expert
+from libero_env.expert.expert import solved_from_events
 from libero_env.perturbations import Perturbation, format_perturbations, parse_perturbations
 
 TASK = "libero_goal/6"  # the cream cheese into the bowl
@@ -31,7 +32,7 @@ def matched():
 
 
 @pytest.mark.parametrize(
-    "kind", ["camera=0.5", "noise=1", "gain=1", "object=1", "receptacle=1", "distractor=1"]
+    "kind", ["camera=0.5", "noise=1", "gain=1", "object=1", "receptacle=1", "distractor=1", "goal=1"]
 )
 @pytest.mark.parametrize("trigger", ["step10", "10%"])
 def test_all_before_an_event_is_the_matched_episode_to_the_bit_and_nothing_after_it(matched, kind, trigger):
@@ -39,9 +40,12 @@ def test_all_before_an_event_is_the_matched_episode_to_the_bit_and_nothing_after
     np.testing.assert_array_equal(pictures[:10], matched[0][:10])
     np.testing.assert_array_equal(positions[:10], matched[1][:10])
     assert info["began"].tolist() == [[10], [10]]
-    is_physical = env.config.perturb[0].definition.physical
-    assert (positions[10] != matched[1][10]).any(axis=-1).all() == is_physical
-    assert (pictures[10] != matched[0][10]).any()
+    one = env.config.perturb[0]
+    assert (positions[10] != matched[1][10]).any(axis=-1).all() == (
+        one.definition.physical and one.kind != "goal"
+    )
+    assert (pictures[10] != matched[0][10]).any() == (one.kind != "goal")
+    assert info["moved"].tolist() == [False, False], "it has just begun in the step before only"
     (alone, where), _, _ = episode(f"{kind}@{trigger}", starts=(1,))
     np.testing.assert_array_equal(alone[:, 0], pictures[:, 1])  # whatever runs beside it
     np.testing.assert_array_equal(where[:, 0], positions[:, 1])
@@ -58,7 +62,7 @@ def test_an_object_is_moved_so_far_and_draws_that_are_not_valid_are_counted(matc
 
 
 def test_an_event_whose_moment_never_comes_changes_nothing(matched):
-    seen, info, _ = episode("object=1@touched,noise=1@lifted")
+    seen, info, _ = episode("receptacle=1@touched,noise=1@lifted")
     assert info["began"].tolist() == [[-1, -1]] * 2
     for part, same in zip(seen, matched, strict=True):
         np.testing.assert_array_equal(part, same)
@@ -86,6 +90,73 @@ def test_phases_come_one_after_the_other_and_another_episode_waits_again():
         assert info["began"].tolist() == [[-1, -1, -1]]
 
 
+def act(env, experts, done=lambda info: False):
+    """Let experts act, and plan again where something has moved, until their episodes are over."""
+    info = {}
+    while env.running.any() and not done(info):
+        actions = np.stack([one.act(env.views[i]) for i, one in enumerate(experts)])
+        info = env.step(actions)[-1]
+        for i in np.flatnonzero(info["moved"]):
+            experts[i].replan(env.task_of(i))
+    return info
+
+
+def test_another_goal_of_the_scene_is_judged_from_the_event_on():
+    with BatchEnv(TASK, 2, cameras=(), horizon=400, perturb="goal=1@lifted") as env:
+        env.reset(options={"init_state": [0, 1]})
+        own, experts = env.task, [Expert(env.task, np.random.default_rng(0)) for _ in range(2)]
+        info = act(env, experts, done=lambda info: info and (info["began"] >= 0).all())
+        other = env.task_of(0)
+        assert other.language != own.language and other.id == own.id and env.task is own
+        assert {str(atom) for task in (own, other) for atom in task.problem.goal.atoms()} == set(env.atoms)
+        states = [env.get_state(i) for i in range(2)]
+        info = act(env, experts)
+        assert info["success"].all() and (info["began"] > 0).all()
+        names = dict(zip(env.atoms, info["progress"].T, strict=True))
+        assert all(names[str(atom)].all() for atom in other.problem.goal.atoms())
+        assert not all(names[str(atom)].all() for atom in own.problem.goal.atoms())
+        env.set_state(0, states[0])  # the goal that an event has changed belongs to the state
+        assert env.task_of(0) is other and not env.check_goal(0)[0]
+        env.reset(options={"init_state": [0, 1]})
+        assert env.task_of(0) is own and env.event_states == {}
+
+
+def test_a_restored_state_has_the_events_that_had_begun():
+    perturb, action = "camera=0.5@step3,noise=1@step8", np.tile([0.0, 0.2, -0.5, 0.0, 0.0, 0.0, 1.0], (2, 1))
+    with BatchEnv(TASK, 2, cameras=("agentview",), camera_size=(32, 32), perturb=perturb) as env:
+        env.reset(options={"init_state": [0, 0]})
+        states = [env.get_state(0)]
+        for _ in range(12):
+            seen = env.step(action)[0]["agentview_rgb"][0]
+            states.append(env.get_state(0))
+        assert states[5][-3:].tolist() == [5, 3, -1]
+        env.set_state(0, states[2])
+        for k in range(2, 12):
+            again, *_, info = env.step(action)
+            np.testing.assert_array_equal(env.get_state(0), states[k + 1])
+        np.testing.assert_array_equal(again["agentview_rgb"][0], seen)
+        env.set_state(1, states[5])  # of another simulation: only the camera has moved
+        assert env.perturbed.began[1].tolist() == [3, -1] and info["began"][0].tolist() == [3, 8]
+        with pytest.raises(
+            InvalidInputError, match="ends with its number of steps, and those before each event"
+        ):
+            env.set_state(0, np.append(states[5][:-1], 0.5))
+
+
+def test_the_expert_tells_whether_the_rest_can_be_solved():
+    with BatchEnv(TASK, 2, cameras=(), horizon=150, perturb="receptacle=1@touched,light=1@step140") as env:
+        env.reset(options={"init_state": [0, 2]})  # in start 1 the hand touches the bowl, too
+        experts = [Expert(env.task, np.random.default_rng(0)) for _ in range(2)]
+        info = act(env, experts, done=lambda info: info and (info["began"][:, 1] >= 0).all())
+        still = np.array([[1.0], [0.0]])  # the second one stands still from there on
+        while env.running.any():
+            actions = np.stack([one.act(env.views[i]) for i, one in enumerate(experts)])
+            info = env.step(still * actions)[-1]
+        began = info["began"]
+        assert (began[:, 1] > 0).all() and began[:, 0].tolist() == [-1, 140]
+        assert solved_from_events(env).tolist() == [[-1, 1], [0, 1]], "in ten steps it cannot be done"
+
+
 def test_the_text_of_events():
     found = parse_perturbations("noise=1@25%,camera=0.5@lifted@7,camera=0.1@3", events=True)
     assert found[1] == Perturbation("camera", 0.5, 7, "lifted") and found[0] == Perturbation("camera", 0.1, 3)
@@ -98,7 +169,9 @@ def test_the_text_of_events():
         ("camera=0.5@lift", UnknownNameError, "unknown trigger 'lift'. Did you mean 'lifted'?"),
         ("camera=0.5@101%", UnknownNameError, "unknown trigger '101%'"),
         ("camera=0.5@step", UnknownNameError, "unknown trigger 'step'"),
-        ("goal=1@step4", InvalidInputError, "goal cannot begin during an episode"),
+        ("layout=1@step4", InvalidInputError, "layout cannot begin during an episode"),
+        ("goal=1@step4,goal=1@lifted", InvalidInputError, "goal cannot be combined with goal"),
+        ("object=1@lifted", InvalidInputError, "the robot touches the object then, so that it is not moved"),
         ("robot=1@lifted", InvalidInputError, "robot cannot begin during an episode"),
         ("light=1@lifted,light=0.5@lifted", InvalidInputError, "light is named twice"),
         ("light=1@lifted@x", InvalidInputError, "expected KIND=SEVERITY"),

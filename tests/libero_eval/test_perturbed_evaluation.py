@@ -111,12 +111,16 @@ def test_an_evaluation_with_events_says_where_they_began(tmp_path, monkeypatch, 
     (tmp_path / "told_policy.py").write_text(POLICY)
     words = ["--perturb", "noise=0.2", "--event", "camera=0.5@step6", "light=1@touched", "--unit-starts"]
     assert main([*EVAL, "--out", "events", *words, "2"]) == 0
-    assert "(events began in 3 of 3, 0 of 3)" in capsys.readouterr().out
+    assert "(events began in 3 of 3 (the expert solves 0 from there), 0 of 3)" in capsys.readouterr().out
     found = EvaluationResult.read(tmp_path / "events")
     assert found.protocol["world"]["perturb"] == "camera=0.5@step6,light=1@touched,noise=0.2"
     assert found.tasks[0].began == ((6, -1),) * 3
+    assert found.tasks[0].solved == ((0, -1),) * 3, "three steps are not enough"
     page = (tmp_path / "events" / "eval.html").read_text()
-    assert "events began in 3 of 3, 0 of 3" in page and "failed because never reached 3" in page
+    assert (
+        "events began in 3 of 3 (the expert solves 0 from there), 0 of 3" in page
+        and "failed because never reached 3" in page
+    )
     assert "camera=0.5@step6,light=1@touched,noise=0.2" in page
     assert main([*EVAL, "--out", "apart", *words, "1", "--workers", "2"]) == 0
     again = EvaluationResult.read(tmp_path / "apart")
