@@ -114,10 +114,12 @@ def certify_tasks(
         again: Run again what is in the folder.
     """
     from libero_env.design.certify import certify, write_results
+    from libero_env.sim.history import over_time
     from libero_env.tasks import find_tasks
 
+    found = find_tasks(tasks)
     certificates = certify(
-        find_tasks(tasks),
+        found,
         states,
         jobs=jobs or cpu_count(),
         out=out,
@@ -131,6 +133,9 @@ def certify_tasks(
     for one in short:
         reason = next((o.reason for o in one.outcomes if not o.success), "")
         lines.append(f"FAIL  {one.task} {one.name}: {100 * one.rate:.0f} %, such as: {reason}")
+    for task in found:
+        if part := next(over_time(task.problem.goal), None):
+            lines.append(f"note  {task.id}: the original's reader refuses {part}")
     good, total = sum(len(c.lengths) for c in certificates), sum(len(c.outcomes) for c in certificates)
     lines.append(
         f"{good}/{total} = {100 * good / total:.1f} %; {len(short)} of {len(certificates)} tasks under {require:.0%}"

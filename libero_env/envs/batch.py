@@ -36,7 +36,7 @@ from libero_env.sim.scene import BUFFER_SIDE, InitialStates
 from libero_env.sim.simulation import Indices, Watch
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.tasks import Task
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.problem import Atom, Expression
 from libero_env.timing import CONTROL_HZ, PHYSICS_HZ
 from libero_env.validation import validate
 
@@ -166,6 +166,11 @@ class BatchEnv(LiberoVectorEnv):
         every = tuple(dict.fromkeys([*atoms, *(later.atoms() if later else ())]))
         self.goals = Goals(goal, every, self.views, config.semantics)
         self._later_goals = None if later is None else Goals(later, every, self.views, config.semantics)
+        self._histories = [one.history for one in (self.goals, self._later_goals) if one is not None]
+        if self.reward.kind == "staged" and self.goals.history.memory.size:
+            raise InvalidInputError(
+                f"reward=staged is of goals of states, and {goal} is over time; leave reward=sparse"
+            )
         controller = self.simulations.controller_state.controller
         self.single_observation_space = self.observer.space()
         self.single_action_space = spaces.Box(
@@ -242,6 +247,7 @@ class BatchEnv(LiberoVectorEnv):
             if request.outdated_controller:
                 self.simulations.outdate_controller(ids)
             self._steps[ids], self._running[ids] = 0, True
+            self._forget(ids)
             for i in map(int, ids) if self._watched else ():
                 self.event_states = {key: state for key, state in self.event_states.items() if key[0] != i}
                 self.watch.goals[i] = self._goal_atoms(i)
@@ -298,7 +304,8 @@ class BatchEnv(LiberoVectorEnv):
         self.require_open()
         i = checked_index(i, self.num_envs)
         began = [] if self.perturbed is None else self.perturbed.began[i]
-        return np.concatenate([self.simulations.get_state(i), [self._steps[i]], began])
+        memory = [history.memory[i].ravel() for history in self._histories]
+        return np.concatenate([self.simulations.get_state(i), [self._steps[i]], began, *memory])
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Restore a state in simulation i; see `LiberoEnv.set_state`.
@@ -311,9 +318,14 @@ class BatchEnv(LiberoVectorEnv):
         self._running[i] = False
         self._errors.pop(i, None)
         size, began = self.simulations.state_size, np.zeros(0)
+        self._forget(np.array([i]))
         if state.size > size:
             self.simulations.set_state(i, state[:size])
-            self._steps[i], began = int(state[size]), state[size + 1 :]
+            events = 0 if self.perturbed is None else len(self.perturbed.events)
+            self._steps[i], began, memory = int(state[size]), *np.split(state[size + 1 :], [events])
+            for history in self._histories:
+                row = history.memory[i]
+                row[:], memory = memory[: row.size].reshape(row.shape), memory[row.size :]
         else:
             self.simulations.set_physics_state(i, state)
             self._steps[i] = 0
@@ -323,6 +335,8 @@ class BatchEnv(LiberoVectorEnv):
         if self._watched:
             self.watch.goals[i] = self._goal_atoms(i)
             self.watch.begin(i)
+        if state.size <= size and any(history.memory.size for history in self._histories):
+            self._goals_reached(np.array([i]))  # the first moment
         self._running[i], self._success[i] = True, False
 
     def observe(self, i: int) -> dict[str, np.ndarray]:
@@ -385,6 +399,7 @@ class BatchEnv(LiberoVectorEnv):
             start = perturbed.begin(i, name, paired, again)
             qpos, qvel, fixtures = self.scene.split_states(start[None])
             self.simulations.reset([i], qpos, qvel, fixtures=fixtures)
+            self._forget(np.array([i]))
             if not perturbed.is_physical or not self.goals.check([i])[0][0]:
                 break
             again += 1
@@ -417,13 +432,15 @@ class BatchEnv(LiberoVectorEnv):
         """Return a vector of `get_state`, or [time, qpos, qvel], as float64."""
         model, steps = self.scene.model, self.simulations.state_size
         size = steps + 1 + (0 if self.perturbed is None else len(self.perturbed.events))
+        size += sum(history.memory[0].size for history in self._histories)
         name = f"state of {self.task.id} (get_state, or [time, qpos, qvel])"
         array = checked_numbers(state, name, ((size,), (1 + model.nq + model.nv,)))
         _check_range(array, self.task)
         counts = array[steps:] if array.size == size else np.zeros(1)
         if not (counts[0] >= 0 and (counts >= NEVER).all() and (counts % 1 == 0).all()):
             raise InvalidInputError(
-                f"a state ends with its number of steps, and those before each event; got {counts.tolist()}"
+                "a state ends with its number of steps, those before each event, and what the goal remembers; got "
+                f"{counts.tolist()}"
             )
         return array
 
@@ -459,13 +476,23 @@ class BatchEnv(LiberoVectorEnv):
             reached[changed] = self._later_goals.check(ids[changed])[0]
         return reached, held
 
+    def missing(self, i: int) -> list[Expression]:
+        """Return what the episode in simulation i lacks now, see `libero_env.sim.history.History.missing`."""
+        later = self._later_goals if self.task_of(i) is not self.task else None
+        return (later or self.goals).missing(i)
+
+    def _forget(self, ids: np.ndarray) -> None:
+        """Begin the conditions over time of the goals anew."""
+        for history in self._histories:
+            history.begin(ids)
+
     def task_of(self, i: int) -> Task:
         """Return the task of simulation i, whose goal an event may have changed."""
         changed = self.later is not None and self.perturbed is not None and self.perturbed.has_new_goal(i)
         return self.later if changed and self.later is not None else self.task
 
     def _goal_atoms(self, i: int) -> tuple[Atom, ...]:
-        own = self.task_of(i).problem.goal.atoms()
+        own = self.task_of(i).problem.goal.wanted()
         return tuple(atom for atom in self.goals.atoms if atom in own)
 
     def _begin_events(self, ids: np.ndarray) -> None:

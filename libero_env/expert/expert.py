@@ -9,7 +9,7 @@ import numpy as np
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError
 from libero_env.expert.arm import OPEN, limit_elbow_extension
-from libero_env.expert.planning.goal_plan import Step, UnsupportedGoalError, plan_goal
+from libero_env.expert.planning.goal_plan import Step, UnsupportedGoalError, look, plan_goal
 from libero_env.expert.planning.pick_planner import is_graspable
 from libero_env.expert.shapes import Shapes
 from libero_env.expert.skills.drag import Drag
@@ -19,6 +19,8 @@ from libero_env.expert.skills.pick_place import PickPlace
 from libero_env.expert.skills.skill import Skill
 from libero_env.expert.variation import ActionNoise, MotionStyle
 from libero_env.objects.model import OPPOSITE_STATES
+from libero_env.sim.history import History
+from libero_env.sim.predicates import ground
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ, SUBSTEPS
@@ -69,6 +71,7 @@ class Expert:
         self.skill: Skill | None = None
         self._finished_retries = 0  # of skills that are over
         self._letting_go = 0  # control steps that the hand still opens
+        self._history: History | None = None  # of the goal, since the first action
 
     @property
     def phase(self) -> str:
@@ -92,6 +95,8 @@ class Expert:
 
     def replan(self, task: Task) -> None:
         """Plan again, for a task in the same scene; what is in the hand is let go before."""
+        if task.problem.goal != self.task.problem.goal:
+            self._history = None
         self.task, self.skill, self._letting_go = task, None, LET_GO
 
     def act(self, view: StateView) -> np.ndarray:
@@ -108,12 +113,15 @@ class Expert:
             )
         if self.shapes is None:
             self.shapes = Shapes(view.scene)
+        if self._history is None:
+            self._history = History(ground(self.task.problem.goal, view.scene), 1)
+        look(self._history, view)
         if self._letting_go:
             self._letting_go -= 1
             return np.array([0.0] * 6 + [OPEN])
         if self.skill is None or self.skill.done(view):
             self._finished_retries = self.retries
-            steps = plan_goal(self.task.problem.goal, view)
+            steps = plan_goal(self.task.problem.goal, view, self._history)
             self.skill = self._skill_for(steps[0], view, self.shapes) if steps else None
         if self.skill is None:
             return np.array([0.0] * 6 + [OPEN])

@@ -10,6 +10,8 @@ from typing import Annotated, Literal, get_args
 from pydantic import Field
 
 Cause = Literal[
+    "forbidden",
+    "wrong order",
     "undone",
     "not released",
     "wrong place",
@@ -33,7 +35,8 @@ class Failure:
     Attributes:
         cause: One of `CAUSES`.
         of: Object or fixture of the goal that it is about; empty where no atom of the goal is missing.
-        what: What the robot collided with, which object it lifted instead, or where the object is; otherwise empty.
+        what: What the robot collided with, which object it lifted instead, where the object is, or the condition over
+            time that was broken; otherwise empty.
         newtons: Largest normal force of a collision; otherwise 0.
         handled: Objects that were lifted, and fixtures whose joints were moved.
         instead: Atoms about these that held at the end, and are no part of the goal.

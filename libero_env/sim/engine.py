@@ -1,18 +1,19 @@
 """What works by the means of a backend: simulations of a model, goals in them, and their observer."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from libero_env.mujoco_compat import mujoco
 from libero_env.sim.backend import Backend
+from libero_env.sim.history import History
 from libero_env.sim.observations import Observer
 from libero_env.sim.predicates import OF_ALL, SEMANTICS, evaluate, ground
 from libero_env.sim.scene import Scene
 from libero_env.sim.simulation import Batch, BatchSimulations, Indices, LoopSimulations, Simulations
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom, Expression, Not, Or
+from libero_env.tasks.problem import Atom, Expression
 
 
 class Goals:
@@ -27,39 +28,43 @@ class Goals:
 
     Attributes:
         one_by_one: Atoms that are evaluated one simulation after the other.
+        history: What the goal's conditions over time remember of each simulation's episode.
     """
 
     def __init__(self, goal: Expression, atoms: Sequence[Atom], views: Sequence[StateView], semantics: str):
         scene, self._simulations = views[0].scene, views[0].simulations
-        self._goal, self.atoms, self._views = ground(goal, scene), tuple(atoms), views
+        self.history = History(ground(goal, scene), len(views))
+        self.atoms, self._views = tuple(atoms), views
         self._semantics, self._all = semantics, StateView(scene, self._simulations, slice(None))
-        self._needed = tuple(dict.fromkeys([*atoms, *self._goal.atoms()]))
+        self._needed = tuple(dict.fromkeys([*atoms, *self.history.goal.atoms()]))
         of_all = OF_ALL if self._simulations.backend.is_warp else ()
         table = SEMANTICS[semantics]
         self.one_by_one = tuple(atom for atom in self._needed if table.get(atom.predicate) not in of_all)
 
     def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return whether the goal is reached in simulations, (k,) bool, and which atoms hold, (k, natoms)."""
-        ids, held = np.asarray(ids, np.int64), dict[Atom, np.ndarray]()
+        """Return whether the goal is reached in simulations, (k,) bool, and which atoms hold, (k, natoms).
+
+        The present state is a moment of the episode for conditions over time; looking at it again changes nothing.
+        """
+        ids, held = np.asarray(ids, np.int64), self._held(np.asarray(ids, np.int64))
+        of_atoms = np.reshape([held[atom] for atom in self.atoms], (len(self.atoms), len(ids)))
+        return self.history.look(ids, held), of_atoms.T.astype(bool)
+
+    def missing(self, i: int) -> list[Expression]:
+        """Return what the episode in simulation i lacks now; see `History.missing`."""
+        held = self._held(np.array([i]))
+        return self.history.missing(i, {atom: bool(values[0]) for atom, values in held.items()})
+
+    def _held(self, ids: np.ndarray) -> dict[Atom, np.ndarray]:
+        """Return whether each atom holds in simulations, (k,)."""
+        held = dict[Atom, np.ndarray]()
         for atom in self._needed:
             if atom in self.one_by_one:
                 held[atom] = np.array([evaluate(atom, self._views[i], self._semantics) for i in ids], bool)
             else:
                 values = SEMANTICS[self._semantics][atom.predicate](self._all, *atom.args)
                 held[atom] = np.broadcast_to(values, self._simulations.num)[ids]
-
-        def holds(node: Expression, parts: Iterator[np.ndarray]) -> np.ndarray:
-            match node:
-                case Atom():
-                    return held[node]
-                case Or():
-                    return np.any([np.zeros(len(ids), bool), *parts], axis=0)
-                case Not():
-                    return ~next(parts)
-            return np.all([np.ones(len(ids), bool), *parts], axis=0)
-
-        of_atoms = np.reshape([held[atom] for atom in self.atoms], (len(self.atoms), len(ids)))
-        return self._goal.fold(holds), of_atoms.T.astype(bool)
+        return held
 
 
 def make_simulations(

@@ -6,7 +6,7 @@ By default their semantics are the original's: objects are points (the origin of
 box is |R size|, and being on a region of the table needs no contact. `semantics="strict"` requires more; see `STRICT`.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -16,9 +16,10 @@ from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP, OPPOSITE_STATES, ObjectModel
 from libero_env.parallel import send_to_workers
+from libero_env.sim.history import History
 from libero_env.sim.scene import ROBOT, Scene, zone_boxes
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Region, declare_predicate
+from libero_env.tasks.problem import OPERATORS, And, Atom, Expression, ForAll, Region, declare_predicate
 
 BOX_BELOW = 0.01  # [m] depth below its box in which a region still contains a point
 ON_BELOW, ON_ABOVE = 0.005, 0.10  # [m] range of heights around the top of a box that are on the region
@@ -239,9 +240,10 @@ def register_predicate(name: str, predicate: Predicate) -> None:
     Raises:
         LiberoError: The name is not valid in a task file.
     """
-    if not name.isidentifier():
+    if not name.isidentifier() or name.capitalize() in OPERATORS:
         raise LiberoError(
-            f"register_predicate: {name!r} is not a valid name; use letters, digits and underscores"
+            f"register_predicate: {name!r} is not a valid name; use letters, digits and underscores, and none of "
+            f"{', '.join(sorted(OPERATORS))}"
         )
     if numbers := declare_predicate(name.capitalize(), predicate):
         predicate = partial(_with_numbers, predicate, numbers)
@@ -255,7 +257,7 @@ def _with_numbers(predicate: Predicate, numbers: tuple[int, ...], view: StateVie
 
 
 def evaluate(expression: Expression, view: StateView, semantics: str = "original") -> bool:
-    """Return whether a goal holds in a state.
+    """Return whether a goal holds in a state; conditions over time are those of an episode that begins there.
 
     Args:
         expression: Goal or atom.
@@ -265,23 +267,14 @@ def evaluate(expression: Expression, view: StateView, semantics: str = "original
         UnknownNameError: A predicate, object or region does not exist.
         LiberoError: A predicate does not apply to the entity, such as opening a plate.
     """
-
-    def holds(node: Expression, parts: Iterator[bool]) -> bool:
-        match node:
-            case Atom(predicate, args):
-                table = SEMANTICS[semantics]
-                if predicate not in table:
-                    raise UnknownNameError("predicate", predicate, table)
-                return bool(table[predicate](view, *args))
-            case Or():
-                return any(parts)
-            case Not():
-                return not next(parts)
-            case ForAll(variables, body):
-                return all(_bind(body, binding).fold(holds) for binding in _bindings(variables, view.scene))
-        return all(parts)
-
-    return expression.fold(holds)
+    if isinstance(expression, Atom):
+        table = SEMANTICS[semantics]
+        if expression.predicate not in table:
+            raise UnknownNameError("predicate", expression.predicate, table)
+        return bool(table[expression.predicate](view, *expression.args))
+    goal = ground(expression, view.scene)
+    held = {atom: np.array([evaluate(atom, view, semantics)]) for atom in goal.atoms()}
+    return bool(History(goal, 1).look(np.zeros(1, np.int64), held)[0])
 
 
 def glowing_sites(view: StateView) -> set[int]:

@@ -16,7 +16,7 @@ from libero_env.sim.costs import LIMITS, Costs
 from libero_env.sim.predicates import PREDICATES, contains, ground, is_over, region_boxes, region_of
 from libero_env.sim.scene import ROBOT
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.problem import Atom, Expression, Never
 from libero_env.timing import TIMESTEP
 
 LIFTED = 0.02  # [m] above the height at the start
@@ -52,12 +52,14 @@ class EpisodeWatch:
             part = _LEFT if first in _ancestors(model, body) else part
             part = _RIGHT if second in _ancestors(model, body) else part
             self._codes[body] = self._names.index(part)
-        self.goals = [self.atoms for _ in views]
+        goal = ground(scene.problem.goal, scene)
+        forbidden = {*goal.atoms()} - {*goal.wanted()}
+        self.goals = [tuple(atom for atom in self.atoms if atom not in forbidden) for _ in views]
         self._owned = {j: name for name in scene.entities for j in scene.joints[name]}
         self._joints = model.jnt_qposadr[list(self._owned)]
         self._scratch: mujoco.MjData | None = None
-        goal = ground(scene.problem.goal, scene)
-        self._named = {scene.owner(name) for atom in (*goal.atoms(), *self.atoms) for name in atom.args}
+        about = {*goal.wanted(), *self.atoms} - forbidden
+        self._named = {scene.owner(name) for atom in about for name in atom.args}
         self._idle = [name for name in scene.objects if name not in self._named]
         addresses = [scene.pose_address(name) for name in self._idle]
         self._poses = np.reshape(addresses, (-1, 1)).astype(int) + np.arange(7)
@@ -119,21 +121,27 @@ class EpisodeWatch:
         self._add_costs(i, needless)
         return trace
 
-    def failure(self, i: int, ever: Sequence[bool], now: Sequence[bool]) -> Failure:
+    def failure(self, i: int, ever: Sequence[bool], lacking: Sequence[Expression]) -> Failure:
         """Return why the episode in simulation i has failed.
 
         Args:
             i: Index of the simulation.
             ever: Whether each of the atoms held at any time.
-            now: Whether each holds at the end.
+            lacking: What the goal lacks at the end, see `libero_env.sim.history.History.missing`.
         """
         trace, view = self.traces[i], self.views[i]
+        held = {atom for atom, before in zip(self.atoms, ever, strict=True) if before}
         missing = [
-            Missing(name, bool(before), over(view, atom), self._place(i, name))
-            for atom, before, holds in zip(self.atoms, ever, now, strict=True)
-            if not holds and atom in self.goals[i] and (name := self._scene.owner(atom.args[0]))
+            Missing(name, atom in held, over(view, atom), self._place(i, name))
+            for atom in lacking
+            if isinstance(atom, Atom) and (name := self._scene.owner(atom.args[0]))
         ]
-        found = explain(trace, missing, self.wanted(i))
+        broken = [
+            Failure("forbidden" if isinstance(one, Never) else "wrong order", what=str(one))
+            for one in lacking
+            if not isinstance(one, Atom)
+        ]
+        found = broken[0] if broken else explain(trace, missing, self.wanted(i))
         moved = np.abs(view.simulations.fields["qpos"][i, self._joints] - self._rest[i]) > _MOVED
         opened = [name for name, far in zip(self._owned.values(), moved, strict=True) if far]
         handled = tuple(dict.fromkeys([*trace.lifted, *(name for name in opened if name in trace.touched)]))

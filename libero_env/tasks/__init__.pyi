@@ -1,19 +1,22 @@
 from .benchmark import suite_names
 from .builder import make_task
-from .problem import And, Atom, ForAll, Not, Or, Problem, Region
+from .problem import And, Atom, Count, ForAll, Never, Not, Or, Problem, Region, Then
 from .suites import find_tasks, get_suite, get_task, is_suite, read_suite, read_task, write_task
 from .task import Suite, Task
 
 __all__ = [
     "And",
     "Atom",
+    "Count",
     "ForAll",
+    "Never",
     "Not",
     "Or",
     "Problem",
     "Region",
     "Suite",
     "Task",
+    "Then",
     "find_tasks",
     "get_suite",
     "get_task",

@@ -3,21 +3,35 @@
 The dialect is the original LIBERO's: `(define (problem NAME) (:domain ...) (:language ...) (:regions ...)
 (:fixtures ...) (:objects ...) (:obj_of_interest ...) (:scene_properties ...) (:init ...) (:goal ...))`, with
 `;` comments. The original has neither `(:views ...)`, in which each list is the text of a `Camera`, nor `(:zones ...)`,
-which names regions. `:requirements` is ignored. Goals may nest and, or, not and forall. Numbers may be arithmetic with
-`pi`; nothing in a file is ever executed.
+which names regions. `:requirements` is ignored. Goals may nest and, or, not and forall, and what the original does not
+have: then, never and count. Numbers may be arithmetic with `pi`; nothing in a file is ever executed.
 """
 
 import re
 import warnings
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
+from functools import reduce
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NoReturn
 
 from libero_env.errors import BDDLError, InvalidInputError
 from libero_env.tasks.cameras import Camera
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem, ProblemError, Region
+from libero_env.tasks.problem import (
+    And,
+    Atom,
+    Count,
+    Expression,
+    ForAll,
+    Never,
+    Not,
+    Or,
+    Problem,
+    ProblemError,
+    Region,
+    Then,
+)
 from libero_env.tasks.sexpr import MAX_CHARACTERS, List, Word, number, parse_tree, show, text_of
 
 SECTIONS = (
@@ -37,6 +51,13 @@ SECTIONS = (
 
 # field of a problem -> section, where its name is another
 _SECTIONS_OF = {"name": ":domain", "cameras": ":views"}
+_FORMS = {
+    "not": "(Not EXPRESSION)",
+    "forall": "(ForAll (?x - CATEGORY) EXPRESSION)",
+    "then": "(Then EXPRESSION EXPRESSION ...)",
+    "never": "(Never EXPRESSION)",
+    "count": "(Count NUMBER EXPRESSION)",
+}
 _PREDICATE = re.compile(r"[A-Za-z][\w-]*", re.ASCII)
 
 
@@ -359,11 +380,22 @@ class Reader:
         head = node.head if isinstance(node, List) else ""
         if head in ("and", "or"):
             return (And if head == "and" else Or)(tuple(map(self.expression, parts)))
-        if head == "not" and len(parts) == 1:
-            return Not(self.expression(parts[0]))
+        if head in ("not", "never") and len(parts) == 1:
+            return (Not if head == "not" else Never)(self.expression(parts[0]))
+        if head == "then" and len(parts) > 1:
+            return reduce(lambda before, after: Then((before, after)), map(self.expression, parts))
+        if head == "count" and len(parts) == 2:
+            return Count(self.times(parts[0]), self.expression(parts[1]))
         if head == "forall" and len(parts) == 2 and isinstance(parts[0], List):
             variables = Reader(self.file).names(parts[0].items)
             return ForAll(tuple(variables.items()), self.expression(parts[1]))
-        if head in ("not", "forall"):
-            self.fail(node.line, show(node), "(Not EXPRESSION) or (ForAll (?x - CATEGORY) EXPRESSION)")
+        if head in _FORMS:
+            self.fail(node.line, show(node), _FORMS[head])
         return self.atom(node)
+
+    def times(self, node: Word | List) -> int:
+        """Return the number of a Count."""
+        word = self.word(node)
+        if not re.fullmatch("[1-9][0-9]{0,2}", word):
+            self.fail(node.line, f"{show(node)} in a Count", "a whole number from 1 to 999")
+        return int(word)

@@ -75,7 +75,7 @@ EMPTY: Mapping[str, str] = {
 _HALF_EXTENT = {"object": 0.025, "fixture": 0.01}  # [m] default, as in the original's scenes
 _PLACING = ("On", "In")  # predicates of init atoms that give an entity its place
 _TABLE = "main_table"  # name of the fixture `table` in the original's task files
-_NESTED = re.compile(r"\(\s*(and|or|not|forall)\b", re.IGNORECASE)
+_NESTED = re.compile(r"\(\s*(and|or|not|forall|then|never|count)\b", re.IGNORECASE)
 # field of a problem, or section of a task file -> key
 _KEYS_OF = {"name": "problem", "domain": "problem", "views": "cameras"}
 

@@ -8,7 +8,7 @@ import inspect
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Annotated, TypeVar
 
 from pydantic import Field
@@ -103,6 +103,10 @@ class Expression:
         """Return all atoms, in reading order."""
         return tuple(atom for child in self.children for atom in child.atoms())
 
+    def wanted(self) -> "tuple[Atom, ...]":
+        """Return the atoms that are not in a `Never`."""
+        return () if isinstance(self, Never) else tuple(a for child in self.children for a in child.wanted())
+
     def __str__(self) -> str:
         return f"({' '.join((type(self).__name__, *map(str, self.children)))})"
 
@@ -117,6 +121,8 @@ class Atom(Expression):
     def atoms(self) -> "tuple[Atom, ...]":
         """Return the atom itself."""
         return (self,)
+
+    wanted = atoms
 
     def __str__(self) -> str:
         return f"({' '.join((self.predicate, *self.args))})"
@@ -150,19 +156,48 @@ class Or(_Several):
 
 
 @checked
-class Not(Expression):
-    """Negation: holds if the part does not."""
+class Then(_Several):
+    """Order: the second part holds, and began to hold after a moment of the episode in which the first did."""
+
+    parts: Annotated[tuple[Expression, ...], Field(min_length=2, max_length=2)]
+
+
+class _OfOne(Expression):
+    """A node with one child."""
 
     part: Expression
 
     @property
     def children(self) -> tuple[Expression, ...]:
-        """The part."""
         return (self.part,)
 
     def map(self, function: Callable[[Expression], Expression]) -> Expression:
-        """Return the negation of what a function returns for the part."""
-        return Not(function(self.part))
+        return replace(self, part=function(self.part))  # type: ignore[type-var]
+
+
+@checked
+class Not(_OfOne):
+    """Negation: holds if the part does not."""
+
+    part: Expression
+
+
+@checked
+class Never(_OfOne):
+    """Prohibition: holds if the part has held at no moment of the episode."""
+
+    part: Expression
+
+
+@checked
+class Count(_OfOne):
+    """Repetition: holds if the part has become true at least so often in the episode; at the start does not count."""
+
+    number: Annotated[int, Field(ge=1, le=1000)]
+    part: Expression
+
+    def __str__(self) -> str:
+        return f"(Count {self.number} {self.part})"
 
 
 @checked
@@ -303,6 +338,9 @@ KINDS: dict[str, tuple[frozenset[str], ...]] = {
     "Incontact": (_SOLID, _SOLID),
     "Printjointstate": (_PLACE,),
 }
+OPERATORS = frozenset(
+    {"And", "Or", "Not", "Forall", "Then", "Never", "Count"}
+)  # no predicate has these names
 BUILTIN_PREDICATES = frozenset(KINDS) | {"True", "False"}
 send_to_workers(__name__, "KINDS")
 
@@ -397,6 +435,8 @@ def _atom(
         return
     for i, name in enumerate(atom.args):
         kind = "object" if name in bound else problem.kind_of(name)
+        if kind is None and name == "robot" and atom.predicate == "Incontact":
+            continue
         if kinds is not None and kinds[i] == _NUMERIC:
             if not _NUMBER.fullmatch(name):
                 yield "kind", f": {name} is not a number", "one such as 0.05 there"
@@ -529,7 +569,8 @@ def _meaning(node: Expression, parts: Iterator[object]) -> object:
     """Return a value that is equal for nodes with the same parts in any order."""
     if isinstance(node, Atom):
         return node
-    return type(node).__name__, getattr(node, "variables", ()), frozenset(parts)
+    what = (getattr(node, "variables", ()), getattr(node, "number", 1))
+    return type(node).__name__, what, (tuple if isinstance(node, Then) else frozenset)(parts)
 
 
 def _same_region(x: Region, y: Region, tolerance: float) -> bool:

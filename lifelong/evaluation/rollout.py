@@ -334,7 +334,8 @@ class EpisodeTracker:
         """Return why an episode that is over, or has run out of time, failed; None where it has not, or for unknown."""
         if self._watch is None or self.success[i] or i in self.errors:
             return None
-        return self._watch.failure(i, self._ever[i].tolist(), self._now[i].tolist())
+        lacking = self._env.missing(i)  # type: ignore[attr-defined]  # of those that are watched
+        return self._watch.failure(i, self._ever[i].tolist(), lacking)
 
     def costs(self, i: int) -> Costs | None:
         """Return what an episode has cost so far; None where the environment does not show its state."""

@@ -7,6 +7,8 @@ from typing import Any
 
 from libero._adapters.files import suite_tasks
 from libero.libero import get_libero_path
+from libero_env.errors import BDDLError
+from libero_env.sim.history import over_time
 from libero_env.tasks import bddl
 from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem
 
@@ -14,8 +16,17 @@ _NO_YAW, _NO_COLOUR = [0, 0], [0, 0, 1, 0]
 
 
 def read_problem(problem_filename: str) -> Problem:
-    """Read a task file, see `task_file`; raise a BDDLError if it is not a task file."""
-    return bddl.read(task_file(problem_filename))
+    """Read a task file, see `task_file`; raise a BDDLError if it is not one, or not one of the original's."""
+    path = task_file(problem_filename)
+    problem = bddl.read(path)
+    if part := next(over_time(problem.goal), None):
+        line = bddl.read_text(path).lower().partition("(:goal")[0].count("\n") + 1
+        what, valid = (
+            f"{part} in the goal",
+            "a goal without Then, Never and Count, which the original does not have",
+        )
+        raise BDDLError(what, f"{valid}; libero_env runs it", path, line)
+    return problem
 
 
 def get_problem_info(problem_filename: str) -> dict[str, str]:

@@ -14,6 +14,7 @@ from libero_env.init_states.placement import sample_start, settle, start_errors
 from libero_env.init_states.store import load_init_states
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES
+from libero_env.sim.history import over_time
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene, build_scene, initial_qpos
 from libero_env.sim.simulation import LoopSimulations
@@ -211,6 +212,9 @@ def _report_start(report: Report, scene: Scene, rule: str, what: str, count: int
 def _check_goal(report: Report, scene: Scene, view: StateView) -> None:
     """Report parts that hold at the start, and objects and regions beyond the arm's length in any orientation."""
     goal = scene.problem.goal
+    if part := next(over_time(goal), None):
+        what = f"{part} is of this package: the original's reader refuses such a goal"
+        report.add("warning", report.lines.line(":goal"), "over-time", what, "correct if it is only run here")
     for part in goal.parts if isinstance(goal, And) and len(goal.parts) > 1 else ():
         if isinstance(part, Atom) and evaluate(part, view):
             what = f"{part} holds from the beginning"

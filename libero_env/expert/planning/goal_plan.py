@@ -2,12 +2,15 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from libero_env.errors import LiberoError
 from libero_env.objects.model import OPPOSITE_STATES
-from libero_env.sim.predicates import contains, evaluate, region_boxes
+from libero_env.sim.history import History
+from libero_env.sim.predicates import contains, evaluate, ground, region_boxes
 from libero_env.sim.scene import Scene
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or
+from libero_env.tasks.problem import And, Atom, Count, Expression, ForAll, Never, Not, Or, Then
 
 PLACES = ("On", "In", "Stack")
 
@@ -29,18 +32,33 @@ class Step:
     slot: tuple[int, int] = (0, 1)
 
 
-def plan_goal(goal: Expression, view: StateView) -> tuple[Step, ...]:
+def look(history: History, view: StateView) -> None:
+    """Take note of the present state, if a goal has conditions over time."""
+    if history.memory.size:
+        held = {atom: np.array([evaluate(atom, view)]) for atom in history.goal.atoms()}
+        history.look(np.zeros(1, np.int64), held)
+
+
+def plan_goal(goal: Expression, view: StateView, history: History | None = None) -> tuple[Step, ...]:
     """Return the steps that are left, in a safe order; none where the goal holds.
 
     The order: close what receives nothing, so that it is not in the way; turn knobs and open parts, including those
     that give access to a place or an object; place objects, each after the object that carries it; close what has
     received something.
 
+    Args:
+        goal: Goal of the episode.
+        view: Its state.
+        history: What the goal's conditions over time remember of it; None where it begins now.
+
     Raises:
         UnsupportedGoalError: No skill reaches an atom of the goal.
     """
     scene = view.scene
-    atoms = _required_atoms(goal, view)
+    if history is None:
+        history = History(ground(goal, scene), 1)
+        look(history, view)
+    atoms = _required_atoms(history.goal if history.memory.size else goal, view, history)
     for atom in atoms:
         _check(atom, scene)
     placements = [atom for atom in atoms if atom.predicate in PLACES]
@@ -58,7 +76,7 @@ def plan_goal(goal: Expression, view: StateView) -> tuple[Step, ...]:
     return tuple(Step(atom, slots.get(atom, (0, 1))) for atom in dict.fromkeys(order))
 
 
-def _required_atoms(goal: Expression, view: StateView) -> list[Atom]:
+def _required_atoms(goal: Expression, view: StateView, history: History) -> list[Atom]:
     """Return the atoms that have to hold; of alternatives, those with the fewest left to do."""
     match goal:
         case Atom("Up" | "True" | "Printjointstate" | "Incontact"):
@@ -68,13 +86,27 @@ def _required_atoms(goal: Expression, view: StateView) -> list[Atom]:
         case Atom():
             return [goal]
         case And(parts):
-            return list(dict.fromkeys(atom for part in parts for atom in _required_atoms(part, view)))
+            return list(
+                dict.fromkeys(atom for part in parts for atom in _required_atoms(part, view, history))
+            )
         case Or(parts):
-            choices = [_required_atoms(part, view) for part in parts]
+            choices = [_required_atoms(part, view, history) for part in parts]
             return min(choices, key=lambda atoms: sum(not evaluate(atom, view) for atom in atoms))
         case Not(Atom(predicate, args)) if predicate.lower() in OPPOSITE_STATES:
             opposite = OPPOSITE_STATES[predicate.lower()].capitalize()
             return [] if evaluate(goal, view) else [Atom(opposite, args)]
+        case Then(parts):
+            if history.is_late(0, goal):
+                return _undone(goal, parts[1])
+            return _required_atoms(parts[history.count(0, goal)], view, history)
+        case Count(number, part):
+            if history.count(0, goal) >= number:
+                return []
+            return _undone(goal, part) if evaluate(part, view) else _required_atoms(part, view, history)
+        case Never():
+            if history.count(0, goal):
+                raise UnsupportedGoalError(f"{goal} is broken, and no skill takes that back")
+            return []
         case Not() | ForAll():
             if evaluate(goal, view):
                 return []
@@ -82,6 +114,13 @@ def _required_atoms(goal: Expression, view: StateView) -> list[Atom]:
                 f"no skill reaches {goal}; state what has to hold instead of what must not"
             )
     raise TypeError(f"not a goal: {goal!r}")
+
+
+def _undone(goal: Expression, part: Expression) -> list[Atom]:
+    """Return the atom that ends a part which has to begin to hold once more."""
+    if isinstance(part, Atom) and (state := part.predicate.lower()) in OPPOSITE_STATES:
+        return [Atom(OPPOSITE_STATES[state].capitalize(), part.args)]
+    raise UnsupportedGoalError(f"{goal}: {part} holds, and no skill ends it so that it can begin again")
 
 
 def _check(atom: Atom, scene: Scene) -> None:
