@@ -36,6 +36,7 @@ UNMEASURED = (
     "failures",
     "costs",
     "began",
+    "atoms_at_start",
     "solved",
 )  # columns that are not part of `outcomes`
 
@@ -61,6 +62,7 @@ class TaskResult(Episodes):
             events); empty without events.
         solved: Whether the expert, from the state just after each event, solves what is left: 1 or 0, -1 where it never
             began.
+        atoms_at_start: Whether each atom held before the policy acted, (episodes, atoms).
 
     Raises:
         EvaluationFileError: The columns have different lengths.
@@ -73,6 +75,7 @@ class TaskResult(Episodes):
     actions: tuple[str, ...] = ()
     attempts: tuple[tuple[Count, ...], ...] = ()
     began: tuple[tuple[Annotated[int, Field(ge=-1)], ...], ...] = ()
+    atoms_at_start: tuple[tuple[bool, ...], ...] = ()
     solved: tuple[tuple[Annotated[int, Field(ge=-1, le=1)], ...], ...] = ()
 
     OPTIONAL: ClassVar[tuple[str, ...]] = (
@@ -81,6 +84,7 @@ class TaskResult(Episodes):
         "actions",
         "attempts",
         "began",
+        "atoms_at_start",
         "solved",
     )
 

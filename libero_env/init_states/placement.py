@@ -173,19 +173,33 @@ def _place_of(scene: Scene, atom: Atom) -> Place:
 def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) -> None:
     """Sample the joints that init atoms require to be open, closed, turned on or off."""
     for atom in scene.problem.init:
-        state = atom.predicate.lower()
-        if state not in OPPOSITE_STATES:
-            continue
-        owner = scene.owner(atom.args[0])
-        ranges = scene.entities[owner].articulation if owner is not None else {}
-        joints = scene.joints.get(atom.args[0], ())
-        if state not in ranges or not joints:
-            raise PlacementError(
-                f"init atom ({atom.predicate} {atom.args[0]}): {atom.args[0]} has no joint with a state {state!r}"
-            )
-        for joint in joints:
-            low, high = np.clip(sorted(ranges[state]), *scene.model.jnt_range[joint])
-            data.qpos[scene.model.jnt_qposadr[joint]] = rng.uniform(low, high)
+        if atom.predicate.lower() in OPPOSITE_STATES:
+            make_true(scene, data, atom, rng)
+
+
+def make_true(scene: Scene, data: mujoco.MjData, atom: Atom, rng: np.random.Generator) -> list[int]:
+    """Sample positions with which an atom holds, of joints or of an object, and return their addresses in `data.qpos`.
+
+    Raises:
+        PlacementError: It is another kind of atom, or there is no such joint or place.
+    """
+    state, name = atom.predicate.lower(), atom.args[0]
+    if state not in OPPOSITE_STATES:
+        mujoco.mj_kinematics(scene.model, data)
+        _place(scene, data, name, _place_of(scene, atom), rng)
+        address = scene.pose_address(name)
+        return list(range(address, address + 7))
+    owner = scene.owner(name)
+    ranges = scene.entities[owner].articulation if owner is not None else {}
+    joints = scene.joints.get(name, ())
+    if state not in ranges or not joints:
+        raise PlacementError(
+            f"init atom ({atom.predicate} {name}): {name} has no joint with a state {state!r}"
+        )
+    for joint in joints:
+        low, high = np.clip(sorted(ranges[state]), *scene.model.jnt_range[joint])
+        data.qpos[scene.model.jnt_qposadr[joint]] = rng.uniform(low, high)
+    return scene.model.jnt_qposadr[list(joints)].tolist()
 
 
 def _place(scene: Scene, data: mujoco.MjData, name: str, place: Place, rng: np.random.Generator) -> None:

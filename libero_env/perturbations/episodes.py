@@ -94,6 +94,8 @@ class PerturbedEpisodes:
         self._starts: list[object] = [""] * num
         sampled = [k for k, one in enumerate(self.perturbations) if one.layer == "observation"]
         filters = (*self._fixed_of("observation"), *(self._sample(k, "") for k in sampled))
+        for k in self._of("start"):  # a task without what a kind needs is refused before anything runs
+            self._sample(k, "")
         self.has_memory = any(one.has_memory for one in filters)
 
     @property

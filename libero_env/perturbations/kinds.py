@@ -223,8 +223,10 @@ class Kind:
 
     @property
     def can_begin(self) -> bool:
-        """Whether it can begin during an episode: without another scene, and without moving the arm."""
-        return self.name == "goal" or (self.layer != "problem" and self.name not in ("robot", "object_pose"))
+        """Whether it can begin during an episode: without another scene, arm or half of the task."""
+        return self.name == "goal" or (
+            self.layer != "problem" and self.name not in ("robot", "object_pose", "partial")
+        )
 
     def amount(self, severity: float) -> float:
         """Return the amount at a severity in [0, 1], in `unit`."""

@@ -8,16 +8,24 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.geometry import quat_from_axis_angle, quat_multiply
+from libero_env.init_states.placement import make_true, settle
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import StartChange, direction, sign
+from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import ROBOT, Scene
-from libero_env.tasks.problem import Problem
+from libero_env.sim.simulation import LoopSimulations
+from libero_env.sim.state import StateView
+from libero_env.tasks.problem import And, Atom, Problem
 from libero_env.workspaces import WORKSPACES
 
 _DIRECTIONS = 60  # tries for each object
 _BESIDE = 0.12  # [m] between the middles of two objects that stand beside each other
 _FULL_STEP, _FULL_TURN = 0.05, np.deg2rad(30.0)  # [m], [rad] at severity 1
+_STILL = (
+    0.01  # [m, rad, or quaternion units] largest change of a start that is at rest, and of what is not moved
+)
 _LIMIT_MARGIN = 0.02  # [rad] between a sampled joint and the end of its range
 
 
@@ -133,6 +141,42 @@ class Gathered(StartChange):
         return moved if contacts(scene, moved) <= before else None
 
 
+@dataclass(frozen=True)
+class PartOfGoal(StartChange):
+    """Some of the atoms of the goal that are missing hold, with what they are about at rest; all else stays.
+
+    Attributes:
+        share: Share of the missing atoms, at least one and not all; a start that lacks only one stays as it is.
+        seed: Seed of their choice and of the positions.
+    """
+
+    share: float
+    seed: int
+
+    def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
+        rng, before = np.random.default_rng(self.seed), contacts(scene, row)
+        simulations = LoopSimulations(scene.model, 1, scene.fixture_bodies)
+        view, (qpos, qvel, fixtures) = StateView(scene, simulations), scene.split_states(row[None])
+        simulations.reset([0], qpos, qvel, fixtures=fixtures)
+        atoms = scene.goal_atoms
+        missing = [atoms[k] for k in rng.permutation(len(atoms)) if not evaluate(atoms[k], view)]
+        chosen = missing[: max(1, round(self.share * (len(missing) - 1)))] if len(missing) > 1 else []
+        (model, data), moved = posed(scene, row), row.copy()
+        made = np.array([a for atom in chosen for a in make_true(scene, data, atom, rng)], int)
+        moved[1 + made] = data.qpos[made]
+        root = model.body_rootid
+        if any(root[a] != root[b] for a, b in contacts(scene, moved) - before):
+            return None
+        try:
+            rest = settle(simulations, 0, moved[1 : 1 + model.nq], scene.nq_robot, fixtures[0])
+            moved[1 + made] = rest[made]
+            settle(simulations, 0, moved[1 : 1 + model.nq], scene.nq_robot, fixtures[0])
+        except PlacementError:
+            return None
+        change = np.abs(simulations.fields["qpos"][0] - moved[1 : 1 + model.nq])[scene.nq_robot :]
+        return moved if change.max() < _STILL and all(evaluate(atom, view) for atom in chosen) else None
+
+
 def _of_goal(scene: Scene) -> tuple[list[str], list[str]]:
     """Return the objects that a goal wants somewhere, and those that it wants them on or in."""
     atoms, objects = scene.problem.goal.atoms(), scene.problem.objects
@@ -229,10 +273,20 @@ def _gathered(count: float, rng: np.random.Generator, scene: Scene) -> Gathered:
     return Gathered(int(count), int(rng.integers(2**63)))
 
 
+def _part_of_goal(share: float, rng: np.random.Generator, scene: Scene) -> PartOfGoal:
+    goal = scene.problem.goal
+    if not (isinstance(goal, And) and len(goal.parts) > 1 and all(isinstance(p, Atom) for p in goal.parts)):
+        raise InvalidInputError(
+            f"perturbation partial: no part of the goal {goal} can hold alone; expected an And of several atoms"
+        )
+    return PartOfGoal(share, int(rng.integers(2**63)))
+
+
 SAMPLERS: dict[str, Callable[..., StartChange]] = {
     "robot": _robot,
     "object_pose": _object_pose,
     "object": partial(_put_aside, receptacle=False),
     "receptacle": partial(_put_aside, receptacle=True),
     "distractor": _gathered,
+    "partial": _part_of_goal,
 }

@@ -273,6 +273,7 @@ class Evaluation:
             attempts=attempts if any(attempts) else (),
             began=began if any(began) else (),
             solved=solved if any(solved) else (),
+            atoms_at_start=tuple(e.at_start for e in done.counted),
             **done.columns(),
         )
         environment, versions = describe_environment(env), dict(self.versions)
