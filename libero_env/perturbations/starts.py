@@ -277,7 +277,8 @@ def _part_of_goal(share: float, rng: np.random.Generator, scene: Scene) -> PartO
     goal = scene.problem.goal
     if not (isinstance(goal, And) and len(goal.parts) > 1 and all(isinstance(p, Atom) for p in goal.parts)):
         raise InvalidInputError(
-            f"perturbation partial: no part of the goal {goal} can hold alone; expected an And of several atoms"
+            f"{scene.problem.language!r}: perturbation partial: no part of the goal {goal} can hold alone; expected an "
+            "And of several atoms"
         )
     return PartOfGoal(share, int(rng.integers(2**63)))
 

@@ -5,9 +5,9 @@ import pickle
 import numpy as np
 import pytest
 
-from libero_env import BatchEnv, LiberoEnv
+from libero_env import BatchEnv, LiberoEnv, make_task
 from libero_env.envs import EnvConfig
-from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.geometry import quat_to_axis_angle
 from libero_env.perturbations import (
     KINDS,
@@ -28,6 +28,7 @@ from libero_env.tasks import get_suite
 TASK = "libero_goal/3"
 SMALL = {"camera_size": (32, 32), "cameras": ("agentview",)}
 ON_OBJECT = "libero_goal/6"  # the cream cheese into the bowl
+OF_TWO = "libero_10/2"  # turn on the stove and put the moka pot on it
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
 
 
@@ -90,7 +91,7 @@ def test_what_is_typed_wrongly_is_one_line(text):
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_does_something(closing, kind, plain):
     base, seen = plain
-    task = ON_OBJECT if kind == "receptacle" else TASK
+    task = {"receptacle": ON_OBJECT, "partial": OF_TWO}.get(kind, TASK)
     if task != TASK:
         base = closing(LiberoEnv(task, **SMALL))
         seen = episode(base, steps=4)
@@ -118,7 +119,9 @@ def test_severity_0_changes_no_bit(closing, plain):
 
 
 def test_draws_do_not_depend_on_the_batch_or_its_order(closing):
-    kinds = [name for name, kind in KINDS.items() if not kind.exclusive and name != "receptacle"]  # a drawer
+    kinds = [
+        name for name, kind in KINDS.items() if not kind.exclusive and name not in ("receptacle", "partial")
+    ]  # a drawer
     perturb = ",".join(f"{name}=0.5" for name in kinds)
     actions = np.random.default_rng(0).uniform(-1, 1, (3, 3, 7))
     batch = closing(BatchEnv(TASK, 3, perturb=perturb, **SMALL))
@@ -420,3 +423,53 @@ def test_a_configuration_with_perturbations_goes_to_other_processes():
         perturb=[Perturbation("noise", 0.5, 3), Appearance(cameras={CAMERA: view}), PixelNoise(2.0)]
     )
     assert pickle.loads(pickle.dumps(config)) == config
+
+
+def test_a_part_of_the_goal_holds_at_the_start_and_goes_on_to_hold():
+    def held(starts, perturb="partial=1"):
+        with BatchEnv(OF_TWO, len(starts), cameras=(), perturb=perturb) as env:
+            _, info = env.reset(options={"init_state": starts})
+            first, states = info["progress"], [env.simulations.get_state(i) for i in range(len(starts))]
+            for _ in range(20):
+                info = env.step(np.zeros((len(starts), 7)))[-1]
+            assert (info["progress"] >= first).all() and not info["success"].any()
+            return first, states
+
+    first, states = held([0, 1, 2, 3])
+    assert (first.sum(axis=1) == 1).all() and (first.sum(axis=0) > 0).all(), (
+        "each atom somewhere, and never both"
+    )
+    np.testing.assert_array_equal(states[2], held([2])[1][0])
+    assert any(
+        (one != other).any() for one, other in zip(first, held([0, 1, 2, 3], "partial=1@1")[0], strict=True)
+    )
+
+
+def test_a_share_of_the_atoms_and_what_holds_already():
+    task = make_task(
+        scene="kitchen", objects=["basket", "butter", "plate", "cream_cheese"], furniture=["flat_stove"],
+        place={"basket_1": (0.0, 0.25), "butter_1": (0.0, -0.2), "plate_1": (0.1, -0.25), "cream_cheese_1": (0.1, 0.0),
+               "flat_stove_1": (-0.3, 0.3)},
+        init_also=["Turnon flat_stove_1"],
+        goal=["In butter_1 basket_1_contain_region", "On cream_cheese_1 plate_1", "On plate_1 kitchen_table_left",
+              "Turnon flat_stove_1"],
+        regions={"kitchen_table": {"left": {"at": (-0.1, 0.0), "half": 0.03}}},
+        language="put the butter into the basket, and the cream cheese on the plate to the left, with the stove on",
+    )  # fmt: skip
+    for severity, count in ((0.1, 1), (0.5, 1), (1.0, 2)):
+        with BatchEnv(task, 1, cameras=(), perturb=f"partial={severity}") as env:
+            held = env.reset(seed=[0])[1]["progress"][0]
+            assert held[3] and held[:3].sum() == count, severity
+
+
+@pytest.mark.parametrize(("task", "perturb", "message"), [
+    ("libero_goal/1", "partial=1", "no part of the goal .And .On akita_black_bowl_1 .* can hold alone"),
+    ("libero_goal/1", "partial=2", "severities are from 0 to 1"),
+    (OF_TWO, "partial=1@lifted", "partial cannot begin during an episode"),
+    (OF_TWO, "partial", "expected KIND=SEVERITY"),
+    (OF_TWO, "part=1", "'part'"),
+])  # fmt: skip
+def test_partial_starts_that_there_are_not_are_refused_in_one_line(task, perturb, message):
+    with pytest.raises(LiberoError, match=message) as error:
+        BatchEnv(task, 1, cameras=(), perturb=perturb)
+    assert "\n" not in str(error.value)
