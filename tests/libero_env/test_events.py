@@ -137,9 +137,7 @@ def test_a_restored_state_has_the_events_that_had_begun():
         np.testing.assert_array_equal(again["agentview_rgb"][0], seen)
         env.set_state(1, states[5])  # of another simulation: only the camera has moved
         assert env.perturbed.began[1].tolist() == [3, -1] and info["began"][0].tolist() == [3, 8]
-        with pytest.raises(
-            InvalidInputError, match="ends with its number of steps, those before each event"
-        ):
+        with pytest.raises(InvalidInputError, match="ends with its number of steps, those before each event"):
             env.set_state(0, np.append(states[5][:-1], 0.5))
 
 
