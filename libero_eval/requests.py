@@ -20,6 +20,7 @@ from libero_env.cli.options import (
 )
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.parallel import cpu_count
+from libero_env.perturbations import format_perturbations, parse_perturbations
 from libero_env.timing import ControlFreq
 from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
@@ -28,6 +29,12 @@ KINDS = (
     *("layout", "distractors", "instruction", "camera", "light", "table", "background"),
     *("robot", "noise", "occlusion", "latency", "gain"),
 )
+SEVERITIES = (0.2, 0.4, 0.6, 0.8, 1.0)
+EVENTS = (
+    *("camera@lifted", "light@touched", "noise@touched"),
+    *("object@step20", "receptacle@lifted", "distractor@step20"),
+)
+EVENT_SEVERITIES = (0.3, 0.6, 1.0)
 PAIRS = ("camera=0.4,light=0.4", "camera=0.4,robot=0.4", "light=0.4,noise=0.4")
 
 
@@ -150,20 +157,38 @@ class RobustnessRequest(Request):
 
     Attributes:
         episodes: Number of the starts, from the first on.
-        kinds: Kinds of perturbations, see `libero perturb list`.
+        kinds: Kinds of perturbations, see `libero perturb list`; those that begin later with their trigger:
+            camera@lifted.
+        events: By default events during the episodes instead: six, at severities 0.3, 0.6 and 1, without pairs.
         severities: Severities above 0, at most 1.
         pairs: Two perturbations at once, of kinds and severities that are also run alone.
     """
 
     episodes: Positive | None = 10
     kinds: tuple[str, ...] = KINDS
-    severities: tuple[Annotated[float, Field(ge=0, le=1)], ...] = (0.2, 0.4, 0.6, 0.8, 1.0)
+    severities: tuple[Annotated[float, Field(ge=0, le=1)], ...] = SEVERITIES
     pairs: tuple[str, ...] = PAIRS
+    events: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.events:  # other defaults
+            defaults = {
+                "kinds": (KINDS, EVENTS),
+                "severities": (SEVERITIES, EVENT_SEVERITIES),
+                "pairs": (PAIRS, ()),
+            }
+            for name, (default, of_events) in defaults.items():
+                if getattr(self, name) == default:
+                    object.__setattr__(self, name, of_events)
 
     def condition(self, perturb: str, out: Path) -> EvalRequest:
         """Return the evaluation under some perturbations, in a folder of its own."""
         shared = {f.name: getattr(self, f.name) for f in fields(Request)}
-        return EvalRequest(**{**shared, "perturb": perturb, "out": out})
+        parts = parse_perturbations(perturb, events=True)
+        events = tuple(str(one) for one in parts if one.trigger)
+        start = format_perturbations(one for one in parts if not one.trigger)
+        return EvalRequest(**{**shared, "perturb": start, "event": events, "out": out})
 
 
 class _Checked:

@@ -71,6 +71,11 @@ class Perturbation:
         _check_event(self.kind, self.trigger)
 
     @property
+    def name(self) -> str:
+        """Kind and trigger, such as `camera@lifted`; the kind alone without one."""
+        return f"{self.kind}@{self.trigger}".rstrip("@")
+
+    @property
     def definition(self) -> Kind:
         """Kind of the perturbation."""
         return KINDS[self.kind]

@@ -15,7 +15,7 @@ from libero_env.perturbations import KINDS
 from libero_env.storage import write_json
 from libero_env.text import text_table
 from libero_eval.judging.page import interval_text, p_text
-from libero_eval.robustness.results import Axis, Outcomes, Robustness, name_of
+from libero_eval.robustness.results import Axis, EventRow, Outcomes, Robustness, name_of
 from lifelong.errors import writing
 from lifelong.report.figures import (
     INK,
@@ -32,6 +32,11 @@ from lifelong.stats.intervals import Estimate
 
 ALPHA = 0.05  # of the kinds together
 COLUMNS = 4
+EVENTS_TEXT = (
+    "In how many episodes each event began, and in how many of these the expert, planning anew from the state just "
+    "after it, solves the rest. In the latter: success in percent of the matched episodes without the event, and with "
+    "it, and the share of the former's successes that is lost."
+)
 
 
 def verdict(policy: Robustness) -> str:
@@ -69,10 +74,16 @@ def render(policy: Robustness) -> str:
                 p_text(policy.adjusted[axis.kind]),
             ]
         )
+    events: list[list[object]] = [
+        ["event", "began", "solvable", "without", "with", "difference", "95 %", "lost"]
+    ]
+    for row in policy.event_rows:
+        events.append([row.name, f"{row.began} of {row.episodes}", row.solved, *_event_cells(row)])
     lines = [
         f"{policy.label}: success in percent by severity, 0 is without perturbation",
         text_table(rows),
         *([f"starts: {len(policy.outcomes.starts)}{lost}"] if (lost := _lost_text(policy.outcomes)) else []),
+        *(["", EVENTS_TEXT, text_table(events)] if len(events) > 1 else []),
         *(
             f"{name_of(pair.condition)}: {100 * pair.success.value:.0f}, expected {100 * pair.expected:.0f}, "
             f"excess {100 * pair.excess.value:+.0f} {interval_text(pair.excess)}".replace("+-", "-")
@@ -112,7 +123,7 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         ],
         verdict=verdict(first),
         policies=policies,
-        units=units,
+        units={axis.kind: units[axis.kind.partition("@")[0]] for axis in first.axes},
         curves=as_svg(curves_figure(axes, units)),
         radar=as_svg(radar_figure(axes)) if len(first.axes) > 2 else "",
         interactions=[
@@ -120,6 +131,8 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
             for policy in policies
             for pair in policy.interactions
         ],
+        event_cells=_event_cells,
+        events_text=EVENTS_TEXT,
         redrawn=[(name, count, episodes) for name, count in first.redrawn.items() if count],
         paths=[os.path.relpath(path, folder) for policy in policies for path in policy.paths],
         interval=interval_text,
@@ -130,6 +143,17 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
     with writing(folder, "the numbers"):
         write_json(folder / "robustness.json", {"policies": [_content(policy) for policy in policies]})
     return page
+
+
+def _event_cells(row: EventRow) -> list[str]:
+    """Return success without and with an event, their difference and its interval, and the share lost: in percent."""
+    counts = row.counts
+    if not counts.pairs:
+        return ["–"] * 5
+    rates = [100 * (counts.both + only) / counts.pairs for only in (counts.only_first, counts.only_second)]
+    lost = "–" if math.isnan(counts.lost) else f"{100 * counts.lost:.1f}"
+    value = f"{100 * row.difference.value:+.1f}"
+    return [f"{rates[0]:.1f}", f"{rates[1]:.1f}", value, interval_text(row.difference), lost]
 
 
 def severity_text(severity: float) -> str:
@@ -163,6 +187,7 @@ def _content(policy: Robustness) -> dict[str, Any]:
             {**asdict(pair), "condition": name_of(pair.condition)} for pair in policy.interactions
         ],
         "redrawn": dict(policy.redrawn),
+        "events": [asdict(row) for row in policy.event_rows],
         "outcomes": {
             name_of(condition): rows.astype(int).tolist()
             for condition, rows in zip(outcomes.conditions, outcomes.successes, strict=True)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from libero_eval.evaluation_file import EvaluationResult
 from lifelong.errors import ResultsError
-from lifelong.stats.intervals import Estimate, Floats, combine_intervals, holm, wilson_interval
+from lifelong.stats.episodes import Counts, mcnemar_exact, score_interval
+from lifelong.stats.intervals import UNKNOWN, Estimate, Floats, combine_intervals, holm, wilson_interval
 
 DRAWS, SEED, CONFIDENCE = 2000, 2023, 0.95
 ONE_EPISODE = 0.96  # z²/4 at 95 %: the variance that Wilson's interval adds, in units of one episode
@@ -196,6 +197,45 @@ class Outcomes:
 
 
 @dataclass(frozen=True)
+class EventRow:
+    """What an event takes, in the episodes in which the expert solves the rest, against the matched ones without it.
+
+    Attributes:
+        name: The event, such as `camera@lifted=0.6`.
+        episodes: Number of episodes.
+        began: Number of these in which it began.
+        solved: Number of these in which the expert, from the state just after it, solves what is left.
+        counts: The last ones by outcome, first that without the event.
+    """
+
+    name: str
+    episodes: int
+    began: int
+    solved: int
+    counts: Counts
+
+    @property
+    def difference(self) -> Estimate:
+        """Success with the event minus that without, with Tango's interval; NaN without episodes."""
+        found = score_interval(self.counts) if self.counts.pairs else UNKNOWN
+        return Estimate(-found.value, -found.high, -found.low)
+
+    @property
+    def p_value(self) -> float:
+        """Of no effect, McNemar's exact one."""
+        return mcnemar_exact(self.counts)
+
+
+def events_of(result: EvaluationResult) -> dict[tuple[str, int], tuple[bool, bool]]:
+    """Return whether an event began in each episode, and whether the expert solves the rest of all that did."""
+    return {
+        (task.task, start): (any(at >= 0 for at in began), 1 in solved and 0 not in solved)
+        for task in result.tasks
+        for start, began, solved in zip(task.init_states, task.began, task.solved, strict=True)
+    }
+
+
+@dataclass(frozen=True)
 class Robustness:
     """What perturbations do to one policy.
 
@@ -204,12 +244,28 @@ class Robustness:
         outcomes: Outcomes of all conditions.
         paths: Folders of the results.
         redrawn: Number of draws that were given up, by condition.
+        events: By condition with an event, whether it began in each episode, and whether the expert solves the rest.
     """
 
     label: str
     outcomes: Outcomes
     paths: tuple[str, ...] = ()
     redrawn: Mapping[str, int] = field(default_factory=dict)
+    events: Mapping[Condition, Mapping[tuple[str, int], tuple[bool, bool]]] = field(default_factory=dict)
+
+    @cached_property
+    def event_rows(self) -> tuple[EventRow, ...]:
+        """What each condition with an event takes."""
+        outcomes, rows = self.outcomes, []
+        keys = [(task, start) for task in outcomes.tasks for start in outcomes.starts]
+        before = outcomes.successes[0].ravel()
+        for condition in filter(self.events.get, outcomes.conditions):
+            began, solved = np.array([self.events[condition][key] for key in keys]).T
+            after = outcomes.successes[outcomes.conditions.index(condition)].ravel()
+            cells = (before & after, before & ~after, ~before & after, ~before & ~after)
+            counts = Counts(*(int((cell & solved).sum()) for cell in cells))
+            rows.append(EventRow(name_of(condition), len(keys), int(began.sum()), int(solved.sum()), counts))
+        return tuple(rows)
 
     @property
     def base(self) -> Estimate:

@@ -7,13 +7,13 @@ from contextlib import redirect_stderr
 from dataclasses import replace
 from pathlib import Path
 
-from libero_env.perturbations import format_perturbations, get_kind, parse_perturbations
+from libero_env.perturbations import format_perturbations, parse_perturbations
 from libero_env.storage import require_own_folders
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
 from libero_eval.plan import further_process, load_policy, plan_evaluation, policy_threads
 from libero_eval.policies import PolicyUnderTest
 from libero_eval.requests import PAIRS, RobustnessRequest
-from libero_eval.robustness.results import Outcomes, Robustness, name_of
+from libero_eval.robustness.results import Outcomes, Robustness, events_of, name_of
 from libero_eval.work.evaluation import Evaluation
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError
@@ -106,17 +106,18 @@ def conditions_of(request: RobustnessRequest) -> list[str]:
         LiberoError: A kind does not exist, or a text is not valid.
     """
     seed = request.perturb_seed
+    parts = [kind.partition("@") for kind in request.kinds]
     texts = [
-        f"{get_kind(kind).name}={severity:g}"
-        for kind in request.kinds
+        f"{kind}={severity:g}{at}{trigger}"
+        for kind, at, trigger in parts
         for severity in sorted(request.severities)
     ]
-    conditions = [format_perturbations(parse_perturbations(text, seed)) for text in texts]
+    conditions = [format_perturbations(parse_perturbations(text, seed, events=True)) for text in texts]
     for text in request.pairs:
-        pair = parse_perturbations(text, seed)
+        pair = parse_perturbations(text, seed, events=True)
         if len(pair) != 2:
             raise ConfigError(f"--pairs {text}: expected two perturbations, such as camera=0.4,light=0.4")
-        if all(one.kind in request.kinds and one.severity in request.severities for one in pair):
+        if all(one.name in request.kinds and one.severity in request.severities for one in pair):
             conditions.append(format_perturbations(pair))
         elif request.pairs != PAIRS:  # those that were named
             raise ConfigError(
@@ -132,18 +133,21 @@ def read_study(folder: Path, name: str = "") -> Robustness:
     Raises:
         ConfigError: It holds no finished conditions.
     """
-    results, redrawn = {}, {}
+    results, redrawn, events = {}, {}, {}
     for path in sorted((folder / CONDITIONS).glob(f"*/{FILE_NAME}")):
         result = EvaluationResult.read(path)
-        perturbations = parse_perturbations(result.protocol.get("world", {}).get("perturb", ""))
-        condition = tuple((one.kind, one.severity) for one in perturbations)
+        perturbations = parse_perturbations(result.protocol.get("world", {}).get("perturb", ""), events=True)
+        condition = tuple((one.name, one.severity) for one in perturbations)
         results[condition] = result
-        redrawn[name_of(condition)] = sum(sum(row) for task in result.tasks for row in task.attempts)
+        if any(one.trigger for one in perturbations):
+            events[condition] = events_of(result)
+        else:
+            redrawn[name_of(condition)] = sum(sum(row) for task in result.tasks for row in task.attempts)
     if not results:
         raise ConfigError(
             f"{folder} holds no finished conditions; `libero robustness POLICY --out {folder}` makes them"
         )
-    return Robustness(name or folder.name, Outcomes.of(results), (str(folder),), redrawn)
+    return Robustness(name or folder.name, Outcomes.of(results), (str(folder),), redrawn, events)
 
 
 def _name(policy: PolicyUnderTest) -> str:

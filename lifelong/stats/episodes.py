@@ -71,6 +71,12 @@ class Counts:
         return self.both + self.only_first + self.only_second + self.neither
 
     @property
+    def lost(self) -> float:
+        """Share of the first's successes that the second does not have; NaN without any."""
+        won = self.both + self.only_first
+        return self.only_first / won if won else math.nan
+
+    @property
     def discordant(self) -> int:
         """Number of pairs in which exactly one of the two succeeded."""
         return self.only_first + self.only_second
