@@ -1,7 +1,7 @@
 """Errors of the package; all derive from `LiberoError`."""
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 
 from libero_env.text import suggest
@@ -37,6 +37,12 @@ class UnknownNameError(LiberoError, LookupError):
         hint = suggest(name, [*names, *unlisted])
         more = f", ... ({len(names)} in all)" if len(names) > MAX_LISTED else ""
         super().__init__(f"unknown {kind} {name!r}.{hint} Valid: {', '.join(names[:MAX_LISTED])}{more}")
+
+
+def require_known(kind: str, name: object, valid: Collection[object]) -> None:
+    """Raise an `UnknownNameError` of the same arguments, unless the name is one of the valid ones."""
+    if name not in valid:
+        raise UnknownNameError(kind, name, valid)
 
 
 class MissingPackageError(LiberoError):

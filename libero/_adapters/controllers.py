@@ -11,7 +11,7 @@ import numpy as np
 from libero._adapters.lookup import Named
 from libero._adapters.sim import Domain
 from libero_env.assets.robot import GRIP_SITE
-from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, require_known
 from libero_env.mujoco_compat import MASS_FIELD
 from libero_env.sim.controller import POINTING_DOWN, ControllerState, get_controller
 from libero_env.sim.osc import goals_from_poses, move_gripper, rotate
@@ -63,14 +63,12 @@ def controller_of(configs: Any) -> dict[str, Any]:
     given = configs if isinstance(configs, Mapping) else {"type": configs}
     config = {key: value for key, value in given.items() if key not in _SET_BY_ROBOT}
     kind = config.setdefault("type", "OSC_POSE")
-    if kind not in DEFAULTS:
-        raise UnknownNameError("controller", kind, DEFAULTS)
+    require_known("controller", kind, DEFAULTS)
     if "use_delta" in config:  # as the attribute is called
         config["control_delta"] = config.pop("use_delta")
     valid = ["type", "control_delta", *DEFAULTS[kind]]
     for key, value in config.items():
-        if key not in valid:
-            raise UnknownNameError(f"key of the controller {kind}", key, valid)
+        require_known(f"key of the controller {kind}", key, valid)
         if key in _FIXED and value != _FIXED[key]:
             raise LiberoError(
                 f"controller {kind}, {key}={shown(value)}: not supported; leave {_FIXED[key]!r}"

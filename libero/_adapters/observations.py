@@ -14,7 +14,7 @@ import numpy as np
 from libero._adapters.lookup import Named, lookup
 from libero._adapters.sim import MjSim
 from libero_env.assets.robot import GRIP_SITE
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, require_known
 from libero_env.geometry import quat_to_mat
 from libero_env.mujoco_compat import mujoco
 
@@ -61,8 +61,7 @@ def _each(value: object, count: int) -> list:
 def _kinds(value: object) -> tuple[str, ...]:
     kinds = tuple(kind for kind in _each(value, 1) if kind is not None)
     for kind in kinds:
-        if kind not in SEGMENTATIONS:
-            raise UnknownNameError("segmentation", kind, SEGMENTATIONS)
+        require_known("segmentation", kind, SEGMENTATIONS)
     return kinds
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from libero_env.errors import UnknownNameError
+from libero_env.errors import UnknownNameError, require_known
 from libero_env.paths import config_file as _config_file
 from libero_env.paths import read_config
 
@@ -74,8 +74,7 @@ def get_libero_path(query_key: str) -> str:
     """Return one of the paths, and warn if it does not exist; raise an UnknownNameError if the key does not exist."""
     from libero._adapters.files import allow_arrays, ensure
 
-    if query_key not in _KEYS:
-        raise UnknownNameError("path", query_key, _KEYS)
+    require_known("path", query_key, _KEYS)
     allow_arrays()
     path, configured = get_path_dict()[query_key], read_config().get(query_key)
     if configured and configured != path and query_key not in _noted:

@@ -28,7 +28,7 @@ import numpy as np
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import Episode
-from libero_env.errors import UnknownNameError
+from libero_env.errors import require_known
 from libero_env.geometry import rotation_between
 from libero_env.mujoco_compat import MASS_FIELD
 from libero_env.sim.controller import get_controller
@@ -55,8 +55,7 @@ class ActionConverter:
     """
 
     def __init__(self, file: Path, kind: str, task: Task | None = None):
-        if kind not in KINDS:
-            raise UnknownNameError("kind of actions", kind, KINDS)
+        require_known("kind of actions", kind, KINDS)
         self.kind, self._file = kind, file
         self._renderer = StateRenderer.of_file(file, RenderConfig(()), task=task) if kind != "delta" else None
 

@@ -26,7 +26,7 @@ from libero_env.demos.read import Episode, Labels, read_episodes
 from libero_env.demos.replay import Regeneration, regenerate
 from libero_env.demos.rlds import RldsWriter
 from libero_env.demos.write import require_absent
-from libero_env.errors import DemoError, UnknownNameError
+from libero_env.errors import DemoError, UnknownNameError, require_known
 from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_folder
 from libero_env.tasks import Task
@@ -112,8 +112,7 @@ def export_published(
         DemoError: A file is broken, no demonstration reaches its goal, or the folder exists.
         LiberoError: PyArrow or PyAV is not installed.
     """
-    if name not in PUBLISHED:
-        raise UnknownNameError("published data set", name, PUBLISHED)
+    require_known("published data set", name, PUBLISHED)
     config, exported, failed = config or Regeneration(), 0, []
     with _data_set(root, PUBLISHED[name]) as (folder, dataset):
         for file in progress_bar(files, desc="export", unit="file", progress=progress):

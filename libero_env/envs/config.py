@@ -1,7 +1,7 @@
 """Configuration that the environments share."""
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import KW_ONLY, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
 
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
-from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.errors import InvalidInputError, require_known
 from libero_env.perturbations.episodes import checked_perturbations
 from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
@@ -51,12 +51,11 @@ def _assets(value: Any) -> Any:
     raise InvalidInputError(f"assets is {shown(value)}; expected builtin, original, a folder, or a Pack")
 
 
-def _known(kind: str, names: Iterable[str]) -> AfterValidator:
+def _known(kind: str, names: Collection[str]) -> AfterValidator:
     """Return the check that a text is one of some names."""
 
     def check(value: str) -> str:
-        if value not in names:
-            raise UnknownNameError(kind, value, names)
+        require_known(kind, value, names)
         return value
 
     return AfterValidator(check)
@@ -153,8 +152,7 @@ class EnvConfig:
             raise InvalidInputError(f"config is {shown(config)}; expected an EnvConfig or None")
         names = [field.name for field in fields(cls)]
         for name in options:
-            if name not in names:
-                raise UnknownNameError("environment option", name, names)
+            require_known("environment option", name, names)
         return replace(config or cls(), **options)
 
 

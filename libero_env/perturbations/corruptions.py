@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.errors import InvalidInputError, require_known
 from libero_env.parallel import compiled
 from libero_env.perturbations.kinds import Episode, ObservationFilter
 
@@ -56,8 +56,7 @@ def corrupt(image: np.ndarray, kind: str, severity: int, rng: np.random.Generato
         UnknownNameError: There is no such kind.
         InvalidInputError: There is no such severity, or the image has another shape or type.
     """
-    if kind not in CORRUPTIONS:
-        raise UnknownNameError("corruption", kind, CORRUPTIONS)
+    require_known("corruption", kind, CORRUPTIONS)
     if not 1 <= severity <= SEVERITIES:
         raise InvalidInputError(f"{kind}: severity {severity}; expected 1 to {SEVERITIES}")
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.errors import InvalidInputError, require_known
 from libero_env.perturbations import appearance, filters, problem, starts
 from libero_env.perturbations.events import PHASES, checked_trigger
 from libero_env.perturbations.instructions import reword
@@ -42,8 +42,7 @@ def get_kind(name: str) -> Kind:
     Raises:
         UnknownNameError: It does not exist; the message lists the kinds.
     """
-    if name not in KINDS:
-        raise UnknownNameError("kind of perturbation", name, KINDS)
+    require_known("kind of perturbation", name, KINDS)
     return KINDS[name]
 
 

@@ -6,7 +6,7 @@ A backend is named in a line of text: `mujoco`, `warp`, or with settings `warp,d
 import importlib.util
 from dataclasses import dataclass
 
-from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, require_known
 from libero_env.text import shown
 
 MUJOCO, WARP = BACKENDS = ("mujoco", "warp")
@@ -49,13 +49,11 @@ class Backend:
         if not isinstance(value, str):
             raise InvalidInputError(f"backend is {shown(value)}; expected a text such as mujoco or warp")
         name, *settings = value.split(",")
-        if name not in BACKENDS:
-            raise UnknownNameError("backend", name, BACKENDS)
+        require_known("backend", name, BACKENDS)
         found: dict[str, str] = {}
         for setting in settings:
             key, _, text = setting.partition("=")
-            if key not in _SETTINGS:
-                raise UnknownNameError("setting of a backend", key, _SETTINGS)
+            require_known("setting of a backend", key, _SETTINGS)
             found[key] = text
         if name == MUJOCO and found:
             raise InvalidInputError(

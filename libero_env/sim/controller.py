@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, require_known
 from libero_env.parallel import compiled
 from libero_env.sim.osc import (
     GAINS,
@@ -141,8 +141,7 @@ def get_controller(name: str = "osc_pose", control_delta: bool = True) -> Contro
         UnknownNameError: No controller has this name.
         LiberoError: `joint_velocity` is asked for without `control_delta`.
     """
-    if name not in CONTROLLERS:
-        raise UnknownNameError("controller", name, CONTROLLERS)
+    require_known("controller", name, CONTROLLERS)
     if name == "joint_velocity" and not control_delta:
         raise LiberoError("joint_velocity has no absolute mode; leave control_delta=True")
     return CONTROLLERS[name](control_delta)

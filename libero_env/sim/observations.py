@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from gymnasium import spaces
 
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, require_known
 from libero_env.geometry import quat_multiply, quat_rotate, quat_to_axis_angle
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import ROOT_BODY
@@ -106,8 +106,7 @@ class Observer:
         camera_size: tuple[int, int] = (128, 128),
     ):
         for name in observations:
-            if name not in NAMES:
-                raise UnknownNameError("observation", name, NAMES)
+            require_known("observation", name, NAMES)
         kinds = [kind for kind in SEGMENTATIONS if f"segmentation_{kind}" in observations]
         if len(kinds) > 1:
             raise LiberoError(f"observations: one kind of segmentation at a time, got {', '.join(kinds)}")
@@ -225,8 +224,7 @@ class Observer:
         Raises:
             UnknownNameError: The camera or the kind does not exist.
         """
-        if kind not in _IMAGE_NAMES:
-            raise UnknownNameError("image", kind, _IMAGE_NAMES)
+        require_known("image", kind, _IMAGE_NAMES)
         base, _, segmentation = kind.partition("_")
         channels, dtype = _IMAGES[base]
         out = np.empty((*self.camera_size, *channels), dtype)
@@ -302,8 +300,7 @@ def segmentation_labels(scene: Scene, kind: str) -> Labels:
         return Labels(
             np.arange(1 + model.ngeom + model.nsite, dtype=np.int32), {0: "nothing", **geoms, **sites}
         )
-    if kind not in SEGMENTATIONS:
-        raise UnknownNameError("segmentation", kind, SEGMENTATIONS)
+    require_known("segmentation", kind, SEGMENTATIONS)
     entities = {name: name if kind == "instance" else item.category for name, item in scene.entities.items()}
     names = dict(enumerate(dict.fromkeys((ARENA, ARM, GRIPPER, *entities.values()))))
     numbers = {name: number for number, name in names.items()}

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from libero_env.errors import UnknownNameError
+from libero_env.errors import UnknownNameError, require_known
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.scene import zone_boxes
@@ -43,8 +43,7 @@ class Reward:
     scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.kind not in REWARDS:
-            raise UnknownNameError("reward", self.kind, REWARDS)
+        require_known("reward", self.kind, REWARDS)
 
     def __call__(
         self, view: StateView, success: bool, atoms: Sequence[Atom] = (), held: Sequence[bool] = ()

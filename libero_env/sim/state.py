@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.assets.robot import FINGER_JOINTS
-from libero_env.errors import UnknownNameError
+from libero_env.errors import UnknownNameError, require_known
 from libero_env.geometry import quat_to_mat
 from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.scene import Scene
@@ -59,8 +59,7 @@ class StateView:
             UnknownNameError: The object, fixture or region does not exist.
         """
         scene, model = self.scene, self.scene.model
-        if address not in scene.joints:
-            raise UnknownNameError("object, fixture or region", address, scene.joints)
+        require_known("object, fixture or region", address, scene.joints)
         return {model.joint(j).name: self._entry("qpos", model.jnt_qposadr[j]) for j in scene.joints[address]}
 
     @property
@@ -116,8 +115,7 @@ class StateView:
         return np.min(low, axis=0), np.max(high, axis=0)
 
     def _bodies(self, name: str) -> np.ndarray:
-        if name not in self.scene.bodies:
-            raise UnknownNameError("object or fixture", name, self.scene.bodies)
+        require_known("object or fixture", name, self.scene.bodies)
         return self.scene.bodies[name]
 
     def _entry(self, field: str, index: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from functools import cache
 
-from libero_env.errors import UnknownNameError
+from libero_env.errors import require_known
 from libero_env.tasks.builder import build_problem, language_from_name, load_data
 from libero_env.tasks.task import Suite, Task
 
@@ -28,8 +28,7 @@ def benchmark_suite(name: str) -> Suite:
         UnknownNameError: No suite has this name; the message lists them.
     """
     parts = _parts()
-    if name not in parts:
-        raise UnknownNameError("suite", name, parts)
+    require_known("suite", name, parts)
     if parts[name]:
         return Suite(name, tuple(task for part in parts[name] for task in benchmark_suite(part).tasks))
     content = load_data(f"{name}.yaml")

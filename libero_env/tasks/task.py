@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.errors import InvalidInputError, require_known
 from libero_env.storage import read_yaml
 from libero_env.tasks import bddl
 from libero_env.tasks.problem import Problem
@@ -114,6 +114,5 @@ class Suite:
             UnknownNameError: The suite has no such order.
         """
         orders = read_yaml("tasks/data/task_orders.yaml") if len(self) == 10 else [list(range(len(self)))]
-        if order_index not in range(len(orders)):
-            raise UnknownNameError(f"task order of {self.name}", order_index, range(len(orders)))
+        require_known(f"task order of {self.name}", order_index, range(len(orders)))
         return tuple(self.tasks[i] for i in orders[order_index])

@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 
 import numpy as np
 
-from libero_env.errors import UnknownNameError
+from libero_env.errors import require_known
 from libero_env.tasks import Task, get_task
 from libero_eval.policies import PROBE_TOLERANCE, PolicyUnderTest
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
@@ -178,8 +178,7 @@ class ServerPolicy(PolicyUnderTest):
             raise ServerError(
                 f"{self.given}: no kind of server has http; write {scheme.replace('http', 'ws')}://{rest}"
             )
-        if scheme not in CLIENTS:
-            raise UnknownNameError("kind of server", scheme, CLIENTS)
+        require_known("kind of server", scheme, CLIENTS)
         kind, transport = CLIENTS[scheme]
         limits = Limits(answer=self.request.timeout, in_flight=self.request.in_flight)
         with closing(kind(checked_address(f"{transport}://{rest}", self.given), limits)) as client:

@@ -32,25 +32,7 @@ LINE_DASHES = ("-", "--", ":", "-.")  # of the first lines, one for each colour,
 LARGEST_WITH_EVERY_TASK = 12  # number of tasks up to which a success matrix has every number
 NAME_WIDTH = 24  # characters of a line of a task's name beside it
 INK = "#010203"  # placeholder of the page's text colour, light or dark, in SVG
-STYLE = {
-    "text.parse_math": False,  # labels are texts of users: $ is a character
-    "svg.fonttype": "none",
-    "svg.hashsalt": "lifelong",
-    "pdf.fonttype": 42,
-    "font.size": 8.5,
-    "axes.titlesize": 9,
-    "axes.linewidth": 0.7,
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "xtick.major.size": 2.5,
-    "ytick.major.size": 2.5,
-    "text.color": INK,
-    "axes.edgecolor": INK,
-    "axes.labelcolor": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "legend.frameon": False,
-}
+STYLE = matplotlib.rc_params_from_file(Path(__file__).with_name("style.mplstyle"), use_default_template=False)
 
 
 @dataclass(frozen=True)

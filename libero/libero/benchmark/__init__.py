@@ -9,7 +9,7 @@ import numpy as np
 
 from libero._adapters.lookup import lookup
 from libero.libero import get_libero_path
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, UnknownNameError, require_known
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.store import load_init_states
 from libero_env.sim.scene import build_scene
@@ -145,8 +145,7 @@ class Benchmark:
 
     def get_task_demonstration(self, i: int) -> str:
         """Return the path of the demonstrations of a task; raise an UnknownNameError if there is no such task."""
-        if i not in range(self.n_tasks):
-            raise UnknownNameError(f"task index of {self.name}", i, range(self.n_tasks))
+        require_known(f"task index of {self.name}", i, range(self.n_tasks))
         return f"{self.tasks[i].problem_folder}/{self.tasks[i].name}_demo.hdf5"
 
     def get_task(self, i: int) -> Task:

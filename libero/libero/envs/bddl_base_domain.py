@@ -42,7 +42,7 @@ from libero_env.errors import (
     DemoError,
     InvalidInputError,
     LiberoError,
-    UnknownNameError,
+    require_known,
 )
 from libero_env.init_states.original_resets import OriginalResets
 from libero_env.init_states.placement import Start, sample_settled
@@ -178,11 +178,9 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         check_arguments(kwargs, signature(BDDLBaseDomain).parameters)
         check_horizon(horizon)
         self._substeps = substeps_of(control_freq)
-        if drawing not in DRAWINGS:
-            raise UnknownNameError("drawing", drawing, DRAWINGS)
+        require_known("drawing", drawing, DRAWINGS)
         self.robot = robot or str(read_config().get("robot") or DEFAULT_ROBOT)
-        if self.robot not in ROBOTS:
-            raise UnknownNameError("robot", self.robot, ROBOTS)
+        require_known("robot", self.robot, ROBOTS)
         self.drawing = drawing
         self.bddl_file_name, self.control_freq = task_file(bddl_file_name), control_freq
         self.problem = with_room(BDDLUtils.read_problem(bddl_file_name), scene_xml, scene_properties)

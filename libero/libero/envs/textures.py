@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from libero_env.errors import UnknownNameError
+from libero_env.errors import require_known
 
 _FILES = """
 brown_ceramic_tile.png canvas_sky_blue.png capriccio_sky.png ceramic.png cream-plaster.png dapper_gray_floor.png
@@ -21,7 +21,6 @@ _WORDS = {"floor": "floor tile ceramic", "wall": "wall plaster ceramic", "table"
 
 def get_texture_file_list(type: str, texture_path: str | os.PathLike) -> list[tuple[str, str]]:
     """Return name and path of the textures of a kind; raise an UnknownNameError if there is no such kind."""
-    if type not in _WORDS:
-        raise UnknownNameError("kind of texture", type, _WORDS)
+    require_known("kind of texture", type, _WORDS)
     names = [name for name in TEXTURE_MAPPING if any(word in name for word in _WORDS[type].split())]
     return [(name, os.path.join(texture_path, TEXTURE_MAPPING[name])) for name in names]

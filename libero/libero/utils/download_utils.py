@@ -15,7 +15,7 @@ from libero_env.assets.downloads import DownloadError, check_names
 from libero_env.assets.downloads import download as _download_assets
 from libero_env.demos.download import REPO as HF_REPO_ID  # noqa: F401 - name of the original
 from libero_env.demos.download import download_demos
-from libero_env.errors import UnknownNameError
+from libero_env.errors import require_known
 
 # Archives of the demonstrations, without published checksums. That of LIBERO-100 holds libero_90 and libero_10.
 DATASET_LINKS = {
@@ -112,8 +112,7 @@ def libero_dataset_download(
         UnknownNameError: The data set does not exist.
         DownloadError: A file did not arrive.
     """
-    if datasets not in ("all", *DATASET_LINKS):
-        raise UnknownNameError("data set", datasets, ("all", *DATASET_LINKS))
+    require_known("data set", datasets, ("all", *DATASET_LINKS))
     folder = Path(download_dir) if download_dir is not None else datasets_folder()
     folder.mkdir(parents=True, exist_ok=True)
     for name in DATASET_LINKS if datasets == "all" else (datasets,):

@@ -16,7 +16,7 @@ from libero.libero.utils.bddl_generation_utils import (
     get_object_dict,
     get_xy_region_kwargs_list_from_regions_info,
 )
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, require_known
 from libero_env.tasks.builder import build_problem, load_scene
 from libero_env.tasks.problem import Problem
 
@@ -78,8 +78,7 @@ class InitialSceneTemplates:
     """
 
     def __init__(self, workspace_name: str, fixture_num_info: Counts, object_num_info: Counts):
-        if workspace_name not in WORKSPACE_CATEGORIES:
-            raise UnknownNameError("workspace", workspace_name, WORKSPACE_CATEGORIES)
+        require_known("workspace", workspace_name, WORKSPACE_CATEGORIES)
         self.workspace_name = workspace_name
         self.fixture_num_info = dict(fixture_num_info)
         if workspace_name not in self.fixture_num_info:

@@ -17,7 +17,7 @@ from libero.libero.utils.bddl_generation_utils import (
     save_to_file,
 )
 from libero.libero.utils.mu_utils import InitialSceneTemplates, get_scene_class, scene_key
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, require_known
 from libero_env.tasks.bddl import parse
 from libero_env.tasks.builder import entities_in_goal
 from libero_env.workspaces import WORKSPACES
@@ -120,8 +120,7 @@ def bddl_text(task: TaskInfoTuple) -> str:
     problem = parse(text)
     categories = {*facade_pack().categories(), *WORKSPACES}
     for category in [*problem.fixtures.values(), *problem.objects.values()]:
-        if category not in categories:
-            raise UnknownNameError("object category", category, categories)
+        require_known("object category", category, categories)
     for atom in [*problem.init, *problem.goal.atoms()]:
         get_predicate_fn(atom.predicate)
     return text

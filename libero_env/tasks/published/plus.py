@@ -27,7 +27,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from libero_env.assets.robot import REST_QPOS
-from libero_env.errors import InvalidInputError, UnknownNameError
+from libero_env.errors import InvalidInputError, require_known
 from libero_env.geometry import quat_from_axis_angle, quat_multiply, quat_rotate
 from libero_env.storage import read_yaml
 
@@ -228,8 +228,7 @@ def camera_pose(workspace: str, view: ViewChange) -> CameraPose:
     Raises:
         UnknownNameError: The workspace does not exist.
     """
-    if workspace not in _cameras():
-        raise UnknownNameError("workspace", workspace, _cameras())
+    require_known("workspace", workspace, _cameras())
     start = _cameras()[workspace]["agentview"]
     pose = CameraPose(np.array(start["pos"]), np.array(start["quat"]))
     if view.elevation:

@@ -22,7 +22,7 @@ import numpy as np
 
 from libero_env.assets.original import LIBERO_PRO
 from libero_env.assets.published import find_distribution
-from libero_env.errors import InvalidInputError, LiberoError, MissingPackageError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, MissingPackageError, require_known
 from libero_env.objects import object_names
 from libero_env.paths import read_config
 from libero_env.tasks import bddl
@@ -234,8 +234,7 @@ def published_suite(name: str) -> Suite:
         InvalidInputError: Its files are not as expected.
     """
     whole, colon, choice = name.partition(":")
-    if whole not in _SUITES:
-        raise UnknownNameError("suite", whole, _SUITES)
+    require_known("suite", whole, _SUITES)
     source = _SUITES[whole].source
     if (folder := find_folder(source)) is None:
         raise MissingPackageError(f"the files of {source.title} are not installed", source.remedy)
@@ -243,8 +242,7 @@ def published_suite(name: str) -> Suite:
     if not colon:
         return Suite(name, tasks)
     valid = (*(KINDS if source is PLUS else ()), AVAILABLE)
-    if choice not in valid:
-        raise UnknownNameError(f"part of {whole}", choice, valid)
+    require_known(f"part of {whole}", choice, valid)
     chosen = (task for task in tasks if (not task.lacks if choice == AVAILABLE else task.kind == choice))
     return Suite(name, tuple(chosen))
 
