@@ -3,6 +3,9 @@
 import os
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
 
 from libero_env.text import suggest
 
@@ -60,6 +63,29 @@ class MissingPackageError(LiberoError):
     def __reduce__(self) -> tuple[type, tuple[str, str]]:
         """Let worker processes send the error: its arguments are not its message."""
         return type(self), (self.reason, self.remedy)
+
+
+def require_package(name: str, extra: str) -> None:
+    """Check that an optional package is installed.
+
+    Args:
+        extra: Extra of this distribution that installs it.
+
+    Raises:
+        MissingPackageError: It is not; the message has the command that installs it.
+    """
+    try:
+        found = find_spec(name)
+    except ModuleNotFoundError:  # not even the package that it is part of
+        found = None
+    if found is None:
+        raise MissingPackageError(f"{name} is not installed", f"pip install 'libero-lifelong[{extra}]'")
+
+
+def need(module: str, extra: str) -> Any:
+    """Import a module of an optional package, such as `websockets.sync.client`; see `require_package`."""
+    require_package(module.partition(".")[0], extra)
+    return import_module(module)
 
 
 class InvalidInputError(LiberoError, ValueError):

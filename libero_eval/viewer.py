@@ -18,7 +18,7 @@ import numpy as np
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.observe import fixture_poses, recorded_frequency, recorded_robot, recorded_task
 from libero_env.demos.read import Episode, read_episodes
-from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.errors import InvalidInputError, LiberoError, require_package
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations import KINDS, Perturbation, format_perturbations, parse_perturbations
 from libero_env.sim.observations import image_name
@@ -28,7 +28,6 @@ from libero_eval.protocols.environment import ProtocolEnv
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import EvalRequest, ViewRequest
-from lifelong.errors import require_package
 from lifelong.evaluation.actors import Actor, TakesNote, WatchesWorld
 from lifelong.evaluation.environments import Obs
 from lifelong.evaluation.rollout import run_episodes

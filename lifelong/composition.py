@@ -14,9 +14,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, UnknownNameError, require_package
 from libero_env.text import closest, flatten, suggest
-from lifelong.errors import ConfigError, require_package
+from lifelong.errors import ConfigError
 
 # launcher -> package of its plug-in, and the extra that installs it
 LAUNCHERS = {

@@ -2,10 +2,9 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 
-from libero_env.errors import LiberoError, MissingPackageError
+from libero_env.errors import LiberoError
 
 
 class LifelongError(LiberoError):
@@ -84,23 +83,6 @@ class EvaluationIncompleteError(LifelongError, RuntimeError):
 
 class ComparisonError(LifelongError, ValueError):
     """Raised when results cannot be compared; the message names both values of every field that differs."""
-
-
-def require_package(name: str, extra: str) -> None:
-    """Check that an optional package is installed.
-
-    Args:
-        extra: Extra of this distribution that installs it.
-
-    Raises:
-        MissingPackageError: It is not; the message has the command that installs it.
-    """
-    try:
-        found = find_spec(name)
-    except ModuleNotFoundError:  # not even the package that it is part of
-        found = None
-    if found is None:
-        raise MissingPackageError(f"{name} is not installed", f"pip install 'libero-lifelong[{extra}]'")
 
 
 @contextmanager

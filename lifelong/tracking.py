@@ -4,7 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from lifelong.errors import LifelongError, require_package
+from libero_env.errors import require_package
+from lifelong.errors import LifelongError
 
 
 class Tracker:

@@ -18,7 +18,7 @@ from libero_env.demos.contents import EXPORTED_STATE
 from libero_env.demos.layouts import FILES_PER_CHUNK, ROBOT_TYPE, Layout
 from libero_env.demos.read import Episode
 from libero_env.demos.video import H264, Mp4Writer, import_av
-from libero_env.errors import DemoError, LiberoError
+from libero_env.errors import DemoError, need
 from libero_env.storage import atomic_write_text
 
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -100,7 +100,7 @@ class _LeRobotWriter(DatasetWriter):
 
     def __init__(self, root: Path, layout: Layout):
         super().__init__(root, layout)
-        self._pa, self._pq = import_arrow()
+        self._pa, self._pq = need("pyarrow", "export"), need("pyarrow.parquet", "export")
         self._frames = 0
         self._tasks: dict[str, int] = {}
         self._episodes: list[dict[str, Any]] = []
@@ -348,20 +348,6 @@ class VideoDatasetWriter(_LeRobotWriter):
             "pandas_version": "2.0.0",
         }
         return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
-
-
-def import_arrow() -> tuple[ModuleType, ModuleType]:
-    """Import PyArrow and return it with its module for Parquet.
-
-    Raises:
-        LiberoError: PyArrow is not installed.
-    """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise LiberoError("the export needs PyArrow: pip install 'libero-lifelong[export]'") from error
-    return pyarrow, pyarrow.parquet
 
 
 class GrowingFile:

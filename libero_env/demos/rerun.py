@@ -18,7 +18,7 @@ from libero_env.demos.contents import is_image, json_attribute, read_header
 from libero_env.demos.layouts import RECORDED
 from libero_env.demos.observe import StateRenderer, recorded_frequency
 from libero_env.demos.read import Episode
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, need
 from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_path
 from libero_env.tasks import Task
@@ -43,9 +43,10 @@ def write_rerun(
 
     Raises:
         DemoError: The file is broken, does not fit its task's scene, or has no such demonstration.
-        LiberoError: Rerun is not installed, or the file to write has another ending.
+        LiberoError: The file to write has another ending.
+        MissingPackageError: Rerun is not installed.
     """
-    rerun = _import_rerun()
+    rerun = need("rerun", "rerun")
     if target.suffix != ".rrd":
         raise LiberoError(f"{target}: Rerun opens files that end with .rrd")
     hz = recorded_frequency(file)
@@ -58,14 +59,6 @@ def write_rerun(
     with atomic_path(target) as temporary:
         temporary.write_bytes(memory.drain_as_bytes())
     return written
-
-
-def _import_rerun() -> ModuleType:
-    try:
-        import rerun
-    except ImportError as error:
-        raise LiberoError("this needs Rerun: pip install 'libero-lifelong[rerun]'") from error
-    return rerun
 
 
 def _mask_names(file: Path) -> dict[int, str]:

@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from lifelong.errors import require_package
+from libero_env.errors import require_package
 from lifelong.stats.intervals import Estimate, Floats
 
 DRAWS = 2000

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from PIL import Image
 
-from lifelong.errors import require_package
+from libero_env.errors import require_package
 
 Size = tuple[int, int]
 

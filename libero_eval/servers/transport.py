@@ -3,7 +3,6 @@
 Errors name the server. `libero_eval.servers` has one module for each kind of server.
 """
 
-import importlib
 import itertools
 import math
 import os
@@ -14,15 +13,17 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
+from functools import partial
 from socket import SHUT_RDWR
 from typing import Any, ClassVar
 
 import numpy as np
 
+from libero_env import errors
 from libero_env.tasks import Task
 from libero_env.text import json_safe, shorten
 from libero_eval.protocols.adapter import PolicyInput
-from lifelong.errors import CodecError, ConnectionLost, ServerError, require_package
+from lifelong.errors import CodecError, ConnectionLost, ServerError
 
 API_KEY = "LIBERO_API_KEY"  # environment variable with the key that servers ask for
 MAX_MESSAGE_BYTES = 4 << 20  # of an answer; chunks of actions have some kB
@@ -33,14 +34,7 @@ _CLOSE_SECONDS = 1.0  # for a server to take note that a connection is closed
 _FIRST_DELAY, _LONGEST_DELAY = 0.1, 5.0  # between attempts to connect, [s]
 
 
-def need(module: str) -> Any:
-    """Return a module of the extra `servers`, such as `websockets.sync.client`.
-
-    Raises:
-        MissingPackageError: Its package is not installed.
-    """
-    require_package(module.partition(".")[0], "servers")
-    return importlib.import_module(module)
+need = partial(errors.need, extra="servers")  # a module of it
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from libero_env.errors import MissingPackageError
 from lifelong.data.windows import WindowDataset
-from lifelong.errors import ConfigError, MissingPackageError, PolicyError
+from lifelong.errors import ConfigError, PolicyError
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, Count, Observation, PolicySpec
 
