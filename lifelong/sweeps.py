@@ -25,7 +25,7 @@ from pydantic import Field
 from libero_env.parallel import is_running, process_start, this_machine
 from libero_env.storage import read_json, write_json
 from libero_env.validation import validate
-from lifelong.errors import ResultsError, RunLockedError
+from lifelong.errors import ResultsError, RunLockedError, writing
 from lifelong.results.provenance import utc_now
 
 SWEEP_FILE, JOB_FILE, FOLDER = "sweep.json", "job.json", "sweep"
@@ -154,11 +154,9 @@ def begin_sweep(folder: Path, words: Sequence[str], planned: int | None) -> None
         ResultsError: The folder cannot be written.
     """
     content = {"words": list(words), "planned": planned, "started": utc_now()}
-    try:
+    with writing(folder, "the sweep"):
         folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / SWEEP_FILE, content)
-    except OSError as error:
-        raise ResultsError(f"{folder}: the sweep cannot be kept there ({error})") from error
 
 
 def read_sweep(folder: Path) -> Sweep:
@@ -299,11 +297,9 @@ def _metrics(run: Path) -> dict[str, float | None]:
 
 
 def _write(file: Path, job: JobRecord) -> None:
-    try:
+    with writing(file, "the record of the job"):
         file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, asdict(job))
-    except OSError as error:
-        raise ResultsError(f"{file}: the record of the job cannot be written ({error})") from error
 
 
 def _read_json(file: Path) -> dict[str, Any]:

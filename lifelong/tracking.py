@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from libero_env.errors import require_package
-from lifelong.errors import LifelongError
+from lifelong.errors import LifelongError, writing
 
 
 class Tracker:
@@ -127,10 +127,8 @@ class TensorBoard(Tracker):
         from torch.utils.tensorboard import SummaryWriter
 
         folder = Path(directory) / "tensorboard"
-        try:
+        with writing(folder, "TensorBoard's files"):
             self._writer = SummaryWriter(folder)
-        except OSError as error:
-            raise LifelongError(f"{folder}: TensorBoard's files cannot be written ({error})") from error
 
     def log(self, values: Mapping[str, float], step: int) -> None:
         """Log metrics by name; a step is an epoch, counted over all tasks."""

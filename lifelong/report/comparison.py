@@ -3,16 +3,12 @@
 Intervals and tests are those of `lifelong.stats.methods`.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from libero_env.storage import atomic_write_text
-from libero_env.text import json_safe
 from lifelong.errors import ComparisonError
 from lifelong.report.runs import Group, Run, check_same_world, unlike
 from lifelong.results.provenance import few_of
@@ -143,13 +139,6 @@ def _named(pair: str, m: Mapping[str, Any], seeds: int | None = None) -> str:
 def _known(value: float | None) -> bool:
     """Return whether a number is known; JSON has null where it is not."""
     return value is not None and bool(np.isfinite(value))
-
-
-def write_comparison(found: Mapping[str, Any], path: Path) -> None:
-    """Write the result of `compare` as JSON, in one step; NaN becomes null."""
-    atomic_write_text(
-        path, json.dumps(json_safe(found), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-    )
 
 
 def _reference(measured: Mapping[str, Sequence[Run]]) -> dict[str, float]:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from libero_env.errors import InvalidInputError
-from libero_env.storage import atomic_write_text, read_bounded, require_own_folders
+from libero_env.storage import atomic_write_text, read_bounded, require_own_folders, write_json
 from libero_env.text import duration, quantity
 from lifelong.errors import LifelongError
-from lifelong.report.comparison import MUJOCO, Plan, compare, findings, write_comparison
+from lifelong.report.comparison import MUJOCO, Plan, compare, findings
 from lifelong.report.figures import (
     Line,
     Panel,
@@ -188,7 +188,7 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
     later = found["after_base_stage"]
     for group in found["groups"].values():  # a page that is sent says nothing of this machine
         group["runs"] = [os.path.relpath(path, folder) for path in group["runs"]]
-    write_comparison(found, folder / "comparison.json")
+    write_json(folder / "comparison.json", found)
     write_episodes(folder / "episodes.csv.gz", [(g.label, run.results) for g in groups for run in g.runs])
     panels, heatmaps, lines = zip(*map(_success_of, groups), strict=True)
     save(heatmap_figure(panels), folder / "heatmap")

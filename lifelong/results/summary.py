@@ -22,7 +22,7 @@ import numpy as np
 from libero_env.storage import atomic_path, atomic_write_text
 from libero_env.text import json_safe, to_json
 from libero_env.validation import validate
-from lifelong.errors import ResultsError
+from lifelong.errors import ResultsError, writing
 from lifelong.results.failures import rollout_summary
 from lifelong.results.provenance import resume_notes
 from lifelong.results.records import DemonstrationsRecord, EvalRecord, Record, RunRecord, TaskEndRecord
@@ -156,11 +156,8 @@ def write_episodes(path: Path, runs: Iterable[tuple[str, Results]]) -> Path:
         order = orders.setdefault(results.run.tasks, len(orders))
         writer.writerows(_rows(method, order, results))
     content = text.getvalue().encode()
-    try:
-        with atomic_path(path) as part:
-            part.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
-    except OSError as error:
-        raise ResultsError(f"{path}: the episodes cannot be written ({error})") from error
+    with writing(path, "the episodes"), atomic_path(path) as part:
+        part.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
     return path
 
 

@@ -1,6 +1,5 @@
 """What values of a setting keep and let learn, and which of them is best: as a table, a picture and files."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -15,7 +14,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
-from libero_env.storage import atomic_write_text
+from libero_env.storage import atomic_write_text, write_json
 from lifelong.errors import ConfigError
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, hide_spines, save
 
@@ -248,7 +247,7 @@ def write_frontier(frontier: Frontier, path: Path, about: Mapping[str, Any]) -> 
         "values": [_row(outcome) for outcome in frontier.outcomes],
         "others": [_row(outcome) for outcome in frontier.others],
     }
-    atomic_write_text(path, json.dumps(record, indent=1) + "\n")
+    write_json(path, record)
 
 
 def _row(outcome: Outcome) -> dict[str, Any]:
