@@ -155,7 +155,6 @@ def begin_sweep(folder: Path, words: Sequence[str], planned: int | None) -> None
     """
     content = {"words": list(words), "planned": planned, "started": utc_now()}
     with writing(folder, "the sweep"):
-        folder.mkdir(parents=True, exist_ok=True)
         write_json(folder / SWEEP_FILE, content)
 
 
@@ -298,7 +297,6 @@ def _metrics(run: Path) -> dict[str, float | None]:
 
 def _write(file: Path, job: JobRecord) -> None:
     with writing(file, "the record of the job"):
-        file.parent.mkdir(parents=True, exist_ok=True)
         write_json(file, asdict(job))
 
 

@@ -196,7 +196,6 @@ def write_results(
         assets: Models that were used, as for `select_pack`.
         disturb: Whether the actions had noise; the names of the files state it.
     """
-    out.mkdir(parents=True, exist_ok=True)
     ending = "-disturbed" if disturb else ""
     written = [out / f"results{ending}.json", out / f"results{ending}.md"]
     write_json(written[0], results(certificates, assets=assets, disturb=disturb))

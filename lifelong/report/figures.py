@@ -243,15 +243,11 @@ def save(figure: Figure, stem: Path) -> None:
     """Write `stem`.png (300 dpi) and `stem`.pdf, black on white."""
     with matplotlib.rc_context(STYLE), _any_script():
         FigureCanvasAgg(figure)
-        for suffix, options in ((".png", {"dpi": 300}), (".pdf", {"metadata": {"CreationDate": None}})):
-            with atomic_path(stem.with_suffix(suffix)) as part:
-                form: dict[str, Any] = {
-                    "format": suffix[1:],
-                    "bbox_inches": "tight",
-                    "pad_inches": 0.05,
-                    **options,
-                }
-                figure.savefig(part, facecolor="white", **form)
+        own: dict[str, dict[str, Any]] = {"png": {"dpi": 300}, "pdf": {"metadata": {"CreationDate": None}}}
+        look: dict[str, Any] = {"facecolor": "white", "bbox_inches": "tight", "pad_inches": 0.05}
+        for kind, options in own.items():
+            with atomic_path(stem.with_suffix(f".{kind}")) as part:
+                figure.savefig(part, format=kind, **look, **options)
 
 
 @contextmanager

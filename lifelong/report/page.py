@@ -132,7 +132,6 @@ def _default_folder(paths: Sequence[Path]) -> Path:
     if len(paths) == 1:
         return paths[0]
     folder = Path.cwd() / "comparison"
-    folder.mkdir(exist_ok=True)
     atomic_write_text(folder / ".gitignore", "*\n")
     return folder
 

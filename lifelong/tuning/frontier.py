@@ -278,6 +278,5 @@ def write_tuned(outcome: Outcome, path: Path, about: str) -> None:
         for name in names[:-1]:
             place = place.setdefault(name, {})
         place[names[-1]] = value
-    path.parent.mkdir(parents=True, exist_ok=True)
     comment = "".join(f"# {line}\n" for line in about.splitlines())
     atomic_write_text(path, comment + yaml.safe_dump(node, sort_keys=False))

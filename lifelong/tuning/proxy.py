@@ -180,7 +180,6 @@ def measure(trial: Trial, data: Callable[[], StreamData], folder: Path) -> Error
         return record["errors"]
     began = time.perf_counter()
     errors = _learn(trial, data(), folder)
-    path.parent.mkdir(parents=True, exist_ok=True)
     write_record(path, {"errors": errors, "seconds": round(time.perf_counter() - began, 1)})
     return errors
 
