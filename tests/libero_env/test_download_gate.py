@@ -90,9 +90,9 @@ def _bits(data: bytes, flag: bool = False, overlap: bool = False, method: int | 
 
 
 @pytest.mark.parametrize(("data", "message"), [
-    (_bits(zipped(), flag=True), "is encrypted"),
-    (_bits(zipped("a", "b"), overlap=True), "overlaps another file"),
-    (_bits(zipped(), method=97), "packed in an unknown way"),
+    (_bits(zipped(), flag=True), "the archive is damaged .File .* is encrypted"),
+    (_bits(zipped("a", "b"), overlap=True), "the archive is damaged"),
+    (_bits(zipped(), method=97), "not packed with deflate"),
     (zipped()[:-10], "the archive is damaged"),
     (zipped().replace(b"\x00\x00\x00a/b.txt\xcb", b"\x00\x00\x00a/b.txt\xff", 1), "the archive is damaged"),
     (b"", "the archive is damaged"),
@@ -102,7 +102,7 @@ def test_damaged_archives_are_one_line(place, data, message):
     with pytest.raises(DownloadError, match=message) as caught:
         unpack(place.parent / "a.zip", place)
     assert "\n" not in str(caught.value)
-    assert entries(place) == ["a.zip"]
+    assert set(entries(place)) <= {"a.zip", "in/a"}  # and complete files that come before the fault
 
 
 def test_recorded_demonstrations_are_kept_beside_an_archive(place, capsys):
