@@ -69,7 +69,21 @@ def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> N
     assert labels == ["first", "second"]
 
 
+def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) -> None:
+    words = ["--kinds", "camera@step1", "light@touched", "--severities", "1", "--pairs", "--out", "found"]
+    assert main(["robustness", *WORDS, *words]) == 0
+    said = capsys.readouterr().out
+    assert "camera@step1=1" in said and "2 of 2" in said and "0 of 2" in said
+    record = json.loads((still / "found" / "robustness.json").read_text())["policies"][0]
+    rows = {row["name"]: (row["episodes"], row["began"], row["solved"]) for row in record["events"]}
+    assert rows == {"camera@step1=1": (2, 2, 0), "light@touched=1": (2, 0, 0)}
+    assert "<h2>Events</h2>" in (still / "found" / "robustness.html").read_text()
+    conditions = conditions_of(RobustnessRequest(events=True))
+    assert len(conditions) == 19 and {"object=0.6@step20", "camera=1@lifted"} <= {*conditions}
+
+
 @pytest.mark.parametrize(("words", "told"), [
+    (["--kinds", "object@lifted"], "the robot touches the object then"),
     (["--kinds", "camra"], "Did you mean 'camera'"),
     (["--severities", "2"], "--severities"),
     (["--kinds", "noise", "--severities", "1", "--pairs", "noise=1,robot=1"], "must also be run alone"),

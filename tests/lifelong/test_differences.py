@@ -203,3 +203,39 @@ def test_tables_of_power_name_what_is_impossible():
     assert "–" in table(Question(0.9, 0.03))
     assert "worse by" in shown(Question(0.9, 0.03), 500)
     assert "no difference that is possible" in shown(Question(0.99, 0.005), 20)
+
+
+# Of 8,000 matched pairs: successes without and with an event, and the share of the former lost, as LIBERO-MAX prints it
+LIBERO_MAX = {
+    "pi0.5": (6374, 5259, 21.6),
+    "OpenVLA-OFT": (5141, 3452, 37.1),
+    "MolmoAct2": (6427, 5355, 20.8),
+    "X-VLA": (5009, 3015, 43.3),
+    "GR00T N1.7": (5541, 4001, 33.7),
+    "SmolVLA": (2086, 1203, 56.1),
+}
+
+
+@pytest.mark.parametrize("name", LIBERO_MAX)
+def test_published_counts_under_events_pass_through_the_arithmetic_of_comparisons(name):
+    base, dynamic, loss = LIBERO_MAX[name]
+    lost = round(base * loss / 100)
+    cells = (
+        base - lost,
+        lost,
+        dynamic - (base - lost),
+        8000 - dynamic - lost,
+    )  # as in Counts
+    first, second = (
+        np.repeat(won, cells)[:, None] for won in ([True, True, False, False], [True, False, True, False])
+    )
+    found = difference(Pairs(np.zeros(8000, int), np.arange(8000), first, second), draws=0)
+    assert found.counts == Counts(*cells) and round(100 * found.counts.lost, 1) == loss
+    assert (round(8000 * found.first), round(8000 * found.second)) == (base, dynamic)
+    assert found.value == pytest.approx((base - dynamic) / 8000) and found.p_value < 1e-50
+    paired = (found.score.high - found.score.low) / (2 * 1.96)
+    rates = np.array([base, dynamic]) / 8000
+    unpaired = np.sqrt((rates * (1 - rates) / 8000).sum())
+    assert paired < unpaired
+    if name == "pi0.5":
+        assert (round(100 * paired, 2), round(100 * unpaired, 2)) == (0.48, 0.70)
