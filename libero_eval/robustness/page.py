@@ -107,7 +107,8 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         ResultsError: The files cannot be written.
     """
     first, axes = policies[0], {policy.label: policy.axes for policy in policies}
-    units = {name: f"{kind.at_one:g} {kind.unit}" for name, kind in KINDS.items()}
+    kinds = {axis.kind: KINDS[axis.kind.partition("@")[0]] for axis in first.axes}
+    units = {name: f"{kind.at_one:g} {kind.unit}" for name, kind in kinds.items()}
     outcomes = first.outcomes
     suites = ", ".join(dict.fromkeys(task.partition("/")[0] for task in outcomes.tasks))
     episodes = len(outcomes.tasks) * len(outcomes.starts)
@@ -123,7 +124,7 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         ],
         verdict=verdict(first),
         policies=policies,
-        units={axis.kind: units[axis.kind.partition("@")[0]] for axis in first.axes},
+        units=units,
         curves=as_svg(curves_figure(axes, units)),
         radar=as_svg(radar_figure(axes)) if len(first.axes) > 2 else "",
         interactions=[

@@ -218,7 +218,7 @@ class EventRow:
     def difference(self) -> Estimate:
         """Success with the event minus that without, with Tango's interval; NaN without episodes."""
         found = score_interval(self.counts) if self.counts.pairs else UNKNOWN
-        return Estimate(-found.value, -found.high, -found.low)
+        return Estimate(0.0 - found.value, 0.0 - found.high, 0.0 - found.low)
 
     @property
     def p_value(self) -> float:
