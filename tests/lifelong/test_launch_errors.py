@@ -165,7 +165,7 @@ def test_classes_of_a_module_in_the_current_folder_are_found(own, monkeypatch, c
 )
 def test_a_package_that_is_not_installed_leaves_no_directory(package, message, here, monkeypatch, capsys):
     find = importlib.util.find_spec
-    for place in ("importlib.util.find_spec", "lifelong.errors.find_spec"):
+    for place in ("importlib.util.find_spec", "libero_env.errors.find_spec"):
         monkeypatch.setattr(place, lambda name, *more: None if name == package else find(name, *more))
     monkeypatch.setenv("PIP_NO_INDEX", "1")
     monkeypatch.setenv("LIBERO_CACHE", str(here / "cache"))

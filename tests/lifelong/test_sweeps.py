@@ -9,9 +9,10 @@ import pytest
 from hydra.errors import HydraException
 
 from libero_env.cli.main import main
+from libero_env.errors import MissingPackageError
 from lifelong import sweeps
 from lifelong.composition import config_folder, explained
-from lifelong.errors import ConfigError, MissingPackageError, ResultsError, RunLockedError
+from lifelong.errors import ConfigError, ResultsError, RunLockedError
 from lifelong.sweeps import (
     JobRecord,
     begin_sweep,
@@ -180,7 +181,7 @@ def test_the_names_of_long_values_differ() -> None:
 def test_a_launcher_whose_plug_in_is_missing_is_named(monkeypatch) -> None:
     launchers = {file.stem for file in (config_folder() / "hydra" / "launcher").glob("*.yaml")}
     assert launchers == {"workstation", "cluster", "ray_cluster"}
-    monkeypatch.setattr("lifelong.errors.find_spec", lambda name: None)
+    monkeypatch.setattr("libero_env.errors.find_spec", lambda name: None)
     for launcher, extra in (("joblib", "joblib"), ("submitit_slurm", "submitit"), ("ray", "ray")):
         refusal = HydraException(f"In 'x': Could not find 'hydra/launcher/{launcher}'")
         with pytest.raises(MissingPackageError, match=rf"libero-lifelong\[{extra}\]"):
