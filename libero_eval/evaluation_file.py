@@ -38,6 +38,7 @@ UNMEASURED = (
     "began",
     "atoms_at_start",
     "solved",
+    "timing",
 )  # columns that are not part of `outcomes`
 
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
@@ -63,6 +64,8 @@ class TaskResult(Episodes):
         solved: Whether the expert, from the state just after each event, solves what is left: 1 or 0, -1 where it never
             began.
         atoms_at_start: Whether each atom held before the policy acted, (episodes, atoms).
+        timing: Requests to the policy, answers that were used, and steps waited for one, of each episode; empty without
+            a clock.
 
     Raises:
         EvaluationFileError: The columns have different lengths.
@@ -77,6 +80,7 @@ class TaskResult(Episodes):
     began: tuple[tuple[Annotated[int, Field(ge=-1)], ...], ...] = ()
     atoms_at_start: tuple[tuple[bool, ...], ...] = ()
     solved: tuple[tuple[Annotated[int, Field(ge=-1, le=1)], ...], ...] = ()
+    timing: tuple[tuple[Count, ...], ...] = ()
 
     OPTIONAL: ClassVar[tuple[str, ...]] = (
         *Episodes.OPTIONAL,
@@ -86,6 +90,7 @@ class TaskResult(Episodes):
         "began",
         "atoms_at_start",
         "solved",
+        "timing",
     )
 
     def __post_init__(self) -> None:
@@ -136,6 +141,15 @@ class TaskResult(Episodes):
             for event, rest in zip(events, solved, strict=True)
         ]
         return f"events began in {', '.join(counts)}" if counts else ""
+
+    @property
+    def clock_note(self) -> str:
+        """How many answers were used, and for how long they were waited for, as text; empty without a clock."""
+        if not self.timing:
+            return ""
+        requests, used, waited = (sum(column) for column in zip(*self.timing, strict=True))
+        share = 100 * waited / max(1, sum(self.lengths))
+        return f"{used} of {requests} answers used, waited in {share:.0f} % of the steps"
 
     @property
     def suite(self) -> str:

@@ -23,6 +23,7 @@ from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, permission_names
 from libero_eval.policies import SELECTION, ExpertPolicy, PolicyUnderTest, RunPolicy
+from libero_eval.protocols.clock import Clock
 from libero_eval.protocols.environment import resolve_world
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
@@ -145,6 +146,7 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
         raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
     require_available(tasks)
     protocol = resolve_protocol(request, policy.protocol(base), tasks)
+    Clock.read(protocol.action.clock).check(policy.chunk, policy.inpaints)
     identity = {**policy.identity, "seed": request.seed}
     versions = {**installed_versions(request.assets), "source": source_digest()}
     if earlier is None:
@@ -270,6 +272,8 @@ def resolve_protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[T
                 f"--event {at_start[0]}: expected KIND=SEVERITY@TRIGGER, such as camera=0.5@lifted"
             )
         changes["world.perturb"] = format_perturbations((*known, *events))
+    if request.clock is not None:
+        changes["action.clock"] = str(Clock.read(request.clock)) if request.clock else ""
     if request.control_freq:
         changes["world.control_freq"] = request.control_freq
     if request.robot:
@@ -356,6 +360,7 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
         control_freq=None,
         robot=None,
         perturb=None,
+        clock=None,
         event=(),
         size=None,
         until=None,

@@ -12,6 +12,7 @@ from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.storage import require_own_folders
 from libero_env.tasks import Task
 from libero_eval.protocols.adapter import ACTION_DIM, view_of
+from libero_eval.protocols.clock import Clock, ClockedActor, Planner
 from libero_eval.protocols.environment import OBSERVATIONS, ProtocolEnv, run_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
@@ -42,6 +43,8 @@ class PolicyUnderTest(ABC):
         tasks: Tasks of its run, if it has one.
         selection: Initial states by which it may have been chosen.
         on_cpu: Whether it is a network of this package on the CPU, whose bits depend on its number of threads.
+        chunk: Number of actions of its answers; None where only they say it.
+        inpaints: Whether it can continue a chunk of actions that is being executed.
         cameras: Cameras that are rendered for it; None for the protocol's.
         observations: Names of its observations, see `libero_env.sim.observations`.
     """
@@ -51,6 +54,8 @@ class PolicyUnderTest(ABC):
     tasks: Sequence[Task] = ()
     selection: Sequence[int] = SELECTION
     on_cpu: bool = False
+    chunk: int | None = None
+    inpaints: bool = False
     cameras: tuple[str, ...] | None = None
     observations: tuple[str, ...] = OBSERVATIONS
 
@@ -75,11 +80,25 @@ class PolicyUnderTest(ABC):
             backend=request.backend,
         )
 
+    @contextmanager
+    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
+        """Yield the task's actor, which starts in the given initial states, on the protocol's clock."""
+        clock = Clock.read(protocol.action.clock) if protocol.action.clock else None
+        with self.planner(task, states, protocol) as planner:
+            yield ClockedActor(
+                planner,
+                clock,
+                self.seeds(task, states),
+                hz=protocol.world.control_freq,
+                still=protocol.episode.settle_action,
+                relative=protocol.world.delta,
+            )
+
     @abstractmethod
-    def actor(
+    def planner(
         self, task: Task, states: Sequence[int], protocol: EvalProtocol
-    ) -> AbstractContextManager[Actor]:
-        """Return the context manager of the task's actor, which starts in the given initial states."""
+    ) -> AbstractContextManager[Planner]:
+        """Return the context manager of what plans in a task, from the given initial states."""
 
     def probe(self, protocol: EvalProtocol) -> tuple[float, ...] | None:
         """Return what the policy answers to a fixed observation; None where `identity` is enough, or chance decides."""
@@ -106,6 +125,7 @@ class RunPolicy(PolicyUnderTest):
         self.tasks = run.tasks
         self.selection = tuple(run.eval.init_states("curve"))
         self.on_cpu = run.device.type == "cpu"
+        self.chunk, self.inpaints = run.policy.chunk, run.policy.inpaints
         self.cameras = tuple(CAMERAS[view] for view in run.policy.spec.views)
 
     def protocol(self, base: EvalProtocol) -> EvalProtocol:
@@ -122,7 +142,7 @@ class RunPolicy(PolicyUnderTest):
         )
 
     @contextmanager
-    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
+    def planner(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Planner]:
         """Yield the policy with a generator for each episode; see `PolicyUnderTest`."""
         run = self.run
         draws = [generator(*words) for words in self.seeds(task, states)]
@@ -133,7 +153,7 @@ class RunPolicy(PolicyUnderTest):
 class ExpertPolicy(PolicyUnderTest):
     """The scripted expert, which sees the whole state: how much of a task can be done at all."""
 
-    out = Path("eval/expert")
+    out, chunk = Path("eval/expert"), 1
 
     def __init__(self, request: Request):
         from libero_env.demos.config import GENERATOR
@@ -144,7 +164,7 @@ class ExpertPolicy(PolicyUnderTest):
         self.observations = ("rgb",) if request.videos else ()
 
     @contextmanager
-    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
+    def planner(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Planner]:
         """Yield an expert for each episode; see `PolicyUnderTest`."""
         yield ExpertActor(self.seeds(task, states), tuple(map(view_of, self.cameras or ())))
 
@@ -157,11 +177,10 @@ class ExpertActor:
         views: Names of the images that recorded rollouts show.
     """
 
-    action_dim, sees_next = ACTION_DIM, False
+    action_dim, replan, observes = ACTION_DIM, 1, "never"
 
     def __init__(self, seeds: Sequence[Sequence[int]], views: tuple[str, ...] = ()):
         self.seeds, self.views = seeds, views
-        self._over = np.zeros(len(seeds), bool)
 
     def watch(self, env: "BatchEnv") -> None:
         """Receive the simulations; see `WatchesWorld`."""
@@ -171,21 +190,16 @@ class ExpertActor:
         self._experts = [Expert(env.task, np.random.default_rng(seed), shapes=shapes) for seed in self.seeds]
 
     def reset(self, num_envs: int) -> None:
-        """Take all episodes as running; see `Actor`."""
-        self._over = np.zeros(num_envs, bool)
-
-    def note(self, over: np.ndarray, success: np.ndarray) -> None:
-        """Take note of which episodes are over; see `TakesNote`."""
-        self._over = over
+        """Do nothing: experts are made for episodes; see `Planner`."""
 
     def hear(self, i: int, task: Task) -> None:
         """Let the expert of simulation i plan again, from its state; see `lifelong.evaluation.actors.Hears`."""
         self._experts[i].replan(task)
 
-    def act(self, obs: Obs) -> np.ndarray:
-        """Return the experts' actions; those that are done or have given up hold still. See `Actor`."""
-        actions = np.zeros((len(self._experts), ACTION_DIM))
-        for i, expert in enumerate(self._experts):
-            if not self._over[i] and not expert.failure_reason:
-                actions[i] = expert.act(self._env.views[i])
-        return actions
+    def plan(self, obs: Obs, rows: Sequence[int]) -> np.ndarray:
+        """Return the action of some experts, each a chunk of one; those that gave up hold still. See `Planner`."""
+        chunks = np.zeros((len(rows), 1, ACTION_DIM))
+        for chunk, i in zip(chunks, rows, strict=True):
+            if not self._experts[i].failure_reason:
+                chunk[0] = self._experts[i].act(self._env.views[i])
+        return chunks

@@ -35,6 +35,7 @@ EVENTS = (
     *("object@step20", "receptacle@lifted", "distractor@step20"),
 )
 EVENT_SEVERITIES = (0.3, 0.6, 1.0)
+CLOCK = "clock="  # beginning of a condition that is no perturbation
 PAIRS = ("camera=0.4,light=0.4", "camera=0.4,robot=0.4", "light=0.4,noise=0.4")
 
 
@@ -52,6 +53,8 @@ class Request:
         episodes: Number of these starts, from the first on (default: all of them).
         protocol: libero, openpi, ..., see `libero protocols list`; or a file of your own, my.yaml.
         perturb_seed: Seed of what perturbations draw.
+        clock: Let inference take time: latency=120ms, and what is executed meanwhile, wait=rest,merge=replace,every=8
+            (default: the protocol's, none).
         horizon: Maximum number of control steps (default: the protocol's).
         control_freq: Control steps per second, 20 or another that divides 500; steps are counted, so that a horizon
             then lasts shorter or longer (default: the protocol's).
@@ -90,6 +93,7 @@ class Request:
     episodes: Positive | None = None
     protocol: str = "libero"
     perturb_seed: Seed = 0
+    clock: str | None = None
     horizon: Horizon | None = None
     control_freq: ControlFreq | None = None
     size: Side | None = None
@@ -158,7 +162,7 @@ class RobustnessRequest(Request):
     Attributes:
         episodes: Number of the starts, from the first on.
         kinds: Kinds of perturbations, see `libero perturb list`; those that begin later with their trigger:
-            camera@lifted.
+            camera@lifted; clock, whose severity is the latency in seconds.
         events: By default events during the episodes instead: six, at severities 0.3, 0.6 and 1, without pairs.
         severities: Severities above 0, at most 1.
         pairs: Two perturbations at once, of kinds and severities that are also run alone.
@@ -182,10 +186,13 @@ class RobustnessRequest(Request):
                 if getattr(self, name) == default:
                     object.__setattr__(self, name, of_events)
 
-    def condition(self, perturb: str, out: Path) -> EvalRequest:
-        """Return the evaluation under some perturbations, in a folder of its own."""
+    def condition(self, text: str, out: Path) -> EvalRequest:
+        """Return the evaluation under some perturbations, or a latency, in a folder of its own."""
         shared = {f.name: getattr(self, f.name) for f in fields(Request)}
-        parts = parse_perturbations(perturb, events=True)
+        if text.startswith(CLOCK):
+            clock = f"latency={text.removeprefix(CLOCK)}s,{self.clock or ''}"
+            return EvalRequest(**{**shared, "perturb": "", "clock": clock, "out": out})
+        parts = parse_perturbations(text, events=True)
         events = tuple(str(one) for one in parts if one.trigger)
         start = format_perturbations(one for one in parts if not one.trigger)
         return EvalRequest(**{**shared, "perturb": start, "event": events, "out": out})

@@ -23,11 +23,11 @@ from libero_env.tasks import Task
 from libero_env.validation import validate
 from libero_eval.policies import PolicyUnderTest
 from libero_eval.protocols.adapter import ACTION_DIM, ProtocolAdapter, view_of
+from libero_eval.protocols.clock import Planner
 from libero_eval.protocols.environment import OBSERVATIONS
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
 from lifelong.errors import LifelongError, MissingObservationError, PolicyError
-from lifelong.evaluation.actors import Actor
 from lifelong.evaluation.environments import Obs
 from lifelong.settings.configuration import require_same_module
 
@@ -74,8 +74,8 @@ class UserPolicy(PolicyUnderTest):
         return base if size is None else base.changed({"pixels.render_size": size})
 
     @contextmanager
-    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
-        """Yield the actor that gives the policy its observations under the names it takes."""
+    def planner(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Planner]:
+        """Yield what gives the policy its observations under the names it takes."""
         views = tuple(map(view_of, self.cameras or ()))
         names = self.request.names or ("native" if protocol.pixels.orientation == "upright" else "original")
         if names == "protocol":
@@ -126,7 +126,7 @@ class _UserActor:
 
     policy: Any
     views: tuple[str, ...]
-    action_dim = ACTION_DIM
+    action_dim, observes = ACTION_DIM, "asked"
 
     def _name(self, method: str) -> str:
         return f"{type(self.policy).__name__}.{method}"
@@ -166,20 +166,22 @@ class CallableActor(_UserActor):
 
     instruction: str
     original: bool = False
+    replan = 1
 
     def reset(self, num_envs: int) -> None:
-        """Call the object's `reset`, if it has one; see `Actor`."""
+        """Call the object's `reset`, if it has one; see `Planner`."""
         self._reset(self.instruction, num_envs)
 
-    def act(self, obs: Obs) -> np.ndarray:
-        """Return the object's actions; see `Actor`.
+    def plan(self, obs: Obs, rows: Sequence[int]) -> np.ndarray:
+        """Return the object's actions, each a chunk of one; see `Planner`.
 
         Raises:
             PolicyError: The actions have the wrong shape, or are not finite.
         """
         observations = as_original(obs) if self.original else obs
         shape = (len(next(iter(obs.values()))), self.action_dim)
-        return self._predict(Observations(observations, instruction=self.instruction), shape)
+        answer = self._predict(Observations(observations, instruction=self.instruction), shape)
+        return answer[list(rows), None]
 
 
 @dataclass
@@ -188,7 +190,7 @@ class ProtocolActor(_UserActor):
 
     Its `predict` receives for all simulations: an array (B, H, W, 3) by name of each camera, `state` (B, 8), and
     `instruction`. It returns (B, 7) actions, or chunks (B, H, 7), of which the protocol executes as many as it says
-    before it asks again.
+    before it asks again. On a clock it is called when an episode asks, and what it returns for the others is not used.
 
     Attributes:
         adapter: Conversion of observations and actions under the protocol.
@@ -199,27 +201,15 @@ class ProtocolActor(_UserActor):
     replan: int | None
 
     def reset(self, num_envs: int) -> None:
-        """Forget what was predicted; the object's `reset` is called with the first instruction. See `Actor`."""
-        self._waiting: list[np.ndarray] = []
+        """Let the next observation begin the episodes: the object's `reset` is called with its instruction."""
         self._num_envs: int | None = num_envs
 
-    @property
-    def sees_next(self) -> bool:
-        """Whether the next observation is given to the object."""
-        return not self._waiting
-
-    def act(self, obs: Obs) -> np.ndarray:
-        """Return the object's actions; see `Actor`.
+    def plan(self, obs: Obs, rows: Sequence[int]) -> np.ndarray:
+        """Return the object's chunks for some simulations; see `Planner`.
 
         Raises:
             PolicyError: The actions have the wrong shape, are too few, or are not finite.
         """
-        if not self._waiting:
-            self._waiting = self._next_actions(obs)
-        return self._waiting.pop(0)
-
-    def _next_actions(self, obs: Obs) -> list[np.ndarray]:
-        """Return the actions (B, A) of the next steps."""
         inputs = self.adapter.inputs(obs)
         if self._num_envs is not None:
             self._reset(inputs[0].prompt, self._num_envs)
@@ -234,12 +224,10 @@ class ProtocolActor(_UserActor):
             raise PolicyError(
                 f"the actions of {self._name('predict')}: expected shape {shapes}, got {answer.shape}"
             )
-        count = chunks.shape[1] if self.replan is None or answer.ndim == 2 else self.replan
-        if chunks.shape[1] < count:
-            raise PolicyError(
-                f"{self._name('predict')} returned {chunks.shape[1]} actions; the protocol executes {count} of them"
-            )
-        return list(self.adapter.actions(chunks[:, :count]).swapaxes(0, 1))
+        if answer.ndim == 3 and chunks.shape[1] < (self.replan or 1):
+            found = f"{self._name('predict')} returned {chunks.shape[1]} actions"
+            raise PolicyError(f"{found}; the protocol executes {self.replan} of them")
+        return self.adapter.actions(chunks[list(rows)])
 
 
 def load_callable(text: str) -> Any:

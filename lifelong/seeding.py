@@ -15,6 +15,7 @@ END_TASK = 2  # what an algorithm draws when a task ends
 ROLLOUT = 3  # actions of a policy that draws them
 BLUR = 4  # windows of other tasks at blurred boundaries
 RELEARN = 5  # batches of relearning
+LATENCY = 6  # time that inference takes
 EVALUATION = 4  # the same as ROLLOUT in `libero eval`, whose seed is not a run's
 
 

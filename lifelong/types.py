@@ -61,6 +61,19 @@ class PolicySpec:
     measured: bool = False
 
 
+@dataclass(frozen=True)
+class Unfinished:
+    """What is still executed of a chunk while the next one is computed.
+
+    Attributes:
+        actions: (L, A) actions that are left, the next one first.
+        delay: Number of these that are probably executed before the next chunk is there.
+    """
+
+    actions: Tensor
+    delay: int
+
+
 def to_device(x: Tensor, device: torch.device | str) -> Tensor:
     """Return a tensor on a device, copied asynchronously to a GPU only.
 

@@ -2,6 +2,7 @@
 
     python experiments/kills/evaluations.py                                  # 20 kills of one of three processes
     python experiments/kills/evaluations.py --policy RUN_DIR --suite libero_object/0 libero_object/1
+    python experiments/kills/evaluations.py --clock latency=lognormal:120/0.5ms,wait=repeat
 
 It exits with status 1 where an episode, a bit of an action, or a unit differs.
 """
@@ -124,7 +125,7 @@ def start(args: argparse.Namespace, out: Path) -> subprocess.Popen:
         out,
     ]
     command += ["--episodes", args.episodes, "--unit-starts", args.unit_starts, "--threads", 1]
-    command += ["--horizon", args.horizon, "--device", "cpu"]
+    command += ["--horizon", args.horizon, "--device", "cpu", "--clock", args.clock]
     paths = [str(HERE), str(ROOT), os.environ.get("PYTHONPATH", "")]
     out.mkdir(parents=True, exist_ok=True)
     with open(out.with_suffix(".log"), "a") as log_file:
@@ -145,6 +146,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--unit-starts", type=int, default=3)
     parser.add_argument("--horizon", type=int, default=60)
+    parser.add_argument("--clock", default="", help="as of libero eval")
     parser.add_argument("--pause", type=float, default=0.5, help="longest pause before a kill, s")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder that is kept")

@@ -99,7 +99,8 @@ def settings(result: EvaluationResult) -> dict[str, Any]:
     """Return everything that must be equal, flat, by dotted name: protocol, environment, instructions of the tasks."""
     world = {k: v for k, v in result.environment.items() if k.partition("_")[0] in WORLD and v is not None}
     tasks = {r.task: {"name": r.name, "instruction": r.instruction} for r in result.tasks}
-    return flatten(plain({"protocol": result.protocol, "environment": world, "tasks": tasks}))
+    protocol = {k: v for k, v in result.protocol.items() if k != "digest"}  # it follows from the others
+    return flatten(plain({"protocol": protocol, "environment": world, "tasks": tasks}))
 
 
 def match(first: Group, second: Group) -> Matched:

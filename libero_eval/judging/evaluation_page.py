@@ -56,6 +56,7 @@ def facts(result: EvaluationResult) -> list[tuple[str, str]]:
         "models": " ".join(str(value) for value in models if value),
         "robot": environment.get("robot"),
         "perturbed by": protocol.get("world", {}).get("perturb"),
+        "clock": protocol.get("action", {}).get("clock"),
         "MuJoCo": result.versions.get("mujoco"),
         "episodes": sum(len(task.init_states) for task in result.tasks),
         "finished": str(result.times.get("finished", "")).replace("T", " ").replace("+00:00", " UTC"),
@@ -68,7 +69,7 @@ def _row(name: str, tasks: Sequence[TaskResult], text: str = "") -> dict[str, An
     notes = [f"failed because {causes}"] if causes else []
     notes += [safety] if (safety := safety_text(tasks)) else []
     if text:  # of one task
-        notes += [tasks[0].event_note] if tasks[0].event_note else []
+        notes += filter(None, (tasks[0].event_note, tasks[0].clock_note))
         notes += [f"{len(errors)} ended with an error, such as: {errors[0]}"] if errors else []
     return {
         "name": name,

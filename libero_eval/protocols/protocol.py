@@ -18,6 +18,7 @@ from libero_env.tasks import Task
 from libero_env.text import plain, shown, suggest
 from libero_env.timing import ControlFreq
 from libero_env.validation import validate
+from libero_eval.protocols.clock import Clock
 from lifelong.errors import ProtocolError, ProtocolMismatchError
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")
@@ -235,6 +236,8 @@ class Actions:
         chunk: Number of actions that the policy predicts at once.
         replan: Number of them that are executed before it is asked again.
         ensembling: How overlapping predictions are combined.
+        clock: Time that inference takes, and what is executed meanwhile, such as `latency=120ms,merge=replace`, see
+            `libero_eval.protocols.clock`; empty for none.
     """
 
     unnorm_key: str | None
@@ -245,9 +248,12 @@ class Actions:
     chunk: _AtLeastOne | None
     replan: _AtLeastOne | None
     ensembling: str | None
+    clock: str = ""
 
     def problems(self) -> Iterator[str]:
         """Yield which values contradict each other."""
+        if self.clock:
+            yield from _clock_problems(self.clock)
         if self.chunk is not None and self.replan is not None and self.replan > self.chunk:
             yield (
                 f"action.replan is {self.replan}, but action.chunk is {self.chunk}: there are not as many actions"
@@ -377,8 +383,11 @@ class EvalProtocol:
 
     @property
     def digest(self) -> str:
-        """Digest of all values, 16 hex digits; name, title and sources are not part of it."""
-        return hashlib.sha256(json.dumps(self.flat(), sort_keys=True).encode()).hexdigest()[:16]
+        """Digest of all values, 16 hex digits; name, title and sources are not part of it, nor an empty clock."""
+        values = self.flat()
+        if not self.action.clock:
+            del values["action.clock"]
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:16]
 
     def steps(self, task: Task) -> int:
         """Return the maximum number of the policy's steps on a task.
@@ -468,6 +477,14 @@ class EvalProtocol:
             raise ProtocolMismatchError(
                 "the policy was made for another protocol; nothing was run. " + "; ".join(wrong)
             )
+
+
+def _clock_problems(text: str) -> Iterator[str]:
+    try:
+        if text != (stored := str(Clock.read(text))):
+            yield f"action.clock is {shown(text)}; in the words that are stored it is {shown(stored)}"
+    except LiberoError as error:
+        yield f"action.clock: {error}"
 
 
 def _perturbation_problems(text: str) -> Iterator[str]:

@@ -107,8 +107,8 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         ResultsError: The files cannot be written.
     """
     first, axes = policies[0], {policy.label: policy.axes for policy in policies}
-    kinds = {axis.kind: KINDS[axis.kind.partition("@")[0]] for axis in first.axes}
-    units = {name: f"{kind.at_one:g} {kind.unit}" for name, kind in kinds.items()}
+    kinds = {axis.kind: KINDS.get(axis.kind.partition("@")[0]) for axis in first.axes}
+    units = {name: f"{kind.at_one:g} {kind.unit}" if kind else "1 s" for name, kind in kinds.items()}
     outcomes = first.outcomes
     suites = ", ".join(dict.fromkeys(task.partition("/")[0] for task in outcomes.tasks))
     episodes = len(outcomes.tasks) * len(outcomes.starts)
@@ -219,8 +219,10 @@ def curves_figure(policies: Mapping[str, Sequence[Axis]], units: Mapping[str, st
                 _draw_axis(axes, axis, number, "" if label in named else shorten(label, 60))
                 named.add(label)
         axes.set_title(f"{kind}\n{shorten(units.get(kind, ''), 34)}".strip(), loc="left", fontsize=8)
-        axes.set(xlim=(-0.03, 1.03), ylim=(0, 102))
-        axes.set_xticks((0, 0.5, 1), ("0", "½", "1"))
+        largest = first[place].severities[-1]
+        axes.set(xlim=(-0.03 * largest, 1.03 * largest), ylim=(0, 102))
+        middle = "½" if largest == 1 else f"{largest / 2:g}"
+        axes.set_xticks((0, largest / 2, largest), ("0", middle, f"{largest:g}"))
         axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
         hide_spines(axes)
         if place % columns == 0:

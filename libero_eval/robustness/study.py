@@ -12,7 +12,7 @@ from libero_env.storage import require_own_folders
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
 from libero_eval.plan import further_process, load_policy, plan_evaluation, policy_threads
 from libero_eval.policies import PolicyUnderTest
-from libero_eval.requests import PAIRS, RobustnessRequest
+from libero_eval.requests import CLOCK, PAIRS, RobustnessRequest
 from libero_eval.robustness.results import Outcomes, Robustness, events_of, name_of
 from libero_eval.work.evaluation import Evaluation
 from libero_eval.work.worker import Worker, Workers
@@ -106,13 +106,14 @@ def conditions_of(request: RobustnessRequest) -> list[str]:
         LiberoError: A kind does not exist, or a text is not valid.
     """
     seed = request.perturb_seed
-    parts = [kind.partition("@") for kind in request.kinds]
-    texts = [
-        f"{kind}={severity:g}{at}{trigger}"
-        for kind, at, trigger in parts
-        for severity in sorted(request.severities)
-    ]
-    conditions = [format_perturbations(parse_perturbations(text, seed, events=True)) for text in texts]
+    conditions = []
+    for kind, at, trigger in (kind.partition("@") for kind in request.kinds):
+        for severity in sorted(request.severities):
+            text = f"{kind}={severity:g}{at}{trigger}"
+            if text.startswith(CLOCK) and not at:
+                conditions.append(text if severity else "")
+            else:
+                conditions.append(format_perturbations(parse_perturbations(text, seed, events=True)))
     for text in request.pairs:
         pair = parse_perturbations(text, seed, events=True)
         if len(pair) != 2:
@@ -138,6 +139,8 @@ def read_study(folder: Path, name: str = "") -> Robustness:
         result = EvaluationResult.read(path)
         perturbations = parse_perturbations(result.protocol.get("world", {}).get("perturb", ""), events=True)
         condition = tuple((one.name, one.severity) for one in perturbations)
+        if (text := path.parent.name).startswith(CLOCK):
+            condition = (("clock", float(text.removeprefix(CLOCK))),)
         results[condition] = result
         if any(one.trigger for one in perturbations):
             events[condition] = events_of(result)

@@ -1,6 +1,5 @@
-"""Actors whose actions come from a policy server: in chunks under a protocol, or as of a run in process."""
+"""Planners whose actions come from a policy server: in chunks under a protocol, or as of a run in process."""
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,10 +16,7 @@ from lifelong.evaluation.environments import Obs
 
 
 class RemoteActor:
-    """Actions from a policy server, a chunk of which each simulation executes before it asks for the next.
-
-    Only simulations whose chunk is used up and whose episode is not over are asked for. A simulation's actions depend
-    on its own answers, not on the order in which answers come.
+    """Chunks of actions from a policy server, which is asked for some simulations; their order does not matter.
 
     Args:
         client: The server.
@@ -30,7 +26,7 @@ class RemoteActor:
         replan: Number of actions of a chunk that are executed; None for a server that answers single actions.
     """
 
-    action_dim = ACTION_DIM
+    action_dim, observes = ACTION_DIM, "asked"
 
     def __init__(
         self,
@@ -41,20 +37,13 @@ class RemoteActor:
         views: tuple[str, ...] = (),
         replan: int | None = None,
     ):
-        self.views = views
-        self._client, self._adapter, self._episodes, self._replan = client, adapter, tuple(episodes), replan
-        self._chunks: list[deque[np.ndarray]] = []
+        self.views, self.replan = views, replan
+        self._client, self._adapter, self._episodes = client, adapter, tuple(episodes)
         self._over = np.zeros(len(episodes), bool)
-
-    @property
-    def sees_next(self) -> bool:
-        """Whether the next observation is sent to the server; the others need no images."""
-        return any(not chunk for chunk, over in zip(self._chunks, self._over, strict=True) if not over)
 
     def reset(self, num_envs: int) -> None:
         """Begin the episodes on the server; see `lifelong.evaluation.actors.Actor`."""
         assert num_envs == len(self._episodes), "one simulation for each episode"
-        self._chunks = [deque() for _ in self._episodes]
         self._over = np.zeros(num_envs, bool)
         self._client.open(self._episodes)
 
@@ -64,30 +53,24 @@ class RemoteActor:
             self._client.finish(int(i), bool(success[i]))
         self._over = over.copy()
 
-    def act(self, obs: Obs) -> np.ndarray:
-        """Return (B, 7) float64 actions; those of finished episodes are zero.
+    def plan(self, obs: Obs, rows: Sequence[int]) -> list[np.ndarray]:
+        """Return the chunks (H, 7) float64 of some simulations.
 
         Raises:
             ServerError: The server fails, is too late, or its actions are not valid.
             ConnectionLost: A connection breaks.
         """
-        running = np.flatnonzero(~self._over).tolist()
-        if rows := [i for i in running if not self._chunks[i]]:
-            inputs = dict(zip(rows, self._adapter.inputs(obs, rows), strict=True))
-            answers = self._client.ask(inputs)
-            for i in rows:
-                episode = self._episodes[i]
-                where = f"{self._client.address} ({episode.task.id}, initial state {episode.init_state})"
-                predicted = checked_actions(answers[i], self._replan, where)
-                self._chunks[i].extend(self._adapter.actions(predicted))
-        actions = np.zeros((len(self._chunks), self.action_dim))
-        for i in running:
-            actions[i] = self._chunks[i].popleft()
-        return actions
+        answers = self._client.ask(dict(zip(rows, self._adapter.inputs(obs, rows), strict=True)))
+        chunks = []
+        for i in rows:
+            episode = self._episodes[i]
+            where = f"{self._client.address} ({episode.task.id}, initial state {episode.init_state})"
+            chunks.append(self._adapter.actions(checked_actions(answers[i], self.replan, where)))
+        return chunks
 
 
 def checked_actions(answer: Any, replan: int | None, where: str) -> np.ndarray:
-    """Return the actions to be executed from a server's answer, (replan, 7) float64.
+    """Return the actions of a server's answer, (H, 7) float64.
 
     Args:
         answer: What the server sent as actions: (H, 7) numbers with H at least `replan`, or (7,) where one is executed.
@@ -116,17 +99,18 @@ def checked_actions(answer: Any, replan: int | None, where: str) -> np.ndarray:
         )
     if len(chunk) < (replan or 1):
         raise ServerError(f"{where} sent {len(chunk)} actions; the protocol executes {replan} of each answer")
-    used = chunk[: replan or 1].astype(np.float64)
-    if not np.isfinite(used).all():
-        bad = used[~np.isfinite(used)][0]
+    chunk = chunk.astype(np.float64)
+    if not np.isfinite(chunk).all():
+        bad = chunk[~np.isfinite(chunk)][0]
         raise ServerError(f"{where} sent actions that are not finite ({bad}); expected {wanted}")
-    return used
+    return chunk
 
 
 class ServedActor:
     """Actions of a run that `libero serve` serves: it is sent what the policy would see in process, to the bit.
 
-    All simulations of a task are one request, so that they are computed as in process.
+    All simulations of a task are one request, so that they are computed as in process. The server has the history, so
+    it is sent every observation, and in `plan` which simulations ask.
 
     Args:
         client: The server.
@@ -134,6 +118,8 @@ class ServedActor:
         episodes: Episode of each simulation; all of one task.
         seeds: Words from which the generator of each episode is made, for stochastic policies.
     """
+
+    observes = "always"
 
     def __init__(
         self,
@@ -146,6 +132,7 @@ class ServedActor:
         self._names = [key.removeprefix(PREFIX) for key in announced["observation"]]
         self.views = tuple(name for name in self._names if name.endswith("_rgb"))
         self.action_dim = int(announced["actions"]["shape"][-1])
+        self.replan = int(announced["replan"])
         task = episodes[0].task
         self._first = {"reset": True, "seed": [list(words) for words in seeds]}
         if task.suite != "file":  # the server does not have those
@@ -160,15 +147,19 @@ class ServedActor:
             self._client.open(self._episodes[:1])
         self._connected, self._begun = True, False
 
-    def act(self, obs: Obs) -> np.ndarray:
-        """Return (B, 7) float64 actions.
+    def plan(self, obs: Obs, rows: Sequence[int]) -> np.ndarray:
+        """Return the chunks of some simulations, (len(rows), H, 7) float64.
 
         Raises:
             ServerError: The server fails, is too late, or its actions are not valid.
             ConnectionLost: The connection breaks.
         """
         request: dict[str, Any] = {PREFIX + name: np.asarray(obs[name]) for name in self._names}
+        request["plan"] = list(rows)
         actions = self._client.request(request if self._begun else request | self._first).get("actions")
         self._begun = True
-        shape = (len(next(iter(obs.values()))), 1, self.action_dim)
-        return checked_numbers(actions, f"the actions of {self._client.address}", (shape,), ServerError)[:, 0]
+        name, wanted = f"the actions of {self._client.address}", f"({len(rows)}, H, {self.action_dim})"
+        chunks = checked_numbers(actions, name, (wanted,), ServerError)
+        if chunks.ndim != 3 or chunks.shape[::2] != (len(rows), self.action_dim):
+            raise ServerError(f"{name}: expected shape {wanted}, got {chunks.shape}")
+        return chunks

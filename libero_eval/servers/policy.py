@@ -13,6 +13,7 @@ from libero_env.errors import require_known
 from libero_env.tasks import Task, get_task
 from libero_eval.policies import PROBE_TOLERANCE, PolicyUnderTest
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
+from libero_eval.protocols.clock import Planner
 from libero_eval.protocols.environment import run_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
@@ -24,7 +25,6 @@ from libero_eval.servers.transport import EpisodeStart, Limits, PolicyClient
 from libero_eval.servers.vla_eval import VlaEvalClient
 from lifelong.data.settings import CAMERAS
 from lifelong.errors import ConfigError, ProtocolError, ServerError
-from lifelong.evaluation.actors import Actor
 
 # scheme of an address -> kind of server, scheme of its transport
 CLIENTS: dict[str, tuple[Any, str]] = {
@@ -144,11 +144,11 @@ class ServerPolicy(PolicyUnderTest):
         client.open([EpisodeStart(task, 0)])
         answer = client.ask(dict(enumerate(adapter.inputs(obs))))[0]
         client.finish(0, success=False)
-        return checked_actions(answer, replan, self.given).ravel().round(6)
+        return checked_actions(answer, replan, self.given)[: replan or 1].ravel().round(6)
 
     @contextmanager
-    def actor(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Actor]:
-        """Yield the actor of episodes, with connections of its own; see `PolicyUnderTest`.
+    def planner(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Planner]:
+        """Yield the planner of episodes, with connections of its own; see `PolicyUnderTest`.
 
         Raises:
             ServerError: The server is not there any more, or announces or answers something else than at first.

@@ -82,6 +82,7 @@ class Announced(TypedDict):
     observation: dict[str, _Array]
     images: Literal["upright: first row on top, not mirrored"]
     actions: _Actions
+    replan: Annotated[int, Field(ge=1)]
     gripper: Literal["opens at -1, closes at +1"]
     openpi_names: bool
     tasks: dict[str, str]
@@ -123,6 +124,7 @@ class Request:
         task: Task that is acted on.
         reset: Whether an episode begins with this request.
         seeds: Words from which the generator of each row is made, if the client sent them.
+        plan: Rows of which chunks are asked for; None for the next action of each.
     """
 
     obs: Mapping[str, np.ndarray]
@@ -130,6 +132,7 @@ class Request:
     task: Task
     reset: bool
     seeds: Sequence[Sequence[int]] | None
+    plan: Sequence[int] | None
 
 
 class ServedPolicy:
@@ -167,6 +170,7 @@ class ServedPolicy:
             "observation": {PREFIX + name: about for name, about in (images | readings).items()},
             "images": "upright: first row on top, not mirrored",
             "actions": {"dtype": "float64", "shape": [1, spec.action_dim], "chunk": 1, "replan": 1},
+            "replan": run.policy.execute,
             "gripper": "opens at -1, closes at +1",
             "openpi_names": not self._lacking(),
             "tasks": {task.id: task.language for task in run.tasks},
@@ -219,7 +223,12 @@ class ServedPolicy:
             seeds = _seeds(seeds, len(next(iter(obs.values()))), rows)
         if not isinstance(reset, bool | np.bool_):
             raise PolicyError("reset is neither true nor false")
-        return Request(obs, rows, task, bool(reset), seeds)
+        plan, places = message.get("plan"), range(len(next(iter(obs.values()))))
+        if plan is not None and not (
+            isinstance(plan, list) and all(type(i) is int and i in places for i in plan)
+        ):
+            raise PolicyError(f"plan is {shown(plan)}; valid: a list of rows, from 0 to {len(places) - 1}")
+        return Request(obs, rows, task, bool(reset), seeds, plan)
 
     def _task(self, message: Mapping[str, Any], before: Task | None) -> Task:
         """Return the task that a request names by `task`, `suite/index`, or by its instruction, `prompt`.
@@ -290,7 +299,7 @@ class Session:
         self._rows = 0
 
     def infer(self, message: Any) -> dict[str, Any]:
-        """Return the answer to a request: `actions` (1, 7) float64, or (B, 1, 7) for B rows.
+        """Return the answer to a request: `actions` (1, 7) float64, or (B, 1, 7) for B rows; with `plan`, their chunks.
 
         Raises:
             PolicyError: The request is not valid.
@@ -304,6 +313,8 @@ class Session:
                 f"{rows} rows in an episode that began with {self._rows}; begin another with reset: true"
             )
         assert self._actor is not None
+        if request.plan is not None:
+            return {"actions": self._actor.plan(request.obs, request.plan)}
         actions = self._actor.act(request.obs)[:, None]
         return {"actions": actions if request.rows else actions[0]}
 

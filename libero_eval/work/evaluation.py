@@ -263,6 +263,7 @@ class Evaluation:
         attempts, began, solved = (
             tuple(getattr(e, name) for e in done.counted) for name in ("attempts", "began", "solved")
         )
+        timing = tuple(e.timing for e in done.counted)
         kept = tuple(e for e, ran in zip(errors, done.episodes, strict=False) if not ran.simulation_error)
         result = TaskResult(
             task=unit.task.id,
@@ -274,6 +275,7 @@ class Evaluation:
             began=began if any(began) else (),
             solved=solved if any(solved) else (),
             atoms_at_start=tuple(e.at_start for e in done.counted),
+            timing=timing if any(timing) else (),
             **done.columns(),
         )
         environment, versions = describe_environment(env), dict(self.versions)

@@ -124,7 +124,8 @@ def table_row(result: TaskResult) -> str:
     raised = sum(error is not None for error in result.errors)
     note = f"  ({raised} ended with an error)" if raised else ""
     note += f"  ({result.error_note})" if result.error_note else ""
-    note += f"  ({result.event_note})" if result.event_note else ""
+    for told in filter(None, (result.event_note, result.clock_note)):
+        note += f"  ({told})"
     return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}{note}"
 
 

@@ -1,7 +1,7 @@
 """A growing library of low-rank experts and a router that mixes them."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -256,6 +256,7 @@ class _Routed(Policy):
         self.inner, self._algorithm = inner, algorithm
         self._coefficients: Tensor | None = None
         self.training = inner.training
+        self.chunk, self.execute, self.inpaints = inner.chunk, inner.execute, inner.inpaints
 
     def window_losses(self, batch: Batch) -> Tensor:
         """Call the inner policy; windows without a query are routed by their own first frame."""
@@ -271,10 +272,17 @@ class _Routed(Policy):
         self.inner.reset(num_envs)
 
     def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
+        with self._routed(observation):
+            return self.inner._act(observation, generators)
+
+    def _plan(self, observation: Observation, *asked: Any) -> Tensor:
+        with self._routed(observation):
+            return self.inner._plan(observation, *asked)
+
+    def _routed(self, observation: Observation) -> AbstractContextManager[None]:
         if self._coefficients is None:
             self._coefficients = self._algorithm.coefficients(observation)
-        with self._algorithm.holding(self._coefficients):
-            return self.inner._act(observation, generators)
+        return self._algorithm.holding(self._coefficients)
 
 
 def _counting(of_tasks: Tensor, counts: Sequence[bool]) -> tuple[list[int], Tensor]:

@@ -1,6 +1,7 @@
 """Actors of rollouts: what answers observations with actions, such as a policy of this package."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -12,7 +13,7 @@ from libero_env.tasks import Task
 from lifelong.evaluation.environments import Obs
 from lifelong.policies.base import Policy
 from lifelong.training.precision import autocast, float32_products
-from lifelong.types import Observation, PolicySpec
+from lifelong.types import Observation, PolicySpec, Unfinished
 
 if TYPE_CHECKING:
     from libero_env.envs.batch import BatchEnv
@@ -78,6 +79,7 @@ class PolicyActor:
     precision: str
     draws: Sequence[torch.Generator]
     embed: Callable[[Task], Tensor] | None = None
+    observes = "always"
 
     @property
     def action_dim(self) -> int:
@@ -101,11 +103,43 @@ class PolicyActor:
         if not torch.equal(rows, self.language.expand_as(rows)):
             self.language = rows
 
+    @property
+    def replan(self) -> int:
+        """Number of actions of a chunk that the policy executes."""
+        return self.policy.execute
+
     def act(self, obs: Obs) -> np.ndarray:
         """Return (B, A) float64 actions; see `Actor`."""
-        observation = observe(obs, self.policy.spec, self.language, self.device)
+        with self._computing():
+            return _array(self.policy.act(self._observe(obs), self.draws))
+
+    def plan(
+        self, obs: Obs, rows: Sequence[int], before: Mapping[int, tuple[np.ndarray, int]] | None = None
+    ) -> np.ndarray:
+        """Return chunks (len(rows), H, A) float64 of some simulations, and take note of what all observe.
+
+        Args:
+            rows: The simulations.
+            before: What of the last chunk is left, and how many of these actions are probably executed until the next
+                one is there, by simulation, for a policy that inpaints.
+        """
+        unfinished: dict[int, Unfinished] | None = None
+        if before is not None:
+            unfinished = {i: Unfinished(torch.from_numpy(left), delay) for i, (left, delay) in before.items()}
+        with self._computing():
+            return _array(self.policy.plan(self._observe(obs), rows, self.draws, unfinished))
+
+    def _observe(self, obs: Obs) -> Observation:
+        return observe(obs, self.policy.spec, self.language, self.device)
+
+    @contextmanager
+    def _computing(self) -> Iterator[None]:
         with autocast(self.device, self.precision), float32_products(self.precision):
-            return self.policy.act(observation, self.draws).cpu().numpy().astype(np.float64)
+            yield
+
+
+def _array(actions: Tensor) -> np.ndarray:
+    return actions.cpu().numpy().astype(np.float64)
 
 
 def observe(obs: Obs, spec: PolicySpec, language: Tensor, device: torch.device) -> Observation:

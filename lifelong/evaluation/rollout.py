@@ -47,6 +47,7 @@ class Episode:
         costs: What it cost; None where the environment does not show its state.
         solved: Whether the expert solves what is left after each event, 1 or 0, -1 where it never began; empty where
             that was not tried.
+        timing: Requests to the policy, answers that were used, and steps waited for one; empty without a clock.
     """
 
     init_state: int
@@ -62,6 +63,7 @@ class Episode:
     began: tuple[int, ...] = ()
     costs: Costs | None = None
     solved: tuple[int, ...] = ()
+    timing: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -251,6 +253,7 @@ def run_episodes(
     bar.close()
     _draw(env, True)
     _tell(actor, tracker, env)
+    timing = getattr(actor, "timing", ())
     done = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
     episodes = tuple(
         replace(
@@ -260,6 +263,7 @@ def run_episodes(
             failure=tracker.failure(i),
             began=tuple(map(int, tracker.began[i])),
             costs=tracker.costs(i),
+            timing=timing[i] if timing else (),
         )
         for i, one in enumerate(done)
     )

@@ -4,7 +4,7 @@ Shape legend: B batch, T time, H chunk, E latent, A action.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import torch
@@ -13,10 +13,11 @@ from torch import Tensor, nn
 
 from lifelong.errors import PolicyError
 from lifelong.nn.heads import ActionHead, full_precision
-from lifelong.types import Depth, Width, to_device
+from lifelong.types import Depth, Unfinished, Width, to_device
 
 _EVAL_SEED = 0
 _OCTAVES = 6  # frequencies that encode the time
+_GUIDANCE = 5.0  # the largest weight of what is left of a chunk, beta
 
 
 class FlowHead(ActionHead):
@@ -33,6 +34,9 @@ class FlowHead(ActionHead):
     In training, noise and times come from torch's default generator, as dropout's do. In eval mode they are the same
     for every window, so that a window's loss depends neither on chance nor on its batch.
 
+    `plan` can continue a chunk that is being executed: real-time chunking (Black, Galliker & Levine, "Real-time
+    execution of action chunking flow policies", 2025), its guidance with the soft mask.
+
     Args:
         in_dim: E.
         action_dim: A.
@@ -45,6 +49,8 @@ class FlowHead(ActionHead):
     Raises:
         PolicyError: More actions are executed than a chunk has.
     """
+
+    inpaints = True
 
     def __init__(
         self,
@@ -127,18 +133,51 @@ class FlowHead(ActionHead):
         noise = to_device(torch.randn(shape, generator=generator), device)
         return self.integrate(params, noise)[..., 0, :]
 
-    def plan(self, params: dict[str, Tensor], generators: Sequence[torch.Generator] | None) -> Tensor:
-        """Return the first `execute` actions of a chunk, (B, execute, A); see `ActionHead`."""
+    def plan(
+        self,
+        params: dict[str, Tensor],
+        generators: Sequence[torch.Generator] | None,
+        before: Mapping[int, Unfinished] | None = None,
+    ) -> Tensor:
+        """Return chunks, (B, H, A); see `ActionHead`."""
         noise = torch.zeros_like(self._empty(params))
         if generators is not None:
             draws = [torch.randn(noise.shape[1:], generator=generator) for generator in generators]
             noise = to_device(torch.stack(draws), noise.device)
-        return self.integrate(params, noise)[:, : self.execute]
+        return self.integrate(params, noise) if before is None else self._continue(params, noise, before)
+
+    def _continue(self, params: dict[str, Tensor], noise: Tensor, before: Mapping[int, Unfinished]) -> Tensor:
+        """Carry noise (B, H, A) to chunks that begin as unfinished ones go on, (B, H, A)."""
+        target, weight = torch.zeros_like(noise), torch.zeros_like(noise)
+        for row, one in before.items():
+            length = min(len(one.actions), self.chunk)
+            target[row, :length] = one.actions[:length].to(target)
+            weight[row, :length] = prefix_weights(length, one.delay).to(target)[:, None]
+        x = noise
+        for k in range(self.steps):
+            s = k / self.steps
+            with torch.enable_grad():
+                x = x.detach().requires_grad_()
+                velocity = self.velocity(x, x.new_full(x.shape[:-2], s), params["latent"], params["slots"])
+                end = x + (1 - s) * velocity
+                (pull,) = torch.autograd.grad(end, x, (target - end.detach()) * weight)
+            strength = min(_GUIDANCE, (s**2 + (1 - s) ** 2) / (s * (1 - s))) if k else _GUIDANCE
+            x = x.detach() + (velocity.detach() + strength * pull) / self.steps
+        return x
 
     def _empty(self, params: dict[str, Tensor]) -> Tensor:
         """Return uninitialised chunks, (..., H, A) float32."""
         slots = params["slots"]
         return slots.new_empty(*slots.shape, self.action_dim)
+
+
+def prefix_weights(length: int, delay: int) -> Tensor:
+    """Return how much each action that is left of a chunk binds the next chunk, (length,).
+
+    Those that are executed before it is there bind fully, the later ones less and less.
+    """
+    place = (length - torch.arange(length)) / (length - min(delay, length) + 1)
+    return torch.where(torch.arange(length) < delay, 1.0, place * place.expm1() / math.expm1(1))
 
 
 class VelocityField(nn.Module):

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lifelong.types import Depth, NonNegative, Width, to_device
+from lifelong.types import Depth, NonNegative, Unfinished, Width, to_device
 
 
 class ActionHead(nn.Module, ABC):
@@ -23,9 +23,13 @@ class ActionHead(nn.Module, ABC):
 
     Attributes:
         chunk: Number of actions that a latent predicts: that of its own step and of the following ones.
+        execute: Number of these that are executed before the next latent is needed.
+        inpaints: Whether `plan` can continue unfinished chunks.
     """
 
     chunk: int = 1
+    execute: int = 1
+    inpaints: bool = False
 
     @abstractmethod
     def forward(self, latent: Tensor) -> dict[str, Tensor]:
@@ -65,15 +69,21 @@ class ActionHead(nn.Module, ABC):
         """
         return (self.mean(params) - teacher["mean"]).square().sum(-1)
 
-    def plan(self, params: dict[str, Tensor], generators: Sequence[torch.Generator] | None) -> Tensor:
-        """Return the actions to execute before the next latent is needed.
+    def plan(
+        self,
+        params: dict[str, Tensor],
+        generators: Sequence[torch.Generator] | None,
+        before: Mapping[int, Unfinished] | None = None,
+    ) -> Tensor:
+        """Return the actions that a latent predicts.
 
         Args:
             params: Parameters for one latent per environment, (B, E).
             generators: One CPU generator per environment to draw with; None takes the most likely actions.
+            before: What environments still execute of their last chunk, by row, for a head that inpaints.
 
         Returns:
-            Actions (B, n, A), n the same for all environments.
+            Actions (B, chunk, A).
         """
         if generators is None:
             return self.mode(params)[:, None]

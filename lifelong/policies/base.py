@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from lifelong.data.settings import Statistics
 from lifelong.data.windows import WindowDataset
 from lifelong.errors import PolicyError
-from lifelong.types import Batch, Observation, PolicySpec
+from lifelong.types import Batch, Observation, PolicySpec, Unfinished
 
 
 class Policy(nn.Module, ABC):
@@ -55,11 +55,17 @@ class Policy(nn.Module, ABC):
     Attributes:
         by_window: Whether the first axis of what its layers are given is that of the windows.
         uses_history: Whether it needs earlier frames to act well, which it learns from windows of several steps.
+        chunk: Number of actions that it predicts at once.
+        execute: Number of these that are executed before it predicts again.
+        inpaints: Whether a chunk can continue what is being executed, see `plan`.
         statistics: What it normalises by where `data.statistics` does not say.
     """
 
     by_window = True
     uses_history = False
+    chunk: int = 1
+    execute: int = 1
+    inpaints: bool = False
     statistics: Statistics = "constants"
 
     def __init__(self, spec: PolicySpec) -> None:
@@ -158,13 +164,48 @@ class Policy(nn.Module, ABC):
         Raises:
             PolicyError: The policy is in training mode or was not reset, or the observation has a wrong shape.
         """
-        if self.training:
-            raise PolicyError("a policy acts in eval mode only (dropout is on); call policy.eval() first")
         self._check(observation)
         with torch.no_grad():
             return self._act(observation, generators).float().clamp(-1.0, 1.0)
 
+    def plan(
+        self,
+        observation: Observation,
+        rows: Sequence[int],
+        generators: Sequence[torch.Generator] | None = None,
+        before: Mapping[int, Unfinished] | None = None,
+    ) -> Tensor:
+        """Return all actions that are predicted for some environments, and advance the history of all.
+
+        Args:
+            observation: As of `act`; it is called at every step, also where nobody asks.
+            rows: Environments whose actions are asked for; only their generators are drawn from.
+            generators: As of `act`.
+            before: What environments still execute of their last chunk, by row, for a policy that inpaints.
+
+        Returns:
+            Actions (len(rows), H, A) float32 in [-1, 1].
+
+        Raises:
+            PolicyError: As of `act`.
+        """
+        self._check(observation)
+        with torch.no_grad():
+            return self._plan(observation, rows, generators, before).float().clamp(-1.0, 1.0)
+
+    def _plan(
+        self,
+        observation: Observation,
+        rows: Sequence[int],
+        generators: Sequence[torch.Generator] | None,
+        before: Mapping[int, Unfinished] | None,
+    ) -> Tensor:
+        """Return the actions of `plan`; by default one, for a policy that has planned no others."""
+        return self._act(observation, generators)[list(rows), None]
+
     def _check(self, observation: Observation) -> None:
+        if self.training:
+            raise PolicyError("a policy acts in eval mode only (dropout is on); call policy.eval() first")
         expected = (1, len(self.spec.views), *self.spec.image_size, 3)
         if tuple(observation.images.shape[1:]) != expected:
             sizes = ", ".join(map(str, expected))

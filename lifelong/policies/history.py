@@ -15,7 +15,7 @@ from lifelong.nn.heads import ActionHead
 from lifelong.nn.tokens import LanguageToken, ProprioScaling, ProprioTokens, named_parts, standardise
 from lifelong.nn.vision import encode_views
 from lifelong.policies.base import Policy
-from lifelong.types import Batch, CompletedWith, Observation, PolicySpec
+from lifelong.types import Batch, CompletedWith, Observation, PolicySpec, Unfinished
 
 # A class of `lifelong.nn`, or a `functools.partial` of one; the policy calls it with the sizes that only it knows.
 Component = Callable[..., Any]
@@ -94,6 +94,21 @@ class HistoryPolicy(Policy):
         return built
 
     @property
+    def chunk(self) -> int:  # type: ignore[override]  # of the head
+        """Number of actions that it predicts at once."""
+        return self.head.chunk
+
+    @property
+    def execute(self) -> int:  # type: ignore[override]
+        """Number of these that are executed before it predicts again."""
+        return self.head.execute
+
+    @property
+    def inpaints(self) -> bool:  # type: ignore[override]
+        """Whether a chunk can continue what is being executed."""
+        return self.head.inpaints
+
+    @property
     def memory_steps(self) -> int:
         """Number of frames used to act: `seq_len`, less where a head learns from the steps that follow."""
         return self.spec.seq_len - self.head.chunk + 1
@@ -143,16 +158,32 @@ class HistoryPolicy(Policy):
         return self.head(self._latest_latent(self.encode(observation)))
 
     def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
-        params = self.step(observation)
-        if not self.stochastic:
-            generators = None
-        elif generators is None or len(generators) != self._num_envs:
+        params, draws = self.step(observation), self._draws(generators)
+        if not self._planned:
+            self._planned = list(self.head.plan(params, draws)[:, : self.head.execute].unbind(1))
+        return self._planned.pop(0)
+
+    def _plan(
+        self,
+        observation: Observation,
+        rows: Sequence[int],
+        generators: Sequence[torch.Generator] | None,
+        before: Mapping[int, Unfinished] | None,
+    ) -> Tensor:
+        params, draws = self.step(observation), self._draws(generators)
+        if not rows:
+            return observation.language.new_empty(0, self.head.chunk, self.spec.action_dim)
+        if draws is not None:  # all rows are planned, so that no bit of one depends on which others ask
+            draws = [draw if i in rows else draw.clone_state() for i, draw in enumerate(draws)]
+        return self.head.plan(params, draws, before)[list(rows)]
+
+    def _draws(self, generators: Sequence[torch.Generator] | None) -> Sequence[torch.Generator] | None:
+        """Return the generators to draw with; None for a policy that takes the most likely actions."""
+        if self.stochastic and (generators is None or len(generators) != self._num_envs):
             raise PolicyError(
                 "a stochastic policy needs one generator per environment: act(..., generators=[...])"
             )
-        if not self._planned:
-            self._planned = list(self.head.plan(params, generators).unbind(1))
-        return self._planned.pop(0)
+        return generators if self.stochastic else None
 
     def _latest_latent(self, features: Tensor) -> Tensor:
         """Append the features (B, 1, ...) of a frame to the history; return the frame's latent (B, E)."""

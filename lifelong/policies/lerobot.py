@@ -21,7 +21,7 @@ from libero_env.errors import MissingPackageError
 from lifelong.data.windows import WindowDataset
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.policies.base import Policy
-from lifelong.types import Batch, Count, Observation, PolicySpec
+from lifelong.types import Batch, Count, Observation, PolicySpec, Unfinished
 
 # type -> its setting for the number of actions in a chunk, which is the length of a window
 CHUNKS = {
@@ -222,6 +222,31 @@ class LeRobotPolicy(Policy):
         steps = getattr(self.inner.config, CHUNKS[self.type])
         noise = torch.stack([torch.randn(steps, *size, generator=g) for g in generators])
         return self._unnormalised(self.inner.select_action(batch, noise=noise.to(observation.language)))
+
+    def _plan(
+        self,
+        observation: Observation,
+        rows: Sequence[int],
+        generators: Sequence[torch.Generator] | None,
+        before: Mapping[int, Unfinished] | None,
+    ) -> Tensor:
+        """Return what LeRobot would execute of a chunk that it plans now; see `Policy`."""
+        queue = getattr(self.inner, "_action_queue", None)
+        queue = getattr(self.inner, "_queues", {}).get(ACTION) if queue is None else queue
+        if rows and queue is not None:
+            queue.clear()
+        first = self._act(observation, generators)
+        return torch.stack([first, *map(self._unnormalised, queue or ())], dim=1)[list(rows)]
+
+    @property
+    def execute(self) -> int:  # type: ignore[override]
+        """Number of actions that are executed before it plans again."""
+        return getattr(self.inner.config, "n_action_steps", 1)
+
+    @property
+    def chunk(self) -> int:  # type: ignore[override]
+        """Number of actions that `plan` returns, those that are executed."""
+        return self.execute
 
     @property
     def _takes_noise(self) -> bool:

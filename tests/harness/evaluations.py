@@ -7,6 +7,7 @@ import numpy as np
 
 from libero_env.tasks import get_suite
 from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.protocols.clock import ClockedActor
 from libero_eval.protocols.files import load_protocol
 from libero_eval.user_policy import CallableActor
 from libero_eval.work.evaluation import Evaluation
@@ -59,7 +60,7 @@ def evaluation(out: Path, policy=None, **changes) -> Evaluation:
 
     @contextmanager
     def actor(task, states):
-        yield CallableActor(policy, (), task.language)
+        yield ClockedActor(CallableActor(policy, (), task.language))
 
     arguments = {
         "identity": {"policy": "still"}, "tasks": TASKS, "init_states": (3, 4, 9, 20), "protocol": QUICK,

@@ -13,9 +13,13 @@ SMALL = ["--suite", "libero_object/0", "--episodes", "8", "--unit-starts", "2"]
 SMALL += ["--horizon", "50", "--pause", "0.1"]  # the last units take longer than the pauses before the kills
 
 
-def test_killed_three_times_three_processes_end_with_the_result_of_one():
+@pytest.mark.parametrize("clock", ["", "latency=lognormal:120/0.5ms,wait=repeat"])
+def test_killed_three_times_three_processes_end_with_the_result_of_one(clock):
     done = subprocess.run(
-        [sys.executable, SCRIPT, "--kills", "3", *SMALL], capture_output=True, text=True, timeout=1800
+        [sys.executable, SCRIPT, "--kills", "3", *SMALL, "--clock", clock],
+        capture_output=True,
+        text=True,
+        timeout=1800,
     )
     assert done.returncode == 0, done.stdout + done.stderr
     assert "kills: 3" in done.stdout and "units: 4, episodes: 8" in done.stdout

@@ -14,6 +14,7 @@ import pytest
 
 from libero_env.tasks import get_suite
 from libero_eval.protocols.adapter import PolicyInput
+from libero_eval.protocols.clock import ClockedActor
 from libero_eval.servers.actors import RemoteActor
 from libero_eval.servers.openpi import OPENPI
 from libero_eval.servers.transport import EpisodeStart, Limits
@@ -181,7 +182,7 @@ def test_our_client_and_vla_eval_server(python, tmp_path):
         try:
             assert client.announced["model_server"] == "Counting"
             assert client.announced["action_spec"]["gripper"]["format"] == "binary_close_positive"
-            actor = RemoteActor(client, Plain(), [EpisodeStart(task, i) for i in range(4)])
+            actor = ClockedActor(RemoteActor(client, Plain(), [EpisodeStart(task, i) for i in range(4)]))
             actor.reset(4)
             for step in range(4):
                 actions = actor.act({"x": np.arange(4.0)})

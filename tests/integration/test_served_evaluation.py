@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from libero_env.cli import main as cli
-from libero_eval.servers.actors import RemoteActor
+from libero_eval.protocols.clock import ClockedActor
 from libero_eval.servers.openpi import OPENPI
 from libero_eval.servers.serving import ServedPolicy
 from lifelong.evaluation.restore import restore
@@ -152,7 +152,7 @@ def test_leaving_out_images_changes_none_that_are_sent(card, tmp_path, capsys, m
     found = []
     for name in ("seen", "all"):
         if name == "all":
-            monkeypatch.setattr(RemoteActor, "sees_next", True)
+            monkeypatch.setattr(ClockedActor, "sees_next", True)
         with policy_servers.openpi(answer) as address:
             assert on_server(address, tmp_path / name, card(OPENPI_CARD)) == 0
         found.append(json.loads((tmp_path / name / "eval.json").read_text())["tasks"])

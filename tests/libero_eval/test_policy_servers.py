@@ -19,6 +19,7 @@ from websockets.server import ServerProtocol
 from libero_env.errors import MissingPackageError
 from libero_env.tasks import get_suite
 from libero_eval.protocols.adapter import PolicyInput
+from libero_eval.protocols.clock import ClockedActor
 from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
 from libero_eval.servers.actors import RemoteActor, checked_actions
@@ -69,9 +70,10 @@ def chunk(state: np.ndarray, length: int) -> np.ndarray:
 def remote(client, episodes: int = 1, replan: int | None = None):
     """Yield the actor of new episodes on a server."""
     with closing(client):
-        actor = RemoteActor(
+        planner = RemoteActor(
             client, Plain(), [EpisodeStart(TASK, 4 + i) for i in range(episodes)], replan=replan
         )
+        actor = ClockedActor(planner)
         actor.reset(episodes)
         yield actor
 
@@ -146,7 +148,9 @@ def test_openpi_observations_and_chunks():
         client = OpenpiClient(address, SHORT)
         assert client.announced == {"name": "mine", "size": 224}
         adapter = Plain()
-        actor = RemoteActor(client, adapter, [EpisodeStart(TASK, i) for i in range(3)], replan=3)
+        actor = ClockedActor(
+            RemoteActor(client, adapter, [EpisodeStart(TASK, i) for i in range(3)], replan=3)
+        )
         actor.reset(3)
         over = np.zeros(3, bool)
         for step in range(7):
@@ -187,7 +191,8 @@ def test_only_images_that_are_seen_are_drawn(settle, record, drawn):
     env.render_images = True
     with policy_servers.openpi(answer) as address:
         client = OpenpiClient(address, SHORT)
-        actor = RemoteActor(client, Plain(), [EpisodeStart(TASK, 0)], replan=3, views=("image",))
+        planner = RemoteActor(client, Plain(), [EpisodeStart(TASK, 0)], replan=3, views=("image",))
+        actor = ClockedActor(planner)
         rollouts = run_episodes(actor, env, [0], horizon=20, settle_steps=settle, record_every=record)
         client.close()
     assert {i for i, seen in enumerate(env.drawn) if seen} - {9} == drawn, "9: it was not known to be over"

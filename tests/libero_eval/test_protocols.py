@@ -10,6 +10,7 @@ import pytest
 from libero_env.cli import main as cli
 from libero_env.tasks import get_task
 from libero_eval.protocols.adapter import ProtocolAdapter, axis_angle, axis_angle_float32, axis_angle_positive
+from libero_eval.protocols.clock import ClockedActor
 from libero_eval.protocols.files import load_protocol, protocol_names
 from libero_eval.protocols.protocol import SUITES, EvalProtocol
 from libero_eval.user_policy import CallableActor, ProtocolActor
@@ -226,7 +227,7 @@ class Chunks:
 
 def test_a_policy_of_the_protocols_inputs_is_asked_again_after_replan_actions():
     policy = Chunks(6)
-    actor = ProtocolActor(policy, (), ProtocolAdapter(load_protocol("openpi"), TASK), 5)
+    actor = ClockedActor(ProtocolActor(policy, (), ProtocolAdapter(load_protocol("openpi"), TASK), 5))
     actor.reset(2)
     taken = [actor.act(observations())[0, 0] for _ in range(7)]
     assert taken == [0, 1, 2, 3, 4, 0, 1] and len(policy.given) == 2
@@ -237,7 +238,7 @@ def test_a_policy_of_the_protocols_inputs_is_asked_again_after_replan_actions():
     short = ProtocolActor(Chunks(4), (), ProtocolAdapter(load_protocol("openpi"), TASK), 5)
     short.reset(2)
     with pytest.raises(PolicyError, match="returned 4 actions; the protocol executes 5"):
-        short.act(observations())
+        short.plan(observations(), [0, 1])
 
 
 def test_an_observation_of_the_other_names_is_named():
@@ -246,7 +247,7 @@ def test_an_observation_of_the_other_names_is_named():
             return np.zeros((len(observations["agentview_rgb"]), 7))
 
     with pytest.raises(MissingObservationError, match="'agentview_rgb', but agentview_image.*--names native"):
-        CallableActor(Native(), (), "go", original=True).act(observations())
+        CallableActor(Native(), (), "go", original=True).plan(observations(), [0])
 
 
 def test_protocols_are_values():

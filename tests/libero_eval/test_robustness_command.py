@@ -69,6 +69,27 @@ def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> N
     assert labels == ["first", "second"]
 
 
+def test_latency_is_a_kind_whose_severity_is_in_seconds(still, capsys) -> None:
+    latencies = ["--kinds", "clock", "--severities", "0", "0.05", "0.2", "--pairs"]
+    assert main(["robustness", *WORDS, *latencies, "--clock", "wait=hold", "--out", "found"]) == 0
+    assert "3/3" in capsys.readouterr().out
+    clocks = {
+        path.parent.name: EvaluationResult.read(path).protocol["action"]["clock"]
+        for path in still.glob("found/conditions/*/eval.json")
+    }
+    assert clocks == {
+        "none": "latency=0ms,wait=hold",
+        "clock=0.05": "latency=50ms,wait=hold",
+        "clock=0.2": "latency=200ms,wait=hold",
+    }
+    (axis,) = json.loads((still / "found" / "robustness.json").read_text())["policies"][0]["axes"]
+    assert axis["kind"] == "clock" and axis["severities"] == [0, 0.05, 0.2]
+    words = ["--kinds", "noise", "--severities", "1", "--pairs", "--clock", "latency=50ms", "--out", "both"]
+    assert main(["robustness", *WORDS, *words]) == 0
+    late = EvaluationResult.read(still / "both" / "conditions" / "noise=1").protocol
+    assert (late["action"]["clock"], late["world"]["perturb"]) == ("latency=50ms", "noise=1")
+
+
 def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) -> None:
     words = ["--kinds", "camera@step1", "light@touched", "--severities", "1", "--pairs", "--out", "found"]
     assert main(["robustness", *WORDS, *words]) == 0
@@ -84,6 +105,7 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
 
 @pytest.mark.parametrize(("words", "told"), [
     (["--kinds", "object@lifted"], "the robot touches the object then"),
+    (["--kinds", "clock", "--clock", "latency=50ms", "--pairs"], "latency is named twice"),
     (["--kinds", "camra"], "Did you mean 'camera'"),
     (["--severities", "2"], "--severities"),
     (["--kinds", "noise", "--severities", "1", "--pairs", "noise=1,robot=1"], "must also be run alone"),

@@ -13,6 +13,7 @@ from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import connect
 
 from libero_env.tasks import get_suite, get_task
+from libero_eval.protocols.clock import Clock, ClockedActor
 from libero_eval.servers.actors import ServedActor
 from libero_eval.servers.openpi import OPENPI, OpenpiClient
 from libero_eval.servers.serving import PREFIX, ServedPolicy, announced_run
@@ -74,10 +75,42 @@ def test_served_actions_are_those_in_process(folder, algo):
             wanted = in_process(served, task, seen, seeds)
             episodes = [EpisodeStart(task, state) for state in range(3)]
             with closing(OpenpiClient(address, Limits(10, 60))) as client:
-                actor = ServedActor(client, served.metadata, episodes, seeds)
+                actor = ClockedActor(ServedActor(client, served.metadata, episodes, seeds))
                 for _ in range(2):  # the second time from the start
                     actor.reset(3)
                     np.testing.assert_array_equal([actor.act(obs) for obs in seen], wanted)
+
+
+def test_served_chunks_are_those_in_process(folder):
+    """On a clock, rows ask at different times, and the server has the history of all."""
+    flow = [
+        "policy/head=flow_small",
+        "policy.head.chunk=2",
+        "policy.head.execute=1",
+        "policy.stochastic=true",
+    ]
+    served = run_of(folder, "algo=dmpel", "algo.recall_steps=2", *flow)
+    task, seeds = served.run.tasks[0], [(0, 4, 0, state) for state in range(3)]
+    seen = frames(served.run.policy.spec, rows=3, steps=8)
+    clock = Clock.read("latency=uniform:0/150ms")
+    run = served.run
+    with run.acting(task) as policy:
+        draws = [generator(*words) for words in seeds]
+        actor = ClockedActor(
+            PolicyActor(policy, run.embed(task), run.device, run.eval.precision, draws), clock, seeds
+        )
+        actor.reset(3)
+        wanted = [actor.act(obs) for obs in seen]
+    assert len({tuple(row) for row in actor.timing}) > 1
+    with policy_servers.served(served) as address, closing(OpenpiClient(address, Limits(10, 60))) as client:
+        episodes = [EpisodeStart(task, state) for state in range(3)]
+        actor = ClockedActor(ServedActor(client, served.metadata, episodes, seeds), clock, seeds)
+        actor.reset(3)
+        np.testing.assert_array_equal([actor.act(obs) for obs in seen], wanted)
+    session = served.session()
+    for plan in ([3], ["0"], [True], 0):
+        with pytest.raises(PolicyError, match="plan is .*a list of rows, from 0 to 0"):
+            session.infer(request(seen[0], prompt=task.language, plan=plan))
 
 
 def test_clients_do_not_touch_each_other(folder):
@@ -249,7 +282,7 @@ def test_health_errors_and_keys_over_the_wire(folder, monkeypatch):
         with closing(OpenpiClient(address, Limits(10, 60))) as client:
             actor = ServedActor(client, served.metadata, [EpisodeStart(task, 0)], [(0,)])
             actor.reset(1)
-            assert actor.act(obs).shape == (1, 7)
+            assert actor.plan(obs, [0]).shape == (1, 1, 7)
         monkeypatch.delenv("LIBERO_API_KEY")
         with pytest.raises(ServerError, match="HTTP 401"):
             OpenpiClient(address, Limits(10, 60))

@@ -245,7 +245,7 @@ def test_names_and_conventions_of_the_original():
 def test_invalid_actions_are_refused(answer, message):
     policy = argparse.Namespace(predict=lambda observations: answer)
     with pytest.raises(PolicyError, match=message):
-        CallableActor(policy, (), "do it").act({"x": np.zeros((3, 1))})
+        CallableActor(policy, (), "do it").plan({"x": np.zeros((3, 1))}, range(3))
 
 
 @pytest.fixture

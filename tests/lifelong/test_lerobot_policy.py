@@ -239,3 +239,21 @@ def test_the_configuration_builds_it() -> None:
     config = composed(*words)
     built = build(config.policy, spec=spec(10))
     assert isinstance(built, LeRobotPolicy) and built.inner.config.chunk_size == 10
+
+
+@pytest.mark.parametrize("type", SMALL)
+def test_a_chunk_is_what_lerobot_would_execute(type) -> None:
+    acts, plans, late = policy(type), policy(type), policy(type)
+    assert plans.execute == plans.chunk == (7 if type == "diffusion" else 8)
+    seen = [fake_observation(acts.spec, 3, torch.Generator().manual_seed(k), steps=1) for k in range(9)]
+    draws = lambda: [torch.Generator().manual_seed(5 + k) for k in range(3)]  # noqa: E731
+    for one in (acts, plans, late):
+        one.eval().reset(3)
+    chunk = plans.plan(seen[0], [0, 2], draws())
+    for step in range(plans.chunk):
+        assert torch.equal(chunk[:, step], acts.act(seen[step], draws())[[0, 2]])
+    for step in (1, 2):  # nobody asks, and the frames are in its history
+        assert plans.plan(seen[step], [], draws()).shape[0] == 0
+    late.plan(seen[2], [], draws())
+    again = plans.plan(seen[3], [1], draws())
+    assert torch.equal(again, late.plan(seen[3], [1], draws())) and not torch.equal(again[0], chunk[0])

@@ -19,7 +19,7 @@ from libero_eval.protocols.adapter import ProtocolAdapter, view_of
 from libero_eval.protocols.environment import ProtocolEnv, resolve_world, run_protocol
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
-from lifelong.errors import PolicyError
+from lifelong.errors import PolicyError, ProtocolError
 from lifelong.evaluation.environments import Obs
 from lifelong.results.provenance import installed_versions
 
@@ -111,6 +111,10 @@ class LiberoBenchmark(StepBenchmark):
             chosen = run_protocol(chosen, (height, width), max_steps or 600, settling)
         self.protocol, notes = resolve_world(chosen, self.tasks, assets)
         self.protocol.require()
+        if self.protocol.action.clock:
+            raise ProtocolError(
+                f"protocol {self.protocol.name} has action.clock, and no time passes in vla-eval: run it by libero eval"
+            )
         for note in notes:
             logger.warning(note)
         self._adapter: ProtocolAdapter | None = None
