@@ -22,7 +22,7 @@ PINNED = next(
 # policy -> algorithms; none: all. Other algorithms do nothing there that they do not with the first.
 LEARNED = {
     "bc_mlp_small": (),
-    "bc_transformer": ("er", "derpp", "lwf", "mlr", "dmpel", "iscil", "clare", "packnet"),
+    "bc_transformer": ("er", "lwf", "mlr", "dmpel", "clare"),
     "bc_rnn": ("er", "iscil"),
     "bc_transformer_flow": ("er", "lwf", "dmpel"),
     "bc_vilt": ("m2distill", "lora"),

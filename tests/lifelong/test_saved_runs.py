@@ -101,7 +101,7 @@ def test_saved_runs_are_reported_together(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.sim
-@every_run
+@pytest.mark.parametrize("name", ["er", "packnet"])
 def test_a_saved_run_resumes_to_the_same_weights(name, tmp_path, demonstrations):
     policy = next(word for word in COMMANDS[name] if word.startswith("policy=")).removeprefix("policy=")
     run = tmp_path / "libero_object" / name / f"{policy}_seed1"
