@@ -125,7 +125,8 @@ def start(args: argparse.Namespace, out: Path) -> subprocess.Popen:
         out,
     ]
     command += ["--episodes", args.episodes, "--unit-starts", args.unit_starts, "--threads", 1]
-    command += ["--horizon", args.horizon, "--device", "cpu", "--clock", args.clock]
+    command += ["--horizon", args.horizon, "--device", "cpu"]
+    command += ["--clock", args.clock] if args.clock else []
     paths = [str(HERE), str(ROOT), os.environ.get("PYTHONPATH", "")]
     out.mkdir(parents=True, exist_ok=True)
     with open(out.with_suffix(".log"), "a") as log_file:
@@ -146,7 +147,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--unit-starts", type=int, default=3)
     parser.add_argument("--horizon", type=int, default=60)
-    parser.add_argument("--clock", default="", help="as of libero eval")
+    parser.add_argument("--clock", help="as of libero eval")
     parser.add_argument("--pause", type=float, default=0.5, help="longest pause before a kill, s")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, help="folder that is kept")

@@ -13,10 +13,10 @@ SMALL = ["--suite", "libero_object/0", "--episodes", "8", "--unit-starts", "2"]
 SMALL += ["--horizon", "50", "--pause", "0.1"]  # the last units take longer than the pauses before the kills
 
 
-@pytest.mark.parametrize("clock", ["", "latency=lognormal:120/0.5ms,wait=repeat"])
+@pytest.mark.parametrize("clock", [[], ["--clock", "latency=lognormal:120/0.5ms,wait=repeat"]])
 def test_killed_three_times_three_processes_end_with_the_result_of_one(clock):
     done = subprocess.run(
-        [sys.executable, SCRIPT, "--kills", "3", *SMALL, "--clock", clock],
+        [sys.executable, SCRIPT, "--kills", "3", *SMALL, *clock],
         capture_output=True,
         text=True,
         timeout=1800,
