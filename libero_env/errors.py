@@ -65,11 +65,11 @@ class MissingPackageError(LiberoError):
         return type(self), (self.reason, self.remedy)
 
 
-def require_package(name: str, extra: str) -> None:
+def require_package(name: str, extra: str | None) -> None:
     """Check that an optional package is installed.
 
     Args:
-        extra: Extra of this distribution that installs it.
+        extra: Extra of this distribution that installs it; None for a package in `integrations/`.
 
     Raises:
         MissingPackageError: It is not; the message has the command that installs it.
@@ -79,10 +79,11 @@ def require_package(name: str, extra: str) -> None:
     except ModuleNotFoundError:  # not even the package that it is part of
         found = None
     if found is None:
-        raise MissingPackageError(f"{name} is not installed", f"pip install 'libero-lifelong[{extra}]'")
+        what = f"'libero-lifelong[{extra}]'" if extra else f"./integrations/{name} in a checkout"
+        raise MissingPackageError(f"{name} is not installed", f"pip install {what}")
 
 
-def need(module: str, extra: str) -> Any:
+def need(module: str, extra: str | None = None) -> Any:
     """Import a module of an optional package, such as `websockets.sync.client`; see `require_package`."""
     require_package(module.partition(".")[0], extra)
     return import_module(module)

@@ -1,1 +1,1 @@
-"""Policy servers: the protocols of openpi, vla-eval and GR00T as a client, and openpi's as a server."""
+"""Policy servers: openpi's protocol as a client and as a server, and what all clients share."""

@@ -4,12 +4,11 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 
-from libero_env.errors import require_known
+from libero_env.errors import need, require_known
 from libero_env.tasks import Task, get_task
 from libero_eval.policies import PROBE_TOLERANCE, PolicyUnderTest
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
@@ -18,20 +17,18 @@ from libero_eval.protocols.environment import run_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
 from libero_eval.servers.actors import RemoteActor, ServedActor, checked_actions
-from libero_eval.servers.groot import GrootClient
 from libero_eval.servers.openpi import OpenpiClient
 from libero_eval.servers.serving import PREFIX, SERVER, announced_run
 from libero_eval.servers.transport import EpisodeStart, Limits, PolicyClient
-from libero_eval.servers.vla_eval import VlaEvalClient
 from lifelong.data.settings import CAMERAS
 from lifelong.errors import ConfigError, ProtocolError, ServerError
 
-# scheme of an address -> kind of server, scheme of its transport
-CLIENTS: dict[str, tuple[Any, str]] = {
-    "ws": (OpenpiClient, "ws"),
-    "wss": (OpenpiClient, "wss"),
-    "vla-eval": (VlaEvalClient, "ws"),
-    "gr00t": (GrootClient, "tcp"),
+# scheme of an address -> module and class of its client, scheme of its transport
+CLIENTS = {
+    "ws": ("libero_eval.servers.openpi", "OpenpiClient", "ws"),
+    "wss": ("libero_eval.servers.openpi", "OpenpiClient", "wss"),
+    "vla-eval": ("policy_servers_libero_lifelong.vla_eval", "VlaEvalClient", "ws"),
+    "gr00t": ("policy_servers_libero_lifelong.groot", "GrootClient", "tcp"),
 }
 PROBED = {"ee_pos": 3, "gripper_states": 2}  # of the fixed observation: name -> size
 
@@ -112,7 +109,7 @@ class ServerPolicy(PolicyUnderTest):
                 assets=self.request.assets,
             )
         base.check(self._kind.stated(about))
-        if base.action.replan is None and self._kind is not VlaEvalClient:
+        if base.action.replan is None and self._kind.needs_replan:
             raise ProtocolError(
                 f"protocol {base.name} does not state action.replan, the number of actions that are executed of each "
                 f"answer: write a file with `extends: {base.name}` that does, and give its path to --protocol"
@@ -179,7 +176,8 @@ class ServerPolicy(PolicyUnderTest):
                 f"{self.given}: no kind of server has http; write {scheme.replace('http', 'ws')}://{rest}"
             )
         require_known("kind of server", scheme, CLIENTS)
-        kind, transport = CLIENTS[scheme]
+        module, name, transport = CLIENTS[scheme]
+        url = checked_address(f"{transport}://{rest}", self.given)
         limits = Limits(answer=self.request.timeout, in_flight=self.request.in_flight)
-        with closing(kind(checked_address(f"{transport}://{rest}", self.given), limits)) as client:
+        with closing(getattr(need(module), name)(url, limits)) as client:
             yield client

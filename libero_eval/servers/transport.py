@@ -1,6 +1,6 @@
 """Policy servers as clients see them: messages as bytes, connections with time limits, and the interface that all have.
 
-Errors name the server. `libero_eval.servers` has one module for each kind of server.
+Errors name the server. Each kind of server has a module of its own; see `CLIENTS` in `libero_eval.servers.policy`.
 """
 
 import itertools
@@ -158,11 +158,13 @@ class PolicyClient(ABC):
         address: URL of the server.
         announced: What the server says about itself when it is first reached, plain data.
         codec: Encoding of the messages.
+        needs_replan: Whether its answers are chunks, of which the protocol must say how much is executed.
     """
 
     address: str
     announced: Mapping[str, Any]
     codec: ClassVar[Codec]
+    needs_replan: ClassVar[bool] = True
 
     @staticmethod
     @abstractmethod

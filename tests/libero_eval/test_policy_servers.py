@@ -14,6 +14,8 @@ import msgpack
 import numpy as np
 import pytest
 from PIL import Image
+from policy_servers_libero_lifelong.groot import ACTION, GROOT, GrootClient
+from policy_servers_libero_lifelong.vla_eval import VLA_EVAL, VlaEvalClient
 from websockets.server import ServerProtocol
 
 from libero_env.errors import MissingPackageError
@@ -23,11 +25,9 @@ from libero_eval.protocols.clock import ClockedActor
 from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
 from libero_eval.servers.actors import RemoteActor, checked_actions
-from libero_eval.servers.groot import ACTION, GROOT, GrootClient
 from libero_eval.servers.openpi import OPENPI, OpenpiClient
 from libero_eval.servers.policy import ServerPolicy
 from libero_eval.servers.transport import EpisodeStart, Limits, connect, need
-from libero_eval.servers.vla_eval import VLA_EVAL, VlaEvalClient
 from lifelong.errors import CodecError, ConfigError, ConnectionLost, ProtocolMismatchError, ServerError
 from lifelong.evaluation.rollout import run_episodes
 from tests.harness import policy_servers

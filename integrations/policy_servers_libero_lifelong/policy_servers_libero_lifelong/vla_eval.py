@@ -101,7 +101,7 @@ VLA_EVAL = Codec("vla-eval", _encode, _decode)
 class VlaEvalClient(WebSocketClient):
     """vla-eval's model server, version 1 of its messages."""
 
-    codec = VLA_EVAL
+    codec, needs_replan = VLA_EVAL, False
 
     @staticmethod
     def stated(announced: Mapping[str, Any]) -> dict[str, Any]:
