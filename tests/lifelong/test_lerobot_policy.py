@@ -10,12 +10,13 @@ import torch
 
 pytest.importorskip("lerobot")
 
+from lerobot_policies_libero_lifelong.policy import FOLDER, LeRobotPolicy, lerobot_module
+
 from libero_eval.user_policy import weights_digest
 from lifelong.data.dataset import SequenceVLDataset, last_frames
 from lifelong.data.fake import fake_observation
 from lifelong.data.windows import frame_moments, frames_of
 from lifelong.errors import ConfigError, PolicyError
-from lifelong.policies.lerobot import FOLDER, LeRobotPolicy, lerobot_module
 from lifelong.settings import build
 from lifelong.training.fit import _make_optimizer
 from lifelong.training.settings import FitSettings

@@ -1,0 +1,1 @@
+"""Policies of LeRobot, such as ACT and diffusion policies, learned by libero-lifelong."""
