@@ -15,7 +15,7 @@ from libero_eval.judging.comparison import Comparison, Contrast, Gate, Row
 from libero_eval.judging.group_scores import Profile
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below, shorten
 from lifelong.report.tables import save_page
-from lifelong.results.failures import QUADRANTS
+from lifelong.results.failures import NOT_SEEN, QUADRANTS, anything_seen
 from lifelong.stats.episodes import Difference
 from lifelong.stats.intervals import Estimate
 from lifelong.stats.sequential import SequentialTest
@@ -138,7 +138,8 @@ def _tallies(comparison: Comparison) -> list[tuple[str, list[str], list[list[obj
     )
     tables = []
     for head, names, found in kinds:
-        if outcomes := [name for name in names if any(name in counts for counts in found)]:
+        outcomes = [name for name in (*names, NOT_SEEN) if any(name in counts for counts in found)]
+        if anything_seen(*found):
             rows = zip(comparison.rates, found, strict=True)
             cells = [[r.label, *(counts.get(name, 0) for name in outcomes)] for r, counts in rows]
             tables.append((head, outcomes, cells))

@@ -3,12 +3,14 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 
 from libero_env.sim.causes import CAUSES, Failure
 from lifelong.results.records import Episodes, EvalRecord
 from lifelong.results.results import Results
 
 QUADRANTS = ("safe success", "unsafe success", "safe failure", "unsafe failure")
+NOT_SEEN = "not seen"
 
 
 @dataclass(frozen=True)
@@ -39,32 +41,47 @@ class FailureScore(Tally):
 
 
 def count_causes(episodes: Iterable[Episodes]) -> dict[str, int]:
-    """Return how many episodes failed of each cause, in the order of the decision tree."""
-    found = Counter(one.cause for part in episodes for one in part.failures if one is not None)
-    return {cause: found[cause] for cause in CAUSES if found[cause]}
+    """Return how many episodes failed of each cause, in the order of the decision tree, and where it was not seen."""
+    found = Counter(
+        NOT_SEEN if one is None else one.cause
+        for part in episodes
+        for one, won in zip_longest(part.failures, part.successes)
+        if not won
+    )
+    return {cause: found[cause] for cause in (*CAUSES, NOT_SEEN) if found[cause]}
 
 
 def causes_text(episodes: Iterable[Episodes]) -> str:
-    """Return these numbers as text, such as `dropped 3, never reached 1`; empty without any."""
-    return ", ".join(f"{cause} {count}" for cause, count in count_causes(episodes).items())
+    """Return these numbers as text, such as `dropped 3, never reached 1`; empty where nothing was seen."""
+    return _text(count_causes(episodes))
 
 
 def count_quadrants(episodes: Iterable[Episodes]) -> dict[str, int]:
-    """Return how many episodes were safe or unsafe and succeeded or failed; empty where costs were not seen."""
+    """Return how many episodes were safe or unsafe and succeeded or failed, and where costs were not seen."""
     found = Counter(
-        f"{'unsafe' if cost.exceeded else 'safe'} {'success' if won else 'failure'}"
+        NOT_SEEN
+        if cost is None
+        else f"{'unsafe' if cost.exceeded else 'safe'} {'success' if won else 'failure'}"
         for part in episodes
-        for cost, won in zip(part.costs, part.successes, strict=False)
-        if cost is not None
+        for cost, won in zip_longest(part.costs, part.successes)
     )
-    return {name: found[name] for name in QUADRANTS} if found else {}
+    return dict.fromkeys(QUADRANTS, 0) | found
 
 
 def safety_text(episodes: Sequence[Episodes]) -> str:
-    """Return these numbers as text, with how many were beyond the limit of each cost; empty without any."""
-    counts = ", ".join(f"{name} {count}" for name, count in count_quadrants(episodes).items())
+    """Return these numbers as text, with how many were beyond the limit of each cost; empty where nothing was seen."""
     beyond = Counter(name for part in episodes for cost in part.costs if cost for name in cost.exceeded)
-    return counts + (f" (unsafe by {', '.join(f'{k} {n}' for k, n in beyond.items())})" if beyond else "")
+    unsafe = f" (unsafe by {', '.join(f'{k} {n}' for k, n in beyond.items())})" if beyond else ""
+    return _text(count_quadrants(episodes)) + unsafe
+
+
+def anything_seen(*counts: Mapping[str, int]) -> bool:
+    """Return whether any of these numbers of episodes by outcome are of an outcome that was seen."""
+    return any(number for found in counts for name, number in found.items() if name != NOT_SEEN)
+
+
+def _text(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items()) if anything_seen(counts) else ""
 
 
 def _matrix(results: Results) -> dict[tuple[int, int], EvalRecord]:
@@ -75,7 +92,8 @@ def _tally(
     cells: Mapping[tuple[int, int], Episodes], count: Callable[[Iterable[Episodes]], dict[str, int]]
 ) -> Tally | None:
     """Return the numbers of rollouts by outcome; None where no outcome occurs."""
-    if not (outcomes := count(cells.values())):
+    outcomes = count(cells.values())
+    if not anything_seen(outcomes):
         return None
     rows = sorted({learned for learned, _ in cells})
     return Tally(

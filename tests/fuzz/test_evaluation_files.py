@@ -3,11 +3,12 @@
 import contextlib
 import io
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import yaml
 from hypothesis import given
 
+from libero_env.sim.costs import Costs
 from libero_env.text import json_safe
 from libero_env.validation import validate
 from libero_eval.cli.compare import _single_groups
@@ -24,8 +25,10 @@ from tests.harness.mutations import changed_text, mutated
 from tests.harness.results import drawn_result
 
 CARD = json_safe(load_protocol("openpi").resolved())
+PLAIN = drawn_result(0.7, 1, tasks=2, protocol=CARD)
+COSTLY = tuple(replace(task, costs=(Costs(force=80.0, moved=("bowl_1",)), None) * 25) for task in PLAIN.tasks)
 VALID = [
-    drawn_result(0.7, 1, tasks=2, protocol=CARD).to_plain(),
+    replace(PLAIN, tasks=COSTLY).to_plain(),
     drawn_result(
         0.4, 2, tasks=1, evaluated={"run": "runs/a", "after": 1, "seed": 3}, unit_starts=10
     ).to_plain(),

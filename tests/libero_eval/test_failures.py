@@ -1,13 +1,15 @@
 """Causes of failed episodes and costs of all in results, on whatever they are run, and in what people read."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.sim.causes import Failure
 from libero_env.sim.costs import Costs
-from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.evaluation_file import FILE_NAME, EvaluationFileError, EvaluationResult
 from libero_eval.judging.comparability import Group
 from libero_eval.judging.comparison import compare_groups
 from libero_eval.judging.evaluation_page import write_evaluation_page
@@ -107,3 +109,41 @@ def test_comparisons_show_how_many_episodes_of_each_policy_were_safe(tmp_path):
     assert ["good", "1", "0", "1", "0"] in rows and ["bad", "0", "2", "0", "0"] in rows
     page = write_page(found, tmp_path / "page.html").read_text()
     assert "<h2>Safety</h2>" in page and "Unsafe success" in page and "Why episodes failed" not in page
+
+
+def test_a_policy_whose_costs_and_causes_were_not_seen_is_not_shown_as_one_without(tmp_path):
+    plain = result_of(task_result("libero_goal/0", [True, False, False]))
+    other = result_of(task_result("libero_goal/0", [True, True, False]), policy="other:make")
+    seen = with_failures(with_costs(plain, Costs()), HIT)
+    found = compare_groups([Group("good", (seen,), ("a",)), Group("bad", (other,), ("b",))])
+    rows = [line.split() for line in render(found).splitlines()]
+    assert ["good", "1", "0", "2", "0", "0"] in rows and ["bad", "0", "0", "0", "0", "3"] in rows
+    assert ["good", "2", "0"] in rows and ["bad", "0", "1"] in rows
+    assert write_page(found, tmp_path / "page.html").read_text().count("Not seen") == 2
+    both = [replace(seen.tasks[0], task="libero_goal/1"), other.tasks[0]]
+    assert total_rows(replace(plain, tasks=tuple(both)))[-2:] == [
+        "failed because     collided 2, not seen 1",
+        "costs              safe success 1, unsafe success 0, safe failure 2, unsafe failure 0, not seen 3",
+    ]
+    nothing = compare_groups([Group("good", (plain,), ("a",)), Group("bad", (other,), ("b",))])
+    assert "safety" not in render(nothing) and "not seen" not in render(nothing)
+
+
+@pytest.mark.parametrize(("costs", "message"), [
+    (5, "costs is 5; expected a list"),
+    ([{}], "costs has 1 entries, init_states has 2"),
+    ([{"force": -1}, None], "costs.0.force is -1; expected at least 0"),
+    ([{"tilt": float("nan")}, None], "costs.0.tilt is nan; expected a finite number"),
+    ([{"heat": 3}, None], "costs.0.heat is an unknown key. Valid: force, shift"),
+    ([None, {"moved": "bowl_1"}], "costs.1.moved is 'bowl_1'; expected a list"),
+])  # fmt: skip
+def test_damaged_costs_of_a_result_are_refused_in_one_line(tmp_path, costs, message):
+    path = with_costs(result_of(task_result("libero_goal/0", [True, False])), SPILT).write(
+        tmp_path / FILE_NAME
+    )
+    values = json.loads(path.read_text())
+    values["tasks"][0]["costs"] = costs
+    path.write_text(json.dumps(values))
+    with pytest.raises(EvaluationFileError) as error:
+        EvaluationResult.read(path)
+    assert message in str(error.value) and "\n" not in str(error.value)

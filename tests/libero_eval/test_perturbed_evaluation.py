@@ -5,7 +5,7 @@ import pytest
 
 from libero_env.cli.main import main
 from libero_env.perturbations import KINDS
-from libero_env.tasks import get_task
+from libero_env.tasks import get_task, make_task, write_task
 from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.judging.comparability import Group, check_comparable, match
 from libero_eval.protocols.environment import ProtocolEnv
@@ -131,3 +131,34 @@ def test_an_evaluation_with_events_says_where_they_began(tmp_path, monkeypatch, 
         line for line in capsys.readouterr().err.splitlines() if "expected" in line or "trigger" in line
     ]
     assert "expected KIND=SEVERITY@TRIGGER" in errors[0] and "unknown trigger 'lift'" in errors[1]
+
+
+BUTTER = {
+    "scene": "kitchen", "furniture": ["flat_stove"], "objects": ["butter", "plate"],
+    "place": {"flat_stove_1": (-0.2, 0.2), "butter_1": (0.0, -0.2), "plate_1": (0.1, -0.25)},
+    "regions": {"kitchen_table": {"hot": {"at": (-0.2, 0.1), "half": 0.03}}}, "zones": ["kitchen_table_hot"],
+    "language": "turn the stove on and put the butter on the plate",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("goal", "perturb"), [
+    ("And (Count 1 (Turnon flat_stove_1)) (On butter_1 plate_1) (Never (Incontact robot plate_1))", "partial=0"),
+    ("And (Turnon flat_stove_1) (On butter_1 plate_1)", "partial=1@1"),
+])  # fmt: skip
+def test_costs_partial_starts_and_goals_over_time_do_not_depend_on_units_nor_workers(
+    goal, perturb, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    path = write_task(make_task(**BUTTER, goal=f"({goal})"), "own.bddl")
+    words = ["eval", "expert", "--suite", str(path), "--episodes", "3", "--threads", "1", "--horizon", "60"]
+    words += ["--perturb", perturb, "--out"]
+    assert main([*words, "together", "--unit-starts", "3"]) == 0
+    assert main([*words, "apart", "--unit-starts", "1", "--workers", "2"]) == 0
+    together, apart = (EvaluationResult.read(tmp_path / name) for name in ("together", "apart"))
+    assert apart.tasks == together.tasks and apart.outcomes == together.outcomes
+    assert apart.actions == together.actions
+    (found,) = apart.tasks
+    assert any(cost.zone for cost in found.costs) and len(set(found.costs)) > 1
+    assert len(set(found.atoms_at_start)) == (2 if "@1" in perturb else 1), (
+        "which part holds depends on the start"
+    )

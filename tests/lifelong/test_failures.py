@@ -5,7 +5,14 @@ from dataclasses import replace
 from libero_env.sim.causes import Failure
 from libero_env.sim.costs import Costs
 from lifelong.report.tables import failure_table, tally_table
-from lifelong.results.failures import causes_text, failure_score, rollout_summary, safety_score, safety_text
+from lifelong.results.failures import (
+    QUADRANTS,
+    causes_text,
+    failure_score,
+    rollout_summary,
+    safety_score,
+    safety_text,
+)
 from lifelong.results.records import from_line, to_line
 from lifelong.results.results import Results
 from tests.harness.records import evaluation, run_start
@@ -75,4 +82,6 @@ def test_safety_of_a_run_by_task_and_after_each():
     assert safety_text(rows[3:4]).endswith("unsafe failure 1 (unsafe by shift 1, hits 1)")
     assert rollout_summary(results)["safety"]["after"][2] == score.after[2]
     assert from_line(to_line(rows[0])) == rows[0]
+    after = safety_score(Results((run_start(["a", "b", "c"]), *ROWS[:3], *rows[3:]), ())).after
+    assert after[0] == {**dict.fromkeys(QUADRANTS, 0), "not seen": 2} and "not seen" not in after[2]
     assert safety_score(Results((run_start(["a"]), *ROWS[:1]), ())) is None and tally_table(None, []) is None
