@@ -2,7 +2,7 @@
 
     python experiments/kills/evaluations.py                                  # 20 kills of one of three processes
     python experiments/kills/evaluations.py --policy RUN_DIR --suite libero_object/0 libero_object/1
-    python experiments/kills/evaluations.py --clock latency=lognormal:120/0.5ms,wait=repeat
+    python experiments/kills/evaluations.py --event object=0.5@step8 light=1@25% --clock latency=lognormal:120/0.5ms,wait=repeat
 
 It exits with status 1 where an episode, a bit of an action, or a unit differs.
 """
@@ -127,6 +127,7 @@ def start(args: argparse.Namespace, out: Path) -> subprocess.Popen:
     command += ["--episodes", args.episodes, "--unit-starts", args.unit_starts, "--threads", 1]
     command += ["--horizon", args.horizon, "--device", "cpu"]
     command += ["--clock", args.clock] if args.clock else []
+    command += ["--event", *args.event] if args.event else []
     paths = [str(HERE), str(ROOT), os.environ.get("PYTHONPATH", "")]
     out.mkdir(parents=True, exist_ok=True)
     with open(out.with_suffix(".log"), "a") as log_file:
@@ -147,6 +148,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=50)
     parser.add_argument("--unit-starts", type=int, default=3)
     parser.add_argument("--horizon", type=int, default=60)
+    parser.add_argument("--event", nargs="+", help="as of libero eval")
     parser.add_argument("--clock", help="as of libero eval")
     parser.add_argument("--pause", type=float, default=0.5, help="longest pause before a kill, s")
     parser.add_argument("--seed", type=int, default=1)

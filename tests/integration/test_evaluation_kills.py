@@ -13,10 +13,12 @@ SMALL = ["--suite", "libero_object/0", "--episodes", "8", "--unit-starts", "2"]
 SMALL += ["--horizon", "50", "--pause", "0.1"]  # the last units take longer than the pauses before the kills
 
 
-@pytest.mark.parametrize("clock", [[], ["--clock", "latency=lognormal:120/0.5ms,wait=repeat"]])
-def test_killed_three_times_three_processes_end_with_the_result_of_one(clock):
+CHANGED = ["--event", "object=0.5@step8", "light=1@25%", "--clock", "latency=lognormal:120/0.5ms,wait=repeat"]
+
+
+def test_killed_three_times_three_processes_end_with_the_result_of_one():
     done = subprocess.run(
-        [sys.executable, SCRIPT, "--kills", "3", *SMALL, *clock],
+        [sys.executable, SCRIPT, "--kills", "3", *SMALL, *CHANGED],
         capture_output=True,
         text=True,
         timeout=1800,

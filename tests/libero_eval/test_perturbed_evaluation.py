@@ -109,7 +109,8 @@ def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypat
 def test_an_evaluation_with_events_says_where_they_began(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "told_policy.py").write_text(POLICY)
-    words = ["--perturb", "noise=0.2", "--event", "camera=0.5@step6", "light=1@touched", "--unit-starts"]
+    words = ["--perturb", "noise=0.2", "--event", "camera=0.5@step6", "light=1@touched"]
+    words += ["--clock", "latency=uniform:0/200ms", "--unit-starts"]
     assert main([*EVAL, "--out", "events", *words, "2"]) == 0
     assert "(events began in 3 of 3 (the expert solves 0 from there), 0 of 3)" in capsys.readouterr().out
     found = EvaluationResult.read(tmp_path / "events")
@@ -125,6 +126,7 @@ def test_an_evaluation_with_events_says_where_they_began(tmp_path, monkeypatch, 
     assert main([*EVAL, "--out", "apart", *words, "1", "--workers", "2"]) == 0
     again = EvaluationResult.read(tmp_path / "apart")
     assert again.tasks == found.tasks and again.actions == found.actions
+    assert len(found.tasks[0].timing) == 3
     assert main([*EVAL, "--out", "none", "--event", "camera=0.5"]) == 2
     assert main([*EVAL, "--out", "none", "--event", "camera=0.5@lift"]) == 2
     errors = [

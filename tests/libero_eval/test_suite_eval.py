@@ -331,6 +331,10 @@ def test_several_workers_of_the_command_line_have_the_result_of_one(module, tmp_
     one, two = (EvaluationResult.read(tmp_path / name) for name in ("one", "two"))
     assert one == two and one.actions == two.actions and one.unit_starts == 2
     assert (one.environment["robot"], one.environment["models"]) == ("robosuite-1.4.1", "builtin")
+    assert cli.main([*command, "--out", "until", "--workers", "2", "--until", "width=0.6"]) == 0
+    until = EvaluationResult.read(tmp_path / "until")
+    assert until.stop_note == "stopped after 6 of 10; width=0.6: known" and until.init_states == (0, 1, 2)
+    assert until.tasks == tuple(task.of_starts(until.init_states) for task in one.tasks)
     assert cli.main([*command, "--out", "two", "--unit-starts", "5"]) == 2
     assert "unit_starts is 2 there and 5 here" in capsys.readouterr().err
     monkeypatch.setattr(memory, "host_memory", lambda: (10**9, 10**10))
