@@ -2,7 +2,7 @@
 
     python experiments/kills/evaluations.py                                  # 20 kills of one of three processes
     python experiments/kills/evaluations.py --policy RUN_DIR --suite libero_object/0 libero_object/1
-    python experiments/kills/evaluations.py --event object=0.5@step8 light=1@25% --clock latency=lognormal:120/0.5ms,wait=repeat
+    python experiments/kills/evaluations.py --event object=0.5@step8 light=1@25% --clock latency=lognormal:120/0.5ms
 
 It exits with status 1 where an episode, a bit of an action, or a unit differs.
 """
