@@ -24,7 +24,7 @@ from libero_env.cli.options import (
     arg,
     modalities,
 )
-from libero_env.errors import DemoError, InvalidInputError
+from libero_env.errors import DemoError, InvalidInputError, need
 
 if TYPE_CHECKING:
     from libero_env.demos.config import DemoConfig, Variation
@@ -344,9 +344,8 @@ def show_file(
         demo: Numbers of demonstrations (default: all).
         bddl: Task file of what was recorded (default: the task that the file states).
     """
-    from libero_env.demos.rerun import write_rerun
-
     demos = [f"demo_{number}" for number in demo] if demo else None
+    write_rerun = need("data_sets_libero_lifelong.rerun").write_rerun
     written = write_rerun(file, rerun, demos=demos, task=task_of(bddl))
     print(f"{rerun}: {written} demonstrations; open it with: rerun {rerun}")
 
@@ -454,27 +453,16 @@ def export(
         bddl: Task file of what was recorded (default: the tasks that the files state).
     """
     from libero_env.demos.curate import find_demo_files
-    from libero_env.demos.export import export_demos, export_published
-    from libero_env.demos.layouts import PUBLISHED
-    from libero_env.demos.replay import Regeneration
 
-    again = {"--settle": settle, "--assets": assets, "--drawing": drawing}
-    refused = {"--actions": actions} if form in PUBLISHED else again
-    if given := [option for option, value in refused.items() if value is not None]:
-        forms = "what was recorded" if form in PUBLISHED else f"published sets: {', '.join(PUBLISHED)}"
-        raise InvalidInputError(f"{', '.join(given)} cannot be used with --as {form}; only with {forms}")
-    found = find_demo_files(files)
-    if form not in PUBLISHED:
-        task = task_of(bddl)
-        episodes, frames = export_demos(
-            found, out, form, labels=labels, actions=actions or "delta", task=task
-        )
-        print(f"{out}: {episodes} episodes, {frames} frames")
-        return
-    chosen: dict[str, Any] = {"settle_steps": settle, "assets": assets, "drawing": drawing}
-    config = Regeneration(labels=labels, **{key: value for key, value in chosen.items() if value is not None})
-    episodes, frames, failed = export_published(found, out, form, config, task=task_of(bddl))
-    print(f"{out}: {episodes} episodes, {frames} frames, as {form}")
-    print(f"models: {config.pack().name}, drawing: {config.drawing}")
-    for where in failed:
-        print(f"left out, does not reach the goal when it is run again: {where}")
+    lines = need("data_sets_libero_lifelong.export").export(
+        find_demo_files(files),
+        out,
+        form,
+        labels=labels,
+        actions=actions,
+        settle=settle,
+        assets=assets,
+        drawing=drawing,
+        task=task_of(bddl),
+    )
+    print("\n".join(lines))

@@ -1,5 +1,4 @@
 from .config import DemoConfig, RenderConfig, Variation
-from .export import export_demos
 from .generate import RecordingJob, ensure_demos, make_demos
 from .read import DemoOrigin, Episode, demo_lengths, demo_origin, iter_demos, read_demos
 from .rendering import rerender
@@ -16,7 +15,6 @@ __all__ = [
     "demo_lengths",
     "demo_origin",
     "ensure_demos",
-    "export_demos",
     "iter_demos",
     "make_demos",
     "read_demos",

@@ -26,7 +26,6 @@ from libero_env.validation import validate
 Pairing = Literal["aligned", "libero"]
 
 LOW_DIM_KEYS = {"gripper_states": 2, "joint_states": 7, "ee_states": 6, "ee_pos": 3, "ee_ori": 3}
-EXPORTED_STATE = ("ee_pos", "ee_ori", "gripper_states")  # the 8 numbers of state in LeRobot data sets
 IMAGE_KEYS = ("agentview_rgb", "eye_in_hand_rgb")
 IMAGE_KINDS = {"_rgb": "u", "_depth": "f", "_segmentation": "iu"}  # end of a key -> kinds of NumPy dtype
 LIMITS = {"actions": 10.0, "expert_actions": 10.0, "robot_states": 100.0} | dict.fromkeys(LOW_DIM_KEYS, 100.0)

@@ -47,8 +47,6 @@ from libero_env.memory import require_memory
 
 Labels = Literal["expert", "executed"]
 NOOP_THRESHOLD = 1e-3  # [action units] largest entry of a motion that counts as none
-# [action units] Euclidean norm below which the published sets count a motion as none
-PUBLISHED_NOOP_NORM = 1e-4
 _SMALLER = "record shorter ones or smaller images"
 _DERIVED = ("num_samples", "init_state", "success", "fixtures")  # attributes that follow from the fields
 
@@ -130,20 +128,10 @@ def noop_steps(actions: np.ndarray, threshold: float = NOOP_THRESHOLD) -> np.nda
         threshold: Largest entry of a motion that counts as none.
     """
     still = (np.abs(actions[:, :6]) <= threshold).all(axis=1)
-    return still & _keeps_gripper(actions)
+    return still & keeps_gripper(actions)
 
 
-def published_noop_steps(actions: np.ndarray) -> np.ndarray:
-    """Return which actions (T, 7) the makers of the published sets leave out as no-ops, (T,) bool.
-
-    The Euclidean norm of the motion decides, and whether the gripper command is that of the last action that is kept;
-    before the first motion no action is kept, whatever the gripper does.
-    """
-    still = np.linalg.norm(actions[:, :6], axis=1) < PUBLISHED_NOOP_NORM
-    return still & (_keeps_gripper(actions) | np.logical_and.accumulate(still))
-
-
-def _keeps_gripper(actions: np.ndarray) -> np.ndarray:
+def keeps_gripper(actions: np.ndarray) -> np.ndarray:
     return np.concatenate([[True], actions[1:, 6] == actions[:-1, 6]])
 
 

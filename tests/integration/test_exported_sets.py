@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from data_sets_libero_lifelong.export import export_demos, export_published
+from data_sets_libero_lifelong.regeneration import Regeneration
 
-from libero_env.demos.export import export_demos, export_published
 from libero_env.demos.generate import generate
 from libero_env.demos.read import read_episodes
-from libero_env.demos.replay import Regeneration
 from tests.harness.peers import ROOT, lerobot
 
 pytest.importorskip("av")

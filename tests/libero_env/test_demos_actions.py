@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from data_sets_libero_lifelong.export import ORIGIN, export_demos
 
 from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.config import RenderConfig
-from libero_env.demos.export import ORIGIN, export_demos
 from libero_env.demos.generate import generate
 from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import read_episodes

@@ -6,12 +6,12 @@ import time
 import h5py
 import numpy as np
 import pytest
+from data_sets_libero_lifelong.export import export_demos
 
 from libero_env import memory
 from libero_env.demos import hdf5
 from libero_env.demos.contents import read_header
 from libero_env.demos.curate import describe, examine, filter_demos
-from libero_env.demos.export import export_demos
 from libero_env.demos.generate import generate, make_demos
 from libero_env.demos.observe import recorded_robot, recorded_task
 from libero_env.demos.read import demo_lengths, iter_demos, read_demos, read_episodes

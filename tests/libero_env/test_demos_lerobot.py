@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from data_sets_libero_lifelong.export import export_demos
 
-from libero_env.demos.export import export_demos
 from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, LiberoError
 from tests.harness.demos import episode, write

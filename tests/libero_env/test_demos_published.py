@@ -10,15 +10,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from data_sets_libero_lifelong.export import ORIGIN, export_demos, export_published
+from data_sets_libero_lifelong.regeneration import Regeneration, published_noop_steps, regenerate
 from PIL import Image
 
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import read_header
-from libero_env.demos.export import ORIGIN, export_demos, export_published
 from libero_env.demos.generate import generate
 from libero_env.demos.observe import StateRenderer, recorded_task
-from libero_env.demos.read import published_noop_steps, read_episodes
-from libero_env.demos.replay import Regeneration, regenerate
+from libero_env.demos.read import read_episodes
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, UnknownNameError
 

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
+from data_sets_libero_lifelong.export import export_demos
 
 from libero_env.demos.config import DemoConfig, RenderConfig, Variation
 from libero_env.demos.contents import read_header
 from libero_env.demos.curate import examine
-from libero_env.demos.export import export_demos
 from libero_env.demos.generate import RecordingJob, generate, make_demos
 from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
 from libero_env.demos.read import Episode, read_demos, read_episodes

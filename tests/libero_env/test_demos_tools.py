@@ -5,11 +5,11 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from data_sets_libero_lifelong.lerobot import QUANTILES, colour_counts, colour_statistics
 
 from libero_env.cli.main import main
 from libero_env.demos.contents import read_header
 from libero_env.demos.curate import examine, filter_demos
-from libero_env.demos.lerobot_writers import QUANTILES, colour_counts, colour_statistics
 from libero_env.demos.observe import recorded_task
 from libero_env.demos.read import noop_steps, read_demos, read_episodes
 from libero_env.errors import DemoError

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from libero_env.demos.contents import EXPORTED_STATE
-from libero_env.demos.layouts import FILES_PER_CHUNK, ROBOT_TYPE, Layout
+from data_sets_libero_lifelong.layouts import FILES_PER_CHUNK, ROBOT_TYPE, STATE, Layout
 from libero_env.demos.read import Episode
 from libero_env.demos.video import H264, Mp4Writer, import_av
 from libero_env.errors import DemoError, need
@@ -111,7 +110,7 @@ class _LeRobotWriter(DatasetWriter):
         """Append an episode.
 
         Args:
-            episode: Its actions and observations; other observations than images and `EXPORTED_STATE` are left out.
+            episode: Its actions and observations; other observations than images and `STATE` are left out.
             language: The instruction.
             where: File and demonstration, for error messages.
 
@@ -144,7 +143,7 @@ class _LeRobotWriter(DatasetWriter):
     def _columns(self, episode: Episode, task: int) -> dict[str, np.ndarray]:
         """Return the columns of the next episode, without images."""
         steps, layout = len(episode), self.layout
-        state = np.concatenate([episode.obs[key] for key in EXPORTED_STATE], axis=1)
+        state = np.concatenate([episode.obs[key] for key in STATE], axis=1)
         actions = episode.actions.astype(np.float32)
         if layout.open_gripper:
             actions[:, -1] = 1.0 - np.clip(actions[:, -1], 0.0, 1.0)

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from libero_env.demos.contents import EXPORTED_STATE
+from data_sets_libero_lifelong.layouts import STATE, Layout
+from data_sets_libero_lifelong.lerobot import DatasetWriter, write_json
 from libero_env.demos.hdf5 import BrokenDemoError
-from libero_env.demos.layouts import Layout
-from libero_env.demos.lerobot_writers import DatasetWriter, write_json
 from libero_env.demos.read import Episode
 from libero_env.errors import DemoError
 from libero_env.parallel import compiled
@@ -61,7 +60,7 @@ class RldsWriter(DatasetWriter):
             raise BrokenDemoError(f"{where}/obs/joint_states is missing; expected it for steps/observation")
         steps = len(episode)
         last = np.arange(steps) == steps - 1
-        state = np.concatenate([episode.obs[key] for key in EXPORTED_STATE], axis=1)
+        state = np.concatenate([episode.obs[key] for key in STATE], axis=1)
         columns: dict[str, Any] = {
             f"observation/{key}": [_jpeg(frame) for frame in frames]
             for key, frames in self._images(episode, where).items()

@@ -2,7 +2,7 @@
 
 All store 8 numbers of state (position of the grip site, rotation vector, fingers), 7 of action (8 of goals of the
 joints), images of agentview and of the hand, and the observation on which an action was chosen. LeRobot's and GR00T's
-need the extra `export` (PyArrow and PyAV).
+need PyArrow and PyAV.
 
 The own forms have recordings as they are: 20 frames per second, upright images. The published sets have images that are
 upright and mirrored left to right, other names, and no no-ops; a policy that is trained on them has to be evaluated on
@@ -16,17 +16,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from data_sets_libero_lifelong.layouts import PUBLISHED, RECORDED, STATE, Layout
+from data_sets_libero_lifelong.lerobot import EpisodeDatasetWriter, VideoDatasetWriter, write_json
+from data_sets_libero_lifelong.regeneration import Regeneration, regenerate
+from data_sets_libero_lifelong.rlds import RldsWriter
 from libero_env.demos.actions import KINDS, ActionConverter
-from libero_env.demos.contents import EXPORTED_STATE, json_attribute, read_header
+from libero_env.demos.contents import json_attribute, read_header
 from libero_env.demos.hdf5 import BrokenDemoError
-from libero_env.demos.layouts import PUBLISHED, RECORDED, Layout
-from libero_env.demos.lerobot_writers import EpisodeDatasetWriter, VideoDatasetWriter, write_json
 from libero_env.demos.observe import recorded_robot, recorded_task, require_default_frequency
 from libero_env.demos.read import Episode, Labels, read_episodes
-from libero_env.demos.replay import Regeneration, regenerate
-from libero_env.demos.rlds import RldsWriter
 from libero_env.demos.write import require_absent
-from libero_env.errors import DemoError, UnknownNameError, require_known
+from libero_env.errors import DemoError, InvalidInputError, UnknownNameError, require_known
 from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_folder
 from libero_env.tasks import Task
@@ -34,6 +34,43 @@ from libero_env.timing import CONTROL_HZ
 
 ORIGIN = "meta/libero.json"  # how a data set was made
 Writer = VideoDatasetWriter | EpisodeDatasetWriter | RldsWriter
+
+
+def export(
+    files: Sequence[Path],
+    root: Path,
+    form: str,
+    *,
+    labels: Labels,
+    actions: str | None,
+    settle: int | None,
+    assets: str | None,
+    drawing: str | None,
+    task: Task | None,
+) -> list[str]:
+    """Do what `libero demos export` is asked for; return lines about what was written.
+
+    Raises:
+        InvalidInputError: An option is given that means nothing for the form.
+    """
+    again = {"--settle": settle, "--assets": assets, "--drawing": drawing}
+    refused = {"--actions": actions} if form in PUBLISHED else again
+    if given := [option for option, value in refused.items() if value is not None]:
+        forms = "what was recorded" if form in PUBLISHED else f"published sets: {', '.join(PUBLISHED)}"
+        raise InvalidInputError(f"{', '.join(given)} cannot be used with --as {form}; only with {forms}")
+    if form not in PUBLISHED:
+        episodes, frames = export_demos(
+            files, root, form, labels=labels, actions=actions or "delta", task=task
+        )
+        return [f"{root}: {episodes} episodes, {frames} frames"]
+    chosen: dict[str, Any] = {"settle_steps": settle, "assets": assets, "drawing": drawing}
+    config = Regeneration(labels=labels, **{key: value for key, value in chosen.items() if value is not None})
+    episodes, frames, failed = export_published(files, root, form, config, task=task)
+    return [
+        f"{root}: {episodes} episodes, {frames} frames, as {form}",
+        f"models: {config.pack().name}, drawing: {config.drawing}",
+        *(f"left out, does not reach the goal when it is run again: {where}" for where in failed),
+    ]
 
 
 def export_demos(
@@ -52,7 +89,7 @@ def export_demos(
     Args:
         files: Files to read, in this order; all have the same cameras and image size.
         root: Folder to write; it must not exist. RLDS takes its name from it.
-        form: One of `libero_env.demos.layouts.RECORDED`.
+        form: One of `data_sets_libero_lifelong.layouts.RECORDED`.
         labels: As for `read_demos`.
         actions: Kind of the actions, one of `libero_env.demos.actions.KINDS`.
         video_mb: Size from which a video of LeRobot's form is continued in another file, [MiB].
@@ -98,7 +135,7 @@ def export_published(
     Args:
         files: Files to read, in this order; their images are not used.
         root: Folder to write; it must not exist. RLDS takes its name from it.
-        name: Published set, one of `libero_env.demos.layouts.PUBLISHED`.
+        name: Published set, one of `data_sets_libero_lifelong.layouts.PUBLISHED`.
         config: How the demonstrations are run.
         task: Task that all files recorded; None for those that they state.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.
@@ -177,7 +214,7 @@ def _language(file: Path, task: Task | None) -> str:
 
 def _exported(episode: Episode, where: str, labels: Labels) -> Episode:
     """Return an episode with the actions to learn, each with the observation on which it was chosen."""
-    for key in EXPORTED_STATE:
+    for key in STATE:
         if key not in episode.obs:
             raise BrokenDemoError(
                 f"{where}/obs/{key} is missing; expected it beside {', '.join(episode.obs)}"

@@ -13,13 +13,15 @@ trains: meta/modality.json as NVIDIA/Isaac-GR00T getting_started/data_preparatio
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from libero_env.demos.video import AV1, H264, PIXEL_FORMAT, Codec
-from libero_env.storage import read_yaml
+from libero_env.storage import parse_yaml
 
 ROBOT_TYPE = "panda"
+STATE = ("ee_pos", "ee_ori", "gripper_states")  # observations that are the 8 numbers of state
 FILES_PER_CHUNK = 1000
 INDICES = ("frame_index", "episode_index", "index", "task_index")
 _AXES = ("height", "width", "channel")
@@ -131,7 +133,7 @@ class Layout:
 def _read_layouts() -> dict[str, Mapping[str, Layout]]:
     """Return the layouts of each section of `layouts.yaml`, by name."""
     codecs = {codec.name: codec for codec in (AV1, H264)}
-    data = read_yaml("demos/layouts.yaml")
+    data = parse_yaml(Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8"))
     return {
         section: MappingProxyType(
             {
