@@ -147,6 +147,12 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
     require_available(tasks)
     protocol = resolve_protocol(request, policy.protocol(base), tasks)
     Clock.read(protocol.action.clock).check(policy.chunk, policy.inpaints)
+    events = parse_perturbations(protocol.world.perturb, events=True)
+    if not policy.hears and (told := [str(one) for one in events if one.name.startswith("goal@")]):
+        raise ConfigError(
+            f"{told[0]}: {request.policy_name} cannot be told another instruction during an episode; "
+            "runs and the expert can"
+        )
     identity = {**policy.identity, "seed": request.seed}
     versions = {**installed_versions(request.assets), "source": source_digest()}
     if earlier is None:

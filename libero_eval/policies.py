@@ -45,6 +45,7 @@ class PolicyUnderTest(ABC):
         on_cpu: Whether it is a network of this package on the CPU, whose bits depend on its number of threads.
         chunk: Number of actions of its answers; None where only they say it.
         inpaints: Whether it can continue a chunk of actions that is being executed.
+        hears: Whether it can be told another instruction during an episode.
         cameras: Cameras that are rendered for it; None for the protocol's.
         observations: Names of its observations, see `libero_env.sim.observations`.
     """
@@ -56,6 +57,7 @@ class PolicyUnderTest(ABC):
     on_cpu: bool = False
     chunk: int | None = None
     inpaints: bool = False
+    hears: bool = False
     cameras: tuple[str, ...] | None = None
     observations: tuple[str, ...] = OBSERVATIONS
 
@@ -112,6 +114,8 @@ class PolicyUnderTest(ABC):
 class RunPolicy(PolicyUnderTest):
     """The policy of a run, evaluated with the images it was trained on: their size and drawing."""
 
+    hears = True
+
     def __init__(self, request: Request):
         super().__init__(request)
         run = restore(
@@ -153,7 +157,7 @@ class RunPolicy(PolicyUnderTest):
 class ExpertPolicy(PolicyUnderTest):
     """The scripted expert, which sees the whole state: how much of a task can be done at all."""
 
-    out, chunk = Path("eval/expert"), 1
+    out, chunk, hears = Path("eval/expert"), 1, True
 
     def __init__(self, request: Request):
         from libero_env.demos.config import GENERATOR

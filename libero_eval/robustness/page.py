@@ -121,6 +121,7 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
             ("starts", f"{len(outcomes.starts)} a task" + _lost_text(outcomes)),
             ("conditions", str(len(outcomes.conditions))),
             ("episodes", str(outcomes.successes.size)),
+            ("control steps at most", _horizons_text(policies)),
         ],
         verdict=verdict(first),
         policies=policies,
@@ -153,7 +154,7 @@ def _event_cells(row: EventRow) -> list[str]:
         return ["–"] * 5
     rates = [100 * (counts.both + only) / counts.pairs for only in (counts.only_first, counts.only_second)]
     lost = "–" if math.isnan(counts.lost) else f"{100 * counts.lost:.1f}"
-    value = f"{100 * row.difference.value:+.1f}"
+    value = f"{100 * row.difference.value:+.1f}".replace("-", "−")
     return [f"{rates[0]:.1f}", f"{rates[1]:.1f}", value, interval_text(row.difference), lost]
 
 
@@ -164,6 +165,12 @@ def severity_text(severity: float) -> str:
 
 def _lost_text(outcomes: Outcomes) -> str:
     return f", {outcomes.lost} left out, where a simulation error ended an episode" if outcomes.lost else ""
+
+
+def _horizons_text(policies: Sequence[Robustness]) -> str:
+    if len({policy.horizon for policy in policies}) == 1:
+        return str(policies[0].horizon)
+    return ", ".join(f"{policy.horizon} ({policy.label})" for policy in policies)
 
 
 def _severities_text(e: Estimate) -> str:

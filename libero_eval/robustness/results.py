@@ -20,6 +20,7 @@ from lifelong.stats.intervals import UNKNOWN, Estimate, Floats, combine_interval
 
 DRAWS, SEED, CONFIDENCE = 2000, 2023, 0.95
 ONE_EPISODE = 0.96  # z²/4 at 95 %: the variance that Wilson's interval adds, in units of one episode
+PLAIN = "without perturbations"
 Condition = tuple[tuple[str, float], ...]  # (kind, severity) of each perturbation, by kind; () is the base
 
 
@@ -201,7 +202,7 @@ class EventRow:
     """What an event takes, in the episodes in which the expert solves the rest, against the matched ones without it.
 
     Attributes:
-        name: The event, such as `camera@lifted=0.6`.
+        name: The event, such as `camera=0.6@lifted`.
         episodes: Number of episodes.
         began: Number of these in which it began.
         solved: Number of these in which the expert, from the state just after it, solves what is left.
@@ -245,6 +246,7 @@ class Robustness:
         paths: Folders of the results.
         redrawn: Number of draws that were given up, by condition.
         events: By condition with an event, whether it began in each episode, and whether the expert solves the rest.
+        horizon: Control steps after which an episode ends.
     """
 
     label: str
@@ -252,6 +254,7 @@ class Robustness:
     paths: tuple[str, ...] = ()
     redrawn: Mapping[str, int] = field(default_factory=dict)
     events: Mapping[Condition, Mapping[tuple[str, int], tuple[bool, bool]]] = field(default_factory=dict)
+    horizon: int = 0
 
     @cached_property
     def event_rows(self) -> tuple[EventRow, ...]:
@@ -301,8 +304,9 @@ class Robustness:
 
 
 def name_of(condition: Condition) -> str:
-    """Return a condition as text, such as `camera=0.4,light=0.2`."""
-    return ",".join(f"{kind}={severity:g}" for kind, severity in condition) or "without perturbations"
+    """Return a condition as text, such as `camera=0.4@lifted,light=0.2`."""
+    parts = [(*kind.partition("@"), severity) for kind, severity in condition]
+    return ",".join(f"{kind}={severity:g}{at}{trigger}" for kind, at, trigger, severity in parts) or PLAIN
 
 
 def half_severity(severities: Sequence[float], rates: Floats) -> float:

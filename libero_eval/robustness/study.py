@@ -150,7 +150,8 @@ def read_study(folder: Path, name: str = "") -> Robustness:
         raise ConfigError(
             f"{folder} holds no finished conditions; `libero robustness POLICY --out {folder}` makes them"
         )
-    return Robustness(name or folder.name, Outcomes.of(results), (str(folder),), redrawn, events)
+    outcomes, horizon = Outcomes.of(results), results[()].protocol["episode"]["horizon"]
+    return Robustness(name or folder.name, outcomes, (str(folder),), redrawn, events, horizon)
 
 
 def _name(policy: PolicyUnderTest) -> str:

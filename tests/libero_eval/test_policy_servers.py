@@ -20,6 +20,7 @@ from websockets.server import ServerProtocol
 
 from libero_env.errors import MissingPackageError
 from libero_env.tasks import get_suite
+from libero_eval.plan import plan_evaluation
 from libero_eval.protocols.adapter import PolicyInput
 from libero_eval.protocols.clock import ClockedActor
 from libero_eval.protocols.files import load_protocol
@@ -374,7 +375,7 @@ def test_what_openpi_announces_identifies_the_policy_and_is_compared_with_the_pr
 
     def policy(metadata: Any, **changes: Any) -> ServerPolicy:
         with policy_servers.openpi(lambda seen: {}, metadata) as address:
-            return ServerPolicy(EvalRequest(policy=address, **changes))
+            return ServerPolicy(EvalRequest(policy=address, suite=("libero_goal/1",), **changes))
 
     about = {"checkpoint": "pi0_1", "action.replan": replan}
     found = policy(about)
@@ -387,6 +388,9 @@ def test_what_openpi_announces_identifies_the_policy_and_is_compared_with_the_pr
     assert policy({"action.replan": replan}, name="pi0_1").protocol(base) is base
     with pytest.raises(ServerError, match="metadata"):
         policy([1])
+    changed = policy({}, name="pi0_1", event=("goal=1@touched",))
+    with pytest.raises(ConfigError, match="^goal=1@touched: ws://.* cannot be told another instruction"):
+        plan_evaluation(changed.request, changed)
 
 
 def deep(count: int) -> bytes:

@@ -124,14 +124,16 @@ def test_the_page_and_the_text_say_the_same_numbers(tmp_path, tab) -> None:
         outcomes({(): 10, A: 3, B: 0, C: 9, BOTH: 0}),
         ("eval/a",),
         {name_of(B): 2, name_of(C): 0},
+        horizon=130,
     )
-    expert = Robustness("expert", outcomes({(): 10, A: 10, B: 10, C: 10}))
+    expert = Robustness("expert", outcomes({(): 10, A: 10, B: 10, C: 10}), horizon=600)
     page = write_robustness([policy, expert], tmp_path)
     assert tab.faults_on_a_phone(page) == []
     text = page.read_text()
     assert "Robustness of sequential" in text and text.count("<svg") == 1, "no radar of two kinds"
     assert "camera=1" in text and ">2</td>" in text, "draws that were given up are told"
     assert "camera=1,light=1" in text, "so are interactions"
+    assert "130 (sequential), 600 (expert)" in text, "the expert had more time"
     assert verdict(policy) in text.replace("&#39;", "'") and "camera" in verdict(policy)
     lines = {line.split()[0]: line.split() for line in render(policy).splitlines() if line}
     assert lines["camera"][1:4] == ["100", "30", "0"]

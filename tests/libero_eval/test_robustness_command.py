@@ -94,10 +94,10 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
     words = ["--kinds", "camera@step1", "light@touched", "--severities", "1", "--pairs", "--out", "found"]
     assert main(["robustness", *WORDS, *words]) == 0
     said = capsys.readouterr().out
-    assert "camera@step1=1" in said and "2 of 2" in said and "0 of 2" in said
+    assert "camera=1@step1" in said and "2 of 2" in said and "0 of 2" in said
     record = json.loads((still / "found" / "robustness.json").read_text())["policies"][0]
     rows = {row["name"]: (row["episodes"], row["began"], row["solved"]) for row in record["events"]}
-    assert rows == {"camera@step1=1": (2, 2, 0), "light@touched=1": (2, 0, 0)}
+    assert rows == {"camera=1@step1": (2, 2, 0), "light=1@touched": (2, 0, 0)}
     assert "<h2>Events</h2>" in (still / "found" / "robustness.html").read_text()
     conditions = conditions_of(RobustnessRequest(events=True))
     assert len(conditions) == 19 and {"object=0.6@step20", "camera=1@lifted"} <= {*conditions}
@@ -105,6 +105,7 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
 
 @pytest.mark.parametrize(("words", "told"), [
     (["--kinds", "object@lifted"], "the robot touches the object then"),
+    (["--kinds", "goal@touched"], "goal=0.2@touched: still_policy:make cannot be told another instruction"),
     (["--kinds", "clock", "--clock", "latency=50ms", "--pairs"], "latency is named twice"),
     (["--kinds", "camra"], "Did you mean 'camera'"),
     (["--severities", "2"], "--severities"),
