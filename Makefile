@@ -16,7 +16,8 @@ PEERS_STAMP := $(VENV)/.peers
 BROWSER_STAMP := $(VENV)/.browser
 EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,tensorboard,view,wandb,warp,docs,dev
 # distributions of integrations/ that need no other project's package
-INTEGRATIONS := data_sets_libero_lifelong lerobot_policies_libero_lifelong policy_servers_libero_lifelong
+INTEGRATIONS := exports_libero_lifelong lerobot_policies_libero_lifelong policy_servers_libero_lifelong \
+  viewer_libero_lifelong
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 

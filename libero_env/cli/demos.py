@@ -345,7 +345,7 @@ def show_file(
         bddl: Task file of what was recorded (default: the task that the file states).
     """
     demos = [f"demo_{number}" for number in demo] if demo else None
-    write_rerun = need("data_sets_libero_lifelong.rerun").write_rerun
+    write_rerun = need("exports_libero_lifelong.rerun").write_rerun
     written = write_rerun(file, rerun, demos=demos, task=task_of(bddl))
     print(f"{rerun}: {written} demonstrations; open it with: rerun {rerun}")
 
@@ -454,7 +454,7 @@ def export(
     """
     from libero_env.demos.curate import find_demo_files
 
-    lines = need("data_sets_libero_lifelong.export").export(
+    lines = need("exports_libero_lifelong.demonstrations").export(
         find_demo_files(files),
         out,
         form,

@@ -1,9 +1,8 @@
 """`libero compare`, `libero power` and `libero results`: is a policy better, and what do others read of its results."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,6 +10,7 @@ import tyro
 
 from libero_env.cli.ending import UNDECIDED
 from libero_env.cli.options import Answer, Field, FilePath, Positional, Probability, Share, arg
+from libero_env.errors import need
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -166,7 +166,6 @@ def export(
         out: Folder of the files (default: the evaluation's, or the working directory).
     """
     from libero_eval.evaluation_file import EvaluationResult
-    from libero_eval.exports import export_eval_results, export_lerobot, export_vla_eval
 
     if (dataset or source) and format != "eval-results":
         raise ConfigError(f"--dataset and --source are of --as eval-results, not of --as {format}")
@@ -181,12 +180,8 @@ def export(
         raise ConfigError(f"--as {format} takes one evaluation, not {len(results)}")
     content, path = EvaluationResult.read(results[0]), Path(results[0])
     folder = out or (path if path.is_dir() else path.parent)
-    writers: dict[str, Callable[[EvaluationResult, Path], list[Path]]] = {
-        "vla-eval": export_vla_eval,
-        "lerobot": export_lerobot,
-        "eval-results": partial(export_eval_results, dataset=dataset, source=source),
-    }
-    print(*writers[format](content, folder), sep="\n")
+    written = need("exports_libero_lifelong.results").export(content, folder, format, dataset, source)
+    print(*written, sep="\n")
 
 
 def _question(options: PowerOptions) -> "Question":

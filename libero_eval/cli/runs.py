@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import Annotated
 
 from libero_env.cli.options import Answer, Device, Field, FilePath, Natural, Positional, Processes, Seed
+from libero_env.errors import need
 from libero_eval.requests import DiagnoseRequest, RelearnRequest, SaliencyRequest, ViewRequest
 
 
@@ -107,9 +108,8 @@ def check(
 
 def view(request: ViewRequest) -> None:
     """Show a scene in the browser until interrupted; print its address."""
-    from libero_eval.viewer import Stage, Viewer
-
-    viewer = Viewer(Stage(request), request.host, request.port)
+    module = need("viewer_libero_lifelong.viewer")
+    viewer = module.Viewer(module.Stage(request), request.host, request.port)
     try:
         viewer.open(viewer.stage.initial)
         port = viewer.port

@@ -6,6 +6,7 @@ import json
 from dataclasses import fields, replace
 
 import yaml
+from exports_libero_lifelong.results import export_lerobot, export_vla_eval
 from hypothesis import given
 
 from libero_env.sim.costs import Costs
@@ -13,7 +14,6 @@ from libero_env.text import json_safe
 from libero_env.validation import validate
 from libero_eval.cli.compare import _single_groups
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
-from libero_eval.exports import export_lerobot, export_vla_eval
 from libero_eval.judging.comparison import compare_groups, write_comparison
 from libero_eval.judging.page import render
 from libero_eval.plan import repeated

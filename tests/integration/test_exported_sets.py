@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from data_sets_libero_lifelong.export import export_demos, export_published
-from data_sets_libero_lifelong.regeneration import Regeneration
+from exports_libero_lifelong.demonstrations import export_demos, export_published
+from exports_libero_lifelong.regeneration import Regeneration
 
 from libero_env.demos.generate import generate
 from libero_env.demos.read import read_episodes

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from data_sets_libero_lifelong.export import ORIGIN, export_demos
+from exports_libero_lifelong.demonstrations import ORIGIN, export_demos
 
 from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.config import RenderConfig

@@ -6,7 +6,7 @@ import time
 import h5py
 import numpy as np
 import pytest
-from data_sets_libero_lifelong.export import export_demos
+from exports_libero_lifelong.demonstrations import export_demos
 
 from libero_env import memory
 from libero_env.demos import hdf5

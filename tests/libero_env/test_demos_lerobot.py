@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from data_sets_libero_lifelong.export import export_demos
+from exports_libero_lifelong.demonstrations import export_demos
 
 from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, LiberoError

@@ -10,8 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from data_sets_libero_lifelong.export import ORIGIN, export_demos, export_published
-from data_sets_libero_lifelong.regeneration import Regeneration, published_noop_steps, regenerate
+from exports_libero_lifelong.demonstrations import ORIGIN, export_demos, export_published
+from exports_libero_lifelong.regeneration import Regeneration, published_noop_steps, regenerate
 from PIL import Image
 
 from libero_env.demos.config import RenderConfig

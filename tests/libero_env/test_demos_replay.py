@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from data_sets_libero_lifelong.export import export_demos
+from exports_libero_lifelong.demonstrations import export_demos
 
 from libero_env.demos.config import DemoConfig, RenderConfig, Variation
 from libero_env.demos.contents import read_header

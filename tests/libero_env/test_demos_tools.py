@@ -5,7 +5,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from data_sets_libero_lifelong.lerobot import QUANTILES, colour_counts, colour_statistics
+from exports_libero_lifelong.lerobot import QUANTILES, colour_counts, colour_statistics
 
 from libero_env.cli.main import main
 from libero_env.demos.contents import read_header

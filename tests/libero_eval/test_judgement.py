@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from exports_libero_lifelong.results import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
 
 from libero_env.cli.main import main  # noqa: E402
-from libero_eval.exports import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
 from libero_eval.judging.comparability import Group, check_comparable, match, settings  # noqa: E402
 from libero_eval.judging.comparison import Comparison, compare_groups, gate, write_comparison  # noqa: E402
 from libero_eval.judging.group_scores import group_scores  # noqa: E402

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from data_sets_libero_lifelong.layouts import STATE, Layout
-from data_sets_libero_lifelong.lerobot import DatasetWriter, write_json
+from exports_libero_lifelong.layouts import STATE, Layout
+from exports_libero_lifelong.lerobot import DatasetWriter, write_json
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.read import Episode
 from libero_env.errors import DemoError

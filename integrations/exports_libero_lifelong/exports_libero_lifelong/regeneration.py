@@ -19,7 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from data_sets_libero_lifelong.layouts import STATE
+from exports_libero_lifelong.layouts import STATE
 from libero_env.assets.pack import Pack, facade_assets, pack_of, select_pack
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import read_header

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from data_sets_libero_lifelong.layouts import RECORDED
+from exports_libero_lifelong.layouts import RECORDED
 from libero_env.demos.config import MASK_NAMES, RenderConfig
 from libero_env.demos.contents import is_image, json_attribute, read_header
 from libero_env.demos.observe import StateRenderer, recorded_frequency

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from data_sets_libero_lifelong.layouts import FILES_PER_CHUNK, ROBOT_TYPE, STATE, Layout
+from exports_libero_lifelong.layouts import FILES_PER_CHUNK, ROBOT_TYPE, STATE, Layout
 from libero_env.demos.read import Episode
 from libero_env.demos.video import H264, Mp4Writer, import_av
 from libero_env.errors import DemoError, need

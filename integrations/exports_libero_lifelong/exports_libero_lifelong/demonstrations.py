@@ -16,10 +16,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from data_sets_libero_lifelong.layouts import PUBLISHED, RECORDED, STATE, Layout
-from data_sets_libero_lifelong.lerobot import EpisodeDatasetWriter, VideoDatasetWriter, write_json
-from data_sets_libero_lifelong.regeneration import Regeneration, regenerate
-from data_sets_libero_lifelong.rlds import RldsWriter
+from exports_libero_lifelong.layouts import PUBLISHED, RECORDED, STATE, Layout
+from exports_libero_lifelong.lerobot import EpisodeDatasetWriter, VideoDatasetWriter, write_json
+from exports_libero_lifelong.regeneration import Regeneration, regenerate
+from exports_libero_lifelong.rlds import RldsWriter
 from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.contents import json_attribute, read_header
 from libero_env.demos.hdf5 import BrokenDemoError
@@ -89,7 +89,7 @@ def export_demos(
     Args:
         files: Files to read, in this order; all have the same cameras and image size.
         root: Folder to write; it must not exist. RLDS takes its name from it.
-        form: One of `data_sets_libero_lifelong.layouts.RECORDED`.
+        form: One of `exports_libero_lifelong.layouts.RECORDED`.
         labels: As for `read_demos`.
         actions: Kind of the actions, one of `libero_env.demos.actions.KINDS`.
         video_mb: Size from which a video of LeRobot's form is continued in another file, [MiB].
@@ -135,7 +135,7 @@ def export_published(
     Args:
         files: Files to read, in this order; their images are not used.
         root: Folder to write; it must not exist. RLDS takes its name from it.
-        name: Published set, one of `data_sets_libero_lifelong.layouts.PUBLISHED`.
+        name: Published set, one of `exports_libero_lifelong.layouts.PUBLISHED`.
         config: How the demonstrations are run.
         task: Task that all files recorded; None for those that they state.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.

@@ -14,6 +14,15 @@ from libero_eval.judging.evaluation_page import facts
 from lifelong.errors import ConfigError, writing
 
 
+def export(
+    result: EvaluationResult, folder: Path, form: str, dataset: str = "", source: str = ""
+) -> list[Path]:
+    """Write a result in one of the forms `vla-eval`, `lerobot` and `eval-results`; return the files."""
+    if form == "eval-results":
+        return export_eval_results(result, folder, dataset, source)
+    return (export_vla_eval if form == "vla-eval" else export_lerobot)(result, folder)
+
+
 def export_vla_eval(result: EvaluationResult, folder: Path) -> list[Path]:
     """Write `SUITE_aggregate.json` for each suite, as `vla-eval export` (0.8.0) writes it for a benchmark.
 

@@ -1,0 +1,1 @@
+"""Demonstrations and results of libero-lifelong in the formats of other tools."""
