@@ -22,7 +22,7 @@ from libero_env.tasks.published import require_available
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, permission_names
-from libero_eval.policies import SELECTION, ExpertPolicy, PolicyUnderTest, RunPolicy
+from libero_eval.policies import AVOIDING, EXPERT, SELECTION, ExpertPolicy, PolicyUnderTest, RunPolicy
 from libero_eval.protocols.clock import Clock
 from libero_eval.protocols.environment import resolve_world
 from libero_eval.protocols.files import load_protocol
@@ -216,7 +216,7 @@ def _kind(policy: str) -> str:
             f"{policy} is an address without the kind of its server: write ws://{policy} (openpi, libero serve), "
             f"vla-eval://{policy} or gr00t://{policy}"
         )
-    return "expert" if policy == "expert" else "module" if ":" in policy else "run"
+    return "expert" if policy in (EXPERT, AVOIDING) else "module" if ":" in policy else "run"
 
 
 def choose_init_states(

@@ -154,23 +154,28 @@ class RunPolicy(PolicyUnderTest):
             yield PolicyActor(policy, run.embed(task), run.device, run.eval.precision, draws, run.embed)
 
 
-class ExpertPolicy(PolicyUnderTest):
-    """The scripted expert, which sees the whole state: how much of a task can be done at all."""
+EXPERT, AVOIDING = "expert", "expert-avoid"
 
-    out, chunk, hears = Path("eval/expert"), 1, True
+
+class ExpertPolicy(PolicyUnderTest):
+    """The scripted expert, which sees the whole state: how much of a task can be done at all, or done safely."""
+
+    chunk, hears = 1, True
 
     def __init__(self, request: Request):
         from libero_env.demos.config import GENERATOR
 
         super().__init__(request)
-        self.identity = {"policy": "expert", "generator": GENERATOR}
+        self.identity = {"policy": request.policy_name, "generator": GENERATOR}
+        self.out = Path("eval", request.policy_name)
         self.cameras = ("agentview",) if request.videos else ()
         self.observations = ("rgb",) if request.videos else ()
 
     @contextmanager
     def planner(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Planner]:
         """Yield an expert for each episode; see `PolicyUnderTest`."""
-        yield ExpertActor(self.seeds(task, states), tuple(map(view_of, self.cameras or ())))
+        avoid = self.request.policy_name == AVOIDING
+        yield ExpertActor(self.seeds(task, states), tuple(map(view_of, self.cameras or ())), avoid)
 
 
 class ExpertActor:
@@ -179,19 +184,23 @@ class ExpertActor:
     Args:
         seeds: Seed of the motion style of each expert.
         views: Names of the images that recorded rollouts show.
+        avoid: Whether they keep clear of what the goal does not need.
     """
 
     action_dim, replan, observes = ACTION_DIM, 1, "never"
 
-    def __init__(self, seeds: Sequence[Sequence[int]], views: tuple[str, ...] = ()):
-        self.seeds, self.views = seeds, views
+    def __init__(self, seeds: Sequence[Sequence[int]], views: tuple[str, ...] = (), avoid: bool = False):
+        self.seeds, self.views, self.avoid = seeds, views, avoid
 
     def watch(self, env: "BatchEnv") -> None:
         """Receive the simulations; see `WatchesWorld`."""
         from libero_env.expert import Expert, Shapes
 
         self._env, shapes = env, Shapes(env.scene)
-        self._experts = [Expert(env.task, np.random.default_rng(seed), shapes=shapes) for seed in self.seeds]
+        self._experts = [
+            Expert(env.task, np.random.default_rng(seed), shapes=shapes, avoid=self.avoid)
+            for seed in self.seeds
+        ]
 
     def reset(self, num_envs: int) -> None:
         """Do nothing: experts are made for episodes; see `Planner`."""

@@ -46,7 +46,7 @@ class Request:
     Attributes:
         policy: A run's directory, one of its checkpoints, module:function that returns an object with predict, the
             address of a policy server: ws://host:port (openpi, libero serve), vla-eval://..., gr00t://..., or `expert`,
-            the scripted one.
+            the scripted one, which as `expert-avoid` keeps clear of what the goal does not need.
         suite: Suites or tasks (default: the run's).
         after: Of a run: the policy after this task, from 0 (default: the last).
         starts: Initial states: all 50, or those by which a policy was not, or may have been, chosen.

@@ -9,6 +9,7 @@ import numpy as np
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError
 from libero_env.expert.arm import OPEN, limit_elbow_extension
+from libero_env.expert.guard import Guard
 from libero_env.expert.planning.goal_plan import Step, UnsupportedGoalError, look, plan_goal
 from libero_env.expert.planning.pick_planner import is_graspable
 from libero_env.expert.shapes import Shapes
@@ -40,6 +41,9 @@ class Expert:
         shapes: Shapes of the task's scene, to share between experts of the same task; computed at the first action
             if None.
         style: Motion style; sampled from `rng` if None.
+        avoid: Whether it keeps clear of what the goal does not need, see `libero_env.sim.costs`: the hand of furniture
+            and of other objects, and what it pushes of them, too. It then takes longer, and is not that of
+            demonstrations.
 
     Attributes:
         skill: Skill that acts now; None before the first action and where nothing is left to do.
@@ -65,8 +69,10 @@ class Expert:
         *,
         shapes: Shapes | None = None,
         style: MotionStyle | None = None,
+        avoid: bool = False,
     ):
-        self.task, self.shapes = task, shapes
+        self.task, self.shapes, self.avoid = task, shapes, avoid
+        self._guard: Guard | None = None
         self.style = MotionStyle.sample(rng) if style is None else style
         self.skill: Skill | None = None
         self._finished_retries = 0  # of skills that are over
@@ -97,7 +103,7 @@ class Expert:
         """Plan again, for a task in the same scene; what is in the hand is let go before."""
         if task.problem.goal != self.task.problem.goal:
             self._history = None
-        self.task, self.skill, self._letting_go = task, None, LET_GO
+        self.task, self.skill, self._letting_go, self._guard = task, None, LET_GO, None
 
     def act(self, view: StateView) -> np.ndarray:
         """Return the next action, (7,) in [-1, 1].
@@ -129,7 +135,11 @@ class Expert:
         if fallback is not None:
             self._finished_retries = self.retries + 1
             self.skill = fallback
-        return limit_elbow_extension(view, self.skill.act(view))
+        action = self.skill.act(view)
+        if self.avoid:
+            self._guard = self._guard or Guard(view, self.task.problem.goal)
+            action = self._guard.steer(view, action, self.skill.atom.args[0])
+        return limit_elbow_extension(view, action)
 
     def _skill_for(self, step: Step, view: StateView, shapes: Shapes) -> Skill:
         atom, style = step.atom, self.style
@@ -139,7 +149,7 @@ class Expert:
         if drop is not None:
             return drop
         if Drag.applies(view, shapes, atom) and not is_graspable(view, shapes, atom.args[0]):
-            return Drag(atom, style=style, shapes=shapes)
+            return Drag(atom, style=style, shapes=shapes, avoid=self.avoid)
         return PickPlace(atom, style=style, shapes=shapes, slot=step.slot)
 
 

@@ -49,8 +49,8 @@ class EpisodeWatch:
         first, second = (model.joint(name).bodyid[0] for name in FINGER_JOINTS)
         for body in scene.bodies[ROBOT]:
             part = _HAND if model.body(body).name.startswith("gripper0_") else _ARM
-            part = _LEFT if first in _ancestors(model, body) else part
-            part = _RIGHT if second in _ancestors(model, body) else part
+            part = _LEFT if first in ancestors(model, body) else part
+            part = _RIGHT if second in ancestors(model, body) else part
             self._codes[body] = self._names.index(part)
         goal = ground(scene.problem.goal, scene)
         forbidden = {*goal.atoms()} - {*goal.wanted()}
@@ -291,7 +291,7 @@ def _holds(view: StateView, atom: Atom) -> bool:
     return bool(PREDICATES[atom.predicate](view, *atom.args))
 
 
-def _ancestors(model: mujoco.MjModel, body: int) -> set[int]:
+def ancestors(model: mujoco.MjModel, body: int) -> set[int]:
     """Return a body and all that it is part of."""
     found = set[int]()
     while body:

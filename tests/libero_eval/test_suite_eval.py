@@ -173,6 +173,20 @@ def test_another_version_of_the_expert_is_another_policy(tmp_path, monkeypatch):
         second.store.join(second.units)
 
 
+def test_the_expert_that_avoids_is_another_policy_and_is_run_again_from_its_result(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    words = ["--suite", "libero_goal/4", "--episodes", "1", "--horizon", "50", "--threads", "1"]
+    for name in ("expert", "expert-avoid"):
+        assert cli.main(["eval", name, *words]) == 0
+    plain, avoiding = (EvaluationResult.read(f"eval/{name}") for name in ("expert", "expert-avoid"))
+    assert avoiding.evaluated["policy"] == "expert-avoid" and plain.actions != avoiding.actions
+    assert cli.main(["eval", "eval/expert-avoid/eval.json", "--threads", "1", "--out", "again"]) == 0
+    assert EvaluationResult.read("again").actions == avoiding.actions
+    assert cli.main(["eval", "expert-careful", *words]) == 2 and "expert-careful" in capsys.readouterr().err
+
+
 def test_an_evaluation_grows_by_starts_and_tasks_and_never_shrinks(tmp_path):
     """What is done is kept, and the result is that of asking for all of it at once."""
     first, counted = {"tasks": TASKS[:1], "init_states": (3, 4), "unit_starts": 2}, []

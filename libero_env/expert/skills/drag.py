@@ -3,6 +3,7 @@
 import numpy as np
 
 from libero_env.expert.arm import CLOSE, GRIPPER, downward, finger_axis, lateral_ramp
+from libero_env.expert.planning.detour import Detour
 from libero_env.expert.shapes import Shapes, pose_of
 from libero_env.expert.skills.skill import Skill, gripper_opening
 from libero_env.expert.variation import MotionStyle
@@ -15,6 +16,7 @@ HOVER = 0.07  # [m] of the fingertips over the object on the way to it
 LEAD = 0.035  # [m] of the target ahead of the hand while it drags
 NEAR = 0.02  # [m] above where the hand presses on the object, from which on it counts as blocked
 PRESS = -0.006  # [m] of the fingertips over the bottom of the hollow: the hand presses, and friction helps
+LOW = 0.05  # [m] of obstacles over the table, which the hand passes above
 DRAG_SPEED = 0.6  # factor on the speed
 
 
@@ -25,13 +27,15 @@ class Drag(Skill):
 
     Args:
         atom: Atom to make true.
+        avoid: Whether the object goes around others, not straight.
     """
 
     NOISE_SCALES = {"reach": 1.0, "carry": 0.3}
 
-    def __init__(self, atom: Atom, *, style: MotionStyle, shapes: Shapes):
+    def __init__(self, atom: Atom, *, style: MotionStyle, shapes: Shapes, avoid: bool = False):
         super().__init__(atom, style)
-        self.shapes = shapes
+        self.shapes, self.avoid = shapes, avoid
+        self._detour: Detour | None = None
         self._still_steps = 0  # just above the object, where something keeps the hand from going lower
 
     @staticmethod
@@ -55,7 +59,10 @@ class Drag(Skill):
         target = goal.copy()
         still = np.linalg.norm(self._velocity) < 0.01 and pos[2] < goal[2] + NEAR
         self._still_steps = self._still_steps + 1 if still else 0
-        if np.linalg.norm(goal[:2] - pos[:2]) > 0.015 or gripper_opening(view) > 0.01:
+        if (
+            np.linalg.norm(goal[:2] - pos[:2]) > (0.025 if self.avoid else 0.015)
+            or gripper_opening(view) > 0.01
+        ):
             target[2] = float(self.shapes.cloud(view, self.atom.args[0])[:, 2].max()) + HOVER
         elif pos[2] < goal[2] + 0.006 or self._still_steps > 1 or self._steps > 90:
             self._enter("carry")
@@ -66,6 +73,9 @@ class Drag(Skill):
         origin, contact = view.body_pos(name), self._contact_pos(view)
         centres = (box[0][:2] for box in region_boxes(view, self.atom.args[1]))
         path = min(centres, key=lambda centre: float(np.linalg.norm(centre - origin[:2]))) - origin[:2]
+        if self.avoid:
+            self._detour = self._detour or self._way_around(view)
+            path = self._detour.path(origin[:2])
         left = float(np.linalg.norm(path))
         lost = np.linalg.norm(pos[:2] - origin[:2]) > 0.10 or self._steps > 150
         if left < 0.012 or lost:
@@ -80,6 +90,17 @@ class Drag(Skill):
         if self._steps > 8:
             self.phase = "rest"
         return self._push(view, view.eef_pos + [0, 0, 0.08])
+
+    def _way_around(self, view: StateView) -> Detour:
+        """Return the way of the object to its place, around what it or the hand would touch."""
+        name, surface = self.atom.args[0], view.scene.workspace.surface_height
+        middle = view.body_pos(name)[:2]
+        radius = float(np.linalg.norm(self.shapes.cloud(view, name)[:, :2] - middle, axis=1).max())
+        x, y, z = self.shapes.obstacles(view, name).T
+        rows = np.column_stack([np.round(x, 2), np.round(y, 2), z > surface + LOW])
+        points = np.unique(rows, axis=0)
+        radii = np.where(points[:, 2], max(radius, GRIPPER.palm_half_length), radius)
+        return Detour(middle, points[:, :2], radii, region_boxes(view, self.atom.args[1]))
 
     def _contact_pos(self, view: StateView) -> np.ndarray:
         """Return the position of the grip site with the closed fingertips in the hollow, (3,)."""
