@@ -116,19 +116,16 @@ def spawn_context() -> SpawnContext:
     return multiprocessing.get_context("spawn")
 
 
-def spawn_pool(
-    workers: int, *, initializer: Callable[[], None] | None = None, picture_seconds: float = PICTURE_SECONDS
-) -> ProcessPoolExecutor:
+def spawn_pool(workers: int, *, picture_seconds: float = PICTURE_SECONDS) -> ProcessPoolExecutor:
     """Return a pool of processes that start with a new interpreter and end when this process ends.
 
     As a context manager, the pool is waited for after an error, and killed where the work is interrupted.
 
     Args:
         workers: Number of processes.
-        initializer: Function of a module that each process calls when it starts.
         picture_seconds: See `limit_first_picture`.
     """
-    arguments = initializer, user_entries(), picture_seconds
+    arguments = user_entries(), picture_seconds
     return _Pool(workers, mp_context=spawn_context(), initializer=_start_worker, initargs=arguments)
 
 
@@ -223,15 +220,13 @@ def run_each(
                         other.cancel()
 
 
-def _start_worker(initializer: Callable[[], None] | None, entries: bytes, picture_seconds: float) -> None:
+def _start_worker(entries: bytes, picture_seconds: float) -> None:
     for name in ("SIGINT", "SIGHUP"):  # a terminal sends them to all its processes; the parent ends this one
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     end_with_parent()
     limit_first_picture(picture_seconds)
     add_entries(entries)
-    if initializer is not None:
-        initializer()
 
 
 def end_with_parent() -> None:

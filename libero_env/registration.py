@@ -8,7 +8,7 @@ Gymnasium 1 has no entry point for packages, so this module has to be imported, 
 
 import gymnasium
 
-from libero_env.tasks.builder import load_data
+from libero_env.storage import read_yaml
 
 NAMESPACE = "libero"
 
@@ -16,11 +16,11 @@ NAMESPACE = "libero"
 def env_ids() -> dict[str, str]:
     """Return the task of each name in Gymnasium, for all tasks of all suites; only lists of tasks are read."""
     sizes: dict[str, int] = {}
-    for suite in load_data("suites.yaml"):
+    for suite in read_yaml("tasks/data/suites.yaml"):
         if isinstance(suite, dict):  # suites that consist of others come after them
             sizes |= {name: sum(sizes[part] for part in parts) for name, parts in suite.items()}
         else:
-            sizes[suite] = len(load_data(f"{suite}.yaml")["tasks"])
+            sizes[suite] = len(read_yaml(f"tasks/data/{suite}.yaml")["tasks"])
     return {f"{NAMESPACE}/{name}-{i}": f"{name}/{i}" for name, size in sizes.items() for i in range(size)}
 
 

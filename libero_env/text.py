@@ -86,12 +86,9 @@ def json_safe(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def to_json(value: Any, *, indent: int | None = 1, sort_keys: bool = False) -> str:
+def to_json(value: Any) -> str:
     """Return the text of a JSON file, which ends with a line break; see `json_safe`."""
-    text = json.dumps(
-        json_safe(value), indent=indent, sort_keys=sort_keys, ensure_ascii=False, allow_nan=False
-    )
-    return text + "\n"
+    return json.dumps(json_safe(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def duration(seconds: float) -> str:
@@ -126,13 +123,12 @@ def quantity(value: float, unit: str = "") -> str:
     return f"{value:.0f} {unit}".rstrip()
 
 
-def text_table(rows: Sequence[Sequence[object]], left: int = 1, gap: str = "  ") -> str:
+def text_table(rows: Sequence[Sequence[object]], left: int = 1) -> str:
     """Return rows of cells as lines whose columns are aligned.
 
     Args:
         rows: Cells, the heads among them; each row has the same number.
         left: Number of columns that are aligned at the left; the others are at the right.
-        gap: Text between two columns.
     """
     cells = [[str(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -143,4 +139,4 @@ def text_table(rows: Sequence[Sequence[object]], left: int = 1, gap: str = "  ")
         )
         for row in cells
     )
-    return "\n".join(gap.join(line).rstrip() for line in lines)
+    return "\n".join("  ".join(line).rstrip() for line in lines)

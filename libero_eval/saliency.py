@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -66,46 +65,37 @@ def saliency(
     policy: Policy,
     batch: Batch,
     settings: SaliencySettings = SaliencySettings(),  # noqa: B008 - frozen
-    *,
-    measure: Literal["action", "loss"] = "action",
 ) -> Tensor:
-    """Return maps of how much each place of each image affects a policy's output on one window.
+    """Return maps of how much each place of each image affects a policy's last action on one window, eq. 2.
 
     Args:
-        policy: Policy with `predict`, or with `window_losses` for `measure="loss"`. Its mode is unchanged.
+        policy: Policy with `predict`. Its mode is unchanged.
         batch: One window (B = 1), on the policy's device.
         settings: Resolution of the maps.
-        measure: `action`: the change of the action at the last step, eq. 2. `loss`: the absolute change of the
-            window's loss, which needs the demonstrated actions.
 
     Returns:
         (V, H, W) float32, at least 0: values at the places, interpolated between them.
 
     Raises:
-        ConfigError: The batch has not one window, or the measure is unknown.
+        ConfigError: The batch has not one window.
         PolicyError: The policy has no `predict`.
     """
     if len(batch) != 1:
         raise ConfigError(f"saliency needs a batch of one window; this one has {len(batch)}")
-    if measure not in ("action", "loss"):
-        raise ConfigError(f"saliency: measure is {measure!r}; valid: action, loss")
     images = batch.observation.images  # (1, T, V, H, W, 3)
     height, width = images.shape[3:5]
     scale = height / 128
     rows, cols = (_places(n, settings.stride * scale) for n in (height, width))
     blurred = _blur(images, settings.blur * scale)
     with in_mode(policy, training=False):
-        reference = _outputs(policy, batch, measure)
+        reference = policy.predict(batch)[:, -1]
         maps = []
         for view in range(images.shape[2]):
             changes = []
             for places in torch.cartesian_prod(rows, cols).split(_CHUNK):
                 masks = _masks(places, (height, width), settings.sigma * scale).to(images.device)
-                outputs = _outputs(policy, _perturbed(batch, blurred, masks, view), measure)
-                difference = outputs - reference
-                changes.append(
-                    0.5 * difference.square().sum(-1) if measure == "action" else difference.abs()[:, 0]
-                )
+                outputs = policy.predict(_perturbed(batch, blurred, masks, view))[:, -1]
+                changes.append(0.5 * (outputs - reference).square().sum(-1))
             maps.append(torch.cat(changes).view(1, 1, len(rows), len(cols)))
     values = torch.cat(maps, dim=1).float()  # at places that are the cell centres of a regular grid
     if (len(rows), len(cols)) != (height, width):
@@ -216,11 +206,6 @@ def _perturbed(batch: Batch, blurred: Tensor, masks: Tensor, view: int) -> Batch
         task_ids=repeat(batch.task_ids),
         window_ids=repeat(batch.window_ids),
     )
-
-
-def _outputs(policy: Policy, batch: Batch, measure: str) -> Tensor:
-    """Return (B, A) actions at the last step, or (B, 1) losses."""
-    return policy.predict(batch)[:, -1] if measure == "action" else policy.window_losses(batch)[:, None]
 
 
 @dataclass

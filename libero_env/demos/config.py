@@ -21,13 +21,12 @@ from libero_env.perturbations.episodes import checked_perturbations
 from libero_env.perturbations.perturbation import KINDS, Perturbation, format_perturbations
 from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS, segmentation_labels
-from libero_env.sim.osc import POSITION_SCALE, ROTATION_SCALE
 from libero_env.sim.scene import FAST, Scene, build_scene, default_drawing
+from libero_env.storage import read_yaml
 from libero_env.tasks import Task, get_task, read_task
 from libero_env.tasks.cameras import camera_name
 from libero_env.tasks.suites import OWN
 from libero_env.tasks.task import FILE
-from libero_env.timing import CONTROL_HZ
 from libero_env.validation import checked
 
 GENERATOR = "scripted-expert-15"  # change it when the same seed yields different demonstrations
@@ -255,30 +254,10 @@ def _contents(part: Any) -> Iterator[tuple[str, bytes]]:
 def _env_kwargs(render: RenderConfig) -> dict[str, Any]:
     """Return the arguments that the original's environment would be made with."""
     height, width = render.size
-    controller = {
-        "type": "OSC_POSE",
-        "input_max": 1,
-        "input_min": -1,
-        "output_max": [POSITION_SCALE] * 3 + [ROTATION_SCALE] * 3,
-        "output_min": [-POSITION_SCALE] * 3 + [-ROTATION_SCALE] * 3,
-        "kp": 150,
-        "damping_ratio": 1,
-        "impedance_mode": "fixed",
-        "control_delta": True,
-        "uncouple_pos_ori": True,
-        "interpolation": None,
-    }
     return {
-        "robots": ["Panda"],
-        "controller_configs": controller,
-        "control_freq": CONTROL_HZ,
+        **read_yaml("demos/original_env.yaml"),
         "camera_names": sorted(map(camera_name, render.cameras), reverse=True),
         "camera_heights": height,
         "camera_widths": width,
         "camera_depths": "depth" in render.modalities,
-        "use_camera_obs": True,
-        "has_renderer": False,
-        "has_offscreen_renderer": True,
-        "ignore_done": True,
-        "reward_shaping": True,
     }

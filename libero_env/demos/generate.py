@@ -20,7 +20,6 @@ from tqdm import tqdm
 
 from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.config import GENERATOR, DemoConfig, task_home
-from libero_env.demos.contents import Pairing
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.record import RecordingReport, record_chunk, recorders
 from libero_env.demos.write import REMEDY, DemoWriter, OtherRecordingError
@@ -117,43 +116,6 @@ def number_of_processes(workers: int) -> int:
     return workers or cpu_count()
 
 
-def generate(
-    task: Task | str,
-    n: int,
-    *,
-    path: str | Path,
-    seed: int = 0,
-    camera_size: tuple[int, int] = (128, 128),
-    workers: int = 0,
-    pairing: Pairing = "aligned",
-    disturb: bool = True,
-    progress: bool | None = None,
-) -> Path:
-    """Record the first `n` demonstrations of a task into one file; those that exist already are kept.
-
-    For other cameras, depth, or another variation, give `make_demos` a whole `DemoConfig`.
-
-    Args:
-        task: A `Task`, what `get_task` takes, or the path of a BDDL file.
-        n: Number of successful demonstrations. Failed attempts are left out and counted in the file.
-        path: File to write. An interrupted recording leaves `<path>.parts`, from which the next call resumes.
-        seed: Seed of the starts, motion styles and action noise. The 50 stored initial states are never used.
-        camera_size: (height, width) of the images, pixels.
-        workers: Number of processes. 0 means one per core; 1 records in this process.
-        pairing: Which observation is stored with an action, see `libero_env.demos.read`.
-        disturb: Whether noise is added to the executed actions; the file then also holds the expert's own actions.
-        progress: Whether to show a progress bar. None shows one if stderr is a terminal, and lines otherwise.
-
-    Raises:
-        DemoError: The existing file was recorded with another configuration, the file cannot be written, or the
-            expert cannot do the task.
-    """
-    config = DemoConfig(task, (camera_size[0], camera_size[1]), seed, pairing, disturb)
-    path = Path(path)
-    _raise_errors(make_demos([RecordingJob(config, path)], n, workers=workers, progress=progress))
-    return path
-
-
 def ensure_demos(
     tasks: str | Iterable[Task],
     n: int,
@@ -175,13 +137,13 @@ def ensure_demos(
     Args:
         tasks: Name of a suite, or tasks.
         n: Demonstrations of each task. The first `n` are the same however many there are.
-        camera_size: As for `generate`.
-        seed: As for `generate`.
+        camera_size: (height, width) of the images, pixels.
+        seed: Seed of the starts, motion styles and action noise. The 50 stored initial states are never used.
         drawing: How images are drawn, see `DemoConfig`.
         root: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
         robot: Model of the arm, see `libero_env.assets.robot`.
-        workers: As for `generate`.
-        progress: As for `generate`.
+        workers: Number of processes. 0 means one per core; 1 records in this process.
+        progress: Whether to show a progress bar. None shows one if stderr is a terminal, and lines otherwise.
 
     Returns:
         One path per task, in order.
@@ -194,7 +156,9 @@ def ensure_demos(
     size = (camera_size[0], camera_size[1])
     configs = [DemoConfig(task, size, seed, drawing=drawing, robot=robot) for task in tasks]
     jobs = [RecordingJob(config, demo_path(root, config)) for config in configs]
-    _raise_errors(make_demos(jobs, n, workers=workers, progress=progress, replace=True))
+    reports = make_demos(jobs, n, workers=workers, progress=progress, replace=True)
+    if failed := [f"{path.name}: {report.error}" for path, report in reports.items() if report.error]:
+        raise DemoError(f"{len(failed)} of {len(reports)} files are not complete. {'; '.join(failed)}")
     return [job.path for job in jobs]
 
 
@@ -213,8 +177,8 @@ def make_demos(
     Args:
         jobs: What to record, and into which files.
         n: Demonstrations of each job.
-        workers: As for `generate`.
-        progress: As for `generate`.
+        workers: As for `ensure_demos`.
+        progress: As for `ensure_demos`.
         replace: Whether to record again what was recorded with another configuration. Only for files whose path
             this package chose.
 
@@ -244,13 +208,6 @@ def demo_path(root: Path, config: DemoConfig) -> Path:
     suffix = f"-{zlib.crc32(json.dumps(options, sort_keys=True).encode()):08x}" if options else ""
     folder = f"{height}x{width}-seed{config.seed}-{GENERATOR}{suffix}"
     return root / task_home(task) / folder / f"{task.name}_demo.hdf5"
-
-
-def _raise_errors(reports: dict[Path, RecordingReport]) -> None:
-    failed = {path: report for path, report in reports.items() if report.error}
-    if failed:
-        each = "; ".join(f"{path.name}: {report.error}" for path, report in failed.items())
-        raise DemoError(f"{len(failed)} of {len(reports)} files are not complete. {each}")
 
 
 def _record(

@@ -17,7 +17,8 @@ from libero_env.tasks.cameras import camera_name
 from libero_env.tasks.task import Task
 from libero_env.timing import CONTROL_HZ
 
-CAMERAS = ("agentview", "robot0_eye_in_hand", "birdview")
+_PAIR = ("agentview", "robot0_eye_in_hand")
+CAMERAS = (*_PAIR, "birdview")
 _EVERY = 2  # [control steps] between frames of a video
 _BAND = 14  # [pixels] height of the caption above a picture
 
@@ -64,7 +65,6 @@ def compare_starts(
     path: Path,
     *,
     start: int = 0,
-    cameras: Sequence[str] = ("agentview", "robot0_eye_in_hand"),
     size: int = 256,
 ) -> Task:
     """Write a PNG of an initial state as it is, and beside it with perturbations, a row for each camera.
@@ -83,9 +83,9 @@ def compare_starts(
     check_picture(path)
     columns = []
     for perturb in ((), tuple(perturbations)):
-        with LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size), perturb=perturb) as env:
+        with LiberoEnv(task, cameras=_PAIR, camera_size=(size, size), perturb=perturb) as env:
             obs = _reset(env, start)
-            columns.append(np.concatenate([obs[image_name(c, "rgb")] for c in cameras]))
+            columns.append(np.concatenate([obs[image_name(c, "rgb")] for c in _PAIR]))
             changed = env.task
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(np.concatenate(columns, axis=1)).save(path)
@@ -102,15 +102,12 @@ def check_picture(path: Path) -> None:
         raise LiberoError(f"{path}: the name of a picture ends in .png, .jpg, .webp, .gif, .bmp or .tiff")
 
 
-def expert_video(
-    task: Task, path: Path, *, start: int = 0, camera: str = "agentview", size: int = 256
-) -> tuple[bool, str]:
-    """Write a video of the expert performing a task.
+def expert_video(task: Task, path: Path, *, size: int = 256) -> tuple[bool, str]:
+    """Write a video of the expert performing a task from the first initial state.
 
     Args:
         task: Task to perform.
         path: File to write, whose name ends in .webp, .gif or .mp4.
-        start: Number of the initial state.
         size: Height and width of the video, [pixels].
 
     Returns:
@@ -119,10 +116,10 @@ def expert_video(
     Raises:
         UnsupportedGoalError: The goal needs a skill that the expert does not have.
     """
-    name = image_name(camera, "rgb")
-    with LiberoEnv(task, cameras=(camera,), camera_size=(size, size), horizon=MAX_STEPS) as env:
-        frames = [_reset(env, start)[name]]
-        expert, terminated, truncated, step = Expert(task, np.random.default_rng(start)), False, False, 0
+    name = image_name("agentview", "rgb")
+    with LiberoEnv(task, cameras=("agentview",), camera_size=(size, size), horizon=MAX_STEPS) as env:
+        frames = [_reset(env, 0)[name]]
+        expert, terminated, truncated, step = Expert(task, np.random.default_rng(0)), False, False, 0
         while not (terminated or truncated or expert.failure_reason):
             env.render_images = step % _EVERY == _EVERY - 1
             obs, _, terminated, truncated, _ = env.step(expert.act(env.view))

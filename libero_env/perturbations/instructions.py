@@ -8,12 +8,12 @@ it knows are replaced, and the frame.
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import Any
 
 import numpy as np
 
 from libero_env.storage import read_yaml
 
+_WORDING = "perturbations/data/wording.yaml"
 _CANDIDATES = 400
 _UNSPLIT = re.compile(
     r"yellow and white|plate and the ramekin|both .+? and .+? (?=in |on )|and (?:place|put) it"
@@ -47,13 +47,8 @@ def reword(sentence: str, distance: float, rng: np.random.Generator) -> str:
 
 
 @cache
-def _wording() -> Mapping[str, Any]:
-    return read_yaml("perturbations/data/wording.yaml")
-
-
-@cache
 def _patterns() -> Mapping[str, re.Pattern[str]]:
-    wording = _wording()
+    wording = read_yaml(_WORDING)
     relations = "|".join(sorted(wording["relations"], key=len, reverse=True))
     return {
         name: re.compile(clause["pattern"].replace("RELATION", relations) + "$")
@@ -63,7 +58,7 @@ def _patterns() -> Mapping[str, re.Pattern[str]]:
 
 def _reworded(sentence: str, rng: np.random.Generator) -> str:
     """Return one of the rewordings; how much it changes is random too."""
-    wording, boldness = _wording(), rng.random()
+    wording, boldness = read_yaml(_WORDING), rng.random()
     clauses = [_say(clause, boldness, rng) for clause in split_clauses(sentence)]
     said = clauses[0]
     for clause in clauses[1:]:
@@ -79,7 +74,7 @@ def split_clauses(sentence: str) -> list[str]:
 
 def _say(clause: str, boldness: float, rng: np.random.Generator) -> str:
     """Return a clause in other words."""
-    wording = _wording()
+    wording = read_yaml(_WORDING)
     for name, pattern in _patterns().items():
         if match := pattern.match(clause):
             parts = match.groupdict()
@@ -102,7 +97,7 @@ def _own_way(match: re.Match[str]) -> str:
 
 def _rename(text: str, boldness: float, rng: np.random.Generator) -> str:
     """Return a text in which things have other names."""
-    names: Mapping[str, Sequence[str]] = _wording()["names"]
+    names: Mapping[str, Sequence[str]] = read_yaml(_WORDING)["names"]
     words, said, i = text.split(), [], 0
     while i < len(words):
         for end in range(len(words), i, -1):

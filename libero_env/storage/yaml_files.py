@@ -3,6 +3,7 @@
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -29,8 +30,9 @@ def parse_yaml(text: str) -> Any:
         loader.dispose()
 
 
+@cache
 def read_yaml(path: str) -> Any:
-    """Return the content of one of the package's YAML files; the path is relative to `libero_env`."""
+    """Return the content of a YAML file of `libero_env`, by its path there; it is shared, do not change it."""
     return parse_yaml(resources.files("libero_env").joinpath(*path.split("/")).read_text(encoding="utf-8"))
 
 

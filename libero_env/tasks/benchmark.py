@@ -3,7 +3,8 @@
 from functools import cache
 
 from libero_env.errors import require_known
-from libero_env.tasks.builder import build_problem, language_from_name, load_data
+from libero_env.storage import read_yaml
+from libero_env.tasks.builder import build_problem, language_from_name
 from libero_env.tasks.task import Suite, Task
 
 
@@ -15,7 +16,7 @@ def suite_names() -> tuple[str, ...]:
 def _parts() -> dict[str, list[str]]:
     """Return suite -> the suites that it consists of; an empty list for a suite with tasks in its file."""
     parts: dict[str, list[str]] = {}
-    for entry in load_data("suites.yaml"):
+    for entry in read_yaml("tasks/data/suites.yaml"):
         parts |= entry if isinstance(entry, dict) else {entry: []}
     return parts
 
@@ -31,7 +32,7 @@ def benchmark_suite(name: str) -> Suite:
     require_known("suite", name, parts)
     if parts[name]:
         return Suite(name, tuple(task for part in parts[name] for task in benchmark_suite(part).tasks))
-    content = load_data(f"{name}.yaml")
+    content = read_yaml(f"tasks/data/{name}.yaml")
     shared = {key: value for key, value in content.items() if key != "tasks"}
     tasks = []
     for index, own in enumerate(content["tasks"]):

@@ -54,7 +54,7 @@ from string import Template
 from typing import Any
 
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
-from libero_env.storage import parse_yaml
+from libero_env.storage import read_yaml
 from libero_env.tasks import bddl
 from libero_env.tasks.cameras import Camera
 from libero_env.tasks.problem import And, Expression, Problem, ProblemError, Region
@@ -82,23 +82,9 @@ _KEYS_OF = {"name": "problem", "domain": "problem", "views": "cameras"}
 Values = Mapping[str, Any]
 
 
-@cache
-def load_data(name: str) -> Any:
-    """Return the content of a file in `data/`; it is shared, do not change it.
-
-    Raises:
-        UnknownNameError: The file does not exist.
-    """
-    folder = resources.files("libero_env.tasks") / "data"
-    file = folder.joinpath(*name.split("/"))
-    if not file.is_file():
-        raise UnknownNameError("task file", name, (entry.name for entry in folder.iterdir()))
-    return parse_yaml(file.read_text(encoding="utf-8"))
-
-
 def load_scene(name: str) -> Values:
     """Return the definition of a scene of the benchmark."""
-    return load_data(f"scenes/{name}.yaml")
+    return read_yaml(f"tasks/data/scenes/{name}.yaml")
 
 
 @cache

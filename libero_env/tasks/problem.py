@@ -39,6 +39,7 @@ _MAX_EVALUATIONS = 10_000  # atoms of a goal, counted for each object that its q
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 _VARIABLE = re.compile(r"\??\w[\w.-]*")
 _PLACING = ("On", "In")
+_TOLERANCE = 1e-9  # largest difference of two equal numbers
 
 Value = TypeVar("Value")
 
@@ -527,16 +528,11 @@ def _goal(problem: Problem) -> Iterator[Violation]:
         yield Violation("size", what, f"at most {_MAX_EVALUATIONS}", ":goal")
 
 
-def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
+def differences(a: Problem, b: Problem) -> list[str]:
     """Return the differences in meaning of two problems, one line each; empty if they describe the same task.
 
     The order of fixtures and objects matters (it is the joint order). The order of regions, of init atoms and of the
     parts of a conjunction does not, nor do case and spacing of the language.
-
-    Args:
-        a: First problem.
-        b: Second problem.
-        tolerance: Largest difference of two equal numbers.
     """
     words = lambda p: " ".join(p.language.split()).casefold()  # noqa: E731
     pairs = {
@@ -555,7 +551,7 @@ def differences(a: Problem, b: Problem, tolerance: float = 1e-9) -> list[str]:
     regions_a, regions_b = ({region.address: region for region in p.regions} for p in (a, b))
     for address in sorted(regions_a.keys() | regions_b.keys()):
         x, y = regions_a.get(address), regions_b.get(address)
-        if x is None or y is None or not _same_region(x, y, tolerance):
+        if x is None or y is None or not _same_region(x, y):
             lines.append(f"region {address}: {x} is not {y}")
     return lines
 
@@ -573,11 +569,11 @@ def _meaning(node: Expression, parts: Iterator[object]) -> object:
     return type(node).__name__, what, (tuple if isinstance(node, Then) else frozenset)(parts)
 
 
-def _same_region(x: Region, y: Region, tolerance: float) -> bool:
+def _same_region(x: Region, y: Region) -> bool:
     def close(p, q) -> bool:
         flat_p, flat_q = ([value for row in rows for value in row] for rows in (p, q))
         return len(flat_p) == len(flat_q) and all(
-            abs(s - t) <= tolerance for s, t in zip(flat_p, flat_q, strict=True)
+            abs(s - t) <= _TOLERANCE for s, t in zip(flat_p, flat_q, strict=True)
         )
 
     return close(x.ranges, y.ranges) and close(x.yaw, y.yaw) and close([x.rgba], [y.rgba])

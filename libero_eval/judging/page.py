@@ -198,8 +198,8 @@ def _groups(comparison: Comparison) -> str:
     )
 
 
-def _short(label: str, length: int = 16) -> str:
-    return label if len(label) <= length else "…" + label[1 - length :]
+def _short(label: str) -> str:
+    return label if len(label) <= 16 else f"…{label[-15:]}"
 
 
 def write_page(comparison: Comparison, path: Path) -> Path:

@@ -1,7 +1,7 @@
 """Costs of an algorithm besides training time: floating-point operations, memory and storage.
 
-Records hold these numbers under the names of `COSTS`; the wall time of training and of evaluation has records of
-its own.
+Records hold these numbers under the names of `lifelong.report.tables.COST_COLUMNS`; the wall time of training and of
+evaluation has records of its own.
 """
 
 import copy
@@ -22,17 +22,6 @@ from lifelong.data.memory import ReplayMemory
 from lifelong.data.windows import WindowDataset
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.seeding import generator, seeded
-
-COSTS: Mapping[str, str] = {
-    "parameters": "parameters of the policy, and those the algorithm adds and trains",
-    "parameters_trained": "parameters that training may change, without those that PackNet has given to earlier tasks",
-    "flops_per_step": "floating-point operations of a training step, replay and penalties included",
-    "flops_per_action": "floating-point operations of one action, with a full history",
-    "stored_bytes": "storage the algorithm keeps from task to task: its state, and the frames it may replay",
-    "end_task_seconds": "wall time of the algorithm's work between two tasks",
-    "peak_gpu_bytes": "largest memory held on the GPU while learning the task",
-    "peak_memory_bytes": "largest memory of the process so far",
-}
 
 _SMALL_BATCH = 2  # [windows] smaller of the two batches whose operations are counted
 

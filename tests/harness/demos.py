@@ -5,9 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from libero_env.demos.generate import generate
+from libero_env.demos.config import DemoConfig
+from libero_env.demos.generate import RecordingJob, make_demos
 from libero_env.demos.read import Episode
 from libero_env.demos.write import DemoWriter, make_header
+from libero_env.errors import DemoError
 from libero_env.expert.expert import Attempt
 
 STEPS = 12  # of an episode by `wander`
@@ -39,6 +41,15 @@ def write(path, episodes, **more):
     for i, one in enumerate(episodes):
         writer.write(i, one)
     return writer.finish()
+
+
+def generate(task, n, *, path, camera_size=(128, 128), workers=0, progress=None, **options):
+    """Record the first `n` demonstrations of a task into one file; raise an error if the file is not complete."""
+    job = RecordingJob(DemoConfig(task, camera_size, **options), path)
+    (report,) = make_demos([job], n, workers=workers, progress=progress).values()
+    if report.error:
+        raise DemoError(f"{path.name}: {report.error}")
+    return path
 
 
 def wander(env, experts, noise, max_steps):

@@ -17,8 +17,8 @@ import pytest
 from exports_libero_lifelong.demonstrations import export_demos, export_published
 from exports_libero_lifelong.regeneration import Regeneration
 
-from libero_env.demos.generate import generate
 from libero_env.demos.read import read_episodes
+from tests.harness.demos import generate
 from tests.harness.peers import ROOT, lerobot
 
 pytest.importorskip("av")

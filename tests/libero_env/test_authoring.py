@@ -17,6 +17,7 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states import store as init_states
 from libero_env.sim.scene import build_scene
+from libero_env.storage import read_yaml
 from libero_env.tasks import (
     bddl,
     get_suite,
@@ -27,7 +28,7 @@ from libero_env.tasks import (
     suite_names,
     write_task,
 )
-from libero_env.tasks.builder import EMPTY, load_data, model_regions
+from libero_env.tasks.builder import EMPTY, model_regions
 from libero_env.tasks.problem import Atom, Not, Or, differences
 from libero_env.workspaces import WORKSPACES
 from lifelong.errors import ConfigError
@@ -87,7 +88,7 @@ def test_a_file_a_call_and_the_bddl_written_are_the_same(tmp_path):
 )
 def test_the_benchmarks_own_facts_mean_the_same_here(suite):
     """The keys of the suites' files are valid in user-defined files."""
-    facts = load_data(f"{suite}.yaml")
+    facts = read_yaml(f"tasks/data/{suite}.yaml")
     for task, own in zip(get_suite(suite).tasks, facts["tasks"], strict=True):
         shared = {key: value for key, value in facts.items() if key != "tasks"}
         made = make_task(**{**shared, **own})

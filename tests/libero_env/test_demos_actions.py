@@ -9,13 +9,13 @@ from exports_libero_lifelong.demonstrations import ORIGIN, export_demos
 
 from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.config import RenderConfig
-from libero_env.demos.generate import generate
 from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import read_episodes
 from libero_env.demos.replay import replay
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.geometry import rotation_about
 from libero_env.sim.controller import get_controller
+from tests.harness.demos import generate
 
 pytestmark = pytest.mark.sim
 

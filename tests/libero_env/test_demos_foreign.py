@@ -12,7 +12,7 @@ from libero_env import memory
 from libero_env.demos import hdf5
 from libero_env.demos.contents import read_header
 from libero_env.demos.curate import describe, examine, filter_demos
-from libero_env.demos.generate import generate, make_demos
+from libero_env.demos.generate import make_demos
 from libero_env.demos.observe import recorded_robot, recorded_task
 from libero_env.demos.read import demo_lengths, iter_demos, read_demos, read_episodes
 from libero_env.demos.replay import rerun_actions
@@ -20,7 +20,7 @@ from libero_env.demos.stored_model import read_fixture_poses
 from libero_env.demos.video import check_video_path, write_video
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, InvalidInputError, LiberoError
-from tests.harness.demos import episode, header, write
+from tests.harness.demos import episode, generate, header, write
 
 
 @pytest.fixture(scope="module")

@@ -14,13 +14,14 @@ import pytest
 
 from libero_env.demos.config import GENERATOR, DemoConfig, Variation, model_digest
 from libero_env.demos.contents import demo_number, read_header
-from libero_env.demos.generate import RecordingJob, demo_path, ensure_demos, generate, make_demos
+from libero_env.demos.generate import RecordingJob, demo_path, ensure_demos, make_demos
 from libero_env.demos.read import read_demos, read_episodes
 from libero_env.demos.record import DemoRecorder
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.env import LiberoEnv
 from libero_env.expert.expert import run_experts
 from libero_env.tasks import get_task
+from tests.harness.demos import generate
 
 pytestmark = pytest.mark.sim
 TASK = "libero_object/9"  # the shortest
@@ -102,9 +103,9 @@ def test_more_demonstrations_are_added_to_existing_ones(whole, tmp_path):
 
 def test_a_killed_recording_is_resumed_to_the_same_file(whole, tmp_path):
     script = f"""
-        import sys
-        from libero_env.demos.generate import generate
-        generate({TASK!r}, 30, path=sys.argv[1], workers=1, camera_size={SIZE}, progress=False)
+        import pathlib, sys
+        from tests.harness.demos import generate
+        generate({TASK!r}, 30, path=pathlib.Path(sys.argv[1]), workers=1, camera_size={SIZE}, progress=False)
     """
     path = tmp_path / "killed.hdf5"
     child = subprocess.Popen([sys.executable, "-c", textwrap.dedent(script), str(path)])
@@ -202,8 +203,8 @@ def test_the_number_of_processes_does_not_matter(whole, tmp_path):
 def test_a_script_without_a_main_guard_is_told_so_and_does_not_wait_for_itself(tmp_path):
     file = tmp_path / "record.py"
     file.write_text(
-        "from libero_env.demos.generate import generate\n"
-        f"generate({TASK!r}, 10, path={str(tmp_path / 'x.hdf5')!r}, workers=2, camera_size={SIZE})\n"
+        "from pathlib import Path\nfrom tests.harness.demos import generate\n"
+        f"generate({TASK!r}, 10, path=Path({str(tmp_path / 'x.hdf5')!r}), workers=2, camera_size={SIZE})\n"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run([sys.executable, str(file)], stderr=subprocess.PIPE, text=True, env=environment)

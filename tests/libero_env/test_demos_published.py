@@ -16,11 +16,11 @@ from PIL import Image
 
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import read_header
-from libero_env.demos.generate import generate
 from libero_env.demos.observe import StateRenderer, recorded_task
 from libero_env.demos.read import read_episodes
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, UnknownNameError
+from tests.harness.demos import generate
 
 av = pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")

@@ -12,7 +12,7 @@ from exports_libero_lifelong.demonstrations import export_demos
 from libero_env.demos.config import DemoConfig, RenderConfig, Variation
 from libero_env.demos.contents import read_header
 from libero_env.demos.curate import examine
-from libero_env.demos.generate import RecordingJob, generate, make_demos
+from libero_env.demos.generate import RecordingJob, make_demos
 from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
 from libero_env.demos.read import Episode, read_demos, read_episodes
 from libero_env.demos.rendering import rerender
@@ -23,7 +23,7 @@ from libero_env.expert import UnsupportedGoalError
 from libero_env.expert.expert import Attempt
 from libero_env.tasks import get_task
 from lifelong.data import demonstrations
-from tests.harness.demos import STEPS, record_wander, wander
+from tests.harness.demos import STEPS, generate, record_wander, wander
 
 pytestmark = pytest.mark.sim
 TASK, SIZE = "libero_goal/3", (24, 32)

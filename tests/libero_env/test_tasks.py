@@ -9,8 +9,9 @@ import pytest
 import yaml
 
 from libero_env.errors import UnknownNameError
+from libero_env.storage import read_yaml
 from libero_env.tasks import bddl, builder, get_suite, get_task, read_task, suite_names
-from libero_env.tasks.builder import build_problem, language_from_name, load_data
+from libero_env.tasks.builder import build_problem, language_from_name
 from libero_env.tasks.problem import Atom, Not, Or, differences
 
 # every task once, whatever number of suites has it
@@ -86,7 +87,11 @@ def test_libero_100_is_90_then_10():
 
 def test_every_scene_is_used_and_has_a_description():
     folder = Path(builder.__file__).parent / "data" / "scenes"
-    facts = [load_data(f"{name}.yaml") for name in suite_names() if name not in ("libero_100", "libero_130")]
+    facts = [
+        read_yaml(f"tasks/data/{name}.yaml")
+        for name in suite_names()
+        if name not in ("libero_100", "libero_130")
+    ]
     used = {task.get("scene", suite.get("scene")) for suite in facts for task in suite["tasks"]}
     assert {file.stem for file in folder.iterdir()} == used
     assert all(file.read_text().startswith("# ") for file in folder.iterdir())

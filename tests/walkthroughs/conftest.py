@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from libero.libero.benchmark import get_benchmark
-from libero_env.demos.generate import generate
+from tests.harness.demos import generate
 from tests.harness.facade_learning import write_demos
 from tests.walkthroughs.blocks import Block, load_blocks
 

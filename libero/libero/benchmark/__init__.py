@@ -13,9 +13,10 @@ from libero_env.errors import LiberoError, UnknownNameError, require_known
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.store import load_init_states
 from libero_env.sim.scene import build_scene
+from libero_env.storage import read_yaml
 from libero_env.tasks import get_suite, suite_names
 from libero_env.tasks import get_task as get_native_task
-from libero_env.tasks.builder import language_from_name, load_data
+from libero_env.tasks.builder import language_from_name
 
 BENCHMARK_MAPPING: dict[str, type["Benchmark"]] = {}
 
@@ -38,7 +39,7 @@ def __getattr__(name: str) -> Any:
     if name == "task_maps":
         return _task_maps()
     if name == "task_orders":
-        return load_data("task_orders.yaml")
+        return read_yaml("tasks/data/task_orders.yaml")
     if name == "libero_task_map":
         from libero.libero.benchmark.libero_suite_task_map import libero_task_map
 
@@ -103,7 +104,7 @@ class Benchmark:
         if self.name in suite_names():
             self.tasks = [_entry(task) for task in get_suite(self.name).order(self.task_order_index)]
         else:
-            orders = load_data("task_orders.yaml")
+            orders = read_yaml("tasks/data/task_orders.yaml")
             order = orders[self.task_order_index] if len(tasks) == 10 else range(len(tasks))
             self.tasks = [tasks[i] for i in order]
         self.n_tasks = len(self.tasks)

@@ -22,7 +22,7 @@ not turn. The point that cameras turn about is 0.8 m above the floor in all scen
 import re
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -228,8 +228,9 @@ def camera_pose(workspace: str, view: ViewChange) -> CameraPose:
     Raises:
         UnknownNameError: The workspace does not exist.
     """
-    require_known("workspace", workspace, _cameras())
-    start = _cameras()[workspace]["agentview"]
+    cameras = read_yaml("assets/workspaces/original_cameras.yaml")
+    require_known("workspace", workspace, cameras)
+    start = cameras[workspace]["agentview"]
     pose = CameraPose(np.array(start["pos"]), np.array(start["quat"]))
     if view.elevation:
         pose = _turned(pose, _Y, -view.elevation, _PIVOT)
@@ -254,11 +255,6 @@ def joint_pose(number: int) -> np.ndarray:
     if not 0 <= number <= POSES:
         raise InvalidInputError(f"pose {number}; LIBERO-Plus has 1 to {POSES}, and 0 for LIBERO's")
     return _all_poses()[number].copy()
-
-
-@cache
-def _cameras() -> dict[str, Any]:
-    return read_yaml("assets/workspaces/original_cameras.yaml")
 
 
 @cache
