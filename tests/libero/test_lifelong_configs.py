@@ -35,8 +35,8 @@ NETWORKS = {
 
 
 def words() -> set[str]:
-    """All attributes and texts in the package, but for those of the list of keys without effect."""
-    found = set()
+    """All attributes and texts in the package, also those that a prefix and an ending make, as f"{prefix}_dropout"."""
+    found, endings = set(), set()
     root = Path(libero.__file__).parent
     for file in (*root.glob("lifelong/**/*.py"), *root.glob("_adapters/**/*.py")):
         for node in ast.walk(ast.parse(file.read_text())):
@@ -44,7 +44,9 @@ def words() -> set[str]:
                 found.add(node.attr)
             if isinstance(node, ast.Constant) and isinstance(node.value, str):
                 found.add(node.value)
-    return found
+            if isinstance(node, ast.JoinedStr) and len(node.values) == 2:
+                endings |= {part.value for part in node.values[1:] if isinstance(part, ast.Constant)}
+    return found | {word + ending for word in found for ending in endings if ending.startswith("_")}
 
 
 def leaves(node, path=""):
