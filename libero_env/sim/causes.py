@@ -83,7 +83,7 @@ class Missing:
         of: Object or fixture that it is about.
         has_held: Whether it held at any time.
         is_over: Whether the object is over or in the place where it belongs.
-        place: What the object touches.
+        place: What the object touches; empty while it is in the air.
     """
 
     of: str
@@ -96,11 +96,11 @@ def explain(trace: Trace, missing: Sequence[Missing], wanted: Sequence[str]) -> 
     """Return why an episode failed.
 
     Of each missing atom the first that is true: the atom held before (undone); the object is in the hand, over its
-    place (not released) or elsewhere (out of time); it was lifted, and has left fingers that had not opened (dropped)
-    or had (wrong place); the gripper still touches the object, or moves the fixture (out of time); the robot has hit
-    something else since it last held the object (collided); it has lifted an object that the goal is not about (wrong
-    object); it has touched the object (missed grasp); or it has not (never reached). Of several missing atoms, the one
-    whose cause is first in `CAUSES` is named.
+    place (not released) or elsewhere (out of time); it was lifted, and still falls into its place (out of time), or has
+    left fingers that had not opened (dropped) or had (wrong place); the gripper still touches the object, or moves the
+    fixture (out of time); the robot has hit something else since it last held the object (collided); it has lifted an
+    object that the goal is not about (wrong object); it has touched the object (missed grasp); or it has not (never
+    reached). Of several missing atoms, the one whose cause is first in `CAUSES` is named.
 
     Args:
         trace: What the episode has shown.
@@ -119,6 +119,8 @@ def _explain(trace: Trace, one: Missing, wanted: Sequence[str]) -> Failure:
         return Failure("undone", of, one.place)
     if trace.in_hand == of:
         return Failure("not released" if one.is_over else "out of time", of)
+    if of in trace.slipped and one.is_over and not one.place:
+        return Failure("out of time", of)  # it still falls
     if of in trace.slipped:
         return Failure("dropped" if trace.slipped[of] else "wrong place", of, one.place)
     if of in trace.touching and not hits:

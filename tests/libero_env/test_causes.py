@@ -25,6 +25,8 @@ OWN = ["milk"]
         (Trace(touched={"milk"}, impacts=[(3, "milk", 150.0)]), Missing("milk"), "missed grasp", ""),  # a hard push
         (Trace(slipped={"milk": True}), Missing("milk", place="table"), "dropped", "table"),
         (Trace(slipped={"milk": False}), Missing("milk", place="plate"), "wrong place", "plate"),
+        (Trace(slipped={"milk": False}), Missing("milk", is_over=True, place="plate"), "wrong place", "plate"),
+        (Trace(slipped={"milk": False}), Missing("milk", is_over=True), "out of time", ""),  # it still falls
         (Trace(in_hand="milk"), Missing("milk"), "out of time", ""),
         (Trace(in_hand="milk"), Missing("milk", is_over=True), "not released", ""),
         (Trace(slipped={"milk": False}), Missing("milk", has_held=True, place="table"), "undone", "table"),
@@ -85,6 +87,9 @@ def test_in_the_hand_released_elsewhere_and_slipped(lifting):
     slipped = held.copy()
     slipped[address + 2] -= 0.06  # out of the closed fingers
     assert failed(lifting, [HOLD] * 2, slipped).cause == "dropped"
+    falling = held.copy()
+    falling[address : address + 3] = env.views[0].body_pos(env.goals.atoms[0].args[1]) + [0, 0, 0.25]
+    assert failed(lifting, [OPEN] * 2, falling).cause == "out of time", "it falls into the bowl"
 
 
 def test_another_goal_that_was_reached_instead_is_named(lifting):
