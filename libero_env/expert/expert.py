@@ -138,7 +138,7 @@ class Expert:
         action = self.skill.act(view)
         if self.avoid:
             self._guard = self._guard or Guard(view, self.task.problem.goal)
-            action = self._guard.steer(view, action, self.skill.atom.args[0])
+            action = self._guard.steer(view, action, view.scene.owner(self.skill.atom.args[0]))
         return limit_elbow_extension(view, action)
 
     def _skill_for(self, step: Step, view: StateView, shapes: Shapes) -> Skill:

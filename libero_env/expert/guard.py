@@ -14,7 +14,7 @@ from libero_env.sim.watch import ancestors
 from libero_env.tasks.problem import Expression
 from libero_env.timing import CONTROL_HZ
 
-MARGIN = 0.008  # [m] that the hand keeps
+MARGIN, TOUCH = 0.008, 0.001  # [m] that the hand keeps, and from a fixture whose part it moves
 NEAR = 0.05  # [m] from which on it is watched
 SWEEPS = 4  # over what is near, so that a hand in a corner keeps clear of both sides
 WRIST = "robot0_link7"
@@ -50,11 +50,11 @@ class Guard:
         self._geoms = np.array([pair[:2] for pair in self._pairs], int).reshape(-1, 2)
         self._pose: Pose | None = None  # of the grip site one step ago
 
-    def steer(self, view: StateView, action: np.ndarray, handled: str) -> np.ndarray:
+    def steer(self, view: StateView, action: np.ndarray, handled: str | None) -> np.ndarray:
         """Return the action (7,) that is nearest to one and keeps the hand clear.
 
         Args:
-            handled: Object that may be touched.
+            handled: Object that is carried and may be touched, or fixture whose part is moved.
         """
         pose = Pose(view.eef_pos, view.eef_mat)
         before, self._pose = self._pose or pose, pose
@@ -71,10 +71,11 @@ class Guard:
         limits = []  # direction away from a thing, (3,), and least distance to go along it, [m]
         for part, geom, name in (self._pairs[k] for k in np.flatnonzero(middles < reach)):
             distance = mujoco.mj_geomDistance(model, data, part, geom, NEAR, ends)
-            if name != handled and distance < NEAR and distance != 0:
+            if distance < NEAR and distance != 0 and (name != handled or name in view.scene.fixtures):
                 away = (ends[:3] - ends[3:]) / distance
                 comes = DAMPING_TIME * CONTROL_HZ * moved + np.cross(spin, ends[:3] - pose.pos)
-                limits.append((away, MARGIN - distance - float(comes @ away)))
+                margin = TOUCH if name == handled else MARGIN
+                limits.append((away, margin - distance - float(comes @ away)))
         move = POSITION_SCALE * action[:3]
         for away, least in limits * SWEEPS:
             move = move + max(least - float(move @ away), 0.0) * away
