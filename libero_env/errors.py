@@ -65,11 +65,11 @@ class MissingPackageError(LiberoError):
         return type(self), (self.reason, self.remedy)
 
 
-def require_package(name: str, extra: str | None) -> None:
+def require_package(name: str, extra: str) -> None:
     """Check that an optional package is installed.
 
     Args:
-        extra: Extra of this distribution that installs it; None for a package in `integrations/`.
+        extra: Extra of this distribution that installs it.
 
     Raises:
         MissingPackageError: It is not; the message has the command that installs it.
@@ -79,11 +79,10 @@ def require_package(name: str, extra: str | None) -> None:
     except ModuleNotFoundError:  # not even the package that it is part of
         found = None
     if found is None:
-        what = f"'libero-lifelong[{extra}]'" if extra else f"./integrations/{name} in a checkout"
-        raise MissingPackageError(f"{name} is not installed", f"pip install {what}")
+        raise MissingPackageError(f"{name} is not installed", f"pip install 'libero-lifelong[{extra}]'")
 
 
-def need(module: str, extra: str | None = None) -> Any:
+def need(module: str, extra: str) -> Any:
     """Import a module of an optional package, such as `websockets.sync.client`; see `require_package`."""
     require_package(module.partition(".")[0], extra)
     return import_module(module)

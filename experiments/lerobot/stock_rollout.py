@@ -14,9 +14,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import yaml
-from lerobot_policies_libero_lifelong.policy import EMBEDDING, FOLDER, IMAGES, lerobot_module
 
 from libero_env import LiberoEnv
+from libero_integrations.lerobot_policy import EMBEDDING, FOLDER, IMAGES, lerobot_module
 from lifelong.language import embed
 
 

@@ -17,7 +17,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-PACKAGES = ("libero_env", "lifelong", "libero_eval", "libero")
+PACKAGES = ("libero_env", "lifelong", "libero_eval", "libero", "libero_integrations")
 LONG = 40  # lines of a function
 
 _GRAPH = """

@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -24,7 +25,7 @@ from libero_env.cli.options import (
     arg,
     modalities,
 )
-from libero_env.errors import DemoError, InvalidInputError, need
+from libero_env.errors import DemoError, InvalidInputError
 
 if TYPE_CHECKING:
     from libero_env.demos.config import DemoConfig, Variation
@@ -345,7 +346,7 @@ def show_file(
         bddl: Task file of what was recorded (default: the task that the file states).
     """
     demos = [f"demo_{number}" for number in demo] if demo else None
-    write_rerun = need("exports_libero_lifelong.rerun").write_rerun
+    write_rerun = import_module("libero_integrations.exports.rerun").write_rerun
     written = write_rerun(file, rerun, demos=demos, task=task_of(bddl))
     print(f"{rerun}: {written} demonstrations; open it with: rerun {rerun}")
 
@@ -454,7 +455,7 @@ def export(
     """
     from libero_env.demos.curate import find_demo_files
 
-    lines = need("exports_libero_lifelong.demonstrations").export(
+    lines = import_module("libero_integrations.exports.demonstrations").export(
         find_demo_files(files),
         out,
         form,

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,7 +11,6 @@ import tyro
 
 from libero_env.cli.ending import UNDECIDED
 from libero_env.cli.options import Answer, Field, FilePath, Positional, Probability, Share, arg
-from libero_env.errors import need
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -180,7 +180,9 @@ def export(
         raise ConfigError(f"--as {format} takes one evaluation, not {len(results)}")
     content, path = EvaluationResult.read(results[0]), Path(results[0])
     folder = out or (path if path.is_dir() else path.parent)
-    written = need("exports_libero_lifelong.results").export(content, folder, format, dataset, source)
+    written = import_module("libero_integrations.exports.results").export(
+        content, folder, format, dataset, source
+    )
     print(*written, sep="\n")
 
 

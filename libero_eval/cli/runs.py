@@ -4,10 +4,10 @@ import asyncio
 import contextlib
 import socket
 from dataclasses import asdict
+from importlib import import_module
 from typing import Annotated
 
 from libero_env.cli.options import Answer, Device, Field, FilePath, Natural, Positional, Processes, Seed
-from libero_env.errors import need
 from libero_eval.requests import DiagnoseRequest, RelearnRequest, SaliencyRequest, ViewRequest
 
 
@@ -108,7 +108,7 @@ def check(
 
 def view(request: ViewRequest) -> None:
     """Show a scene in the browser until interrupted; print its address."""
-    module = need("viewer_libero_lifelong.viewer")
+    module = import_module("libero_integrations.viewer")
     viewer = module.Viewer(module.Stage(request), request.host, request.port)
     try:
         viewer.open(viewer.stage.initial)

@@ -3,12 +3,13 @@
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from importlib import import_module
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import numpy as np
 
-from libero_env.errors import need, require_known
+from libero_env.errors import require_known
 from libero_env.tasks import Task, get_task
 from libero_eval.policies import PROBE_TOLERANCE, PolicyUnderTest
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
@@ -27,8 +28,8 @@ from lifelong.errors import ConfigError, ProtocolError, ServerError
 CLIENTS = {
     "ws": ("libero_eval.servers.openpi", "OpenpiClient", "ws"),
     "wss": ("libero_eval.servers.openpi", "OpenpiClient", "wss"),
-    "vla-eval": ("policy_servers_libero_lifelong.vla_eval", "VlaEvalClient", "ws"),
-    "gr00t": ("policy_servers_libero_lifelong.groot", "GrootClient", "tcp"),
+    "vla-eval": ("libero_integrations.servers.vla_eval", "VlaEvalClient", "ws"),
+    "gr00t": ("libero_integrations.servers.groot", "GrootClient", "tcp"),
 }
 PROBED = {"ee_pos": 3, "gripper_states": 2}  # of the fixed observation: name -> size
 
@@ -179,5 +180,5 @@ class ServerPolicy(PolicyUnderTest):
         module, name, transport = CLIENTS[scheme]
         url = checked_address(f"{transport}://{rest}", self.given)
         limits = Limits(answer=self.request.timeout, in_flight=self.request.in_flight)
-        with closing(getattr(need(module), name)(url, limits)) as client:
+        with closing(getattr(import_module(module), name)(url, limits)) as client:
             yield client

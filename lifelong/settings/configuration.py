@@ -25,7 +25,6 @@ from typing import Annotated, Any, Union, get_args, get_origin
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from libero_env.errors import require_package
 from libero_env.text import shown, suggest
 from libero_env.validation import is_plain, parameters_of, validate, validate_arguments
 from lifelong.errors import ConfigError
@@ -55,7 +54,7 @@ _COMPONENTS = (
     "lifelong.algorithms.importance.ImportanceEstimator",
     "torch.nn.Module",
 )
-_OURS = ("lifelong", "lerobot_policies_libero_lifelong")  # packages whose classes may always be named
+_OURS = ("lifelong", "libero_integrations")  # packages whose classes may always be named
 # where a user's own class must be derived from ours; elsewhere it may resemble it
 _STRICT = ("algo", "policy")
 _SPECIAL = ("_target_", "_partial_")  # keys of a node that are not arguments
@@ -280,8 +279,6 @@ def find_target(name: object, allowed: Sequence[str] | None = None) -> Target:
     parts = name.split(".") if isinstance(name, str) and len(name) <= 200 else []
     if len(parts) < 2 or not all(part.isidentifier() for part in parts):
         raise ConfigError(f"is {shown(name)}; expected the name of a class, such as {GROUPS['algo']}")
-    if parts[0] in _OURS:
-        require_package(parts[0], None)
     if allowed is None:
         return _resolve(str(name))
     if parts[0] in _OURS:

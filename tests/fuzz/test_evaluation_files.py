@@ -6,7 +6,6 @@ import json
 from dataclasses import fields, replace
 
 import yaml
-from exports_libero_lifelong.results import export_lerobot, export_vla_eval
 from hypothesis import given
 
 from libero_env.sim.costs import Costs
@@ -20,6 +19,7 @@ from libero_eval.plan import repeated
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import EvalRequest
+from libero_integrations.exports.results import export_lerobot, export_vla_eval
 from tests.harness.fuzz import examples, survive
 from tests.harness.mutations import changed_text, mutated
 from tests.harness.results import drawn_result

@@ -72,8 +72,7 @@ def inspect_robots() -> Peer:
     """Return the environment of Inspect Robots with our distribution, and Rerun, 530 MB, beside that of the tests."""
     python = counterpart("hatchling", no_deps=("inspect-robots==0.60.0", "rerun-sdk==0.41.0"))
     installed = _installed(python, "inspect_robots_libero_lifelong")
-    ours = str(INTEGRATIONS / "exports_libero_lifelong")
-    return Peer(python, (str(ROOT), ours, installed, sysconfig.get_path("purelib")))
+    return Peer(python, (str(ROOT), installed, sysconfig.get_path("purelib")))
 
 
 def lerobot() -> Peer:

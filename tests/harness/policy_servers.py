@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import zmq
-from policy_servers_libero_lifelong.groot import ACTION, GROOT
-from policy_servers_libero_lifelong.vla_eval import VLA_EVAL
 from websockets.asyncio.server import serve
 from websockets.exceptions import ConnectionClosed
 
 from libero_eval.servers.openpi import OPENPI
 from libero_eval.servers.serving import PolicyServer, ServedPolicy
+from libero_integrations.servers.groot import ACTION, GROOT
+from libero_integrations.servers.vla_eval import VLA_EVAL
 
 MODALITIES = {
     "video": ["image", "wrist_image"],

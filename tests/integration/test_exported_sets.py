@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from exports_libero_lifelong.demonstrations import export_demos, export_published
-from exports_libero_lifelong.regeneration import Regeneration
 
 from libero_env.demos.read import read_episodes
+from libero_integrations.exports.demonstrations import export_demos, export_published
+from libero_integrations.exports.regeneration import Regeneration
 from tests.harness.demos import generate
 from tests.harness.peers import ROOT, lerobot
 

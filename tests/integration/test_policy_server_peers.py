@@ -11,7 +11,6 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
-from policy_servers_libero_lifelong.vla_eval import VLA_EVAL, VlaEvalClient
 
 from libero_env.tasks import get_suite
 from libero_eval.protocols.adapter import PolicyInput
@@ -19,6 +18,7 @@ from libero_eval.protocols.clock import ClockedActor
 from libero_eval.servers.actors import RemoteActor
 from libero_eval.servers.openpi import OPENPI
 from libero_eval.servers.transport import EpisodeStart, Limits
+from libero_integrations.servers.vla_eval import VLA_EVAL, VlaEvalClient
 from lifelong.errors import ServerError
 from lifelong.evaluation.actors import PolicyActor
 from lifelong.evaluation.restore import restore

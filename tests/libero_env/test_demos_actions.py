@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exports_libero_lifelong.demonstrations import ORIGIN, export_demos
 
 from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.config import RenderConfig
@@ -15,6 +14,7 @@ from libero_env.demos.replay import replay
 from libero_env.errors import DemoError, UnknownNameError
 from libero_env.geometry import rotation_about
 from libero_env.sim.controller import get_controller
+from libero_integrations.exports.demonstrations import ORIGIN, export_demos
 from tests.harness.demos import generate
 
 pytestmark = pytest.mark.sim

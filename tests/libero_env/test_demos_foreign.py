@@ -6,7 +6,6 @@ import time
 import h5py
 import numpy as np
 import pytest
-from exports_libero_lifelong.demonstrations import export_demos
 
 from libero_env import memory
 from libero_env.demos import hdf5
@@ -20,6 +19,7 @@ from libero_env.demos.stored_model import read_fixture_poses
 from libero_env.demos.video import check_video_path, write_video
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, InvalidInputError, LiberoError
+from libero_integrations.exports.demonstrations import export_demos
 from tests.harness.demos import episode, generate, header, write
 
 

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from exports_libero_lifelong.demonstrations import export_demos
 
 from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, LiberoError
+from libero_integrations.exports.demonstrations import export_demos
 from tests.harness.demos import episode, write
 
 av = pytest.importorskip("av")

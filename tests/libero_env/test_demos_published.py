@@ -10,8 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exports_libero_lifelong.demonstrations import ORIGIN, export_demos, export_published
-from exports_libero_lifelong.regeneration import Regeneration, published_noop_steps, regenerate
 from PIL import Image
 
 from libero_env.demos.config import RenderConfig
@@ -20,6 +18,8 @@ from libero_env.demos.observe import StateRenderer, recorded_task
 from libero_env.demos.read import read_episodes
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, UnknownNameError
+from libero_integrations.exports.demonstrations import ORIGIN, export_demos, export_published
+from libero_integrations.exports.regeneration import Regeneration, published_noop_steps, regenerate
 from tests.harness.demos import generate
 
 av = pytest.importorskip("av")

@@ -7,7 +7,6 @@ from types import SimpleNamespace
 import h5py
 import numpy as np
 import pytest
-from exports_libero_lifelong.demonstrations import export_demos
 
 from libero_env.demos.config import DemoConfig, RenderConfig, Variation
 from libero_env.demos.contents import read_header
@@ -22,6 +21,7 @@ from libero_env.errors import DemoError
 from libero_env.expert import UnsupportedGoalError
 from libero_env.expert.expert import Attempt
 from libero_env.tasks import get_task
+from libero_integrations.exports.demonstrations import export_demos
 from lifelong.data import demonstrations
 from tests.harness.demos import STEPS, generate, record_wander, wander
 

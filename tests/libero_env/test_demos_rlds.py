@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from exports_libero_lifelong.demonstrations import ORIGIN, export_demos
-from exports_libero_lifelong.layouts import RECORDED
-from exports_libero_lifelong.rlds import _crc32c
 from PIL import Image
 
 from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, UnknownNameError
+from libero_integrations.exports.demonstrations import ORIGIN, export_demos
+from libero_integrations.exports.layouts import RECORDED
+from libero_integrations.exports.rlds import _crc32c
 from tests.harness.demos import episode, write
 
 LENGTHS = (9, 14)
@@ -129,7 +129,7 @@ def test_metadata_say_what_the_records_hold(rlds):
 
 def test_large_sets_have_several_shards(file, tmp_path, monkeypatch):
     small = {"rlds": replace(RECORDED["rlds"], data_mb=0)}
-    monkeypatch.setattr("exports_libero_lifelong.demonstrations.RECORDED", small)
+    monkeypatch.setattr("libero_integrations.exports.demonstrations.RECORDED", small)
     export_demos([file], tmp_path / "set", "rlds", progress=False)
     names = sorted(path.name for path in (tmp_path / "set/1.0.0").glob("*.tfrecord-*"))
     assert names == [f"set-train.tfrecord-0000{i}-of-00002" for i in range(2)]
@@ -151,7 +151,7 @@ def test_a_full_disk_leaves_nothing(file, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("exports_libero_lifelong.rlds.RldsWriter._write", full)
+    monkeypatch.setattr("libero_integrations.exports.rlds.RldsWriter._write", full)
     with pytest.raises(OSError, match="No space left"):  # of which the command line makes one line
         export_demos([file], tmp_path / "set", "rlds", progress=False)
     assert not list(tmp_path.iterdir())

@@ -5,7 +5,6 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from exports_libero_lifelong.lerobot import QUANTILES, colour_counts, colour_statistics
 
 from libero_env.cli.main import main
 from libero_env.demos.contents import read_header
@@ -15,6 +14,7 @@ from libero_env.demos.read import noop_steps, read_demos, read_episodes
 from libero_env.errors import DemoError
 from libero_env.tasks import get_task, write_task
 from libero_env.tasks.problem import same_meaning
+from libero_integrations.exports.lerobot import QUANTILES, colour_counts, colour_statistics
 from tests.harness.demos import episode, write
 
 

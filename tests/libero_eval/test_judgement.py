@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from exports_libero_lifelong.results import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
 
 from libero_env.cli.main import main  # noqa: E402
 from libero_eval.judging.comparability import Group, check_comparable, match, settings  # noqa: E402
 from libero_eval.judging.comparison import Comparison, compare_groups, gate, write_comparison  # noqa: E402
 from libero_eval.judging.group_scores import group_scores  # noqa: E402
 from libero_eval.judging.page import gate_text, render  # noqa: E402
+from libero_integrations.exports.results import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
 from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
 from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
 

@@ -14,8 +14,6 @@ import msgpack
 import numpy as np
 import pytest
 from PIL import Image
-from policy_servers_libero_lifelong.groot import ACTION, GROOT, GrootClient
-from policy_servers_libero_lifelong.vla_eval import VLA_EVAL, VlaEvalClient
 from websockets.server import ServerProtocol
 
 from libero_env.errors import MissingPackageError
@@ -29,6 +27,8 @@ from libero_eval.servers.actors import RemoteActor, checked_actions
 from libero_eval.servers.openpi import OPENPI, OpenpiClient
 from libero_eval.servers.policy import ServerPolicy
 from libero_eval.servers.transport import EpisodeStart, Limits, connect, need
+from libero_integrations.servers.groot import ACTION, GROOT, GrootClient
+from libero_integrations.servers.vla_eval import VLA_EVAL, VlaEvalClient
 from lifelong.errors import CodecError, ConfigError, ConnectionLost, ProtocolMismatchError, ServerError
 from lifelong.evaluation.rollout import run_episodes
 from tests.harness import policy_servers

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 import viser
 import zstandard
-from viewer_libero_lifelong.viewer import POLICY, Stage, Viewer
 from websockets.sync.client import connect
 
 from libero_env.cli.main import main
@@ -20,6 +19,7 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.perturbations import Perturbation
 from libero_eval.requests import ViewRequest
+from libero_integrations.viewer import POLICY, Stage, Viewer
 from tests.harness.demos import STEPS, record_wander
 
 pytestmark = pytest.mark.sim

@@ -10,9 +10,8 @@ import torch
 
 pytest.importorskip("lerobot")
 
-from lerobot_policies_libero_lifelong.policy import FOLDER, LeRobotPolicy, lerobot_module
-
 from libero_eval.user_policy import weights_digest
+from libero_integrations.lerobot_policy import FOLDER, LeRobotPolicy, lerobot_module
 from lifelong.data.dataset import SequenceVLDataset, last_frames
 from lifelong.data.fake import fake_observation
 from lifelong.data.windows import frame_moments, frames_of

@@ -16,10 +16,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from exports_libero_lifelong.layouts import PUBLISHED, RECORDED, STATE, Layout
-from exports_libero_lifelong.lerobot import EpisodeDatasetWriter, VideoDatasetWriter, write_json
-from exports_libero_lifelong.regeneration import Regeneration, regenerate
-from exports_libero_lifelong.rlds import RldsWriter
 from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.contents import json_attribute, read_header
 from libero_env.demos.hdf5 import BrokenDemoError
@@ -31,6 +27,10 @@ from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_folder
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ
+from libero_integrations.exports.layouts import PUBLISHED, RECORDED, STATE, Layout
+from libero_integrations.exports.lerobot import EpisodeDatasetWriter, VideoDatasetWriter, write_json
+from libero_integrations.exports.regeneration import Regeneration, regenerate
+from libero_integrations.exports.rlds import RldsWriter
 
 ORIGIN = "meta/libero.json"  # how a data set was made
 Writer = VideoDatasetWriter | EpisodeDatasetWriter | RldsWriter
@@ -89,7 +89,7 @@ def export_demos(
     Args:
         files: Files to read, in this order; all have the same cameras and image size.
         root: Folder to write; it must not exist. RLDS takes its name from it.
-        form: One of `exports_libero_lifelong.layouts.RECORDED`.
+        form: One of `libero_integrations.exports.layouts.RECORDED`.
         labels: As for `read_demos`.
         actions: Kind of the actions, one of `libero_env.demos.actions.KINDS`.
         video_mb: Size from which a video of LeRobot's form is continued in another file, [MiB].
@@ -135,7 +135,7 @@ def export_published(
     Args:
         files: Files to read, in this order; their images are not used.
         root: Folder to write; it must not exist. RLDS takes its name from it.
-        name: Published set, one of `exports_libero_lifelong.layouts.PUBLISHED`.
+        name: Published set, one of `libero_integrations.exports.layouts.PUBLISHED`.
         config: How the demonstrations are run.
         task: Task that all files recorded; None for those that they state.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from exports_libero_lifelong.layouts import FILES_PER_CHUNK, ROBOT_TYPE, STATE, Layout
 from libero_env.demos.read import Episode
 from libero_env.demos.video import H264, Mp4Writer, import_av
 from libero_env.errors import DemoError, need
 from libero_env.storage import atomic_write_text
+from libero_integrations.exports.layouts import FILES_PER_CHUNK, ROBOT_TYPE, STATE, Layout
 
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from exports_libero_lifelong.layouts import RECORDED
 from libero_env.demos.config import MASK_NAMES, RenderConfig
 from libero_env.demos.contents import is_image, json_attribute, read_header
 from libero_env.demos.observe import StateRenderer, recorded_frequency
@@ -22,6 +21,7 @@ from libero_env.errors import LiberoError, need
 from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_path
 from libero_env.tasks import Task
+from libero_integrations.exports.layouts import RECORDED
 
 _QUALITY = 95  # of JPEG
 

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from exports_libero_lifelong.layouts import STATE, Layout
-from exports_libero_lifelong.lerobot import DatasetWriter, write_json
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.read import Episode
 from libero_env.errors import DemoError
 from libero_env.parallel import compiled
+from libero_integrations.exports.layouts import STATE, Layout
+from libero_integrations.exports.lerobot import DatasetWriter, write_json
 
 VERSION = "1.0.0"
 _QUALITY = 95  # that of TensorFlow's encoder

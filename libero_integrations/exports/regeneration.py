@@ -19,7 +19,6 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from exports_libero_lifelong.layouts import STATE
 from libero_env.assets.pack import Pack, facade_assets, pack_of, select_pack
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import read_header
@@ -29,6 +28,7 @@ from libero_env.demos.replay import EXTRA_STEPS
 from libero_env.envs.config import Assets, Drawing, Size
 from libero_env.tasks import Task
 from libero_env.validation import checked
+from libero_integrations.exports.layouts import STATE
 
 Steps = Annotated[int, Field(ge=0)]
 # [action units] Euclidean norm below which the published sets count a motion as none

@@ -1,1 +1,0 @@
-"""Policies of LeRobot, such as ACT and diffusion policies, learned by libero-lifelong."""

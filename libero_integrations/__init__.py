@@ -1,0 +1,1 @@
+"""What other projects read, write and serve: their data sets, results, policies and servers, and a viewer."""
