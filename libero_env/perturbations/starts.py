@@ -129,9 +129,7 @@ class Gathered(StartChange):
 
     def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
         rng, before, moved = np.random.default_rng(self.seed), contacts(scene, row), row
-        wanted, receptacles = _of_goal(scene)
-        used = {*wanted, *receptacles}
-        idle = [name for name, load in carried(scene.problem).items() if not used & {name, *load}]
+        (wanted, _), idle = _of_goal(scene), _idle(scene)
         if not wanted or not idle:
             return None
         for k in rng.permutation(len(idle))[: self.count]:
@@ -139,6 +137,32 @@ class Gathered(StartChange):
             step = row[there : there + 2] + _BESIDE * direction(rng, 2) - row[here : here + 2]
             moved = shifted(scene, moved, (idle[k], *carried(scene.problem)[idle[k]]), step)
         return moved if contacts(scene, moved) <= before else None
+
+
+@dataclass(frozen=True)
+class Obstacle(StartChange):
+    """An object that the goal is not about stands between one that it is about and its place, without new contacts.
+
+    Attributes:
+        aside: Distance from the straight line, near its middle, [m].
+        seed: Seed of the choice and of the place.
+    """
+
+    aside: float
+    seed: int
+
+    def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
+        rng, idle = np.random.default_rng(self.seed), _idle(scene)
+        ways = [a.args for a in scene.goal_atoms if len(a.args) == 2 and a.args[0] in scene.problem.objects]
+        ends = [(name, owner) for name, address in ways if (owner := scene.owner(address)) in scene.entities]
+        if not idle or not ends:
+            return None
+        name, (start, end) = idle[rng.integers(len(idle))], (_middle(scene, row, n) for n in ends[0])
+        way, here = end - start, _middle(scene, row, name)
+        across = np.array([-way[1], way[0]]) / max(float(np.linalg.norm(way)), 1e-9)
+        step = start + rng.uniform(0.4, 0.6) * way + sign(rng) * self.aside * across - here
+        moved = shifted(scene, row, (name, *carried(scene.problem)[name]), step)
+        return moved if contacts(scene, moved) <= contacts(scene, row) else None
 
 
 @dataclass(frozen=True)
@@ -183,6 +207,19 @@ def _of_goal(scene: Scene) -> tuple[list[str], list[str]]:
     wanted = dict.fromkeys(atom.args[0] for atom in atoms if atom.args[0] in objects)
     owners = (scene.owner(name) for atom in atoms for name in atom.args[1:])
     return list(wanted), list(dict.fromkeys(name for name in owners if name and name in objects))
+
+
+def _idle(scene: Scene) -> list[str]:
+    """Return the objects on the workspace that the goal is not about, nor what they carry."""
+    used = {name for names in _of_goal(scene) for name in names}
+    return [name for name, load in carried(scene.problem).items() if not used & {name, *load}]
+
+
+def _middle(scene: Scene, row: np.ndarray, name: str) -> np.ndarray:
+    """Return where an object or a fixture stands in a state, (2,) [m]."""
+    if name in scene.objects:
+        return row[1 + scene.pose_address(name) :][:2]
+    return scene.split_states(row[None])[2][0, list(scene.fixtures).index(name), :2]
 
 
 def _touched(scene: Scene, name: str, touching: set[tuple[int, int]]) -> bool:
@@ -273,6 +310,10 @@ def _gathered(count: float, rng: np.random.Generator, scene: Scene) -> Gathered:
     return Gathered(int(count), int(rng.integers(2**63)))
 
 
+def _obstacle(nearness: float, rng: np.random.Generator, scene: Scene) -> Obstacle:
+    return Obstacle((1 - nearness) * _BESIDE, int(rng.integers(2**63)))
+
+
 def _part_of_goal(share: float, rng: np.random.Generator, scene: Scene) -> PartOfGoal:
     goal = scene.problem.goal
     if not (isinstance(goal, And) and len(goal.parts) > 1 and all(isinstance(p, Atom) for p in goal.parts)):
@@ -289,5 +330,6 @@ SAMPLERS: dict[str, Callable[..., StartChange]] = {
     "object": partial(_put_aside, receptacle=False),
     "receptacle": partial(_put_aside, receptacle=True),
     "distractor": _gathered,
+    "obstacle": _obstacle,
     "partial": _part_of_goal,
 }

@@ -32,7 +32,8 @@ def matched():
 
 
 @pytest.mark.parametrize(
-    "kind", ["camera=0.5", "noise=1", "gain=1", "object=1", "receptacle=1", "distractor=1", "goal=1"]
+    "kind",
+    ["camera=0.5", "noise=1", "gain=1", "object=1", "receptacle=1", "distractor=1", "obstacle=0.5", "goal=1"],
 )
 @pytest.mark.parametrize("trigger", ["step10", "10%"])
 def test_all_before_an_event_is_the_matched_episode_to_the_bit_and_nothing_after_it(matched, kind, trigger):
@@ -183,3 +184,24 @@ def test_what_is_no_event_is_refused_in_one_line(text, error, message):
         parse_perturbations("camera=0.5@lifted")  # where there are no episodes, such as in certifying
     with pytest.raises(InvalidInputError, match="camera=0.5@lifted"):
         RenderConfig(perturb="camera=0.5@lifted")
+
+
+@pytest.mark.parametrize(("severity", "aside"), [(1, 0.0), (0.5, 0.06)])
+def test_an_obstacle_stands_between_an_object_and_its_place(severity, aside):
+    with BatchEnv("libero_object/0", 1, cameras=(), perturb=f"obstacle={severity}@step2") as env:
+        env.reset(options={"init_state": [3]})
+        before = {
+            name: env.simulations.fields["qpos"][0, env.scene.pose_address(name) :][:2].copy()
+            for name in env.scene.objects
+        }
+        for _ in range(3):
+            *_, info = env.step(np.zeros((1, 7)))
+        after = {
+            name: env.simulations.fields["qpos"][0, env.scene.pose_address(name) :][:2].copy()
+            for name in env.scene.objects
+        }
+    (moved,) = (name for name in before if np.linalg.norm(after[name] - before[name]) > 0.02)
+    way, to = before["basket_1"] - before["alphabet_soup_1"], after[moved] - before["alphabet_soup_1"]
+    length = np.linalg.norm(way)
+    assert abs(way[0] * to[1] - way[1] * to[0]) / length == pytest.approx(aside, abs=2e-3)
+    assert 0.39 < to @ way / length**2 < 0.61 and info["began"].tolist() == [[2]]
