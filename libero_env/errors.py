@@ -9,6 +9,7 @@ from typing import Any
 
 from libero_env.text import suggest
 
+ENDING_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")  # that ask a process to end
 DEBUG_VARIABLE = "LIBERO_DEBUG"  # environment variable that asks for every traceback
 QUIET_VARIABLE = "LIBERO_QUIET"  # environment variable that asks for no progress
 MAX_LISTED = 64  # valid names in a message; all categories of objects fit

@@ -24,7 +24,7 @@ import cloudpickle
 import psutil
 from tqdm import tqdm
 
-from libero_env.errors import LiberoError, is_quiet
+from libero_env.errors import ENDING_SIGNALS, LiberoError, is_quiet
 
 _log = logging.getLogger(__name__)
 _DAMAGED = (EOFError, pickle.UnpicklingError, ValueError, LookupError, TypeError, AttributeError, ImportError)
@@ -150,6 +150,10 @@ def check_main_guard() -> None:
 
 
 class _Pool(ProcessPoolExecutor):
+    def submit(self, *args: Any, **kwargs: Any) -> Future[Any]:
+        with _signals_later():  # it starts the processes, and one that is started in half prints a traceback
+            return super().submit(*args, **kwargs)
+
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
@@ -165,6 +169,26 @@ class _Pool(ProcessPoolExecutor):
                 "a worker process ended, for the reason above or killed by the system if memory was short; what is "
                 "finished is kept. The same command goes on; fewer workers need less memory"
             ) from error
+
+
+@contextmanager
+def _signals_later() -> Iterator[None]:
+    """Heed the signals that ask this process to end after the block only."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    numbers = [getattr(signal, name) for name in ENDING_SIGNALS if hasattr(signal, name)]
+    before = {n: handler for n in numbers if callable(handler := signal.getsignal(n))}
+    for number in before:
+        signal.signal(number, lambda n, _: came.append(n))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in came:
+            signal.raise_signal(number)
 
 
 class SilentWorkersError(LiberoError):

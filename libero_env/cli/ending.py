@@ -26,13 +26,19 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 
-from libero_env.errors import DEBUG_VARIABLE, QUIET_VARIABLE, RAISED_BY, LiberoError, is_debugging
+from libero_env.errors import (
+    DEBUG_VARIABLE,
+    ENDING_SIGNALS,
+    QUIET_VARIABLE,
+    RAISED_BY,
+    LiberoError,
+    is_debugging,
+)
 from libero_env.text import printable
 
 MISTAKE, UNDECIDED, DEFECT, SIGNALLED = 2, 3, 70, 128
 _SIGPIPE = 13  # Windows has no name for it
 EVERYWHERE = {"--debug": DEBUG_VARIABLE, "--quiet": QUIET_VARIABLE}  # options of every command
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 _MAX_FRAMES = 12  # of the user's code in a message
 _ROOTS = [
     str(Path(__file__).parents[2] / name) + os.sep
@@ -78,7 +84,7 @@ def interruptible() -> Iterator[None]:
         raise Interrupted(number)
 
     if threading.current_thread() is threading.main_thread():
-        for number in (getattr(signal, name) for name in _SIGNALS if hasattr(signal, name)):
+        for number in (getattr(signal, name) for name in ENDING_SIGNALS if hasattr(signal, name)):
             handler = signal.getsignal(number)
             if handler is not None and handler is not signal.SIG_IGN:
                 before[number] = handler

@@ -11,7 +11,7 @@ import pytest
 from libero_env.demos.config import DemoConfig, RenderConfig, Variation
 from libero_env.demos.contents import read_header
 from libero_env.demos.curate import examine
-from libero_env.demos.generate import RecordingJob, make_demos
+from libero_env.demos.generate import RecordingJob, ensure_demos, make_demos
 from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
 from libero_env.demos.read import Episode, read_demos, read_episodes
 from libero_env.demos.rendering import rerender
@@ -224,7 +224,7 @@ def test_a_task_that_the_expert_cannot_do_stops_no_other(tmp_path, monkeypatch):
     assert not reports[1].error and reports[1].recorded == reports[1].attempts == 2
     assert len(read_demos(jobs[1].path)) == 2
     with pytest.raises(DemoError, match=r"1 of 1 files are not complete.*no skill for that"):
-        generate(TASK, 1, path=tmp_path / "again.hdf5", camera_size=(8, 8), workers=1, progress=False)
+        ensure_demos([get_task(TASK)], 1, root=tmp_path, camera_size=(8, 8), workers=1, progress=False)
 
 
 def test_recording_ends_if_the_expert_always_fails(tmp_path, monkeypatch):

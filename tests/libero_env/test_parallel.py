@@ -1,5 +1,6 @@
 """Pools of processes that hang."""
 
+import signal
 import subprocess
 import sys
 import time
@@ -68,3 +69,17 @@ def test_a_process_that_nobody_watches_says_so_itself():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 2 and done.stderr.splitlines() == [f"error: {NO_PICTURE_TEXT}"]
+
+
+def test_a_signal_while_workers_start_is_heeded_when_they_have(monkeypatch):
+    begun = []
+
+    def submit(self, *args):
+        signal.raise_signal(signal.SIGINT)
+        begun.append(args)
+
+    monkeypatch.setattr("libero_env.parallel.ProcessPoolExecutor.submit", submit)
+    handler = signal.getsignal(signal.SIGINT)
+    with spawn_pool(1) as pool, pytest.raises(KeyboardInterrupt):
+        pool.submit(print, 1)
+    assert begun == [(print, 1)] and signal.getsignal(signal.SIGINT) is handler
