@@ -6,6 +6,7 @@ Shape legend: B batch, T time, E latent, K modes, A action.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -39,8 +40,8 @@ class ActionHead(nn.Module, ABC):
     def losses(self, params: dict[str, Tensor], actions: Tensor) -> Tensor:
         """Return the loss of each action, (..., A) -> (...)."""
 
-    def mode(self, params: dict[str, Tensor]) -> Tensor:
-        """Return the most likely action, (..., A); by default the mean."""
+    def greedy(self, params: dict[str, Tensor]) -> Tensor:
+        """Return the action of a policy that does not draw, (..., A); by default the mean."""
         return self.mean(params)
 
     @abstractmethod
@@ -79,14 +80,14 @@ class ActionHead(nn.Module, ABC):
 
         Args:
             params: Parameters for one latent per environment, (B, E).
-            generators: One CPU generator per environment to draw with; None takes the most likely actions.
+            generators: One CPU generator per environment to draw with; None: nothing is drawn.
             before: What environments still execute of their last chunk, by row, for a head that inpaints.
 
         Returns:
             Actions (B, chunk, A).
         """
         if generators is None:
-            return self.mode(params)[:, None]
+            return self.greedy(params)[:, None]
         device, on_host = next(iter(params.values())).device, {k: v.cpu() for k, v in params.items()}
         draws = [
             self.sample({k: v[i : i + 1] for k, v in on_host.items()}, generator)
@@ -130,6 +131,8 @@ class GMMHead(ActionHead):
             grow without bound; 0.02 or so balances dimensions when data and time are short.
         low_eval_noise: Whether to sample with `min_std` instead of the learned deviation in eval mode.
         absolute: Weight of the absolute error of the mixture's mean beside the likelihood; the original has none.
+        acts: What a policy that does not draw does: the mean of the `heaviest` component, or the `mean` of all. With
+            the heaviest, a policy of one frame stands still for ever where that is what it does.
     """
 
     def __init__(
@@ -144,9 +147,10 @@ class GMMHead(ActionHead):
         min_std: NonNegative = 1e-4,
         low_eval_noise: bool = False,
         absolute: NonNegative = 0.0,
+        acts: Literal["heaviest", "mean"] = "heaviest",
     ) -> None:
         super().__init__()
-        self.absolute = absolute
+        self.absolute, self.acts = absolute, acts
         self.modes, self.action_dim = modes, action_dim
         self.min_std, self.low_eval_noise = min_std, low_eval_noise
         self.trunk = _trunk(in_dim, hidden, layers, norm)
@@ -180,8 +184,10 @@ class GMMHead(ActionHead):
             losses = losses + self.absolute * (actions.float() - self.mean(params)).abs().mean(-1)
         return losses
 
-    def mode(self, params: dict[str, Tensor]) -> Tensor:
-        """Return the mean of the heaviest component, (..., A)."""
+    def greedy(self, params: dict[str, Tensor]) -> Tensor:
+        """Return the mixture's mean or that of its heaviest component, (..., A)."""
+        if self.acts == "mean":
+            return self.mean(params)
         return _take_mode(params["means"], params["logits"].argmax(-1))
 
     def mean(self, params: dict[str, Tensor]) -> Tensor:

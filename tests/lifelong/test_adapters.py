@@ -415,7 +415,7 @@ def test_dmpel_acts_as_it_was_trained(kind, head):
         if head == "flow":  # only the last frame that it may look back to has a whole chunk ahead
             whole = acting.predict(batch)
         else:
-            whole = policy.head.mode(policy.distribution(batch.observation))
+            whole = policy.head.greedy(policy.distribution(batch.observation))
         whole = whole.clamp(-1, 1)  # as every action that is acted out
         acting.reset(2)
         for step in range(steps):

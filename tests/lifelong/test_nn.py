@@ -219,14 +219,16 @@ def test_attention_weights_have_a_dropout_of_their_own() -> None:
     assert (layer.dropout, layer.drop.p) == (0.0, 0.5)
 
 
-def test_gmm_mode_is_the_heaviest_mean_and_samples_follow_the_mixture() -> None:
+def test_a_mixture_acts_by_its_heaviest_component_its_mean_or_samples() -> None:
     head = GMMHead(in_dim=4, action_dim=1, modes=2, hidden=8, low_eval_noise=True)
     params = {
         "means": torch.tensor([[-0.5], [0.5]]).expand(20_000, 2, 1),
         "stds": torch.tensor([[0.05], [0.1]]).expand(20_000, 2, 1),
         "logits": torch.tensor([0.25, 0.75]).log().expand(20_000, 2),
     }
-    assert (head.mode(params) == 0.5).all()
+    assert (head.greedy(params) == 0.5).all()
+    head.acts = "mean"
+    torch.testing.assert_close(head.greedy(params), torch.full((20_000, 1), 0.25))
     drawn = head.sample(params, generator())[:, 0]
     right = drawn[drawn > 0]
     assert len(right) / len(drawn) == pytest.approx(0.75, abs=0.02)
@@ -239,7 +241,7 @@ def test_deterministic_head_loss_is_absolute_error() -> None:
     head = DeterministicHead(in_dim=4, action_dim=3, hidden=8)
     params, actions = head(randn(5, 4)), randn(5, 3)
     torch.testing.assert_close(head.losses(params, actions), (params["means"] - actions).abs().mean(-1))
-    assert torch.equal(head.mode(params), head.sample(params, None))
+    assert torch.equal(head.greedy(params), head.sample(params, None))
 
 
 def mixture(seed: int, modes: int = 3, rows: int = 5) -> dict[str, torch.Tensor]:
