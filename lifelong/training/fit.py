@@ -223,7 +223,6 @@ def _make_optimizer(
         lr=settings.lr,
         betas=tuple(settings.betas),
         weight_decay=settings.weight_decay,
-        fused=device_of(policy).type == "cpu",  # a tenth of a small policy's step
     )
 
 
