@@ -67,7 +67,7 @@ CHECKS = [
     ),
     Check("late", 60, f"{LEARNING} late", "0: copies to the host are not read before they are there"),
     Check("waits", 60, f"{LEARNING} step preset=paper", "no waits"),
-    Check("waits_libero", 60, f"{LEARNING} step preset=paper compat=libero", "no waits"),
+    Check("waits_libero", 60, f"{LEARNING} step preset=paper,compat=libero", "no waits"),
     Check(
         "speed",
         270,

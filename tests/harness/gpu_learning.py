@@ -1,9 +1,9 @@
 """What learning asks of a GPU, real or pretended. Prints lines of JSON.
 
-    python -m tests.harness.gpu_learning DEVICE learn POLICY [ALGORITHM ...]  # `Learned`, of all algorithms without any
-    python -m tests.harness.gpu_learning DEVICE step OVERRIDE ...             # `Asked`, of a configuration's step
-    python -m tests.harness.gpu_learning DEVICE late                          # memories that differ from the CPU's
-    python -m tests.harness.gpu_learning pretended faults                     # what planted faults lead to
+    python -m tests.harness.gpu_learning DEVICE learn POLICY[:ALGORITHM,...] ...  # `Learned`, of each or all
+    python -m tests.harness.gpu_learning DEVICE step OVERRIDE[,...] ...           # `Asked`, of each step
+    python -m tests.harness.gpu_learning DEVICE late                              # memories that differ from the CPU's
+    python -m tests.harness.gpu_learning pretended faults                         # what planted faults lead to
 
 DEVICE is `cpu`, `cuda` or `pretended`, POLICY one of `POLICIES`.
 """
@@ -60,6 +60,7 @@ SHORT = {  # what algorithms compute between tasks
     "clare": ["algo.discriminator_steps=3", "algo.windows=8"],
     "iscil": ["algo.bases=3"],
 }
+TASKS = 2
 _FIT = FitSettings(epochs=2, steps_per_epoch=3, batch_size=2, lr=1e-3, precision="fp32")
 
 
@@ -69,6 +70,7 @@ class Learned:
 
     Attributes:
         algorithm: Its name.
+        policy: The policy's.
         losses: Loss of each epoch of the last task.
         launches: Number of kernels of a step of the last task; None where they cannot be counted.
         waits: Where the host waits for the GPU in such a step, before the kill and after it.
@@ -79,6 +81,7 @@ class Learned:
     """
 
     algorithm: str
+    policy: str
     losses: list[float] = field(default_factory=list)
     launches: int | None = None
     waits: list[list[str]] = field(default_factory=list)
@@ -144,8 +147,8 @@ class Killed(BaseException):
 
 
 def learn(algorithm: str, policy: str, device: torch.device) -> Learned:
-    """Learn three tasks with an algorithm, killed after the first epoch of the last one and resumed, and act."""
-    found = Learned(algorithm)
+    """Learn two tasks with an algorithm, killed after the first epoch of the last one and resumed, and act."""
+    found = Learned(algorithm, policy)
     with tempfile.TemporaryDirectory() as folder, watched(device) as watch, ExitStack() as stack:
         _count(found, watch, stack)
         stack.enter_context(patch.object(Recovery, "is_due", lambda _: True))
@@ -158,7 +161,7 @@ def learn(algorithm: str, policy: str, device: torch.device) -> Learned:
                 raise AssertionError("it was not killed")
         resumed = _sequence(Path(folder), algorithm, policy, device)
         resumed.run()
-        losses = [r for r in resumed.log.read().of(LossRecord) if r.task == sequences.TASKS - 1]
+        losses = [r for r in resumed.log.read().of(LossRecord) if r.task == TASKS - 1]
     found.losses, found.waits, found.unsafe = [r.loss for r in losses], found.waits[:2], list(watch.unsafe)
     return found
 
@@ -167,7 +170,7 @@ def _save_and_die(
     self: Recovery, task: int, phase: int, fit: Any = None, save: Callable = Recovery.save_progress
 ) -> None:
     save(self, task, phase, fit)
-    if task == sequences.TASKS - 1 and fit is not None and fit["epoch"] == 1:
+    if task == TASKS - 1 and fit is not None and fit["epoch"] == 1:
         raise Killed
 
 
@@ -177,7 +180,7 @@ def _sequence(folder: Path, algorithm: str, policy: str, device: torch.device) -
     config = composed(f"algo={algorithm}", f"augmentation={augmentation}", *SHORT.get(algorithm, []))
     with seeded(1):
         built = make(spec=sequences.SPEC).to(device)
-    context = sequences.run_context(folder, "sequential")
+    context = sequences.run_context(folder, "sequential", TASKS)
     context = replace(
         context,
         policy=built,
@@ -187,7 +190,7 @@ def _sequence(folder: Path, algorithm: str, policy: str, device: torch.device) -
         fit=_FIT,
         eval=replace(context.eval, curve="none", select="last", episodes=2, horizon=3),
     )
-    data = {task: sequences.dataset(task) for task in range(sequences.TASKS)}
+    data = {task: sequences.dataset(task) for task in range(TASKS)}
     data = {t: windows.with_batches_on(device) if t else windows.to(device) for t, windows in data.items()}
     return sequences.TaskSequence(context, data)
 
@@ -312,10 +315,13 @@ def main(device: str, command: str, *words: str) -> None:
         pretended_gpu.pretend()
     chosen, repeats = torch.device("cuda" if device == "pretended" else device), 20 if device == "cuda" else 1
     if command == "learn":
-        for algorithm in words[1:] or ALGORITHMS:
-            print(json.dumps(asdict(learn(algorithm, words[0], chosen))), flush=True)
+        for word in words:
+            policy, _, algorithms = word.partition(":")
+            for algorithm in algorithms.split(",") if algorithms else ALGORITHMS:
+                print(json.dumps(asdict(learn(algorithm, policy, chosen))), flush=True)
     elif command == "step":
-        print(json.dumps(asdict(published_step(words, chosen))))
+        for word in words:
+            print(json.dumps(asdict(published_step(word.split(","), chosen))))
     else:
         print(json.dumps(planted_faults() if command == "faults" else differing_memories(chosen, repeats)))
 

@@ -18,6 +18,7 @@ import ctypes
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -68,7 +69,6 @@ _register_device()
 
 import torch  # noqa: E402
 from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing  # noqa: E402
-from torch.utils._pytree import tree_iter, tree_map  # noqa: E402
 
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
 aten = torch.ops.aten
@@ -180,7 +180,7 @@ class _PretendedMode(TorchDispatchMode):
 def _execute(func: Any, args: tuple, kwargs: dict) -> Any:
     """Carry out an operation of any device on the CPU, and note what it would do to a GPU."""
     operation = func.overloadpacket
-    tensors = [x for x in tree_iter((args, kwargs)) if isinstance(x, torch.Tensor)]
+    tensors = list(_tensors((args, *kwargs.values())))
     on_gpu = any(isinstance(x, GpuTensor) for x in tensors)
     to = kwargs.get("device")
     to_gpu = on_gpu if to is None else torch.device(to).type == "cuda"
@@ -195,14 +195,28 @@ def _execute(func: Any, args: tuple, kwargs: dict) -> Any:
         SEEN.uploads.append(place())
     _check(operation, tensors, (*args, *kwargs.values()))
     own = {name: x for name, x in kwargs.items() if name != "pin_memory"}
-    out = func(*tree_map(_host, args), **tree_map(_host, own | ({"device": CPU} if "device" in own else {})))
+    own |= {"device": CPU} if "device" in own else {}
+    out = func(*_each(_host, args), **{name: _each(_host, x) for name, x in own.items()})
     _note(func, args, kwargs, out, to_gpu)
     if operation is aten._to_copy and not to_gpu:
         return out
     if on_gpu and operation is aten.copy_:
         return args[0]
-    wrapped = tree_map(lambda x: GpuTensor(x) if to_gpu and type(x) is torch.Tensor else x, out)
+    wrapped = _each(lambda x: GpuTensor(x) if type(x) is torch.Tensor else x, out) if to_gpu else out
     return return_and_correct_aliasing(func, args, kwargs, wrapped) if on_gpu else wrapped
+
+
+def _tensors(arguments: tuple | list) -> Iterator[torch.Tensor]:
+    for x in arguments:
+        if isinstance(x, torch.Tensor):
+            yield x
+        elif isinstance(x, tuple | list):
+            yield from _tensors(x)
+
+
+def _each(change: Callable[[Any], Any], x: Any) -> Any:
+    """Change a value, or each in lists and tuples: those of operations hold no other containers."""
+    return type(x)(_each(change, part) for part in x) if type(x) in (tuple, list) else change(x)
 
 
 def _host(x: Any) -> Any:
