@@ -24,12 +24,12 @@ from tests.harness.gpu_learning import SHORT
 from tests.harness.policies import small_transformer
 
 ALGORITHMS = sorted(file.stem for file in CONFIGS.glob("algo/*.yaml"))
-STEPS, TASKS = 6, 2
+STEPS, TASKS = 4, 2
 # Seven windows: two processes get three and four. One step is an epoch, so that records hold every step's loss.
 FIT = FitSettings(
     epochs=STEPS, steps_per_epoch=1, batch_size=7, lr=3e-3, warmup_steps=2, grad_clip=1.0, precision="fp32"
 )
-EVAL = EvalSettings(episodes=2, curve_episodes=2, every=3, horizon=3, settle_steps=0, precision="fp32")
+EVAL = EvalSettings(episodes=2, curve_episodes=2, every=STEPS, horizon=3, settle_steps=0, precision="fp32")
 
 
 def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float], dict[str, torch.Tensor]]:
@@ -58,7 +58,8 @@ def refuse(*args, **kwargs):
 
 
 def learn_all(folder: Path, ranks: Ranks) -> None:
-    """Learn with all algorithms; each rank writes its weights, and the first one the losses."""
+    """Communicate, then learn with all algorithms; each rank writes its weights, and the first one the losses."""
+    talk(folder, ranks)
     if not ranks.first:
         checkpoints_save, checkpoints.save, ResultLog.append = checkpoints.save, refuse, refuse
     else:
@@ -99,4 +100,4 @@ def die(folder: Path, ranks: Ranks) -> None:
 if __name__ == "__main__":
     torch.set_num_threads(1)
     with process_group() as ranks:
-        {"learn": learn_all, "talk": talk, "die": die}[sys.argv[1]](Path(sys.argv[2]), ranks)
+        {"learn": learn_all, "die": die}[sys.argv[1]](Path(sys.argv[2]), ranks)
