@@ -1,17 +1,14 @@
-"""`libero relearn` on a run from train.py."""
+"""`libero relearn` on a run of `libero train`."""
 
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
+from libero_env.cli.main import main
 from lifelong.results.relearning import read_relearning
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
-ROOT = Path(__file__).parents[2]
 TINY = (
     *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "threads=1", "data.demos=2"),
     *("train.epochs=1", "train.steps_per_epoch=4", "train.batch_size=4", "eval.horizon=6", "eval.episodes=1"),
@@ -19,20 +16,19 @@ TINY = (
 )
 
 
-def test_from_the_command_line(tmp_path, demos):
-    env = os.environ | {"LIBERO_CACHE": str(tmp_path / "cache"), "LIBERO_DEMOS": str(demos)}
+def test_from_the_command_line(tmp_path, demos, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["libero"])
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("LIBERO_DEMOS", str(demos))
 
     def call(*words: str) -> str:
-        done = subprocess.run(
-            [sys.executable, *words], env=env, cwd=ROOT, capture_output=True, text=True, timeout=900
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        return done.stdout
+        assert main(words) == 0
+        return capsys.readouterr().out
 
-    call("train.py", *TINY, f"runs_dir={tmp_path / 'runs'}")
+    call("train", *TINY, f"runs_dir={tmp_path / 'runs'}")
     (config,) = (tmp_path / "runs" / "libero_object" / "lora").glob("*/config.yaml")
     run = config.parent
-    command = ("-m", "libero_env.cli", "relearn", str(run), "--steps", "4", "--every", "2", "--held-out", "1")
+    command = ("relearn", str(run), "--steps", "4", "--every", "2", "--held-out", "1")
     said = call(*command)
     assert "savings" in said and "report.html" in said
     found = read_relearning(run)
