@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # its parts are imported when they are first used
 from numpy.typing import NDArray
-from scipy import optimize, special, stats
 
 from lifelong.stats.intervals import UNKNOWN, Estimate, Floats
 
@@ -162,7 +162,11 @@ def mcnemar_exact(counts: Counts) -> float:
     Given the number of discordant pairs, those that the first policy wins are binomial with share 1/2 if both are
     equally good in every start. Where they are equal on average only, the test rejects less often than it may.
     """
-    return float(stats.binomtest(counts.only_first, counts.discordant).pvalue) if counts.discordant else 1.0
+    return (
+        float(scipy.stats.binomtest(counts.only_first, counts.discordant).pvalue)
+        if counts.discordant
+        else 1.0
+    )
 
 
 def sign_flip_test(differences: Floats, draws: int = DRAWS, seed: int = SEED) -> float:
@@ -179,7 +183,7 @@ def sign_flip_test(differences: Floats, draws: int = DRAWS, seed: int = SEED) ->
     moved = differences[differences != 0]  # the others stay what they are when they are swapped
     if len(moved) < 2:
         return 1.0
-    found = stats.permutation_test(
+    found = scipy.stats.permutation_test(
         (moved, np.zeros_like(moved)),
         lambda x, y, axis: (x - y).sum(axis=axis),
         permutation_type="samples",
@@ -204,7 +208,7 @@ def score_interval(counts: Counts, confidence: float = CONFIDENCE) -> Estimate:
         confidence: Two-sided confidence level.
     """
     b, c, n = counts.only_first, counts.only_second, counts.pairs
-    value, z = (b - c) / n, float(special.ndtri(0.5 + confidence / 2))
+    value, z = (b - c) / n, float(scipy.special.ndtri(0.5 + confidence / 2))
 
     def excess(d: float) -> float:
         root = 2 * n * d - (b - c) * d - b - c
@@ -212,8 +216,8 @@ def score_interval(counts: Counts, confidence: float = CONFIDENCE) -> Estimate:
         return (b - c - n * d) ** 2 - z**2 * n * (2 * q + d * (1 - d))
 
     aside = 1e-12  # at the value itself the excess is at most 0, and exactly 0 at the edges
-    low = -1.0 if value == -1 else optimize.brentq(excess, -1.0, value - aside)
-    high = 1.0 if value == 1 else optimize.brentq(excess, value + aside, 1.0)
+    low = -1.0 if value == -1 else scipy.optimize.brentq(excess, -1.0, value - aside)
+    high = 1.0 if value == 1 else scipy.optimize.brentq(excess, value + aside, 1.0)
     return Estimate(value, float(low), float(high))
 
 
@@ -253,7 +257,7 @@ def _bootstrap(strata: Sequence[Floats], draws: int, seed: int) -> Estimate:
     def mean(*samples: Floats, axis: int) -> Floats:
         return (fixed + sum(s.sum(axis=axis) for s in samples)) / total
 
-    found = stats.bootstrap(
+    found = scipy.stats.bootstrap(
         drawn,
         mean,
         n_resamples=draws,
@@ -269,5 +273,5 @@ def _bootstrap(strata: Sequence[Floats], draws: int, seed: int) -> Estimate:
 def chance_difference(counts: Counts, confidence: float = CONFIDENCE) -> float:
     """Return the absolute difference that two equal policies with as many discordant pairs exceed in 1 of 20 cases."""
     m = counts.discordant
-    most = stats.binom.ppf(0.5 + confidence / 2, m, 0.5)
+    most = scipy.stats.binom.ppf(0.5 + confidence / 2, m, 0.5)
     return float(abs(2 * most - m) / counts.pairs)

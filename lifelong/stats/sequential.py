@@ -10,8 +10,8 @@ the p_t is m.
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # its parts are imported when they are first used
 from numpy.typing import NDArray
-from scipy import optimize, special
 
 from lifelong.stats.episodes import ALPHA, CONFIDENCE, Pairs
 from lifelong.stats.intervals import Estimate, Floats
@@ -109,14 +109,16 @@ def anytime_interval(won: int, episodes: int, confidence: float = CONFIDENCE) ->
         confidence: Two-sided confidence level.
     """
     value, lost = won / episodes if episodes else np.nan, episodes - won
-    mixture = special.betaln(won + 0.5, lost + 0.5) - special.betaln(0.5, 0.5) + np.log(1 - confidence)
+    mixture = (
+        scipy.special.betaln(won + 0.5, lost + 0.5) - scipy.special.betaln(0.5, 0.5) + np.log(1 - confidence)
+    )
 
     def excess(m: float) -> float:
-        return float(mixture - special.xlogy(won, m) - special.xlog1py(lost, -m))
+        return float(mixture - scipy.special.xlogy(won, m) - scipy.special.xlog1py(lost, -m))
 
     aside = 1e-12  # of 0 and 1, where the evidence is infinite
-    low = optimize.brentq(excess, aside, value) if won else 0.0
-    high = optimize.brentq(excess, value, 1 - aside) if lost else 1.0
+    low = scipy.optimize.brentq(excess, aside, value) if won else 0.0
+    high = scipy.optimize.brentq(excess, value, 1 - aside) if lost else 1.0
     return Estimate(value, float(low), float(high))
 
 
@@ -135,10 +137,10 @@ def log_evidence(
         margin: Difference, in (-1, 1); other than 0, e holds at the ends of complete rounds.
     """
     if not margin:
-        return (won + lost) * np.log(2.0) + special.betaln(won + 1, lost + 1)
+        return (won + lost) * np.log(2.0) + scipy.special.betaln(won + 1, lost + 1)
     m = (1 - margin) / 2  # mean of 1 where the first won, 0 where it lost, 1/2 of ties
     stakes = ((np.arange(_STAKES) + 0.5) / _STAKES - m) / (m * (1 - m))
     gains = [np.log1p(stakes * (x - m)) for x in (1.0, 0.0, 0.5)]
     counts = [np.asarray(n)[..., None] for n in (won, lost, 0 if tied is None else tied)]
     logs = sum((n * gain for n, gain in zip(counts, gains, strict=True)), np.zeros(_STAKES))
-    return np.asarray(special.logsumexp(logs, axis=-1) - np.log(_STAKES))
+    return np.asarray(scipy.special.logsumexp(logs, axis=-1) - np.log(_STAKES))

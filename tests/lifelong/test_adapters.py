@@ -335,16 +335,16 @@ LONG = dataclasses.replace(SMALL, batch_size=4, epochs=2, steps_per_epoch=60, lr
 
 def test_dmpel_recall_keeps_the_coefficients_of_earlier_tasks():
     drift = {}
-    for steps in (0, 1000):
+    for steps in (0, 300):
         policy, algorithm = make_policy(head="deterministic"), DMPEL(rank=2, pool=2, recall_steps=steps)
-        for task in range(4):
+        for task in range(3):
             learn_frames(algorithm, policy, task, settings=LONG)
         memory = algorithm.state_dict()["memory"]
         now = {t: algorithm.router(m["queries"]) for t, m in memory.items()}
         then = {t: m["coefficients"] for t, m in memory.items()}  # of the experts that there were
-        then = {t: functional.pad(c, (0, 3 - c.shape[-1])) for t, c in then.items()}
+        then = {t: functional.pad(c, (0, 2 - c.shape[-1])) for t, c in then.items()}
         drift[steps] = max((then[t] - now[t]).abs().max().item() for t in memory)
-    assert drift[1000] < 0.1 < 0.3 < drift[0], drift
+    assert drift[300] < 0.1 < 0.3 < drift[0], drift
 
 
 @pytest.mark.parametrize(("experts", "tasks"), [(1, 5), (2, 4)])
