@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
+import scipy  # its parts are imported when they are first used
 
 from lifelong.errors import ConfigError
 from lifelong.stats.sequential import log_evidence
@@ -93,10 +93,11 @@ def paired_power(question: Question, pairs: int) -> float:
     middle = pairs * question.differing
     m = np.arange(max(0, math.floor(middle - spread)), min(pairs, math.ceil(middle + spread)) + 1)
     share = min(1.0, (question.differing + abs(question.difference)) / (2 * question.differing))
-    bound = stats.binom.ppf(question.level / 2, m, 0.5)  # its distribution function there is level/2 or more
-    bound -= stats.binom.cdf(bound, m, 0.5) > question.level / 2  # the largest count that is rejected, or -1
-    rejected = stats.binom.cdf(bound, m, share) + stats.binom.sf(m - bound - 1, m, share)
-    return float(stats.binom.pmf(m, pairs, min(1.0, question.differing)) @ np.where(bound < 0, 0.0, rejected))
+    binom = scipy.stats.binom
+    bound = binom.ppf(question.level / 2, m, 0.5)  # its distribution function there is level/2 or more
+    bound -= binom.cdf(bound, m, 0.5) > question.level / 2  # the largest count that is rejected, or -1
+    rejected = binom.cdf(bound, m, share) + binom.sf(m - bound - 1, m, share)
+    return float(binom.pmf(m, pairs, min(1.0, question.differing)) @ np.where(bound < 0, 0.0, rejected))
 
 
 def paired_episodes(question: Question) -> int:
@@ -127,8 +128,8 @@ def unpaired_episodes(question: Question) -> int:
     """
     first, second = question.base, question.other
     mean = (first + second) / 2
-    pooled = stats.norm.isf(question.level / 2) * math.sqrt(2 * mean * (1 - mean))
-    apart = stats.norm.ppf(question.power) * math.sqrt(first * (1 - first) + second * (1 - second))
+    pooled = scipy.stats.norm.isf(question.level / 2) * math.sqrt(2 * mean * (1 - mean))
+    apart = scipy.stats.norm.ppf(question.power) * math.sqrt(first * (1 - first) + second * (1 - second))
     return math.ceil(((pooled + apart) / question.difference) ** 2)
 
 
