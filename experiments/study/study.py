@@ -85,7 +85,7 @@ LONG = (
     *("benchmark=libero_130", "data.demos=20", "train.steps_per_epoch=75", "eval.episodes=5"),
     *("eval.cells=sampled", "eval.cells_share=0.05", "eval.curve=none"),
 )
-SMALL = ("data.demos=20", "train.steps_per_epoch=100", "eval.episodes=10")
+SMALL = ("data.demos=20", "train.steps_per_epoch=75", "eval.episodes=10")
 # fmt: off
 TEN = ("sequential", "er", "packnet", "lora", "single_task", "ewc", "iscil", "dmpel", "derpp", "multitask")
 # fmt: on
@@ -101,7 +101,7 @@ STUDIES = (
         "ten_demonstrations",
         _plain("sequential", "er", "packnet", "lora", "single_task", "iscil"),
         5,
-        ("benchmark=libero_object", "data.demos=10", "train.steps_per_epoch=100", "eval.episodes=10"),
+        ("benchmark=libero_object", "data.demos=10", "train.steps_per_epoch=75", "eval.episodes=10"),
     ),
     Study(
         "libero_130",
