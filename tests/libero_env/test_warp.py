@@ -29,7 +29,7 @@ EVERYTHING = os.environ.get("LIBERO_WARP") == "all"  # twenty minutes more on a 
 TASK = "libero_10/3"  # a bowl into a drawer that is then closed: fixtures, joints, contacts
 WARP = "warp,device=cpu"
 NUM = 3
-FREE_STEPS = 50 if EVERYTHING else 15
+FREE_STEPS = 50 if EVERYTHING else 8
 EXPERT_TASKS, EXPERT_STARTS = ["libero_object/3", "libero_spatial/0", "libero_goal/5", "libero_90/1"], 25
 TEN_TASKS = ["libero_spatial/0", "libero_object/3", "libero_object/7", "libero_goal/0", "libero_goal/5"]
 TEN_TASKS += ["libero_10/3", "libero_10/9", "libero_90/1", "libero_90/20", "libero_90/60"]
