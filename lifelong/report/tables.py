@@ -1,7 +1,7 @@
 """Tables of pages, and the templates that show them: self-contained HTML in one style."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ COST_COLUMNS: dict[str, tuple[str, str, Callable[[float], str]]] = {
 }
 
 
+@cache
 def page_template(name: str, package: str = "lifelong.report") -> jinja2.Template:
     """Return a template of a package, with the filter `percent`; an undefined name is an error.
 
