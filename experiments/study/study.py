@@ -3,7 +3,6 @@
     python experiments/study/study.py list                # each run: done or missing, its cost, its command
     python experiments/study/study.py run --minutes 120   # go on with what is missing, until it is stopped
     python experiments/study/study.py report              # tables and pictures of what is finished
-    python experiments/study/table.py                     # puts the tables into README.md
 
 README.md has the plan. A run is a process of its own on one thread. One that was stopped goes on where it was; of a
 finished one the records are kept in records/, compressed. All methods are run with one seed before the next, so that
