@@ -1,13 +1,14 @@
-"""The study of all algorithms, in pieces: run what is missing, keep all outcomes, write tables and pictures.
+"""The study of algorithms, in pieces: run what is missing, keep all outcomes, write tables and pictures.
 
     python experiments/algorithms/study.py list                # each run: done or missing, its cost, its command
     python experiments/algorithms/study.py run --minutes 120   # go on with what is missing, until it is stopped
-    python experiments/algorithms/study.py relearn             # how fast tasks come back (--by success)
     python experiments/algorithms/study.py report              # tables and pictures of what is finished
+    python experiments/algorithms/table.py                     # puts the tables into README.md
 
-A run is a process of its own on one thread. One that was stopped goes on where it was; of a finished one the records
-are kept in records/, compressed. All algorithms are run with one seed before the next, so that what is finished can be
-compared at any time. Records of another configuration than today's count as missing.
+plan.md has what is to be run; README.md the first three, which are finished. A run is a process of its own on one
+thread. One that was stopped goes on where it was; of a finished one the records are kept in records/, compressed. All
+methods are run with one seed before the next, so that what is finished can be compared at any time. Records of another
+configuration than today's count as missing.
 """
 
 import argparse
@@ -22,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import chdir
 from dataclasses import dataclass
 from functools import cached_property
@@ -44,54 +45,103 @@ from lifelong.settings import Configuration, plain_data
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 RECORDS = HERE / "records"
-REFERENCES = ("er", "sequential", "single_task")  # that each other algorithm is compared with
-SETTINGS = ("policy=bc_mlp_small", "eval.episodes=20", "threads=1", "eval.sim_threads=1", "progress=false")
-# keys that came after the runs, with the values by which nothing changes
+REFERENCES = ("er", "sequential", "single_task")  # that each other method is compared with
+# an order of the tasks and demonstrations for each seed: what they do is in the differences between seeds
+BY_SEED = ("seed", "benchmark.order_seed", "data.seed")
+# keys that came after the first runs, with the values by which nothing changes
 ADDED = {
     **{"data.files": [], "eval.cells_share": 0.1, "eval.unseen": "none"},
     **{"algo.adapters": "own", "algo.instruction": "earlier"},
 }
-# the rate is constant, so that neither comes nearer in a few hundred steps
-RELEARN = {
-    "error": ("--steps", "800", "--every", "20", "--tolerance", "0.5"),
-    "success": ("--steps", "800", "--every", "40", "--tolerance", "0.1", "--episodes", "20"),
-}
+SETTINGS = ("threads=1", "eval.sim_threads=1", "progress=false")
+WINDOW = 64 * 64 * 3 * 2 + 4 * (7 + 2 + 3 + 7)  # bytes: two images, readings and the action
 
 
 @dataclass(frozen=True)
 class Study:
-    """Algorithms that are compared with each other.
+    """Methods that are compared with each other.
 
     Args:
         name: Its folder beside this file, and the first part of its runs' names.
-        benchmark: Suite of tasks.
-        algorithms: Algorithms, in the order in which they are run.
+        methods: What the command of each has, by its name in tables, in the order in which they are run.
         seeds: Number of seeds of each.
-        overrides: What its commands have beyond those of the other studies.
+        overrides: What all its commands have.
+        by_seed: Keys that are set to the seed.
     """
 
     name: str
-    benchmark: str
-    algorithms: tuple[str, ...]
+    methods: Mapping[str, tuple[str, ...]]
     seeds: int
-    overrides: tuple[str, ...] = ()
+    overrides: tuple[str, ...]
+    by_seed: tuple[str, ...] = BY_SEED
 
 
+def _plain(*algorithms: str) -> dict[str, tuple[str, ...]]:
+    return {name: (f"algo={name}",) for name in algorithms}
+
+
+def _memories(megabytes: float) -> dict[str, tuple[str, ...]]:
+    """Replay of windows as they are and compressed, in as many bytes."""
+    size = int(megabytes * 1e6)
+    return {
+        f"er {megabytes:g} MB": ("algo=er", f"algo.memory.budget={size // WINDOW}"),
+        f"compressed_er {megabytes:g} MB": ("algo=compressed_er", f"algo.budget={size}"),
+    }
+
+
+LONG = (
+    *("benchmark=libero_130", "data.demos=20", "train.steps_per_epoch=75", "eval.episodes=5"),
+    *("eval.cells=sampled", "eval.cells_share=0.05", "eval.curve=none"),
+)
+SMALL = ("data.demos=20", "train.steps_per_epoch=75", "eval.episodes=10")
 # fmt: off
+TEN = ("sequential", "er", "packnet", "lora", "single_task", "ewc", "iscil", "dmpel", "derpp", "multitask")
 OBJECT = (
     "sequential", "er", "packnet", "ewc", "multitask", "single_task", "lora", "dmpel", "iscil", "clare", "omla",
     "compressed_er", "mlr", "m2distill", "derpp", "agem", "lwf", "mas", "si", "averaging",
 )
 # fmt: on
-STUDIES = (
-    Study("libero_object", "libero_object", OBJECT, seeds=5),
-    Study("libero_goal", "libero_goal", ("sequential", "er", "ewc", "packnet", "iscil"), seeds=3),
+MLP = ("policy=bc_mlp_small", "eval.episodes=20")
+FIRST = (
+    Study("libero_object", _plain(*OBJECT), 5, ("benchmark=libero_object", *MLP), ("seed",)),
+    Study(
+        "libero_goal",
+        _plain("sequential", "er", "ewc", "packnet", "iscil"),
+        3,
+        ("benchmark=libero_goal", *MLP),
+        ("seed",),
+    ),
     Study(
         "pretrained6",
-        "libero_object",
-        ("sequential", "er", "iscil", "mlr", "m2distill"),
-        seeds=3,
-        overrides=("stream=pretrained6",),
+        _plain("sequential", "er", "iscil", "mlr", "m2distill"),
+        3,
+        ("benchmark=libero_object", "stream=pretrained6", *MLP),
+        ("seed",),
+    ),
+)
+STUDIES = (
+    *FIRST,
+    Study("goal", _plain(*TEN), 5, ("benchmark=libero_goal", *SMALL)),
+    Study(
+        "memory",
+        {name: words for size in (0.1, 1.0, 10.0, 100.0) for name, words in _memories(size).items()},
+        5,
+        ("benchmark=libero_goal", *SMALL),
+    ),
+    Study(
+        "ten_demonstrations",
+        _plain("sequential", "er", "packnet", "lora", "single_task", "iscil"),
+        5,
+        ("benchmark=libero_object", "data.demos=10", "train.steps_per_epoch=75", "eval.episodes=10"),
+    ),
+    Study(
+        "libero_130",
+        {
+            **_plain("sequential", "er", "compressed_er", "lora"),
+            "packnet": ("algo=packnet", "algo.prune_perc=0.98"),
+        },
+        1,
+        LONG,
     ),
 )
 
@@ -101,19 +151,19 @@ class Planned:
     """A run of the study."""
 
     study: Study
-    algo: str
+    method: str
     seed: int
 
     @property
     def name(self) -> str:
         """Its name in lists."""
-        return f"{self.study.name}/{self.algo}/seed{self.seed}"
+        return f"{self.study.name}/{self.method.replace(' ', '_')}/seed{self.seed}"
 
     @property
     def overrides(self) -> list[str]:
         """What its command has beyond `python train.py`."""
-        choices = [f"algo={self.algo}", f"benchmark={self.study.benchmark}", *self.study.overrides]
-        return [*choices, f"seed={self.seed}", *SETTINGS]
+        seeds = (f"{key}={self.seed}" for key in self.study.by_seed)
+        return [*self.study.methods[self.method], *self.study.overrides, *seeds, *SETTINGS]
 
     @property
     def record(self) -> Path:
@@ -164,22 +214,22 @@ def _read(record: Path) -> dict[str, str]:
 def planned() -> list[Planned]:
     """Return all runs, in the order in which they are made: seed after seed."""
     return [
-        Planned(study, algo, seed)
+        Planned(study, method, seed)
         for seed in range(1, max(study.seeds for study in STUDIES) + 1)
         for study in STUDIES
         if seed <= study.seeds
-        for algo in study.algorithms
+        for method in study.methods
     ]
 
 
 def show(runs: Sequence[Planned]) -> None:
     """Print each run, and how long the missing ones take if they cost what those of the same algorithm did."""
-    hours: dict[tuple[Study, str], list[float]] = {}
+    hours: dict[tuple[str, str], list[float]] = {}
     missing = []
     for run in runs:
         if run.is_done():
             spent = _hours(run)
-            hours.setdefault((run.study, run.algo), []).append(spent)
+            hours.setdefault((run.study.name, run.method), []).append(spent)
             print(f"done     {60 * spent:4.0f} min  python train.py {shlex.join(run.overrides)}")
         else:
             missing.append(run)
@@ -188,7 +238,7 @@ def show(runs: Sequence[Planned]) -> None:
     known = [h for spent in hours.values() for h in spent]
     if missing and known:
         mean = sum(known) / len(known)
-        left = sum(_mean(hours.get((run.study, run.algo))) or mean for run in missing)
+        left = sum(_mean(hours.get((run.study.name, run.method))) or mean for run in missing)
         print(
             f"{len(runs) - len(missing)} of {len(runs)} runs are done; the others take about {left:.0f} core hours"
         )
@@ -239,7 +289,7 @@ def make(runs: Sequence[Planned], folder: Path, minutes: float, jobs: int) -> in
 
 def _start(run: Planned, folder: Path) -> "subprocess.Popen[bytes]":
     _demonstrations(run)
-    command = [sys.executable, str(ROOT / "train.py"), *run.overrides, f"runs_dir={folder / run.study.name}"]
+    command = [sys.executable, str(ROOT / "train.py"), *run.overrides, f"runs_dir={folder / run.name}"]
     log = _log(run, folder)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as out:
@@ -255,28 +305,8 @@ def _demonstrations(run: Planned) -> None:
     find_demos(tasks, [data.demos] * len(tasks), data, progress=False)
 
 
-def relearn(runs: Sequence[Planned], folder: Path, by: str) -> int:
-    """Measure the relearning of finished runs whose weights are in a folder, and keep it with their records.
-
-    Returns:
-        Number of runs that failed.
-    """
-    failed = 0
-    for run in runs:
-        directory = _directory(run, folder)
-        if directory is None or not run.is_done():
-            continue
-        command = [sys.executable, "-m", "libero_env.cli", "relearn", str(directory), *RELEARN[by]]
-        print(run.name, flush=True)
-        if subprocess.run(command, cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"}).returncode == 0:
-            run.keep(directory)
-        else:
-            failed += 1
-    return failed
-
-
 def _directory(run: Planned, folder: Path) -> Path | None:
-    return next((folder / run.study.name / run.study.benchmark / run.algo).glob(f"*_seed{run.seed}"), None)
+    return next((folder / run.name).glob("*/*/*"), None)
 
 
 def _log(run: Planned, folder: Path) -> Path:
@@ -289,7 +319,7 @@ def report(runs: Sequence[Planned]) -> None:
         found = [run for run in runs if run.study == study and run.is_done()]
         if not found:
             continue
-        references = tuple(name for name in REFERENCES if name in study.algorithms)
+        references = tuple(name for name in REFERENCES if name in study.methods)
         with (
             tempfile.TemporaryDirectory() as scratch,
             chdir(scratch),
@@ -297,7 +327,9 @@ def report(runs: Sequence[Planned]) -> None:
             write_report(
                 [run.unpack(Path()) for run in found],
                 Path("report.html"),
-                Plan(references, other_worlds=True),  # README.md says which runs are of which models
+                Plan(
+                    references, other_worlds=study in FIRST
+                ),  # README.md says which runs are of which models
             )
             for file in Path().glob("*.*"):
                 shutil.move(file, HERE / study.name / file.name)
@@ -308,7 +340,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=("list", "run", "relearn", "report"))
+    parser.add_argument("what", choices=("list", "run", "report"))
     parser.add_argument("--minutes", type=float, default=float("inf"), help="then what runs is stopped")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="runs at a time")
     parser.add_argument(
@@ -317,15 +349,12 @@ def main() -> int:
     parser.add_argument(
         "--only", nargs="+", default=[], help="words that a run's name contains, such as /er/ or seed1"
     )
-    parser.add_argument("--by", choices=RELEARN, default="error", help="what has to come back in relearning")
     args = parser.parse_args()
     runs = [run for run in planned() if all(word in f"{run.name}/" for word in args.only)]
     if args.what == "run":
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # and end what runs
         args.runs.mkdir(parents=True, exist_ok=True)
         return int(make(runs, args.runs.resolve(), args.minutes, args.jobs) > 0)
-    if args.what == "relearn":
-        return int(relearn(runs, args.runs.resolve(), args.by) > 0)
     show(runs) if args.what == "list" else report(runs)
     return 0
 

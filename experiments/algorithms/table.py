@@ -128,7 +128,7 @@ def training_seconds(study: str) -> dict[str, str]:
         epochs: dict[int, list[float]] = {}
         for record in ResultLog(folder / "results.jsonl").read().of(LossRecord):
             epochs.setdefault(record.task, []).append(record.seconds)
-        seconds = found.setdefault(run.algo, {})
+        seconds = found.setdefault(run.method, {})
         for task, times in epochs.items():
             seconds[task] = min(seconds.get(task, float("inf")), len(times) * min(times))
     return {
@@ -150,7 +150,7 @@ def relearning(study: str) -> Iterator[tuple[str, list[str]]]:
     found: dict[bool, dict[str, list[Savings]]] = {False: {}, True: {}}
     for run, folder in finished(study):
         for part in by_measure(read_relearning(folder)):
-            found[bool(part[0].episodes)].setdefault(run.algo, []).extend(savings(part))
+            found[bool(part[0].episodes)].setdefault(run.method, []).extend(savings(part))
     steps = ["steps again", "steps at first", "savings", "tasks"]
     rows = [[algo, _growth(tasks), *_steps(tasks)] for algo, tasks in sorted(found[False].items())]
     yield "relearning", table(["algorithm", "error at the end", *steps], rows) if rows else []
