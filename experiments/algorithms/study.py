@@ -91,7 +91,7 @@ def _memories(megabytes: float) -> dict[str, tuple[str, ...]]:
 
 LONG = (
     *("benchmark=libero_130", "data.demos=20", "train.steps_per_epoch=75", "eval.episodes=5"),
-    *("eval.cells=sampled", "eval.cells_share=0.05", "eval.curve=none"),
+    *("eval.cells=sampled", "eval.cells_share=0.03", "eval.curve=none"),
 )
 SMALL = ("data.demos=20", "train.steps_per_epoch=75", "eval.episodes=10")
 # fmt: off
@@ -124,14 +124,14 @@ STUDIES = (
     Study("goal", _plain(*TEN), 5, ("benchmark=libero_goal", *SMALL)),
     Study(
         "memory",
-        {name: words for size in (0.1, 1.0, 10.0, 100.0) for name, words in _memories(size).items()},
-        5,
+        {name: words for size in (0.1, 1.0, 10.0) for name, words in _memories(size).items()},
+        3,
         ("benchmark=libero_goal", *SMALL),
     ),
     Study(
         "ten_demonstrations",
         _plain("sequential", "er", "packnet", "lora", "single_task", "iscil"),
-        5,
+        3,
         ("benchmark=libero_object", "data.demos=10", "train.steps_per_epoch=75", "eval.episodes=10"),
     ),
     Study(
