@@ -1,6 +1,6 @@
 """The first half hour with a GPU: does everything run on it, is it right, and is it as fast as expected?
 
-    python experiments/benchmarks/first_gpu.py --folder runs/first_gpu          # 38 minutes at most
+    python experiments/benchmarks/first_gpu.py --folder runs/first_gpu          # 40 minutes at most
     python experiments/benchmarks/first_gpu.py --folder runs/first_gpu --only machine tests
     python experiments/benchmarks/first_gpu.py --folder runs/first_gpu --table  # of what has been run
 
@@ -101,9 +101,9 @@ CHECKS = [
     ),
     Check(
         "warp_motion",
-        180,
+        300,
         f"{WARP} motion --backend warp --out motion.jsonl",
-        "below 1e-5 rad; compiles for 90 s",
+        "below 1e-5 rad; compiles for 3 minutes",
     ),
     Check(
         "warp_expert",

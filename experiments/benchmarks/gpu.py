@@ -89,7 +89,7 @@ def measure(args: argparse.Namespace, worlds: int, pictures: bool) -> Measuremen
         wp.synchronize_device(device)
 
     def observe() -> None:
-        simulations._copies.forget()
+        simulations.fields.clear()  # copies on the host, which a step makes again
         env.proprioception()
 
     images = env.observer.empty_images()
@@ -166,6 +166,8 @@ def main() -> None:
                 break
             found.append(Measurement(**json.loads(done.stdout.splitlines()[-1])))
             print(found[-1], file=sys.stderr, flush=True)
+    if not found:
+        sys.exit("error: nothing was measured")
     show(found)
 
 
