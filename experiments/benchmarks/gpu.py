@@ -18,6 +18,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +74,8 @@ def measure(args: argparse.Namespace, worlds: int, pictures: bool) -> Measuremen
         camera_size=(args.size, args.size),
         horizon=10**6,
     )
-    device, ids = env.simulations.device, np.arange(worlds)
+    simulations: Any = env.simulations  # those of the back end
+    device, ids = simulations.device, np.arange(worlds)
     starts = {"init_state": ids % 50}
     actions = np.random.default_rng(0).uniform(-0.3, 0.3, (worlds, 7))
     # of the processor one thread works, beside others
@@ -82,7 +84,6 @@ def measure(args: argparse.Namespace, worlds: int, pictures: bool) -> Measuremen
     env.reset(options=starts)
     env.step(actions)  # compiles, and captures the graph
     first, free = clock() - begin, device.free_memory if device.is_cuda else 0
-    simulations = env.simulations
 
     def physics() -> None:
         simulations.step(ids, actions)

@@ -30,7 +30,7 @@ def simulate(
     for i in range(simulations):
         won = level + rng.standard_normal(episodes) + rng.standard_normal((len(truth), episodes)) > 0
         won = won.astype(float)
-        curve = Curve(epochs, won.mean(1), count, won[..., None], np.arange(episodes), ("task",))
+        curve = Curve(epochs, won.mean(1), count, won[..., None])
         for name in get_args(Transfer):
             found[name][i] = curve.transfer(name)
         kept = rates.copy()

@@ -16,7 +16,9 @@ import torch
 from tests.harness import original, original_results
 from tests.harness.original_results import relative, update_difference, where_owners_agree, worst
 
-PARTS = {  # by policy: functions of original_results and the batches they take
+PARTS: dict[
+    str, dict[str, tuple[str, ...]]
+] = {  # by policy: functions of original_results and the batches they take
     "bc_transformer": {
         "learn": ("first", "episode"),
         "with_dropout": ("first",),

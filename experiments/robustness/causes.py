@@ -13,6 +13,7 @@ import json
 import random
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -58,7 +59,7 @@ def record(folder: Path, count: int, out: Path, draws: random.Random) -> None:
     evaluation = plan_evaluation(request)
     starts = result.init_states  # all, for a policy's bits may depend on how many act together
     for task in dict.fromkeys(name for name, _ in failed):
-        env = evaluation.env(get_task(task), len(starts))
+        env: Any = evaluation.env(get_task(task), len(starts))
         poses: list[np.ndarray] = []
         step = env.step
 

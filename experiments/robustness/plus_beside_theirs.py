@@ -155,7 +155,7 @@ def compare_pro(folder: Path) -> dict[str, dict]:
 def differences_of(path: Path) -> int:
     """Return how many parts of a task file both readers read differently."""
     ours, own = (
-        bddl.parse(path.read_text(), path.name, check=False),
+        bddl.parse(path.read_text(), path.name),
         their_bddl.robosuite_parse_problem(str(path)),
     )
     info = their_bddl.get_problem_info(str(path))

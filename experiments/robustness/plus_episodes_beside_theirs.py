@@ -16,6 +16,7 @@ from that of the base task, in grey levels.
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from liberoplus.liberoplus.envs.env_wrapper import ControlEnv, OffScreenRenderEnv
@@ -134,7 +135,7 @@ def main() -> None:
     args = parser.parse_args()
     pictures = []
     for suite in SUITES:
-        variants = get_suite(f"{suite}:camera").tasks
+        variants: Any = get_suite(f"{suite}:camera").tasks
         for task in variants[:: len(variants) // args.each][: args.each]:
             pictures.append(compare_pictures(task, args.assets))
             print(f"{task.id:32} {task.variant.view} {pictures[-1]}", flush=True)
