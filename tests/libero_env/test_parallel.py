@@ -79,7 +79,10 @@ def test_a_signal_while_workers_start_is_heeded_when_they_have(monkeypatch):
         begun.append(args)
 
     monkeypatch.setattr("libero_env.parallel.ProcessPoolExecutor.submit", submit)
-    handler = signal.getsignal(signal.SIGINT)
-    with spawn_pool(1) as pool, pytest.raises(KeyboardInterrupt):
-        pool.submit(print, 1)
-    assert begun == [(print, 1)] and signal.getsignal(signal.SIGINT) is handler
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job ignores
+    try:
+        with spawn_pool(1) as pool, pytest.raises(KeyboardInterrupt):
+            pool.submit(print, 1)
+        assert begun == [(print, 1)] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, handler)
