@@ -90,10 +90,14 @@ def _memories(megabytes: float) -> dict[str, tuple[str, ...]]:
 
 
 LONG = (
-    *("benchmark=libero_130", "data.demos=20", "train.steps_per_epoch=75", "eval.episodes=5"),
-    *("eval.cells=sampled", "eval.cells_share=0.03", "eval.curve=none"),
+    *("benchmark=libero_130", "data.demos=20", "train.steps_per_epoch=75", "eval.episodes=4"),
+    *("eval.cells=sampled", "eval.cells_share=0.02", "eval.curve=none", "eval.horizon=300"),
 )
-SMALL = ("data.demos=20", "train.steps_per_epoch=75", "eval.episodes=10")
+SMALL = (
+    *("train.steps_per_epoch=75", "eval.episodes=10", "eval.every=8"),
+    *("eval.cells=sampled", "eval.cells_share=0.3"),
+)
+GOAL = ("benchmark=libero_goal", "data.demos=20", "eval.horizon=240", *SMALL)
 # fmt: off
 TEN = ("sequential", "er", "packnet", "lora", "single_task", "ewc", "iscil", "dmpel", "derpp", "multitask")
 OBJECT = (
@@ -121,18 +125,18 @@ FIRST = (
 )
 STUDIES = (
     *FIRST,
-    Study("goal", _plain(*TEN), 5, ("benchmark=libero_goal", *SMALL)),
+    Study("goal", _plain(*TEN), 5, GOAL),
     Study(
         "memory",
         {name: words for size in (0.1, 1.0, 10.0) for name, words in _memories(size).items()},
         3,
-        ("benchmark=libero_goal", *SMALL),
+        GOAL,
     ),
     Study(
         "ten_demonstrations",
         _plain("sequential", "er", "packnet", "lora", "single_task", "iscil"),
         3,
-        ("benchmark=libero_object", "data.demos=10", "train.steps_per_epoch=75", "eval.episodes=10"),
+        ("benchmark=libero_object", "data.demos=10", *SMALL),
     ),
     Study(
         "libero_130",
