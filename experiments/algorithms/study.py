@@ -310,7 +310,7 @@ def _demonstrations(run: Planned) -> None:
 
 
 def _directory(run: Planned, folder: Path) -> Path | None:
-    return next((folder / run.name).glob("*/*/*"), None)
+    return next((file.parent for file in (folder / run.name).glob("*/*/*/config.yaml")), None)
 
 
 def _log(run: Planned, folder: Path) -> Path:
