@@ -21,11 +21,6 @@ REGISTRIES = (  # which users add to, besides those that are sent to workers
 KEPT: set[str] = set()  # modules that are not of a temporary folder
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put what takes long first, so that no process is left with it when the others have ended."""
-    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
-
-
 @pytest.fixture(autouse=True)
 def forgetting(tmp_path_factory):
     """Take back what a test registers, and the modules that it imports from a temporary folder."""
@@ -91,7 +86,8 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as `unit` every test that is not marked as `sim`."""
+    """Mark as `unit` every test that is not `sim`, and put the slow ones first, so that no process is left with one."""
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
     for item in items:
         if item.get_closest_marker("sim") is None:
             item.add_marker("unit")

@@ -79,7 +79,8 @@ def test_a_signal_while_workers_start_is_heeded_when_they_have(monkeypatch):
         begun.append(args)
 
     monkeypatch.setattr("libero_env.parallel.ProcessPoolExecutor.submit", submit)
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background job ignores
+    # which a shell's background job ignores
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with spawn_pool(1) as pool, pytest.raises(KeyboardInterrupt):
             pool.submit(print, 1)
