@@ -15,8 +15,8 @@ ASSETS_STAMP := $(VENV)/.assets
 PEERS_STAMP := $(VENV)/.peers
 BROWSER_STAMP := $(VENV)/.browser
 EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,tensorboard,view,wandb,warp,docs,dev
-# test processes, each on one thread: one more than cores, as some wait for other processes; at most 8
-WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n + 1 : 8)))
+# test processes, each on one thread: as many as cores, at most 8
+WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
 .DEFAULT_GOAL := help
 .PHONY: help setup gl assets train test lint audit fuzz lerobot docs release clean

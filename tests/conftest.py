@@ -86,8 +86,7 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as `unit` every test that is not `sim`, and put the slow ones first, so that no process is left with one."""
-    items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+    """Mark as `unit` every test that is not marked as `sim`."""
     for item in items:
         if item.get_closest_marker("sim") is None:
             item.add_marker("unit")
