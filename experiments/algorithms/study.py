@@ -335,6 +335,7 @@ def report(runs: Sequence[Planned]) -> None:
                     references, other_worlds=study in FIRST
                 ),  # README.md says which runs are of which models
             )
+            (HERE / study.name).mkdir(exist_ok=True)
             for file in Path().glob("*.*"):
                 shutil.move(file, HERE / study.name / file.name)
         print(f"{len(found)} runs: {HERE / study.name / 'report.html'}")
