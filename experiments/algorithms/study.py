@@ -125,7 +125,7 @@ FIRST = (
 )
 STUDIES = (
     *FIRST,
-    Study("goal", {**_plain(*TEN), "ewc": ("algo=ewc", "algo.strength=15")}, 5, GOAL),
+    Study("goal", _plain(*TEN), 5, GOAL),
     Study(
         "memory",
         {name: words for size in (0.1, 1.0, 10.0) for name, words in _memories(size).items()},

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lifelong.data.windows import WindowDataset
 from lifelong.policies.base import Policy, in_mode
-from lifelong.types import Batch, Count, Natural, to_device
+from lifelong.types import Batch, Count, Natural, NonNegative, to_device
 
 
 class ImportanceEstimator:
@@ -20,17 +20,24 @@ class ImportanceEstimator:
         windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
         batch_size: Number of windows per gradient.
         augment: Whether the windows are augmented as in training.
+        strength: Strength of a penalty that goes with the estimate.
 
     Attributes:
         training: Whether the policy is in training mode meanwhile.
-        strength: Strength of a penalty that goes with the estimate.
     """
 
     training = False
-    strength = 1.0
 
-    def __init__(self, *, windows: Natural = 512, batch_size: Count = 1, augment: bool = False):
+    def __init__(
+        self,
+        *,
+        windows: Natural = 512,
+        batch_size: Count = 1,
+        augment: bool = False,
+        strength: NonNegative = 1.0,
+    ):
         self.windows, self.batch_size, self.augment = windows, batch_size, augment
+        self.strength = strength
 
     def objective(self, policy: Policy, batch: Batch, draws: torch.Generator) -> Tensor:
         """Return the scalar whose gradient is taken; `draws` is a CPU generator."""
@@ -83,12 +90,11 @@ class SampleFisher(ImportanceEstimator):
     Args:
         windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
         augment: Whether the windows are augmented as in training.
+        strength: Strength of a penalty that goes with the estimate.
     """
 
-    strength = 1500.0
-
-    def __init__(self, *, windows: Natural = 512, augment: bool = False):
-        super().__init__(windows=windows, augment=augment)
+    def __init__(self, *, windows: Natural = 512, augment: bool = False, strength: NonNegative = 1500.0):
+        super().__init__(windows=windows, augment=augment, strength=strength)
 
 
 class BatchFisher(ImportanceEstimator):
@@ -101,13 +107,20 @@ class BatchFisher(ImportanceEstimator):
         windows: Number of windows, drawn without replacement, that the estimate uses; 0: all.
         batch_size: Number of windows per gradient.
         augment: Whether the windows are augmented as in training.
+        strength: Strength of a penalty that goes with the estimate.
     """
 
     training = True
-    strength = 5e4
 
-    def __init__(self, *, windows: Natural = 512, batch_size: Count = 32, augment: bool = False):
-        super().__init__(windows=windows, batch_size=batch_size, augment=augment)
+    def __init__(
+        self,
+        *,
+        windows: Natural = 512,
+        batch_size: Count = 32,
+        augment: bool = False,
+        strength: NonNegative = 5e4,
+    ):
+        super().__init__(windows=windows, batch_size=batch_size, augment=augment, strength=strength)
 
 
 class ActionSensitivity(ImportanceEstimator):

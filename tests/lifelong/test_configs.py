@@ -68,7 +68,7 @@ def choice(file: Path) -> list[str]:
         groups = [g for g in ("algo", "policy", "language") if (CONFIGS / g / file.name).is_file()]
         return ["compat=libero", *(f"{group}={file.stem}" for group in groups)]
     if file.parts[0] == "tuned":  # chosen by the policy's head and the algorithm
-        return [f"policy/head={file.parent.name}", f"algo={file.stem}"]
+        return [f"policy/head={file.parent.name}", f"algo={file.stem.removesuffix('_sample')}"]
     option = f"{file.parent}={file.stem}"
     return ["algo=ewc", option] if str(file.parent) == "algo/estimator" else [option]
 
