@@ -51,7 +51,7 @@ BY_SEED = ("seed", "benchmark.order_seed", "data.seed")
 # keys that came after the first runs, with the values by which nothing changes
 ADDED = {
     **{"data.files": [], "eval.cells_share": 0.1, "eval.unseen": "none"},
-    **{"algo.adapters": "own", "algo.instruction": "earlier"},
+    **{"algo.adapters": "own", "algo.instruction": "earlier", "algo.estimator.strength": 1500},
 }
 SETTINGS = ("threads=1", "eval.sim_threads=1", "progress=false")
 WINDOW = 64 * 64 * 3 * 2 + 4 * (7 + 2 + 3 + 7)  # bytes: two images, readings and the action
