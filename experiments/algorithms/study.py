@@ -272,6 +272,8 @@ def make(runs: Sequence[Planned], folder: Path, minutes: float, jobs: int) -> in
         while True:
             while len(active) < jobs and time.monotonic() < end and (run := next(waiting, None)):
                 active[_start(run, folder)] = run
+            if not active or time.monotonic() > end:
+                return failed
             for process in [p for p in active if p.poll() is not None]:
                 run = active.pop(process)
                 directory = _directory(run, folder)
@@ -281,8 +283,6 @@ def make(runs: Sequence[Planned], folder: Path, minutes: float, jobs: int) -> in
                 else:
                     failed += 1
                     print(f"{time.strftime('%H:%M')} failed: {_log(run, folder)}", flush=True)
-            if not active or time.monotonic() > end:
-                return failed
             time.sleep(1)
     finally:
         for process in active:
