@@ -43,7 +43,7 @@ $(PEERS_STAMP): $(STAMP)
 	@touch $@
 
 # Chromium or Chrome, in which tests look at pages
-$(BROWSER_STAMP): $(STAMP)
+$(BROWSER_STAMP): $(STAMP) $(GL_STAMP)
 	@if ! $(BIN)/python -c "from tests.harness.browser import program; program()" 2>/dev/null && \
 	  [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
 	  apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium; \

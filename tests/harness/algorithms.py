@@ -70,14 +70,17 @@ def by_hand(policy: LinearPolicy, data: Windows) -> torch.Tensor:
 
 
 def assert_resumed_equals_uninterrupted(
-    folder, algo, monkeypatch, make_context=None, last: int = sequences.TASKS - 1
+    folder, algo, monkeypatch, make_context=None, last: int = sequences.TASKS - 1, first: int = 1
 ):
-    """Learn the sequence uninterrupted, and killed at every few writes; return how many processes that took."""
+    """Learn the sequence uninterrupted, and killed again and again; return how many processes that took.
+
+    The first process is killed at its `first` write, the others at their fourth to eighth.
+    """
     make_context = make_context or sequences.run_context
     uninterrupted = make_context(folder / "whole", algo)
     sequences.sequence(uninterrupted).run()
     records, state = sequences.outcome(folder / "whole", uninterrupted.directory.log, last)
-    starts, resumed = _killed_repeatedly(folder / "killed", algo, monkeypatch, make_context)
+    starts, resumed = _killed_repeatedly(folder / "killed", algo, monkeypatch, make_context, first)
     assert starts > 2
     same_records, same_state = sequences.outcome(folder / "killed", resumed.directory.log, last)
     assert same_records == records
@@ -85,9 +88,9 @@ def assert_resumed_equals_uninterrupted(
     return starts
 
 
-def _killed_repeatedly(path, algo, monkeypatch, make_context):
+def _killed_repeatedly(path, algo, monkeypatch, make_context, first):
     """Learn the sequence in processes that are killed; return how many there were, and the context of the last."""
-    starts, writes = 0, 1
+    starts, writes = 0, first
     while True:
         starts += 1
         assert starts < 100
@@ -99,4 +102,4 @@ def _killed_repeatedly(path, algo, monkeypatch, make_context):
                 sequences.sequence(p).run()
                 return starts, p
             except sequences.Killed:
-                writes = 2 + starts % 3
+                writes = 4 + starts % 5
