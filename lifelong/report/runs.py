@@ -236,7 +236,7 @@ def _unlike_facts(groups: Sequence[Group], names: Sequence[str], *, unknown: boo
 
 
 def _unlike_demonstrations(groups: Sequence[Group]) -> list[str]:
-    """Return a sentence for each set of runs whose demonstrations differ although their settings of them are equal.
+    """Return a sentence for each set of runs whose demonstrations differ although settings and `data.seed` are equal.
 
     That happens when the expert was improved, or files of `data.folder` were replaced, between two runs.
     """
@@ -251,7 +251,7 @@ def _unlike_demonstrations(groups: Sequence[Group]) -> list[str]:
             counts = tuple(sorted(zip(run.record.tasks, found.counts, strict=True)))
             digests = tuple(sorted(zip(run.record.tasks, found.digests, strict=True)))
             data = tuple(item for item in _identity(run) if item[0].startswith("data."))
-            alike = sets.setdefault((run.record.benchmark, counts, data), {})
+            alike = sets.setdefault((run.record.benchmark, run.record.data_seed, counts, data), {})
             alike.setdefault(digests, []).append(name)
     lines = (
         [f"No record tells which demonstrations these learned from: {few_of(unknown)}."] if unknown else []

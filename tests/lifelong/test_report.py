@@ -589,10 +589,19 @@ def test_no_two_methods_have_one_label(tmp_path: Path):
 
 
 def test_runs_that_learned_from_other_demonstrations_are_told(tmp_path: Path):
-    kinds = {"old": ("aa", "bb"), "older": ("aa", "bb"), "new": ("aa", "cc"), "fewer": ("dd", "ee")}
+    kinds = {
+        "old": ("aa", "bb"),
+        "older": ("aa", "bb"),
+        "new": ("aa", "cc"),
+        "fewer": ("dd", "ee"),
+        "seed": ("ff", "gg"),
+    }
     runs = []
     for number, (name, digests) in enumerate(kinds.items()):
-        runs.append(make_run(tmp_path / name, ("ewc", "er")[number % 2], number, tasks=2))
+        data_seed = 2 if name == "seed" else None  # which asks for others
+        runs.append(
+            make_run(tmp_path / name, ("ewc", "er")[number % 2], number, tasks=2, data_seed=data_seed)
+        )
         counts = (10, 10) if name == "fewer" else (50, 50)
         ResultLog(runs[-1] / "results.jsonl").append(
             DemonstrationsRecord(counts=counts, generators=("expert",) * 2, digests=digests)
