@@ -210,9 +210,12 @@ class Results:
         return estimate_cells(rates, [(group[-1], group.start) for group in self.run.groups])
 
     def average_success(self) -> NDArray[np.float64]:
-        """Return the mean success over the tasks learned so far, after each task, (K,); NaN from the next task on."""
+        """Return the mean success over the tasks learned so far, after each task, (K,); NaN from the next task on.
+
+        Where it is estimated from a sample of the cells, it is held within [0, 1].
+        """
         size, average = self.learned_tasks(), np.full(len(self.run.tasks), np.nan)
-        average[:size] = average_success(self._estimated(self.success_matrix()[0])[:size, :size])
+        average[:size] = average_success(self._estimated(self.success_matrix()[0])[:size, :size]).clip(0, 1)
         return average
 
     @property

@@ -203,18 +203,19 @@ def average_success(matrix: ArrayLike) -> Floats:
 def estimate_cells(matrix: ArrayLike, rows: Sequence[tuple[int, int]]) -> Floats:
     """Return a matrix (K, K) whose every cell, and so NBT and AUC, is unbiased over the samples that may be drawn.
 
-    Of each row, a uniform sample of the earlier tasks is measured, of the last row all. The last row predicts the rows
-    above it, and what is measured there corrects the prediction, weighted by its chance to be drawn: the difference
-    estimator (Särndal, Swensson and Wretman, Model Assisted Survey Sampling, 1992, section 6.3). Single cells may lie
-    outside of [0, 1]. Before the last row is measured, the others are NaN.
+    Of each row, a uniform sample of the earlier tasks is measured, of the last row all. The mean of a task's success
+    just learned and at the end predicts what lies between, and what is measured there corrects the prediction, weighted
+    by its chance to be drawn: the difference estimator (Särndal, Swensson and Wretman, Model Assisted Survey Sampling,
+    1992, section 6.3). Single cells may lie outside of [0, 1]. Before the last row is measured, the others are NaN.
 
     Args:
         matrix: Success rates c[i,j], NaN where they were not measured.
         rows: Row and number of earlier tasks of each step of the sequence, in order.
     """
     c = np.array(matrix, dtype=float)
+    learned = np.concatenate([c[row, earlier : row + 1] for row, earlier in rows])
     for row, earlier in rows[:-1]:
-        seen, predicted = np.isfinite(c[row, :earlier]), c[-1, :earlier]
+        seen, predicted = np.isfinite(c[row, :earlier]), (learned + c[-1])[:earlier] / 2
         if not seen.all():
             weight = earlier / max(1, seen.sum())
             c[row, :earlier] = predicted + np.where(seen, weight * (c[row, :earlier] - predicted), 0.0)

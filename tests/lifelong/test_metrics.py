@@ -97,6 +97,11 @@ def test_sampled_cells_give_unbiased_forgetting():
     assert np.array(found).std(0).max() > 0.05
     unfinished = estimate_cells(np.where(np.arange(5)[:, None] < 4, sampled, NAN), rows)
     assert np.isnan(negative_backward_transfer(unfinished)).any()
+    together = np.where(
+        np.arange(5)[:, None] < 1, NAN, sampled
+    )  # tasks 0 and 1, in one stage that ends in row 1
+    together[1, :2] = 0.25, 0.75
+    assert np.isfinite(estimate_cells(together, [(1, 0), *rows[2:]])[1:][np.tril_indices(4, k=1, m=5)]).all()
 
 
 def test_best_epoch_is_the_earliest_of_equals_and_holding_changes_nothing_else():
