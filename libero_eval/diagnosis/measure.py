@@ -93,10 +93,15 @@ class Swap:
     final: float
     swapped: dict[str, float]
 
+    @property
+    def lost(self) -> float:
+        """What was lost since the task was just learned; 0 where it is less than a tenth of what remained then."""
+        lost = self.final - self.learned
+        return lost if lost > max(0.0, 0.1 * self.learned) else 0.0
+
     def restored(self, part: str) -> float:
         """Return the share of what was lost that a part's return brings back; NaN where nothing was lost."""
-        lost = self.final - self.learned
-        return (self.final - self.swapped[part]) / lost if lost > 0 else float("nan")
+        return (self.final - self.swapped[part]) / self.lost if self.lost else float("nan")
 
 
 @dataclass(frozen=True)

@@ -57,8 +57,8 @@ def _swap_text(swap: Swap) -> str:
         f"Task {swap.task + 1}: {MEASURES[swap.measure]} {number(swap.learned)} just learned, {number(swap.final)} "
         "at the end"
     )
-    if swap.final <= swap.learned:
-        return f"{start}; nothing is lost."
+    if not swap.lost:
+        return f"{start}; nothing is lost, or less than a tenth."
     best = min(swap.swapped, key=lambda part: swap.swapped[part])
     shares = ", ".join(f"{part} {percent(swap.restored(part), 0)} %" for part in swap.swapped)
     verdict = f"the {best} restores the largest share" if swap.restored(best) > 0 else "no part restores any"
