@@ -63,9 +63,7 @@ def test_every_algorithm_is_here():
 
 @pytest.mark.parametrize(("first", "make"), list(enumerate((EVERY | COMPAT).values())), ids=EVERY | COMPAT)
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, first, make, monkeypatch):
-    assert_resumed_equals_uninterrupted(
-        tmp_path, make, monkeypatch, first=1 + first % 6
-    )  # all writes, together
+    assert_resumed_equals_uninterrupted(tmp_path, make, monkeypatch, first=1 + first % 6)
 
 
 @pytest.mark.parametrize("name", sorted(set(EVERY) - {"packnet"}))  # which prunes
