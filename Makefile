@@ -18,6 +18,9 @@ EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
+# byte code is kept whatever the shell says: without it each process compiles torch again, for seconds
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help setup gl assets train test lint audit fuzz lerobot docs release clean
 
