@@ -74,6 +74,14 @@ def set_damping(joint: mujoco.MjsJoint, damping: float) -> None:
         joint.damping = damping
 
 
+def make_directional(light: mujoco.MjsLight) -> None:
+    """Let a light shine in one direction everywhere."""
+    if hasattr(mujoco, "mjtLightType"):
+        light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    else:  # before MuJoCo 3.4
+        light.directional = True
+
+
 # Sparse mass matrix in MjData: rows of the lower triangle; before MuJoCo 3.3.3 for each joint its chain to the root.
 MASS_FIELD = "M" if hasattr(mujoco.MjModel, "M_rowadr") else "qM"
 

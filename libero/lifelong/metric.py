@@ -234,13 +234,14 @@ class _EvalEnv(BatchEnv):
         self.sim_states, self.on_step = sim_states, on_step
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
-        obs, info = super().reset(seed=seed, options=options)
         if self.rows is not None and options is not None:
-            rows = self.rows[np.asarray(options["init_state"]) % len(self.rows)]
-            qpos, qvel, fixtures = self.scene.split_states(rows)
-            poses = fixtures if fixtures.size else None
-            self.simulations.reset(range(self.num_envs), qpos, qvel, fixtures=poses)
-        return obs, info
+            indices = np.asarray(options["init_state"])
+            rows = self.rows[indices % len(self.rows)]
+            poses = self.init_states[
+                indices, rows.shape[1] :
+            ]  # of the fixtures, where the user's states have none
+            options = {**options, "start": np.hstack([rows, poses])}
+        return super().reset(seed=seed, options=options)
 
     def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:
         running = self.running

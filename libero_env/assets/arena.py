@@ -18,7 +18,7 @@ from libero_env.assets.furnishing import (
 from libero_env.assets.own_arena import read_own, read_room
 from libero_env.assets.robot import load_robosuite
 from libero_env.errors import UnknownNameError
-from libero_env.mujoco_compat import delete, mujoco
+from libero_env.mujoco_compat import delete, make_directional, mujoco
 from libero_env.objects.builtin.mesh import Mesh, merge
 from libero_env.storage import read_yaml
 from libero_env.workspaces import BUILTIN_WORKSPACES, WORKSPACES, find_workspace
@@ -210,10 +210,7 @@ def add_light(
     light = spec.worldbody.add_light(name=name, pos=list(pos), dir=list(dir), castshadow=False)
     light.diffuse, light.specular = list(diffuse), list(specular)
     if directional:
-        if hasattr(mujoco, "mjtLightType"):
-            light.type = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-        else:  # before MuJoCo 3.4
-            light.directional = True
+        make_directional(light)
 
 
 def add_mount(spec: mujoco.MjSpec, workspace: Workspace, detailed: bool = False) -> None:

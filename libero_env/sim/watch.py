@@ -24,6 +24,7 @@ OVER = 0.30  # [m] above its place, an object is over it
 _CONJUGATE = (1.0, -1.0, -1.0, -1.0)  # of a quaternion, wxyz
 _MOVED = 0.02  # [rad] or [m] that a joint of a fixture was moved
 _LEFT, _RIGHT, _HAND, _ARM = "left finger", "right finger", "hand", "arm"
+_STATE = int(mujoco.mjtState.mjSTATE_INTEGRATION)  # all that a step depends on
 
 
 class EpisodeWatch:
@@ -177,7 +178,9 @@ class EpisodeWatch:
         needless: dict[str, float] = {}
         simulations.pose_fixtures(i)
         self._scratch = data = self._scratch or mujoco.MjData(model)
-        mujoco.mj_copyData(data, model, simulations.data(i))
+        state = np.empty(mujoco.mj_stateSize(model, _STATE))
+        mujoco.mj_getState(model, simulations.data(i), state, _STATE)
+        mujoco.mj_setState(model, data, state, _STATE)
         mujoco.mj_forward(model, data)
         for k, (a, b) in enumerate(self._pairs(data.contact.geom[: data.ncon]).tolist()):
             what, other, by_robot = self._names[a], self._names[b], b >= self._first

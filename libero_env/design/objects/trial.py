@@ -12,7 +12,7 @@ from libero_env.errors import LiberoError
 from libero_env.expert.arm import GRIPPER
 from libero_env.expert.grasping.grasps import Grasp, GraspError, find_grasps
 from libero_env.geometry import surface_points
-from libero_env.mujoco_compat import log_warnings, mujoco, set_damping
+from libero_env.mujoco_compat import log_warnings, make_directional, mujoco, set_damping
 from libero_env.objects.model import ROOT_BODY, ObjectModel
 from libero_env.sim.render import Renderer, RenderTarget
 
@@ -126,9 +126,8 @@ def _scene(item: ObjectModel) -> mujoco.MjModel:
     spec.visual.map.znear, spec.visual.headlight.ambient = 0.005, [0.35] * 3
     grey = (0.55, 0.57, 0.6, 1.0)
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=(10, 10, 1), rgba=grey, group=1)
-    spec.worldbody.add_light(
-        pos=(0.5, -0.5, 2.0), dir=(-0.2, 0.2, -1.0), type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
-    )
+    light = spec.worldbody.add_light(pos=(0.5, -0.5, 2.0), dir=(-0.2, 0.2, -1.0))
+    make_directional(light)
     spec.worldbody.add_camera(name="turntable", fovy=35.0)
     joint = item.spec.body(ROOT_BODY).add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
     set_damping(joint, item.joint_damping)
