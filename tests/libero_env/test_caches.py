@@ -3,6 +3,7 @@
 import importlib.util
 import logging
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -364,6 +365,7 @@ def test_compiled_functions_that_are_damaged_are_compiled_again(tmp_path, functi
 
 
 def test_functions_are_compiled_where_nothing_can_be_cached(tmp_path, function, lines, monkeypatch):
+    shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)  # of the module's byte code
     (tmp_path / "__pycache__").write_text("no folder")
     monkeypatch.setenv("XDG_CACHE_HOME", "/proc/1")
     assert [parallel.compiled(function)(x) for x in (1, 2)] == [2, 4]
