@@ -5,7 +5,7 @@ PYTHONPATH=. python docs/pictures.py matrices OUT.png ALGORITHM ...     mean suc
 PYTHONPATH=. python docs/pictures.py page OUT.png PAGE.html TOP HEIGHT  a part of a page, in pixels
 
 film.jpg: `libero eval expert --suite libero_goal/3 libero_10/2 libero_object/0 --episodes 1 --videos 1 --size 256`,
-then `film` of eval/expert/videos/*. forgetting.png: `matrices` of sequential, ewc and er. first-run-*: what the
+then `film` of eval/expert/videos/*. forgetting.png: `matrices` of sequential, packnet and er. first-run-*: what the
 commands of docs/first-run.md write.
 """
 
@@ -34,7 +34,7 @@ def film(out: Path, *recordings: str) -> None:
 
 
 def matrices(out: Path, *algorithms: str) -> None:
-    """Draw the success matrices of algorithms on LIBERO-Object, means over the seeds, side by side."""
+    """Draw the success matrices of algorithms on LIBERO-Goal, means over the seeds, side by side."""
     sys.path.append(str(STUDY))
     from study import planned
 
@@ -44,9 +44,10 @@ def matrices(out: Path, *algorithms: str) -> None:
     panels = []
     for algorithm in algorithms:
         with tempfile.TemporaryDirectory() as folder:
-            runs = [run for run in planned() if f"{run.name}/".startswith(f"libero_object/{algorithm}/")]
+            runs = [run for run in planned() if f"{run.name}/".startswith(f"goal/{algorithm}/") and run.is_done()]
             logs = [ResultLog(run.unpack(Path(folder)) / "results.jsonl").read() for run in runs]
-        rates = np.mean([log.scores().matrix for log in logs], 0)
+        measured = np.ma.masked_invalid([log.success_matrix()[0] for log in logs])
+        rates = measured.mean(0).filled(np.nan)
         panels.append(Panel(algorithm, rates, [str(i) for i in range(len(rates))]))
     heatmap_figure(panels).savefig(out, dpi=130, bbox_inches="tight", facecolor="white")
     _shrink(out)

@@ -5,10 +5,10 @@
     python experiments/algorithms/study.py report              # tables and pictures of what is finished
     python experiments/algorithms/table.py                     # puts the tables into README.md
 
-plan.md has what is to be run; README.md the first three, which are finished. A run is a process of its own on one
-thread. One that was stopped goes on where it was; of a finished one the records are kept in records/, compressed. All
-methods are run with one seed before the next, so that what is finished can be compared at any time. Records of another
-configuration than today's count as missing.
+plan.md has what is to be run; README.md what came of it. A run is a process of its own on one thread. One that was
+stopped goes on where it was; of a finished one the records are kept in records/, compressed. All methods are run with
+one seed before the next, so that what is finished can be compared at any time. Records of another configuration than
+today's count as missing.
 """
 
 import argparse
@@ -48,11 +48,6 @@ RECORDS = HERE / "records"
 REFERENCES = ("er", "sequential", "single_task")  # that each other method is compared with
 # an order of the tasks and demonstrations for each seed: what they do is in the differences between seeds
 BY_SEED = ("seed", "benchmark.order_seed", "data.seed")
-# keys that came after the first runs, with the values by which nothing changes
-ADDED = {
-    **{"data.files": [], "eval.cells_share": 0.1, "eval.unseen": "none"},
-    **{"algo.adapters": "own", "algo.instruction": "earlier", "algo.estimator.strength": 1500},
-}
 SETTINGS = ("threads=1", "eval.sim_threads=1", "progress=false")
 WINDOW = 64 * 64 * 3 * 2 + 4 * (7 + 2 + 3 + 7)  # bytes: two images, readings and the action
 
@@ -66,14 +61,12 @@ class Study:
         methods: What the command of each has, by its name in tables, in the order in which they are run.
         seeds: Number of seeds of each.
         overrides: What all its commands have.
-        by_seed: Keys that are set to the seed.
     """
 
     name: str
     methods: Mapping[str, tuple[str, ...]]
     seeds: int
     overrides: tuple[str, ...]
-    by_seed: tuple[str, ...] = BY_SEED
 
 
 def _plain(*algorithms: str) -> dict[str, tuple[str, ...]]:
@@ -98,33 +91,8 @@ SMALL = (
     *("eval.cells=sampled", "eval.cells_share=0.3"),
 )
 GOAL = ("benchmark=libero_goal", "data.demos=20", "eval.horizon=240", *SMALL)
-# fmt: off
 TEN = ("sequential", "er", "packnet", "lora", "single_task", "ewc", "iscil", "dmpel", "derpp", "multitask")
-OBJECT = (
-    "sequential", "er", "packnet", "ewc", "multitask", "single_task", "lora", "dmpel", "iscil", "clare", "omla",
-    "compressed_er", "mlr", "m2distill", "derpp", "agem", "lwf", "mas", "si", "averaging",
-)
-# fmt: on
-MLP = ("policy=bc_mlp_small", "eval.episodes=20")
-FIRST = (
-    Study("libero_object", _plain(*OBJECT), 5, ("benchmark=libero_object", *MLP), ("seed",)),
-    Study(
-        "libero_goal",
-        _plain("sequential", "er", "ewc", "packnet", "iscil"),
-        3,
-        ("benchmark=libero_goal", *MLP),
-        ("seed",),
-    ),
-    Study(
-        "pretrained6",
-        _plain("sequential", "er", "iscil", "mlr", "m2distill"),
-        3,
-        ("benchmark=libero_object", "stream=pretrained6", *MLP),
-        ("seed",),
-    ),
-)
 STUDIES = (
-    *FIRST,
     Study("goal", _plain(*TEN), 5, GOAL),
     Study(
         "memory",
@@ -166,7 +134,7 @@ class Planned:
     @property
     def overrides(self) -> list[str]:
         """What its command has beyond `python train.py`."""
-        seeds = (f"{key}={self.seed}" for key in self.study.by_seed)
+        seeds = (f"{key}={self.seed}" for key in BY_SEED)
         return [*self.study.methods[self.method], *self.study.overrides, *seeds, *SETTINGS]
 
     @property
@@ -187,7 +155,7 @@ class Planned:
         saved = yaml.safe_load(_read(self.record)["config"])
         known = set(result_relevant(self.config))  # a saved configuration also names how pictures were drawn
         was = {k: v for k, v in result_relevant(saved).items() if k in known}
-        now = {k: v for k, v in result_relevant(self.config).items() if v is not None and v != ADDED.get(k)}
+        now = {k: v for k, v in result_relevant(self.config).items() if v is not None}
         return {k: v for k, v in was.items() if k in now} == now
 
     def keep(self, directory: Path) -> None:
@@ -328,13 +296,7 @@ def report(runs: Sequence[Planned]) -> None:
             tempfile.TemporaryDirectory() as scratch,
             chdir(scratch),
         ):  # runs are named relative to their page
-            write_report(
-                [run.unpack(Path()) for run in found],
-                Path("report.html"),
-                Plan(
-                    references, other_worlds=study in FIRST
-                ),  # README.md says which runs are of which models
-            )
+            write_report([run.unpack(Path()) for run in found], Path("report.html"), Plan(references))
             (HERE / study.name).mkdir(exist_ok=True)
             for file in Path().glob("*.*"):
                 shutil.move(file, HERE / study.name / file.name)

@@ -15,16 +15,10 @@ from study import REFERENCES, Planned, planned
 from libero_env.text import duration, quantity
 from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
-from lifelong.results.relearning import Savings, by_measure, read_relearning, savings
 
 HERE = Path(__file__).parent
-# the first head of every table: the runs of a study were made in two versions of models and demonstrations
-HEADS = {
-    "libero_object": "algorithm (seeds 1, 2: older models and demonstrations than 3 to 5)",
-    "libero_goal": "algorithm (seed 1, and er's seed 2: older models and demonstrations than the others)",
-    "pretrained6": "algorithm (seed 1, and iscil's seed 2: older models and demonstrations than the others)",
-}
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "fwt": "FWT", "nbt": "NBT", "auc": "AUC"}
+COMPARED = {"final_success": "final success", "auc": "AUC"}
 
 
 def table(heads: list[str], rows: list[list[str]], align: str = "---:|") -> list[str]:
@@ -43,23 +37,25 @@ def metric(cell: dict) -> str:
 
 
 def tables(study: str, found: dict) -> Iterator[tuple[str, list[str]]]:
-    """Metrics, costs, and the planned pairs; best AUC first."""
-    head, measured = HEADS[study], {label: group["metrics"] for label, group in found["groups"].items()}
-    yield "metrics", metrics(head, measured)
-    yield "pairs", pairs(head, by_auc(measured), found["differences"])
-    if later := found["after_base_stage"]:
-        yield "later tasks", metrics(head, later["metrics"])
-        yield "pairs of later tasks", pairs(head, by_auc(later["metrics"]), later["differences"])
+    """Metrics, the planned pairs, and costs; best AUC first."""
+    groups = found["groups"]
+    order = by_auc({label: group["metrics"] for label, group in groups.items()})
+    rows = [
+        [
+            label,
+            str(len(groups[label]["seeds"])),
+            "yes" if groups[label]["told_task"] else "no",
+            *(metric(groups[label]["metrics"][name]) for name in COLUMNS),
+        ]
+        for label in order
+    ]
+    yield "metrics", table(["algorithm", "seeds", "told the task", *COLUMNS.values()], rows)
+    for name, title in COMPARED.items():
+        yield f"pairs of {title}", pairs(order, found["differences"], name, title)
     training = training_seconds(study)
-    rows = [[label, training[label], *costs(found["groups"][label]["costs"])] for label in by_auc(measured)]
+    rows = [[label, training[label], *costs(groups[label]["costs"])] for label in order]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
-
-
-def metrics(head: str, measured: dict[str, dict]) -> list[str]:
-    """Lines of the table of metrics, by label."""
-    rows = [[label, *(metric(measured[label][name]) for name in COLUMNS)] for label in by_auc(measured)]
-    return table([head, *COLUMNS.values()], rows)
 
 
 def by_auc(measured: dict[str, dict]) -> list[str]:
@@ -67,21 +63,21 @@ def by_auc(measured: dict[str, dict]) -> list[str]:
     return sorted(measured, key=lambda label: -(measured[label]["auc"]["mean"] or 0))
 
 
-def pairs(head: str, labels: list[str], differences: list[dict]) -> list[str]:
-    """Each algorithm's AUC less that of each reference, and of the first one with every seed, in points."""
+def pairs(labels: list[str], differences: list[dict], name: str, title: str) -> list[str]:
+    """A metric of each algorithm less that of each reference, and of the first one with every seed, in points."""
     found = {}
     for pair in differences:
-        auc = pair["metrics"]["auc"]
-        found[pair["of"], pair["less"]] = auc
-        found.setdefault((pair["less"], pair["of"]), _turned(auc))
-    references = [name for name in REFERENCES if any(less == name for _, less in found)]
+        cell = pair["metrics"][name]
+        found[pair["of"], pair["less"]] = cell
+        found.setdefault((pair["less"], pair["of"]), _turned(cell))
+    references = [label for label in REFERENCES if any(less == label for _, less in found)]
     rows = []
     for label in labels:
-        cells = [found.get((label, name)) for name in references]
+        cells = [found.get((label, reference)) for reference in references]
         if any(cell and cell["value"] is not None for cell in cells):
             rows.append([label, *(_difference(cell) for cell in cells), _by_seed(cells[0])])
-    heads = [head, *(f"AUC less {name}" for name in references), f"less {references[0]}, each seed"]
-    return table(heads, rows)
+    heads = [f"{title} less {reference}" for reference in references]
+    return table(["algorithm", *heads, f"less {references[0]}, each seed"], rows)
 
 
 def _turned(cell: dict) -> dict:
@@ -145,43 +141,6 @@ def finished(study: str) -> Iterator[tuple[Planned, Path]]:
                 yield run, run.unpack(Path(scratch))
 
 
-def relearning(study: str) -> Iterator[tuple[str, list[str]]]:
-    """Tables of relearning, by error and by success; without lines where nothing was measured."""
-    found: dict[bool, dict[str, list[Savings]]] = {False: {}, True: {}}
-    for run, folder in finished(study):
-        for part in by_measure(read_relearning(folder)):
-            found[bool(part[0].episodes)].setdefault(run.method, []).extend(savings(part))
-    steps = ["steps again", "steps at first", "savings", "tasks"]
-    rows = [[algo, _growth(tasks), *_steps(tasks)] for algo, tasks in sorted(found[False].items())]
-    yield "relearning", table(["algorithm", "error at the end", *steps], rows) if rows else []
-    rows = [[algo, *_success(tasks), *_steps(tasks)] for algo, tasks in sorted(found[True].items())]
-    heads = ["algorithm", "just learned", "at the end", *steps]
-    yield "relearning by success", table(heads, rows) if rows else []
-
-
-def _growth(tasks: list[Savings]) -> str:
-    return f"{statistics.median(t.final_error / t.learned_error for t in tasks):.1f}"
-
-
-def _success(tasks: list[Savings]) -> list[str]:
-    means = (
-        statistics.mean(1 - getattr(t, name) for t in tasks) for name in ("learned_error", "final_error")
-    )
-    return [f"{mean:.2f}" for mean in means]
-
-
-def _steps(tasks: list[Savings]) -> list[str]:
-    shares = [t.share for t in tasks if t.share is not None]
-    saved = f"{statistics.median(shares):.2f}" if shares else "–"
-    return [_middle([t.again for t in tasks]), _middle([t.first for t in tasks]), saved, str(len(tasks))]
-
-
-def _middle(steps: list[int | None]) -> str:
-    """The median number of steps, where tasks that were given up count as the largest."""
-    middle = statistics.median_high([float("inf") if s is None else s for s in steps])
-    return "given up" if middle == float("inf") else f"{middle:.0f}"
-
-
 def insert(text: str, name: str, lines: list[str]) -> str:
     """Return a text with lines in place of what stands between the marks of a name."""
     start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
@@ -197,8 +156,6 @@ def main() -> None:
     text = readme.read_text(encoding="utf-8")
     for path in sorted(HERE.glob("*/comparison.json")):
         for name, lines in tables(path.parent.name, json.loads(path.read_text(encoding="utf-8"))):
-            text = insert(text, f"{path.parent.name}: {name}", lines)
-        for name, lines in relearning(path.parent.name):
             text = insert(text, f"{path.parent.name}: {name}", lines)
     readme.write_text(text, encoding="utf-8")
 

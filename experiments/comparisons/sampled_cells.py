@@ -1,6 +1,6 @@
 """How far NBT and AUC of a sample of the success matrix are from those of the whole one.
 
-    python experiments/comparisons/sampled_cells.py experiments/algorithms/*/episodes.csv.gz
+    python experiments/comparisons/sampled_cells.py experiments/comparisons/matrices/*
 
 Every recorded matrix is sampled `--draws` times as `eval.cells=sampled` does. Besides, each is stretched to `--tasks`:
 column k becomes a recorded column, of which the success after later tasks is taken by its share of the rest.

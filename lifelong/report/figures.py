@@ -199,17 +199,20 @@ def storage_figure(points: Mapping[str, tuple[float, Estimate]]) -> Figure:
         points: Bytes and AUC of each method.
     """
     least = min([size for size, _ in points.values() if size > 0], default=1.0)
+    most = max(least, *(size for size, _ in points.values()))
+    decades = 10.0 ** np.arange(math.floor(math.log10(least)), math.log10(2 * most))
     with matplotlib.rc_context(STYLE):
         room = 0.18 * math.ceil(len(points) / _legend_columns(list(points)))
         figure = Figure(figsize=(5.6, 2.8 + room), layout="constrained")
         axes = figure.subplots()
-        axes.set_xscale("symlog", linthresh=least)  # methods that keep nothing stand at 0
+        axes.set_xscale("symlog", linthresh=decades[0])  # methods that keep nothing stand at 0
+        axes.set_xticks([0.0, *decades])
         for number, (label, (size, auc)) in enumerate(points.items()):
             ends = np.nan_to_num([[auc.value - auc.low], [auc.high - auc.value]])
             look = _look(number) | {"ls": "none"}
             axes.errorbar([size], [100 * auc.value], 100 * ends, **look, elinewidth=0.8, label=shorten(label))
         axes.xaxis.set_major_formatter(lambda size, _: quantity(size, "B"))
-        axes.set_xlim(-0.3 * least, 2 * max(least, *(size for size, _ in points.values())))
+        axes.set_xlim(-0.3 * decades[0], 2 * most)
         axes.set_xlabel("kept from one task to the next")
         axes.set_ylabel("AUC (%)")
         axes.grid(lw=0.4, alpha=0.3, color=INK)

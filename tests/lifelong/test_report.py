@@ -1,6 +1,7 @@
 """Reports of synthetic runs: self-contained pages, also of unfinished and damaged runs."""
 
 import base64
+import itertools
 import json
 import os
 import re
@@ -472,6 +473,15 @@ def test_auc_stands_against_what_is_stored():
     assert [line.get_xdata()[0] for line in drawn] == [size for size, _ in points.values()]
     looks = {(line.get_color(), line.get_marker(), line.get_markerfacecolor()) for line in drawn}
     assert len(looks) == 20
+
+
+@pytest.mark.parametrize("least", [1.0, 6.2e5, 1e6, 9.9e6])
+def test_ticks_of_what_is_stored_do_not_touch(least):
+    figure = storage_figure({"none": (0.0, Estimate(0.2, 0.1, 0.3)), "little": (least, Estimate(0.7, 0.6, 0.8)),
+                             "much": (2.5e8, Estimate(0.8, 0.7, 0.9))})  # fmt: skip
+    figure.draw_without_rendering()
+    ends = [tick.label1.get_window_extent() for tick in figure.axes[0].xaxis.get_major_ticks()]
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(ends) if right.width)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,126 @@
+"""What happens along a stream: plasticity, forgetting by distance and by what was learned since, and cost.
+
+    python experiments/algorithms/along.py libero_130     # the finished runs of a stream of the study
+
+Prints Markdown tables, a column for each method, means over its seeds. Plasticity is the success just after learning.
+Forgotten is that success less the success after a later task, over all measured cells of which the task was learned.
+"""
+
+import argparse
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+from table import finished, table
+
+from libero_env.text import duration, quantity
+from lifelong.language.encoder import embed
+from lifelong.results.log import ResultLog
+from lifelong.results.results import Results
+
+LEARNED = 0.5  # success just after learning, from which on a task can be forgotten
+DISTANCES = (1, 2, 4, 10, 30, 60, 130)  # tasks learned since; ends of bins
+SIMILARITIES = (-1.0, 0.5, 0.7, 0.8, 0.9, 1.01)  # largest cosine to the instructions learned since
+MOMENTS = (10, 30, 90, 130)  # tasks learned, at which cost is shown
+
+
+def plasticity(results: Results) -> Iterator[tuple[str, float]]:
+    """Yield the success just after learning in each fifth of the stream."""
+    learned = np.diag(results.success_matrix()[0])
+    for part in np.array_split(np.arange(len(learned)), 5):
+        yield f"tasks {part[0] + 1} to {part[-1] + 1}", float(np.nanmean(learned[part]))
+
+
+def cells(results: Results) -> Iterator[tuple[int, int, float]]:
+    """Yield (last task learned, earlier task, success lost since it was learned) of the measured cells."""
+    matrix, _ = results.success_matrix()
+    for i, k in zip(
+        *np.nonzero(~np.isnan(np.tril(matrix, -1)) & np.tri(len(matrix), k=-1, dtype=bool)), strict=True
+    ):
+        if matrix[k, k] >= LEARNED:
+            yield int(i), int(k), float(matrix[k, k] - matrix[i, k])
+
+
+def binned(
+    values: list[tuple[float, float]], ends: tuple[float, ...], name: Callable
+) -> Iterator[tuple[str, float]]:
+    """Yield the mean loss of the cells between two ends."""
+    for low, high in zip(ends[:-1], ends[1:], strict=True):
+        inside = [lost for at, lost in values if low <= at < high]
+        yield name(low, high), float(np.mean(inside)) if inside else float("nan")
+
+
+def by_distance(results: Results) -> Iterator[tuple[str, float]]:
+    """Yield what was lost by the number of tasks learned since."""
+    values = [(i - k, lost) for i, k, lost in cells(results)]
+    yield from binned(values, DISTANCES, lambda low, high: f"{low} to {high - 1} tasks since")
+
+
+def by_similarity(results: Results) -> Iterator[tuple[str, float]]:
+    """Yield what was lost by the likeness of the tasks learned since: of instructions, and the same scene."""
+    run = results.run
+    texts = embed(run.instructions).numpy()
+    texts /= np.linalg.norm(texts, axis=1, keepdims=True)
+    cosine, found = texts @ texts.T, list(cells(results))
+    values = [(float(cosine[k, k + 1 : i + 1].max()), lost) for i, k, lost in found]
+    yield from binned(
+        values, SIMILARITIES, lambda low, high: f"nearest instruction {low:g} to {min(high, 1):g}"
+    )
+    scenes = [scene.group() if (scene := re.match(r"[A-Z_]+_SCENE\d+", name)) else None for name in run.tasks]
+    again = [(scenes[k] in scenes[k + 1 : i + 1], lost) for i, k, lost in found if scenes[k] is not None]
+    for same, title in ((True, "its scene was seen again"), (False, "its scene was not seen again")):
+        lost = [value for is_same, value in again if is_same == same]
+        yield title, float(np.mean(lost)) if lost else float("nan")
+
+
+def costs(results: Results) -> Iterator[tuple[str, str]]:
+    """Yield the costs of a task after some numbers of tasks."""
+    found = results.costs_by_task()
+    for moment in (m for m in MOMENTS if m - 1 in found):
+        last = [found[task] for task in range(max(0, moment - 5), moment) if task in found]
+        seconds = [cost["training_seconds"] + cost.get("end_task_seconds", 0.0) for cost in last]
+        yield f"a task's seconds, after {moment}", duration(float(np.median(seconds)))
+        yield f"stored, after {moment}", quantity(found[moment - 1]["stored_bytes"], "B")
+        yield f"memory of the process, after {moment}", quantity(found[moment - 1]["peak_memory_bytes"], "B")
+
+
+def main() -> None:
+    """Print the tables of a stream."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("stream", help="name of a stream of the study")
+    stream = parser.parse_args().stream
+    runs: dict[str, list[Results]] = {}
+    for run, folder in finished(stream):
+        results = ResultLog(Path(folder) / "results.jsonl").read()
+        if not np.isnan(results.success_matrix()[0][0, 0]):  # all tasks at once are no stream
+            runs.setdefault(run.method, []).append(results)
+    for title, measure in (
+        ("just learned", plasticity),
+        ("forgotten", by_distance),
+        ("forgotten", by_similarity),
+    ):
+        columns = {method: [dict(measure(results)) for results in found] for method, found in runs.items()}
+        names = list(next(iter(columns.values()))[0])
+        means = [[np.array([seed[name] for seed in seeds]) for seeds in columns.values()] for name in names]
+        rows = [[name, *map(_mean, row)] for name, row in zip(names, means, strict=True)]
+        rows = [row for row in rows if set(row[1:]) != {"–"}]  # more tasks apart than the stream has
+        print("\n".join(table([title, *columns], rows)), end="\n\n")
+    spent = {method: dict(costs(found[0])) for method, found in runs.items()}
+    names = list(next(iter(spent.values())))
+    print(
+        "\n".join(
+            table(["cost", *spent], [[name, *(spent[m].get(name, "–") for m in spent)] for name in names])
+        )
+    )
+
+
+def _mean(values: np.ndarray) -> str:
+    known = values[~np.isnan(values)]
+    return f"{known.mean():z.2f}" if len(known) else "–"
+
+
+if __name__ == "__main__":
+    main()
