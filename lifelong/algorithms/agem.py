@@ -6,7 +6,7 @@ from torch import Tensor
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.memory import ReplayMemory
 from lifelong.policies.base import Policy
-from lifelong.types import Batch, NonNegative
+from lifelong.types import Batch, Positive
 
 
 class AGEM(Rehearsal):
@@ -23,9 +23,10 @@ class AGEM(Rehearsal):
     LIBERO's code has `FirstWindows` as memory and augments its windows. No results of that are published.
     """
 
+    draws_after_backward = True
     tuned = {"ratio": (0.5, 1.0, 2.0)}
 
-    def __init__(self, *, memory: ReplayMemory, ratio: NonNegative = 1.0, augment_reference: bool = False):
+    def __init__(self, *, memory: ReplayMemory, ratio: Positive = 1.0, augment_reference: bool = False):
         """Create the algorithm.
 
         Args:

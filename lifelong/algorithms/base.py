@@ -102,6 +102,8 @@ class Algorithm:
             first is the one it varies unasked. They do not act before the `end_task` of the first task.
         plain_start: Whether the first task is learned as by fine-tuning, with no state before its `end_task`;
             `libero tune` then learns it once for all such algorithms.
+        draws_after_backward: Whether `after_backward` draws at random, by dropout for instance: the gradients of the
+            first rank are then those of all.
     """
 
     augment: Augmentation | None = None
@@ -109,6 +111,7 @@ class Algorithm:
     acts_by_weights: ClassVar[bool] = False
     tuned: ClassVar[Mapping[str, tuple[float, ...]]] = {}
     plain_start: ClassVar[bool] = False
+    draws_after_backward: ClassVar[bool] = False
 
     def set_augmentation(self, augment: Augmentation | None) -> None:
         """Receive the augmentation of training batches, before any other hook and also when a run is resumed."""

@@ -4,7 +4,7 @@ import torch
 
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.compressed import COMPRESSED_FORM, CompressedMemory, Quality
-from lifelong.types import Batch, Count, NonNegative
+from lifelong.types import Batch, Count, Positive
 
 
 class CompressedER(Rehearsal):
@@ -23,7 +23,7 @@ class CompressedER(Rehearsal):
         *,
         budget: Count = 9_500_000,
         quality: Quality = 60,
-        ratio: NonNegative = 1.0,
+        ratio: Positive = 1.0,
         keep_decoded: bool = True,
     ):
         """Create the algorithm.

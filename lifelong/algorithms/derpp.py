@@ -10,7 +10,7 @@ from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy, device_of, in_mode
-from lifelong.types import Batch, Count, NonNegative, to_device
+from lifelong.types import Batch, Count, NonNegative, Positive, to_device
 
 _CHUNK = 32  # windows per forward pass at the end of a task
 
@@ -33,7 +33,7 @@ class DERpp(Rehearsal):
     state_form = {"memory": MEMORY_FORM, "outputs": {int: {str: Tensor}}}
     tuned = {"alpha": (0.01, 0.03, 0.1, 0.3, 1.0), "ratio": (0.5, 1.0, 2.0)}
 
-    def __init__(self, *, budget: Count = 10_000, ratio: NonNegative = 1.0, alpha: NonNegative = 0.3):
+    def __init__(self, *, budget: Count = 10_000, ratio: Positive = 1.0, alpha: NonNegative = 0.3):
         """Create the algorithm.
 
         Args:

@@ -2,7 +2,7 @@
 
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.data.memory import ReplayMemory
-from lifelong.types import NonNegative
+from lifelong.types import Positive
 
 
 class ER(Rehearsal):
@@ -16,7 +16,7 @@ class ER(Rehearsal):
 
     tuned = {"ratio": (0.25, 0.5, 1.0, 2.0)}
 
-    def __init__(self, *, memory: ReplayMemory, ratio: NonNegative = 1.0):
+    def __init__(self, *, memory: ReplayMemory, ratio: Positive = 1.0):
         """Create the algorithm.
 
         Args:

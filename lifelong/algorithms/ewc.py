@@ -21,7 +21,7 @@ class EWC(Anchored):
     OBJECT .56 / .69 / .16, GOAL .32 / .48 / .06).
     """
 
-    tuned = {"strength": (150.0, 500.0, 1.5e3, 5e3, 1.5e4), "gamma": (0.5, 0.9, 1.0)}
+    tuned = {"strength": (1.5, 15.0, 150.0, 1.5e3, 1.5e4), "gamma": (0.5, 0.9, 1.0)}
     plain_start = True
 
     def __init__(

@@ -10,7 +10,7 @@ from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy, copy_weights, device_of
 from lifelong.policies.history import HistoryPolicy, with_features
-from lifelong.types import Batch, Count, NonNegative, Observation
+from lifelong.types import Batch, Count, NonNegative, Observation, Positive
 
 _NOT_IMAGES = ("language", "proprio")
 
@@ -41,7 +41,7 @@ class M2Distill(Rehearsal):
         self,
         *,
         budget: Count = 10_000,
-        ratio: NonNegative = 1.0,
+        ratio: Positive = 1.0,
         image: NonNegative = 0.003,
         language: NonNegative = 0.003,
         proprio: NonNegative = 0.003,

@@ -10,7 +10,7 @@ from lifelong.algorithms.base import acting_with
 from lifelong.algorithms.er import ER
 from lifelong.data.memory import ReplayMemory
 from lifelong.policies.base import Policy, device_of, in_mode
-from lifelong.types import Batch, NonNegative, Positive
+from lifelong.types import Batch, Positive
 
 
 class MIR(ER):
@@ -32,7 +32,7 @@ class MIR(ER):
         self,
         *,
         memory: ReplayMemory,
-        ratio: NonNegative = 1.0,
+        ratio: Positive = 1.0,
         candidates: Annotated[float, Field(ge=1)] = 5.0,
         rate: Positive = 0.05,
     ):

@@ -15,7 +15,7 @@ from lifelong.data.latents import LATENTS_FORM, LatentMemory
 from lifelong.data.windows import TaskWindows
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.policies.history import HistoryPolicy, with_features
-from lifelong.types import Batch, Count, Natural, NonNegative, Observation, Share, to_device
+from lifelong.types import Batch, Count, Natural, NonNegative, Observation, Positive, Share, to_device
 
 _SAMPLE = 512  # windows whose features describe a task
 _CHUNK = 64  # windows of a forward pass
@@ -63,7 +63,7 @@ class MLR(Algorithm):
         *,
         budget: Count = 10_000,
         keep: Share = 1.0,
-        ratio: NonNegative = 1.0,
+        ratio: Positive = 1.0,
         adjustment: NonNegative = 0.1,
         margin: Share = 0.72,
         base_tasks: Natural = 1,

@@ -15,7 +15,7 @@ from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
 from lifelong.nn.experts import freeze_statistics
 from lifelong.policies.base import Policy
-from lifelong.types import NonNegative
+from lifelong.types import Positive
 
 _log = logging.getLogger(__name__)
 _DIVIDED = (nn.Linear, nn.Conv2d)  # layers whose weights LIBERO's code divides
@@ -46,7 +46,7 @@ class PackNet(Algorithm):
         self,
         *,
         prune_perc: Annotated[float, Field(gt=0, lt=1)] = 0.75,
-        post_prune_share: NonNegative = 1.0,
+        post_prune_share: Positive = 1.0,
         masks_only: bool = False,
     ):
         """Create the algorithm.
@@ -101,9 +101,9 @@ class PackNet(Algorithm):
         )
 
     def mode_train(self, policy: Policy) -> None:
-        """Set training mode, with running statistics frozen after the first task (`masks_only`: from the start)."""
+        """Set training mode, with running statistics frozen after the first stage (`masks_only`: from the start)."""
         policy.train()
-        if self.task_index > 0 or self.masks_only:
+        if self.masks_only or self._has_earlier():
             freeze_statistics(policy)
 
     def after_backward(self, policy: Policy) -> None:
@@ -180,7 +180,7 @@ class PackNet(Algorithm):
     def _freeze(self, policy: Policy) -> None:
         """Store the frozen values, which are those of the policy now: none has changed since the phase began."""
         self._fixed, self._movable = {}, {}
-        target = self.task_index + 1 if self.pruned else 0
+        target, later = self.task_index + 1 if self.pruned else 0, self._has_earlier()
         untrained = _layers(policy, _DIVIDED, "bias") | _layers(policy, _UNTRAINED, "weight", "bias")
         for name, tensor in _tensors(policy).items():
             if name in self.owner:
@@ -191,8 +191,13 @@ class PackNet(Algorithm):
                     )
                 self._movable[name] = self.owner[name] == target
                 self._fixed[name] = tensor.detach().clone()
-            elif name in untrained if self.masks_only else self.task_index > 0:
+            elif name in untrained if self.masks_only else later:
                 self._fixed[name] = tensor.detach().clone()
+
+    def _has_earlier(self) -> bool:
+        """Return whether weights belong to an earlier stage."""
+        own = self.task_index + 1
+        return any(bool(((owner > 0) & (owner != own)).any()) for owner in self.owner.values())
 
     def _freeze_once(self, policy: Policy) -> None:
         if not self._fixed:

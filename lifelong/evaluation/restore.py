@@ -144,7 +144,7 @@ def restore(
         ConfigError: The configuration is not valid, or names a class of another package.
         LifelongError: There is no such run or checkpoint, or it does not match its configuration.
     """
-    path, checkpoint, after = _find(source, after)
+    path, checkpoint = _find(source, after)
     config = read_config(path / "config.yaml", allow)
     where = Ranks().device(device)
     plan, language = plan_tasks(config), config.build("language")
@@ -180,10 +180,14 @@ def restore(
     )
 
 
-def _find(source: Path, after: int | None) -> tuple[Path, Path, int]:
-    """Return the directory of the run, the checkpoint, and the position of the task it was written after."""
+def _find(source: Path, after: int | None) -> tuple[Path, Path]:
+    """Return the directory of the run, and the checkpoint."""
     if source.is_file():
-        return source.parent.parent, source, -1
+        if after is not None:
+            raise LifelongError(
+                f"{source} is one checkpoint, and after={after} names another; give one of them"
+            )
+        return source.parent.parent, source
     if not source.exists():
         raise LifelongError(
             f"{source} does not exist; give the directory of a run, such as runs/libero_object/er/NAME, or one of its "
@@ -197,8 +201,7 @@ def _find(source: Path, after: int | None) -> tuple[Path, Path, int]:
         )
     if after is not None and after not in there:
         raise LifelongError(f"{source} has no checkpoint after task {after}; valid: {there}")
-    chosen = there[-1] if after is None else after
-    return source, folder.task_path(chosen), chosen
+    return source, folder.task_path(there[-1] if after is None else after)
 
 
 def read_config(file: Path, allow: Sequence[str]) -> Configuration:

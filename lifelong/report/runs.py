@@ -33,7 +33,20 @@ _IGNORED = (
     "eval.shift",
 )
 # sections of the config
-_COMPARED = ("algo", "policy", "train", "data", "eval", "language", "benchmark", "stream", "pretrain")
+_COMPARED = (
+    *(
+        "algo",
+        "policy",
+        "augmentation",
+        "train",
+        "data",
+        "eval",
+        "language",
+        "benchmark",
+        "stream",
+        "pretrain",
+    ),
+)
 
 
 @dataclass(frozen=True)

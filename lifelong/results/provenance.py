@@ -36,8 +36,11 @@ VOLATILE = (
     "runs_dir",
     "threads",
     "tracker",
+    "data.folder",  # what was learned from is recorded by digest
     "data.memory",
-    "eval.transfer",  # how records are read, not what they hold
+    "eval.open_environments",
+    "eval.sim_threads",
+    "language.cache_dir",
     "eval.shift",  # evaluations besides all others
 )
 VERSIONED_PACKAGES = (

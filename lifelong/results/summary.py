@@ -2,7 +2,8 @@
 
 results.json     the success matrix, learning curves, metrics and times of a run
 episodes.csv.gz  one row an episode: the method's label, seeds of the run and its demonstrations, its order, `transfer`
-                 (how its forward transfer is estimated), `together` (numbers of tasks learned together), the
+                 (how its forward transfer is estimated), `together` (numbers of tasks learned together), which
+                 `cells` of the matrix were measured and their share, the
                  evaluation (`phase` curve or matrix, `row`: position of the task learned last, `epoch` trained on it),
                  the task (`position` in the sequence, and its name), `start` (initial state), `success` (0 or 1),
                  `length` [control steps]; episodes that a simulation error ended are left out
@@ -32,8 +33,8 @@ from lifelong.stats.intervals import wilson_interval
 from lifelong.stats.metrics import METRIC_NAMES, Metrics, lifelong_metrics
 
 COLUMNS = (
-    *("method", "seed", "data_seed", "order", "transfer", "together", "phase", "row", "epoch"),
-    *("position", "task", "start", "success", "length"),
+    *("method", "seed", "data_seed", "order", "transfer", "together", "cells", "cells_share"),
+    *("phase", "row", "epoch", "position", "task", "start", "success", "length"),
 )
 _OF_EPISODES = (
     "phase",
@@ -164,7 +165,7 @@ def write_episodes(path: Path, runs: Iterable[tuple[str, Results]]) -> Path:
 def _rows(method: str, order: int, results: Results) -> Iterator[tuple[Any, ...]]:
     run = results.run
     together = " ".join(str(len(group)) for group in run.groups)
-    of_run = (method, run.seed, run.data_seed, order, results.transfer, together)
+    of_run = (method, run.seed, run.data_seed, order, results.transfer, together, run.cells, run.cells_share)
     for record in results.evaluations():
         task = run.tasks[record.task] if record.task < len(run.tasks) else ""
         key = (*of_run, record.phase, record.learned)
@@ -223,6 +224,8 @@ def _run(row: Mapping[str, str], tasks: list[str]) -> RunRecord:
         "cpu_count": 0,
         "group_sizes": [int(size) for size in row["together"].split()],
         "transfer": row["transfer"],
+        "cells": row["cells"],
+        "cells_share": float(row["cells_share"]),
     }
     return validate(RunRecord, values)
 

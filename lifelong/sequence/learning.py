@@ -112,9 +112,9 @@ class TaskSequence:
         context.ranks.barrier()  # all have read the saved progress
         costs.reset_peak(context.device)
         if saved is None:
-            context.policy.meet_task(dataset, context.instructions[task])
-            self._normalise(number)
+            self._meet(number)
             context.algorithm.begin_task(task, dataset, context.policy)
+            self._meet(number)  # again: it may have gone back to weights that do not know the stage
         first, resume = (0, None) if saved is None else (saved["phase"], saved["fit"])
         for phase in phases[first:]:
             self._train(phase, dataset, resume if phase.number == first else None)
@@ -124,8 +124,10 @@ class TaskSequence:
             self.recovery.apply_stage(stage)
         self._reached = number
 
-    def _normalise(self, number: int) -> None:
-        """Give the policy the statistics of the stages that count before a stage is learned."""
+    def _meet(self, number: int) -> None:
+        """Tell the policy of a stage, and give it the statistics of the stages that count before it is learned."""
+        task = self.stages[number][-1]
+        self.context.policy.meet_task(self.data[task], self.context.instructions[task])
         kind = self.context.data.statistics or self.context.policy.statistics
         if kind == "constants":
             return

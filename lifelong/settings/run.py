@@ -92,6 +92,10 @@ class BenchmarkSettings:
             if not 1 <= self.tasks <= len(tasks):
                 raise ConfigError(f"benchmark.tasks is {self.tasks}; {self.suite} has {len(tasks)} tasks")
             return tasks[: self.tasks]
+        if self.order:
+            raise ConfigError(
+                f"benchmark.order is {self.order} and benchmark.tasks a list, which has its own order; give one of them"
+            )
         known = {t.name: t for t in suite.tasks} | {str(i): t for i, t in enumerate(suite.tasks)}
         for name in self.tasks:
             if str(name) not in known:

@@ -84,6 +84,8 @@ class Step:
         self.ranks.sum_gradients(self._with_gradients())
         with self._autocast():
             self.algorithm.after_backward(self.policy)
+        if self.algorithm.draws_after_backward and self.ranks.size > 1:
+            self.ranks.synchronise([p.grad for p in self._with_gradients() if p.grad is not None])
         if self.settings.grad_clip:
             nn.utils.clip_grad_norm_(self._optimized, self.settings.grad_clip)
         self.algorithm.after_clipping(self.policy)

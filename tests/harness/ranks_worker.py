@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from lifelong import checkpoints
+from lifelong import Algorithm, checkpoints
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.nn.augmentation import RandomShift
 from lifelong.results.log import ResultLog
@@ -24,6 +24,17 @@ from tests.harness.gpu_learning import SHORT
 from tests.harness.policies import small_transformer
 
 ALGORITHMS = sorted(file.stem for file in CONFIGS.glob("algo/*.yaml"))
+# those that change gradients or weights after these are summed over the ranks
+CHANGING_GRADIENTS = [
+    algo
+    for algo in ALGORITHMS
+    if any(
+        name in vars(kind)
+        for kind in type(build(composed(f"algo={algo}").algo)).__mro__[:-1]
+        if kind is not Algorithm
+        for name in ("after_backward", "after_step")
+    )
+]
 STEPS, TASKS = 4, 2
 # Seven windows: two processes get three and four. One step is an epoch, so that records hold every step's loss.
 FIT = FitSettings(
@@ -32,14 +43,16 @@ FIT = FitSettings(
 EVAL = EvalSettings(episodes=2, curve_episodes=2, every=STEPS, horizon=3, settle_steps=0, precision="fp32")
 
 
-def learn(algo: str, folder: Path, ranks: Ranks, **changes) -> tuple[list[float], dict[str, torch.Tensor]]:
+def learn(
+    algo: str, folder: Path, ranks: Ranks, dropout: float = 0.0, **changes
+) -> tuple[list[float], dict[str, torch.Tensor]]:
     """Learn two tasks with a configured algorithm; return every step's loss, and the weights at the end.
 
-    Without dropout: its masks are each rank's own.
+    The masks of dropout are each rank's own, so losses are those of one process without it.
     """
     sequences.ALGORITHMS[algo] = lambda: build(composed(f"algo={algo}", *SHORT.get(algo, [])).algo)
     with seeded(7):
-        policy = small_transformer(sequences.SPEC, dropout=0.0)
+        policy = small_transformer(sequences.SPEC, dropout=dropout)
     context = replace(
         sequences.run_context(folder / algo, algo, TASKS),
         policy=policy,
@@ -69,6 +82,9 @@ def learn_all(folder: Path, ranks: Ranks) -> None:
         checkpoints_save(folder / f"{algo}_{ranks.rank}.safetensors", weights)
         if ranks.first:
             (folder / f"{algo}.json").write_text(json.dumps(losses))
+    for algo in CHANGING_GRADIENTS:
+        _, weights = learn(algo, folder / "dropout", ranks, dropout=0.1)
+        checkpoints_save(folder / f"{algo}-dropout_{ranks.rank}.safetensors", weights)
 
 
 def talk(folder: Path, ranks: Ranks) -> None:

@@ -131,3 +131,14 @@ def test_packnet_trains_norms_and_biases_with_the_first_task_only():
         assert not torch.equal(first[name], fresh[name])
         assert torch.equal(first[name], second[name])
     assert not torch.equal(first["head.weight"], second["head.weight"])
+
+
+def test_packnet_trains_all_weights_with_a_first_stage_of_several_tasks():
+    policy, algorithm = DeepPolicy(), PackNet()
+    fresh = copy.deepcopy(policy.state_dict())
+    learn(algorithm, policy, 2)  # a stage has the number of its last task
+    first = copy.deepcopy(policy.state_dict())
+    learn(algorithm, policy, 3)
+    for name in ("norm.running_mean", "norm.weight", "head.bias", "memory.bias_hh_l0"):
+        assert not torch.equal(first[name], fresh[name])
+        assert torch.equal(first[name], policy.state_dict()[name])

@@ -50,7 +50,9 @@ def test_two_processes_learn_as_one_with_the_same_batch(algo, learned, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algo", worker.ALGORITHMS)
+@pytest.mark.parametrize(
+    "algo", [*worker.ALGORITHMS, *(f"{algo}-dropout" for algo in worker.CHANGING_GRADIENTS)]
+)
 def test_all_processes_end_with_the_same_weights(algo, learned):
     first, second = (checkpoints.load(learned / f"{algo}_{rank}.safetensors") for rank in (0, 1))
     assert first.keys() == second.keys()

@@ -17,7 +17,7 @@ from lifelong.report import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.records import EvalRecord
 from lifelong.results.run_directory import RunDirectory
-from lifelong.results.summary import summarize
+from lifelong.results.summary import read_episodes, summarize, write_episodes
 from lifelong.seeding import seeded
 from lifelong.sequence import is_measured
 from lifelong.sequence.measuring import digest
@@ -269,6 +269,11 @@ def test_only_the_cells_that_are_asked_for_are_measured(tmp_path, whole, cells, 
     assert {name for name in names if not np.isnan(getattr(found, name).value)} == defined
     for name in defined:
         assert getattr(found, name) == getattr(of_whole, name)
+    ((_, table),) = read_episodes(write_episodes(tmp_path / "episodes.csv", [("sequential", results)]))
+    of_table = lifelong_metrics(table.scores())
+    assert {name for name in names if not np.isnan(getattr(of_table, name).value)} == defined
+    for name in defined:
+        assert getattr(of_table, name) == getattr(found, name)
     assert not [f for f in examine(tmp_path / "some").findings if "lacks" in f.text]
     assert sum(results.episodes()) == 3 * len(measured) + 18
     assert f"{results.episodes()[0]} episodes were run" in write_report([tmp_path / "some"]).read_text()

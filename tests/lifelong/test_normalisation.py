@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from lifelong.algorithms import Averaging, Sequential
+from lifelong.algorithms import Averaging, Sequential, SingleTask
 from lifelong.errors import PolicyError
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
@@ -79,6 +79,13 @@ def test_what_does_not_vary_keeps_its_size_and_contradictions_are_refused(tmp_pa
         small_transformer(replace(SPEC, measured=True), normalise_proprio=False)
     with pytest.raises(PolicyError, match=r"BCTransformer has no normalise.*set data.statistics=constants"):
         Policy.normalise(made.policy, torch.zeros(4, 9), once=True)
+
+
+@pytest.mark.parametrize(("kind", "tasks"), COUNTED.items())
+def test_going_back_to_the_first_weights_keeps_the_statistics(tmp_path, kind, tasks):
+    made = context(tmp_path, kind, algorithm=SingleTask)
+    sequence(made).run()
+    torch.testing.assert_close(scaling(made.policy).centre_x, readings(tasks).mean(0))
 
 
 def test_averages_keep_the_statistics_of_the_new_task(tmp_path):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from omegaconf import DictConfig
 from PIL import Image
 
 from libero_env.sim.causes import Failure
@@ -49,6 +50,7 @@ from lifelong.stats.intervals import Estimate
 from lifelong.stats.methods import MethodRun, statistics
 from lifelong.stats.metrics import METRIC_NAMES, Curve
 from tests.harness.browser import PHONE
+from tests.harness.configs import composed
 
 GROCERIES = [
     "alphabet soup", "cream cheese", "salad dressing", "bbq sauce", "ketchup", "tomato sauce", "butter", "milk",
@@ -339,6 +341,18 @@ def test_two_runs_of_one_seed_count_once(tmp_path: Path):
     assert partial in {r.path for r in group.repeats} and len(group.repeats) == 2
     page = Page(write_report([first, partial, other], tmp_path / "out").read_text())
     assert "../partial: a further run of seed 1 of er; it is not counted" in page.text
+
+
+def test_runs_that_differ_in_any_section_are_methods_of_their_own(tmp_path: Path):
+    """Each top-level section of a configuration that decides results is compared."""
+    sections = {str(key) for key, value in composed().items() if isinstance(value, DictConfig)} - {"tracker"}
+    for name in sorted(sections):
+        runs = [make_run(tmp_path / name / str(n), "er", 1, tasks=2) for n in (1, 2)]
+        for number, run in enumerate(runs):
+            config = yaml.safe_load((run / "config.yaml").read_text())
+            config[name] = {**config.get(name, {}), "strange": number}
+            (run / "config.yaml").write_text(yaml.safe_dump(config))
+        assert len(group_runs([load_run(run) for run in runs])) == 2, name
 
 
 def test_intervals_stay_where_the_metric_can_be(tmp_path: Path, monkeypatch):

@@ -66,6 +66,8 @@ def test_paths_that_are_no_runs_are_named(tmp_path):
     make_run(tmp_path / "run")
     with pytest.raises(LifelongError, match=r"no checkpoint after task 5; valid: \[0, 1\]"):
         restore(tmp_path / "run", after=5)
+    with pytest.raises(LifelongError, match=r"is one checkpoint, and after=1 names another"):
+        restore(tmp_path / "run" / "checkpoints" / "task_0.safetensors", after=1)
     (tmp_path / "run" / "config.yaml").unlink()
     with pytest.raises(LifelongError, match="needs the configuration of its run"):
         restore(tmp_path / "run" / "checkpoints" / "task_0.safetensors")

@@ -327,3 +327,5 @@ def test_orders_by_seed_hold_the_same_tasks():
         ConfigError, match="benchmark.order is 3 and benchmark.order_seed 1; give one of them"
     ):
         BenchmarkSettings("libero_10", order=3, order_seed=1).sequence()
+    with pytest.raises(ConfigError, match="benchmark.order is 3 and benchmark.tasks a list"):
+        BenchmarkSettings("libero_10", order=3, tasks=(0, 1)).sequence()
