@@ -12,7 +12,7 @@ be what has to come back instead of the error, which costs next to nothing.
 import copy
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, nullcontext, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -36,11 +36,11 @@ from lifelong.results.records import RelearnRecord, back_limit
 from lifelong.results.relearning import FILE_NAME
 from lifelong.seeding import RELEARN
 from lifelong.settings import Configuration
-from lifelong.streams import StreamSettings
+from lifelong.streams import StageData, StreamSettings
 from lifelong.training.fit import EpochEnd, fit
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import BatchAugmentation
-from lifelong.tuning.proxy import CHUNK, MEASURED
+from lifelong.tuning.proxy import CHUNK, MEASURED, meet
 from lifelong.types import Batch
 
 Start = Literal["final", "initial"]
@@ -131,10 +131,20 @@ def relearn(request: RelearnRequest, initial: Policy) -> Path:
                 learned = measure(then)
             trial = Trial(task, training, measure, back_limit(learned, request.tolerance, request.episodes))
             for start in starts:
-                acting = run.acting(run.tasks[task]) if start == "final" else nullcontext(initial)
+                acting = run.acting(run.tasks[task]) if start == "final" else _met(run, initial, task, config)
                 with acting as policy:
                     log.append(_relearned(run, policy, start, trial, learned, request, config))
     return log.path
+
+
+@contextmanager
+def _met(run: LoadedRun, initial: Policy, task: int, config: Configuration) -> Iterator[Policy]:
+    """Yield a copy of the initial policy that has met a task as the run had before it learned it."""
+    policy = copy.deepcopy(initial)
+    last = next(stage for stage in run.stages if task in stage)[-1]
+    instruction = run.learned_task(last).language
+    meet(policy, stage_windows(run, config), last, instruction, run.data.statistics)
+    yield policy
 
 
 def _relearned(
@@ -259,6 +269,26 @@ def _recorded(log: ResultLog, task: int, start: str, request: RelearnRequest, ra
     )
 
 
+def stage_windows(run: LoadedRun, config: Configuration) -> StageData:
+    """Return the windows that the run learned from in each stage, as recorded: without perturbations of what is seen.
+
+    Args:
+        config: Configuration of the run.
+    """
+    stream, learned = _learned_from(run, config)
+    paths, read = find_demos(run.tasks, learned, run.data, None), replace(run.data, memory="host")
+    languages = torch.stack([run.embed(run.learned_task(task)) for task in range(len(run.tasks))])
+    windows = DemoDatasets(paths, learned, run.policy.spec, languages, read, run.device)
+    return StageData(windows, run.stages, stream, run.seed)
+
+
+def _learned_from(run: LoadedRun, config: Configuration) -> tuple[StreamSettings, tuple[int, ...]]:
+    """Return the run's stream, and the number of demonstrations of each task."""
+    data: DataSettings = config.build("data")
+    stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
+    return stream, stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])
+
+
 def task_windows(
     run: LoadedRun, task: int, held_out: int, config: Configuration
 ) -> tuple[TaskWindows, Batch | None]:
@@ -269,8 +299,7 @@ def task_windows(
         config: Configuration of the run.
     """
     data: DataSettings = config.build("data")
-    stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
-    learned = stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])
+    _, learned = _learned_from(run, config)
     learned_from, needed = learned[task], list(learned)
     needed[task] += held_out
     recorded = find_demos(run.tasks, needed, data, None)[task]  # data.files may name files of every task

@@ -113,6 +113,9 @@ def test_the_algorithm_of_the_guide():
     with torch.no_grad():
         policy.bias += 1.0
     assert algorithm.penalty(policy).item() == pytest.approx(2 * config["strength"])
+    resumed = names["L2"](**config)
+    resumed.load_state_dict(algorithm.state_dict(), policy.state_dict())
+    assert resumed.penalty(policy) == algorithm.penalty(policy)
 
 
 @pytest.mark.sim

@@ -17,7 +17,7 @@ from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
 
 HERE = Path(__file__).parent
-COLUMNS = {"just_learned": "just learned", "final_success": "final", "fwt": "FWT", "nbt": "NBT", "auc": "AUC"}
+COLUMNS = {"just_learned": "just learned", "final_success": "final", "nbt": "NBT", "auc": "AUC"}
 COMPARED = {"final_success": "final success", "auc": "AUC"}
 
 

@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("files", type=Path, nargs="+")
     parser.add_argument("--draws", type=int, default=100)
     parser.add_argument("--tasks", type=int, default=130)
-    parser.add_argument("--shares", type=float, nargs="+", default=[0.05, 0.1, 0.2])
+    parser.add_argument("--shares", type=float, nargs="+", default=[0.05, 0.1, 0.2, 0.3])
     args = parser.parse_args()
     rng = np.random.default_rng(0)
     runs = [results for file in args.files for _, results in read_episodes(file)]

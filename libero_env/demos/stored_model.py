@@ -38,6 +38,10 @@ def spec_without_textures(
         spec.compile()
     except ValueError:  # before MuJoCo 3.4 some materials still ask for theirs
         whole = scene_spec(problem, pack, drawing=drawing, robot=robot)
+        for texture in whole.textures:
+            if len(texture.data):  # pixels, which MJCF cannot hold
+                texture.data, texture.builtin = b"", mujoco.mjtBuiltin.mjBUILTIN_FLAT
+                texture.type, texture.width, texture.height = mujoco.mjtTexture.mjTEXTURE_2D, 1, 1
         whole.compile()
         spec = mujoco.MjSpec.from_string(_stripped(whole.to_xml()))
         spec.assets = whole.assets

@@ -132,7 +132,7 @@ class Algorithm:
         """
 
     def phases(self) -> tuple[Phase, ...]:
-        """Return the phases of training that every task goes through, in order."""
+        """Return the phases of training that every task goes through, in order: the same whenever it is asked."""
         return (Phase(),)
 
     def begin_phase(self, phase: Phase, policy: Policy) -> None:

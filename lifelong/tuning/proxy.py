@@ -19,8 +19,8 @@ from libero_env.tasks import Task
 from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.demonstrations import DemoDatasets, find_demos
-from lifelong.data.settings import DataSettings
-from lifelong.data.windows import TaskWindows
+from lifelong.data.settings import DataSettings, Statistics
+from lifelong.data.windows import TaskWindows, frame_moments, frames_of
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
 from lifelong.results.provenance import source_digest
@@ -36,6 +36,19 @@ FORMAT = 1  # of a trial's record; another one is measured again
 MEASURED = 512  # largest number of held-out windows of a task
 CHUNK = 128  # windows of a forward pass
 _GROUPS = ("algo", "policy", "data", "augmentation", "train", "language")  # that a trial depends on
+# Keys that no trial obeys -> their values besides null that it agrees with. Not seed, benchmark.suite and eval, which
+# presets choose for the runs
+_UNUSED: dict[str, tuple[Any, ...]] = {
+    **dict.fromkeys(("stream.base_tasks", "stream.demos_later", "stream.perturb", "pretrain.suite"), ()),
+    **dict.fromkeys(("data.perturb", "init_from", "run_id"), ()),
+    "stream.blur": (0,),
+    "benchmark.group_size": (1,),
+    "device": ("auto", "cpu"),
+    "runs_dir": ("runs",),
+    "resume": (True,),
+    "progress": (False,),
+    "tracker": ({"_target_": "lifelong.tracking.Tracker"},),
+}
 # Tasks of libero_90: packages into a basket, in a scene that of the reported suites only libero_10 has. Five, because
 # strengths that are chosen on two hold back a longer stream (experiments/tuning)
 STREAMS = (
@@ -113,16 +126,17 @@ class Trial:
 
     def key(self) -> str:
         """Return a digest of all that the trial depends on: its settings and the source, the expert's included."""
-        return self._digest(self.config["algo"], self.stream)
+        return self._digest(self.config["algo"])
 
     def start_key(self, algorithm: Algorithm) -> str:
-        """Return a digest of all that the first task's learning depends on."""
+        """Return a digest of all that the first task's learning depends on; on later tasks by their statistics."""
         own = {name: value for name, value in self.config["algo"].items() if name not in algorithm.tuned}
-        return self._digest({} if algorithm.plain_start else own, self.stream[:1])
+        return self._digest({} if algorithm.plain_start else own)
 
-    def _digest(self, algo: Mapping[str, Any], tasks: Sequence[Task]) -> str:
+    def _digest(self, algo: Mapping[str, Any]) -> str:
         groups = {group: self.config[group] for group in _GROUPS} | {"algo": algo}
-        rest = [FORMAT, [task.id for task in tasks], self.seed, self.steps, self.held_out, source_digest()]
+        stream = [task.id for task in self.stream]
+        rest = [FORMAT, stream, self.seed, self.steps, self.held_out, source_digest()]
         return hashlib.sha256(json.dumps([groups, rest], sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -194,6 +208,7 @@ def _learn(trial: Trial, data: StreamData, folder: Path) -> Errors:
     with seeded(seed, INIT):
         policy: Policy = config.build("policy", spec=data.spec)
     settings = scaled(config.build("train"), trial.steps)
+    statistics, stages = config.build("data").statistics, dict(enumerate(data.training))
     algorithm.set_augmentation(config.build("augmentation"))
     first = folder / "first" / f"{trial.start_key(algorithm)}.safetensors"
     errors: Errors = []
@@ -204,6 +219,10 @@ def _learn(trial: Trial, data: StreamData, folder: Path) -> Errors:
             if not algorithm.plain_start:
                 algorithm.load_state_dict(state["algorithm"], {})
         else:
+            met = policy, stages, task, trial.stream[task].language, statistics
+            meet(*met)
+            algorithm.begin_task(task, windows, policy)
+            meet(*met)  # again: it may have gone back to weights that do not know the task
             _train(algorithm, policy, task, windows, settings, seed)
             if task == 0:
                 own = {} if algorithm.plain_start else algorithm.state_dict()
@@ -215,11 +234,35 @@ def _learn(trial: Trial, data: StreamData, folder: Path) -> Errors:
     return errors
 
 
+def meet(
+    policy: Policy,
+    stages: Mapping[int, TaskWindows],
+    last: int,
+    instruction: str,
+    statistics: Statistics | None,
+) -> None:
+    """Tell a policy of a stage and normalise it, as a run does before it learns the stage.
+
+    Args:
+        stages: Windows of all stages in learning order, by their last task.
+        last: Last task of the stage.
+        instruction: Its instruction as text.
+        statistics: Value of `data.statistics`.
+    """
+    policy.meet_task(stages[last], instruction)
+    kind = statistics or policy.statistics
+    if kind == "constants":
+        return
+    ends = list(stages)
+    counted = {"first": ends[:1], "seen": ends[: ends.index(last) + 1], "stream": ends}.get(kind, [last])
+    moments = frame_moments([frames_of(stages[end], tuple(policy.spec.proprio)) for end in counted])
+    policy.normalise(moments, once=kind in ("first", "stream"))
+
+
 def _train(
     algorithm: Algorithm, policy: Policy, task: int, windows: TaskWindows, settings: FitSettings, seed: int
 ) -> None:
     """Train on a task through all phases of the algorithm."""
-    algorithm.begin_task(task, windows, policy)
     for number, phase in enumerate(algorithm.phases()):
         algorithm.begin_phase(phase, policy)
         epochs = max(1, round(settings.epochs * phase.share))
@@ -274,9 +317,11 @@ def measure_frontier(
         folder: Folder of what is measured.
 
     Raises:
-        ConfigError: A stream is too short to forget anything.
+        ConfigError: A stream is too short to forget anything, or a setting has no effect on the trials.
     """
     everyone = (fine_tuning, *others, *candidates)
+    for one in everyone:
+        _check_obeyed(one)
     errors: dict[str, list[Errors]] = {one.label: [] for one in everyone}
     places = [(stream, seed) for stream in proxy.streams for seed in proxy.seeds]
     total, done = len(places) * len(everyone), 0
@@ -302,6 +347,21 @@ def measure_frontier(
         return Outcome(one.label, one.settings, tuple(errors[one.label]), base)
 
     return Frontier(tuple(map(outcome, candidates)), tuple(map(outcome, (fine_tuning, *others))))
+
+
+def _check_obeyed(one: Candidate) -> None:
+    """Raise an error for a setting that no trial obeys."""
+    tops = {key: key.lstrip("+").partition(".")[0] for key in one.settings}
+    unused = [key for key, top in tops.items() if top in one.config and top not in _GROUPS]
+    for key, agreed in _UNUSED.items():
+        group, _, name = key.rpartition(".")
+        value = (one.config[group] if group else one.config).get(name)
+        if value is not None and value not in agreed:
+            unused.append(key)
+    if unused:
+        raise ConfigError(
+            f"{unused[0]} has no effect in libero tune; leave it out, or the preset that sets it"
+        )
 
 
 def _opened(trial: Trial) -> StreamData:

@@ -14,8 +14,11 @@ from libero_eval import relearning
 from libero_eval.relearning import Trial, error_on, failure_share, relearn, steps_until
 from libero_eval.requests import RelearnRequest
 from lifelong.algorithms import Sequential
+from lifelong.checkpoints import load
 from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError, LifelongError
+from lifelong.evaluation.restore import LoadedRun
+from lifelong.evaluation.settings import EvalSettings
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.records import RelearnRecord, from_line, to_line
@@ -24,13 +27,20 @@ from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Batch
 from tests.harness.fakes import LinearPolicy, Windows
+from tests.harness.policies import small_transformer
 from tests.harness.records import run_start
+from tests.harness.sequences import SPEC, dataset, run_context, sequence
 
 FIT = FitSettings(epochs=1, batch_size=10, lr=0.05, warmup_steps=5, weight_decay=0.0, precision="fp32")
 SETTINGS = RelearnRequest(run=Path("run"), steps=200, every=5, tolerance=0.05, held_out=1)
 
 
 class Linear(LinearPolicy):
+    statistics = "constants"
+
+    def meet_task(self, dataset, instruction):
+        assert (dataset.task_id, instruction) in enumerate("abc")
+
     def predict(self, batch):
         return self.linear(batch.observation.proprio["x"])
 
@@ -220,6 +230,8 @@ def finished(tmp_path, monkeypatch):
             acting=lambda task: nullcontext(end),
             device=torch.device("cpu"),
             seed=1,
+            data=SimpleNamespace(statistics=None),
+            learned_task=lambda task: SimpleNamespace(language="abc"[task]),
         )
 
     def read_config(*_):
@@ -228,6 +240,7 @@ def finished(tmp_path, monkeypatch):
     monkeypatch.setattr(relearning, "restore", restore)
     monkeypatch.setattr(relearning, "read_config", read_config)
     monkeypatch.setattr(relearning, "task_windows", lambda run, task, *_: (Windows(task), held_out(task)))
+    monkeypatch.setattr(relearning, "stage_windows", lambda *_: {task: Windows(task) for task in range(3)})
     return tmp_path, ends
 
 
@@ -265,6 +278,62 @@ def test_a_killed_measurement_goes_on_and_changes_nothing_else(finished, monkeyp
     assert len(outcome(folder / "killed")) == 6, "under other settings it is"
     for end, state in zip(ends, before, strict=True):
         assert all(torch.equal(value, state[name]) for name, value in end.state_dict().items())
+
+
+@pytest.mark.parametrize("kind", ["first", "latest", "seen", "stream"])
+def test_initial_weights_are_normalised_as_the_run_was_when_it_met_the_task(
+    tmp_path, kind, monkeypatch
+) -> None:
+    def context():
+        made = run_context(tmp_path, "sequential")
+        policy = small_transformer(replace(SPEC, measured=True))
+        data = replace(made.data, statistics=kind, proprio=("joint_states",))
+        few = EvalSettings(
+            episodes=1, curve="none", select="last", cells="diagonal", horizon=2, precision="fp32"
+        )
+        return replace(made, policy=policy, data=data, eval=few, fit=replace(made.fit, epochs=1))
+
+    made = context()
+    sequence(made).run()
+
+    def restore(path: Path, *, after: int = 2, **_):
+        policy, file = context().policy, made.directory.checkpoints.task_path(after)
+        policy.load_state_dict(load(file)["policy"])
+        return LoadedRun(
+            tmp_path, file, tuple(made.tasks), after, policy, made.algorithm, made.eval, 1, made.device,
+            SimpleNamespace(embed=lambda texts: made.languages), made.instructions, made.data,
+        )  # fmt: skip
+
+    files = list(map(Path, "abc"))
+
+    def windows(paths, counts, spec, languages, *_):
+        assert (paths, list(counts), spec.measured) == (files, [2, 2, 2], True)
+        assert torch.equal(languages, made.languages)
+        return {task: dataset(task) for task in range(3)}
+
+    started, config = {}, SimpleNamespace(build={"train": made.fit, "data": made.data}.get, values={})
+
+    def steps(policy, trial, **_):
+        started.setdefault(trial.task, []).append(policy.proprio.scaling.centre_x.clone())
+        return [0], [0.0]
+
+    monkeypatch.setattr(relearning, "restore", restore)
+    monkeypatch.setattr(relearning, "read_config", lambda *_: config)
+    monkeypatch.setattr(relearning, "find_demos", lambda *_: files)
+    monkeypatch.setattr(relearning, "DemoDatasets", windows)
+    held = partial(Batch.rows, rows=slice(0, 2))
+    monkeypatch.setattr(
+        relearning,
+        "task_windows",
+        lambda run, task, *_: (dataset(task), held(dataset(task).batch(torch.arange(8)))),
+    )
+    monkeypatch.setattr(relearning, "steps_until", steps)
+    initial = context().policy
+    relearn(replace(SETTINGS, run=tmp_path, tasks=(0, 1)), initial)
+    for task, (_, begun) in started.items():
+        then = restore(tmp_path, after=task).policy.proprio.scaling.centre_x
+        assert torch.equal(begun, then) and begun.any()
+    assert list(started) == [0, 1] and not initial.proprio.scaling.taken
 
 
 def test_tasks_that_do_not_exist_and_settings_that_make_no_sense_are_refused(finished) -> None:

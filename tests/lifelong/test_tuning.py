@@ -14,11 +14,12 @@ from libero_env.cli.main import main
 from lifelong import algorithms
 from lifelong.composition import compose_run, swept
 from lifelong.errors import LiberoError
-from lifelong.settings import Configuration, plain_data
+from lifelong.policies.base import Policy
+from lifelong.settings import BenchmarkSettings, Configuration, plain_data
 from lifelong.training.settings import FitSettings
 from lifelong.tuning import proxy
 from lifelong.tuning.frontier import Frontier, Outcome, render, write_tuned
-from lifelong.tuning.proxy import StreamData, Trial, scaled
+from lifelong.tuning.proxy import StreamData, Trial, measure, scaled
 from tests.harness.configs import CONFIGS, composed
 from tests.harness.runs import TINY, make_windows
 
@@ -27,6 +28,7 @@ TUNED = {
     for name, kind in vars(algorithms).items()
     if isinstance(kind, type) and getattr(kind, "tuned", None)
 }
+STREAM = BenchmarkSettings("libero_90", tasks=[61, 62]).sequence()
 FAST = ("--steps", "2", "--stream", "61,62", "--beside")
 WORDS = [
     *TINY,
@@ -198,6 +200,41 @@ def test_the_first_task_is_learned_once_for_all_values_to_the_same_bits(
     assert (tmp_path / "shared" / name).read_text() == (tmp_path / "apart" / name).read_text()
 
 
+def test_starts_are_not_shared_between_streams_by_whose_later_tasks_the_first_is_normalised() -> None:
+    config, tasks = plain_data(composed("algo=ewc", "data.statistics=stream")), STREAM
+    algorithm = Configuration(config).build("algo")
+    one, other = (Trial(config, stream, 1, 10, 0.25) for stream in (tasks, tasks[:1]))
+    assert one.start_key(algorithm) != other.start_key(algorithm)
+
+
+@pytest.mark.parametrize("algo", ["sequential", "single_task"])  # which goes back to its first weights
+@pytest.mark.parametrize(("kind", "counted"), [
+    ("first", [[0], [0]]), ("latest", [[0], [1]]), ("seen", [[0], [0, 1]]), ("stream", [[0, 1], [0, 1]])
+])  # fmt: skip
+def test_tasks_are_met_and_readings_normalised_as_in_a_run(
+    algo, kind, counted, tmp_path, monkeypatch
+) -> None:
+    words = [*TINY, "policy/head=deterministic_small", "train.batch_size=4", f"data.statistics={kind}"]
+    config = plain_data(composed(*words, f"algo={algo}"))
+    spec = Configuration(config).build("data").spec(384)
+    windows = tuple(make_windows(task, spec) for task in range(2))
+    data = StreamData(spec, windows, tuple(w.batch(torch.arange(8)) for w in windows))
+    found, met, fit = [], [], proxy.fit
+
+    def watched(policy, *rest, **settings):
+        scaling = policy.proprio.scaling
+        found.append(torch.cat([getattr(scaling, f"centre_{name}") for name in spec.proprio]))
+        fit(policy, *rest, **settings)
+
+    monkeypatch.setattr(proxy, "fit", watched)
+    monkeypatch.setattr(Policy, "meet_task", lambda policy, dataset, text: met.append(text))
+    measure(Trial(config, STREAM, 1, 2, 0.25), lambda: data, tmp_path)
+    readings = [torch.cat([w.proprio[name] for name in spec.proprio], 1) for w in windows]
+    for centre, tasks in zip(found, counted, strict=True):
+        torch.testing.assert_close(centre, torch.cat([readings[k] for k in tasks]).mean(0))
+    assert list(dict.fromkeys(met)) == [task.language for task in STREAM]
+
+
 # --- what is typed wrongly
 
 
@@ -229,6 +266,27 @@ def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> 
     assert tune(*TINY, *words, "--steps", "1", "--beside", "--out", str(tmp_path)) != 0
     error = capsys.readouterr().err
     assert told in error and len(error.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(("words", "key"), [
+    (["init_from=/no/such/run"], "init_from"),
+    (["pretrain=libero_90"], "pretrain.suite"),
+    (["stream.demos_later=5"], "stream.demos_later"),
+    (["stream.blur=0.5"], "stream.blur"),
+    (["stream=pretrained6"], "stream.base_tasks"),
+    (["stream.perturb={light:1}"], "stream.perturb"),
+    (["data.perturb='light=1'"], "data.perturb"),
+    (["benchmark.group_size=2"], "benchmark.group_size"),
+    (["device=cuda"], "device"),
+    (["tracker=wandb"], "tracker"),
+    (["eval.episodes=1,2"], "eval.episodes"),
+    (["seed=1,2"], "seed"),
+])  # fmt: skip
+def test_what_no_trial_obeys_is_refused_by_name(words, key, capsys, tmp_path, fake_streams) -> None:
+    assert tune(*WORDS, "threads=1", "progress=false", *words, *FAST, "--out", str(tmp_path)) != 0
+    error = capsys.readouterr().err
+    assert f"{key} has no effect in libero tune; leave it out" in error
+    assert len(error.strip().splitlines()) == 1 and not fake_streams
 
 
 def test_a_key_outside_of_the_algorithm_is_measured_but_not_written(tmp_path) -> None:
