@@ -44,7 +44,9 @@ def matrices(out: Path, *algorithms: str) -> None:
     panels = []
     for algorithm in algorithms:
         with tempfile.TemporaryDirectory() as folder:
-            runs = [run for run in planned() if f"{run.name}/".startswith(f"goal/{algorithm}/") and run.is_done()]
+            runs = [
+                run for run in planned() if f"{run.name}/".startswith(f"goal/{algorithm}/") and run.is_done()
+            ]
             logs = [ResultLog(run.unpack(Path(folder)) / "results.jsonl").read() for run in runs]
         measured = np.ma.masked_invalid([log.success_matrix()[0] for log in logs])
         rates = measured.mean(0).filled(np.nan)
