@@ -141,26 +141,35 @@ def _known(value: float | None) -> bool:
     return value is not None and bool(np.isfinite(value))
 
 
-def _reference(measured: Mapping[str, Sequence[Run]]) -> dict[str, float]:
+_Rates = Mapping[
+    tuple[int, int | None] | None, Mapping[str, float]
+]  # (seed, data_seed), None: all -> task -> success
+
+
+def _reference(measured: Mapping[str, Sequence[Run]]) -> _Rates:
     """Return the mean success on each task of policies that learned it alone, or with all others; {} without such."""
     for algo in ("single_task", "multitask"):
-        found: dict[str, list[float]] = {}
+        found: dict[tuple[int, int | None] | None, dict[str, list[float]]] = {}
         for run in (run for runs in measured.values() for run in runs if run.record.algo == algo):
-            rates = run.results.success_matrix()[0]
-            for name, rate in zip(
-                run.record.tasks, rates[-1] if algo == "multitask" else np.diag(rates), strict=True
-            ):
-                found.setdefault(name, []).append(float(rate))
+            matrix = run.results.success_matrix()[0]
+            rates = matrix[-1] if algo == "multitask" else np.diag(matrix)
+            for key in ((run.record.seed, run.record.data_seed), None):
+                for name, rate in zip(run.record.tasks, rates, strict=True):
+                    found.setdefault(key, {}).setdefault(name, []).append(float(rate))
         if found:
-            return {name: float(np.mean(rates)) for name, rates in found.items()}
+            return {k: {name: float(np.mean(rates)) for name, rates in v.items()} for k, v in found.items()}
     return {}
 
 
-def _conventions(runs: Sequence[Run], reference: Mapping[str, float]) -> dict[str, dict[str, float]]:
-    """Return what other papers print, by its name in `lifelong.stats.metrics`, over the runs."""
+def _conventions(runs: Sequence[Run], reference: _Rates) -> dict[str, dict[str, float]]:
+    """Return what other papers print, by its name in `lifelong.stats.metrics`, over the runs.
+
+    Intransigence is that against the reference of a run's own seeds, where there is one, else against all.
+    """
     rows = []
     for run in runs:
-        alone = [reference.get(name, np.nan) for name in run.record.tasks[: run.learned]]
+        paired = reference.get((run.record.seed, run.record.data_seed), reference.get(None, {}))
+        alone = [paired.get(name, np.nan) for name in run.record.tasks[: run.learned]]
         whole = run.results.success_matrix()[0][: run.learned, : run.learned]
         rows.append(run.results.other_conventions() | {"intransigence": intransigence(whole, alone)})
     means = {name: _mean([row[name] for row in rows]) for name in (rows[0] if rows else {})}
@@ -168,7 +177,7 @@ def _conventions(runs: Sequence[Run], reference: Mapping[str, float]) -> dict[st
 
 
 def _group(
-    group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None, reference: Mapping[str, float]
+    group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None, reference: _Rates
 ) -> dict[str, Any]:
     return {
         "runs": [str(r.path) for r in group.runs],
