@@ -25,6 +25,7 @@ from lifelong.policies.history import HistoryPolicy
 from lifelong.settings import build
 from lifelong.training.precision import bf16_runs_on_cpu
 from lifelong.types import Batch, Observation, PolicySpec
+from tests.harness.policies import small_transformer
 
 SPEC = PolicySpec(image_size=(32, 32), language_dim=6, seq_len=4)
 HEADS = {
@@ -304,6 +305,22 @@ def test_language_and_every_input_matter(kind: str) -> None:
     for changed in changes:
         other = policy.predict(Batch(changed, batch.actions, batch.task_ids, batch.window_ids))
         assert not torch.allclose(other, base, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("readout", ["instruction", "all"])
+def test_a_head_that_reads_all_tokens_sees_the_camera_past_the_transformer(readout: str) -> None:
+    policy, obs = (
+        small_transformer(SPEC, readout=readout).eval(),
+        fake_batch(SPEC, 2, generator()).observation,
+    )
+    for parameter in policy.transformer.parameters():
+        parameter.data.zero_()
+    other = Observation(obs.images.flip(0), obs.proprio, obs.language)
+    tokens, latents = policy.encode(obs), [policy.over_time(policy.encode(o)) for o in (obs, other)]
+    width = tokens.shape[-1]
+    assert latents[0].shape == (2, SPEC.seq_len, width * (1 + (readout == "all") * tokens.shape[2]))
+    assert torch.equal(latents[0][..., :width], latents[1][..., :width])  # it passes on nothing of a camera
+    assert torch.equal(*latents) == (readout == "instruction")
 
 
 @every_policy
