@@ -35,12 +35,13 @@ from lifelong.results.log import ResultLog
 from lifelong.results.records import RelearnRecord, back_limit
 from lifelong.results.relearning import FILE_NAME
 from lifelong.seeding import RELEARN
+from lifelong.sequence.learning import meet
 from lifelong.settings import Configuration
 from lifelong.streams import StageData, StreamSettings
 from lifelong.training.fit import EpochEnd, fit
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import BatchAugmentation
-from lifelong.tuning.proxy import CHUNK, MEASURED, meet
+from lifelong.tuning.proxy import CHUNK, MEASURED
 from lifelong.types import Batch
 
 Start = Literal["final", "initial"]
@@ -143,7 +144,8 @@ def _met(run: LoadedRun, initial: Policy, task: int, config: Configuration) -> I
     policy = copy.deepcopy(initial)
     last = next(stage for stage in run.stages if task in stage)[-1]
     instruction = run.learned_task(last).language
-    meet(policy, stage_windows(run, config), last, instruction, run.data.statistics)
+    windows = stage_windows(run, config)
+    meet(policy, windows, list(windows), last, instruction, run.data.statistics, {})
     yield policy
 
 

@@ -40,7 +40,7 @@ class TuneRequest:
 
     libero tune algo=ewc policy/head=gmm_small: with another head
 
-    libero tune algo=er train.lr=5e-4,1e-3,2e-3: any key of the configuration
+    libero tune algo=er train.lr=5e-4,1e-3,2e-3: any key that learning depends on
 
     libero tune algo=ewc --write my_configs: write the chosen value, for
     libero train --config-dir my_configs algo=ewc tuned@algo=HEAD/ewc

@@ -17,7 +17,9 @@ from torch import Tensor
 
 from libero_env.errors import is_quiet
 from lifelong.context import RunContext
+from lifelong.data.settings import Statistics
 from lifelong.data.windows import TaskWindows, frame_moments, frames_of
+from lifelong.policies.base import Policy
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
 from lifelong.seeding import END_TASK, FIT, generator, seeded
 from lifelong.sequence.measuring import Evaluator
@@ -125,19 +127,11 @@ class TaskSequence:
         self._reached = number
 
     def _meet(self, number: int) -> None:
-        """Tell the policy of a stage, and give it the statistics of the stages that count before it is learned."""
-        task = self.stages[number][-1]
-        self.context.policy.meet_task(self.data[task], self.context.instructions[task])
-        kind = self.context.data.statistics or self.context.policy.statistics
-        if kind == "constants":
-            return
-        stages = {"seen": range(number + 1), "stream": range(len(self.stages))}.get(kind, [number])
-        for stage in stages:
-            if stage not in self._frames:
-                dataset = self.data[self.stages[stage][-1]]
-                self._frames[stage] = frames_of(dataset, tuple(self.context.policy.spec.proprio))
-        moments = frame_moments([self._frames[stage] for stage in stages])
-        self.context.policy.normalise(moments, once=kind in ("first", "stream"))
+        """Tell the policy of a stage, and normalise it, see `meet`."""
+        context, ends = self.context, [stage[-1] for stage in self.stages]
+        last = ends[number]
+        text, statistics = context.instructions[last], context.data.statistics
+        meet(context.policy, self.data, ends, last, text, statistics, self._frames)
 
     def _train(self, phase: TrainingPhase, dataset: TaskWindows, resume: dict[str, Any] | None) -> None:
         """Train for one phase, from its first step or a saved epoch, and load the weights that are kept."""
@@ -265,3 +259,33 @@ class TaskSequence:
         rows = [self.context.eval.row(stage, count) for stage in self.stages if stage[-1] > task]
         seconds = remaining * training / learned + sum(map(len, rows)) * sum(cells) / max(1, len(cells))
         return f"; about {max(1, round(seconds / 60))} min left"
+
+
+def meet(
+    policy: Policy,
+    data: Mapping[int, TaskWindows] | Sequence[TaskWindows],
+    ends: Sequence[int],
+    last: int,
+    instruction: str,
+    statistics: Statistics | None,
+    frames: dict[int, tuple[Tensor, Tensor]],
+) -> None:
+    """Tell a policy of a stage, and normalise it by the stages that count before it is learned.
+
+    Args:
+        data: Windows by the last task of their stage.
+        ends: Last task of every stage, in learning order.
+        last: Last task of the stage.
+        instruction: Its instruction as text.
+        statistics: Value of `data.statistics`.
+        frames: Readings and actions of stages that were read already; others are added.
+    """
+    policy.meet_task(data[last], instruction)
+    kind = statistics or policy.statistics
+    if kind == "constants":
+        return
+    counted = {"first": ends[:1], "seen": ends[: ends.index(last) + 1], "stream": ends}.get(kind, [last])
+    for end in counted:
+        if end not in frames:
+            frames[end] = frames_of(data[end], tuple(policy.spec.proprio))
+    policy.normalise(frame_moments([frames[end] for end in counted]), once=kind in ("first", "stream"))

@@ -13,18 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from libero_env.storage import read_record, write_record
 from libero_env.tasks import Task
 from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.demonstrations import DemoDatasets, find_demos
-from lifelong.data.settings import DataSettings, Statistics
-from lifelong.data.windows import TaskWindows, frame_moments, frames_of
+from lifelong.data.settings import DataSettings
+from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
 from lifelong.results.provenance import source_digest
 from lifelong.seeding import END_TASK, FIT, INIT, generator, seeded
+from lifelong.sequence.learning import meet
 from lifelong.settings import Configuration
 from lifelong.training.fit import fit
 from lifelong.training.precision import autocast
@@ -208,7 +210,8 @@ def _learn(trial: Trial, data: StreamData, folder: Path) -> Errors:
     with seeded(seed, INIT):
         policy: Policy = config.build("policy", spec=data.spec)
     settings = scaled(config.build("train"), trial.steps)
-    statistics, stages = config.build("data").statistics, dict(enumerate(data.training))
+    statistics = config.build("data").statistics
+    frames: dict[int, tuple[Tensor, Tensor]] = {}  # readings and actions that normalise the policy
     algorithm.set_augmentation(config.build("augmentation"))
     first = folder / "first" / f"{trial.start_key(algorithm)}.safetensors"
     errors: Errors = []
@@ -219,10 +222,11 @@ def _learn(trial: Trial, data: StreamData, folder: Path) -> Errors:
             if not algorithm.plain_start:
                 algorithm.load_state_dict(state["algorithm"], {})
         else:
-            met = policy, stages, task, trial.stream[task].language, statistics
-            meet(*met)
+            ends, text = range(len(data.training)), trial.stream[task].language
+            met = partial(meet, policy, data.training, ends, task, text, statistics, frames)
+            met()
             algorithm.begin_task(task, windows, policy)
-            meet(*met)  # again: it may have gone back to weights that do not know the task
+            met()  # again: it may have gone back to weights that do not know the task
             _train(algorithm, policy, task, windows, settings, seed)
             if task == 0:
                 own = {} if algorithm.plain_start else algorithm.state_dict()
@@ -232,31 +236,6 @@ def _learn(trial: Trial, data: StreamData, folder: Path) -> Errors:
             algorithm.end_task(task, windows, policy, generator(seed, END_TASK, task))
         errors.append([_error(algorithm, policy, k, data.held_out[k], settings) for k in range(task + 1)])
     return errors
-
-
-def meet(
-    policy: Policy,
-    stages: Mapping[int, TaskWindows],
-    last: int,
-    instruction: str,
-    statistics: Statistics | None,
-) -> None:
-    """Tell a policy of a stage and normalise it, as a run does before it learns the stage.
-
-    Args:
-        stages: Windows of all stages in learning order, by their last task.
-        last: Last task of the stage.
-        instruction: Its instruction as text.
-        statistics: Value of `data.statistics`.
-    """
-    policy.meet_task(stages[last], instruction)
-    kind = statistics or policy.statistics
-    if kind == "constants":
-        return
-    ends = list(stages)
-    counted = {"first": ends[:1], "seen": ends[: ends.index(last) + 1], "stream": ends}.get(kind, [last])
-    moments = frame_moments([frames_of(stages[end], tuple(policy.spec.proprio)) for end in counted])
-    policy.normalise(moments, once=kind in ("first", "stream"))
 
 
 def _train(
