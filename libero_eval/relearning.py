@@ -12,7 +12,7 @@ be what has to come back instead of the error, which costs next to nothing.
 import copy
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -132,21 +132,20 @@ def relearn(request: RelearnRequest, initial: Policy) -> Path:
                 learned = measure(then)
             trial = Trial(task, training, measure, back_limit(learned, request.tolerance, request.episodes))
             for start in starts:
-                acting = run.acting(run.tasks[task]) if start == "final" else _met(run, initial, task, config)
-                with acting as policy:
+                acting = run.acting(run.tasks[task]) if start == "final" else None
+                with acting or nullcontext(_met(run, initial, task, config)) as policy:
                     log.append(_relearned(run, policy, start, trial, learned, request, config))
     return log.path
 
 
-@contextmanager
-def _met(run: LoadedRun, initial: Policy, task: int, config: Configuration) -> Iterator[Policy]:
-    """Yield a copy of the initial policy that has met a task as the run had before it learned it."""
+def _met(run: LoadedRun, initial: Policy, task: int, config: Configuration) -> Policy:
+    """Return a copy of the initial policy that has met a task as the run had before it learned it."""
     policy = copy.deepcopy(initial)
     last = next(stage for stage in run.stages if task in stage)[-1]
     instruction = run.learned_task(last).language
     windows = stage_windows(run, config)
     meet(policy, windows, list(windows), last, instruction, run.data.statistics, {})
-    yield policy
+    return policy
 
 
 def _relearned(

@@ -35,10 +35,8 @@ def plasticity(results: Results) -> Iterator[tuple[str, float]]:
 def cells(results: Results) -> Iterator[tuple[int, int, float]]:
     """Yield (last task learned, earlier task, success lost since it was learned) of the measured cells."""
     matrix, _ = results.success_matrix()
-    for i, k in zip(
-        *np.nonzero(~np.isnan(np.tril(matrix, -1)) & np.tri(len(matrix), k=-1, dtype=bool)), strict=True
-    ):
-        if matrix[k, k] >= LEARNED:
+    for i, k in zip(*np.tril_indices(len(matrix), -1), strict=True):
+        if matrix[k, k] >= LEARNED and not np.isnan(matrix[i, k]):
             yield int(i), int(k), float(matrix[k, k] - matrix[i, k])
 
 

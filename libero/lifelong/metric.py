@@ -237,9 +237,8 @@ class _EvalEnv(BatchEnv):
         if self.rows is not None and options is not None:
             indices = np.asarray(options["init_state"])
             rows = self.rows[indices % len(self.rows)]
-            poses = self.init_states[
-                indices, rows.shape[1] :
-            ]  # of the fixtures, where the user's states have none
+            # poses of the fixtures, where the user's states have none
+            poses = self.init_states[indices, rows.shape[1] :]
             options = {**options, "start": np.hstack([rows, poses])}
         return super().reset(seed=seed, options=options)
 

@@ -141,9 +141,8 @@ def _known(value: float | None) -> bool:
     return value is not None and bool(np.isfinite(value))
 
 
-_Rates = Mapping[
-    tuple[int, int | None] | None, Mapping[str, float]
-]  # (seed, data_seed), None: all -> task -> success
+# (seed, data_seed), or None for all together -> task -> success
+_Rates = Mapping[tuple[int, int | None] | None, Mapping[str, float]]
 
 
 def _reference(measured: Mapping[str, Sequence[Run]]) -> _Rates:

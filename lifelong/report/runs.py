@@ -34,19 +34,8 @@ _IGNORED = (
 )
 # sections of the config
 _COMPARED = (
-    *(
-        "algo",
-        "policy",
-        "augmentation",
-        "train",
-        "data",
-        "eval",
-        "language",
-        "benchmark",
-        "stream",
-        "pretrain",
-    ),
-)
+    "algo", "policy", "augmentation", "train", "data", "eval", "language", "benchmark", "stream", "pretrain"
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -3,10 +3,10 @@
 results.json     the success matrix, learning curves, metrics and times of a run
 episodes.csv.gz  one row an episode: the method's label, seeds of the run and its demonstrations, its order, `transfer`
                  (how its forward transfer is estimated), `together` (numbers of tasks learned together), which
-                 `cells` of the matrix were measured and their share, the
-                 evaluation (`phase` curve or matrix, `row`: position of the task learned last, `epoch` trained on it),
-                 the task (`position` in the sequence, and its name), `start` (initial state), `success` (0 or 1),
-                 `length` [control steps]; episodes that a simulation error ended are left out
+                 `cells` of the matrix were measured and their share, the evaluation (`phase` curve or matrix, `row`:
+                 position of the task learned last, `epoch` trained on it), the task (`position` in the sequence, and
+                 its name), `start` (initial state), `success` (0 or 1), `length` [control steps]; episodes that a
+                 simulation error ended are left out
 """
 
 import csv
