@@ -14,6 +14,7 @@ today's count as missing.
 import argparse
 import json
 import lzma
+import math
 import os
 import re
 import shlex
@@ -40,6 +41,7 @@ from lifelong.report.comparison import Plan
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import result_relevant
+from lifelong.results.shifts import shift_scores
 from lifelong.settings import Configuration, plain_data
 
 HERE = Path(__file__).parent
@@ -61,12 +63,16 @@ class Study:
         methods: What the command of each has, by its name in tables, in the order in which they are run.
         seeds: Number of seeds of each.
         overrides: What all its commands have.
+        shifts: Perturbations under which finished runs are evaluated besides, each alone.
+        shifted: The methods of which they are.
     """
 
     name: str
     methods: Mapping[str, tuple[str, ...]]
     seeds: int
     overrides: tuple[str, ...]
+    shifts: tuple[str, ...] = ()
+    shifted: tuple[str, ...] = ()
 
 
 def _plain(*algorithms: str) -> dict[str, tuple[str, ...]]:
@@ -90,10 +96,23 @@ SMALL = (
     *("train.steps_per_epoch=75", "eval.episodes=10", "eval.every=8"),
     *("eval.cells=sampled", "eval.cells_share=0.3"),
 )
+BRIEF = (  # of which only costs are read
+    *("benchmark=libero_goal", "benchmark.tasks=3", "data.demos=20"),
+    *("train.epochs=2", "train.steps_per_epoch=75", "eval.episodes=1"),
+    *("eval.cells=diagonal_and_last_row", "eval.curve=none", "eval.horizon=10"),
+)
+ALL = sorted(file.stem for file in (config_folder() / "algo").glob("*.yaml"))
 GOAL = ("benchmark=libero_goal", "data.demos=20", "eval.horizon=240", *SMALL)
 TEN = ("sequential", "er", "packnet", "lora", "single_task", "ewc", "iscil", "dmpel", "derpp", "multitask")
 STUDIES = (
-    Study("goal", _plain(*TEN), 5, GOAL),
+    Study(
+        "goal",
+        _plain(*TEN),
+        5,
+        GOAL,
+        shifts=("instruction=0.6", "camera=0.2"),
+        shifted=("er", "lora", "iscil", "dmpel"),
+    ),
     Study(
         "memory",
         {name: words for size in (0.1, 1.0, 10.0) for name, words in _memories(size).items()},
@@ -115,6 +134,7 @@ STUDIES = (
         1,
         LONG,
     ),
+    Study("costs", _plain(*ALL), 1, BRIEF),
 )
 
 
@@ -157,6 +177,16 @@ class Planned:
         was = {k: v for k, v in result_relevant(saved).items() if k in known}
         now = {k: v for k, v in result_relevant(self.config).items() if v is not None}
         return {k: v for k, v in was.items() if k in now} == now
+
+    def missing(self) -> list[str]:
+        """Return the shifts that it was not evaluated under; before them "" if the run itself is missing."""
+        shifts = self.study.shifts if self.method in self.study.shifted else ()
+        if not self.is_done():
+            return ["", *shifts]
+        with tempfile.TemporaryDirectory() as scratch:
+            found = shift_scores(ResultLog(self.unpack(Path(scratch)) / "results.jsonl").read())
+        measured = {score.shift for score in found if not math.isnan(score.success("final_shifted").value)}
+        return [shift for shift in shifts if shift not in measured]
 
     def keep(self, directory: Path) -> None:
         """Keep the records of a finished run."""
@@ -233,21 +263,24 @@ def make(runs: Sequence[Planned], folder: Path, minutes: float, jobs: int) -> in
     Returns:
         Number of runs that failed.
     """
-    waiting = iter([run for run in runs if not run.is_done()])
+    waiting = [(run, parts) for run in runs if (parts := run.missing())]
     end, failed = time.monotonic() + 60 * minutes, 0
-    active: dict[subprocess.Popen[bytes], Planned] = {}
+    active: dict[subprocess.Popen[bytes], tuple[Planned, list[str]]] = {}
     try:
         while True:
-            while len(active) < jobs and time.monotonic() < end and (run := next(waiting, None)):
-                active[_start(run, folder)] = run
+            while len(active) < jobs and time.monotonic() < end and waiting:
+                run, parts = waiting.pop(0)
+                active[_start(run, parts[0], folder)] = run, parts
             if not active or time.monotonic() > end:
                 return failed
             for process in [p for p in active if p.poll() is not None]:
-                run = active.pop(process)
+                run, (part, *others) = active.pop(process)
                 directory = _directory(run, folder)
                 if process.returncode == 0 and directory is not None:
                     run.keep(directory)
-                    print(f"{time.strftime('%H:%M')} done: {run.name}", flush=True)
+                    print(f"{time.strftime('%H:%M')} done: {run.name} {part}", flush=True)
+                    if others:
+                        waiting.insert(0, (run, others))
                 else:
                     failed += 1
                     print(f"{time.strftime('%H:%M')} failed: {_log(run, folder)}", flush=True)
@@ -259,9 +292,10 @@ def make(runs: Sequence[Planned], folder: Path, minutes: float, jobs: int) -> in
             process.wait()
 
 
-def _start(run: Planned, folder: Path) -> "subprocess.Popen[bytes]":
+def _start(run: Planned, shift: str, folder: Path) -> "subprocess.Popen[bytes]":
     _demonstrations(run)
-    command = [sys.executable, str(ROOT / "train.py"), *run.overrides, f"runs_dir={folder / run.name}"]
+    words = [*run.overrides, *([f"eval.shift='{shift}'"] if shift else []), f"runs_dir={folder / run.name}"]
+    command = [sys.executable, str(ROOT / "train.py"), *words]
     log = _log(run, folder)
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as out:

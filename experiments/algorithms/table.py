@@ -5,16 +5,20 @@ python experiments/algorithms/table.py          # reads STUDY/comparison.json, w
 
 import argparse
 import json
+import math
 import statistics
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 from study import REFERENCES, Planned, planned
 
 from libero_env.text import duration, quantity
 from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
+from lifelong.results.shifts import shift_scores
+from lifelong.stats.methods import paired_difference
 
 HERE = Path(__file__).parent
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "nbt": "NBT", "auc": "AUC"}
@@ -56,6 +60,7 @@ def tables(study: str, found: dict) -> Iterator[tuple[str, list[str]]]:
     rows = [[label, training[label], *costs(groups[label]["costs"])] for label in order]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
+    yield from shifts(study, order, {label: group["told_task"] for label, group in groups.items()})
 
 
 def by_auc(measured: dict[str, dict]) -> list[str]:
@@ -131,6 +136,42 @@ def training_seconds(study: str) -> dict[str, str]:
         algo: duration(statistics.mean(tasks.values())) + (" (all tasks)" if len(tasks) == 1 else "")
         for algo, tasks in found.items()
     }
+
+
+def shifts(study: str, order: list[str], told: dict[str, bool]) -> Iterator[tuple[str, list[str]]]:
+    """Final success under each held-out shift, and what the shift costs, alone and beside the first reference."""
+    found: dict[str, dict[str, dict[int, tuple[float, float]]]] = {}  # by shift, algorithm and seed
+    for run, folder in finished(study):
+        for score in shift_scores(ResultLog(folder / "results.jsonl").read()):
+            both = (score.success("final").value, score.success("final_shifted").value)
+            found.setdefault(score.shift, {}).setdefault(run.method, {})[run.seed] = both
+    for shift, methods in found.items():
+        lost = {m: {seed: a - b for seed, (a, b) in seeds.items()} for m, seeds in methods.items()}
+        rows = []
+        for label in (label for label in order if label in methods):
+            own, other = lost[label], lost[REFERENCES[0]]
+            seeds = sorted(own.keys() & other.keys())
+            less = "–" if label == REFERENCES[0] else _plain_difference([own[s] - other[s] for s in seeds])
+            means = [statistics.mean(values) for values in zip(*methods[label].values(), strict=True)]
+            rows.append(
+                [
+                    label,
+                    str(len(own)),
+                    "yes" if told[label] else "no",
+                    *(f"{mean:.2f}" for mean in means),
+                    _plain_difference(list(own.values())),
+                    less,
+                ]
+            )
+        heads = ["algorithm", "seeds", "told the task", "final", f"under `{shift}`", "lost"]
+        yield f"under {shift}", table([*heads, f"lost, less {REFERENCES[0]}'s"], rows)
+
+
+def _plain_difference(values: list[float]) -> str:
+    """The mean of differences in points, with Student's interval of these alone."""
+    found = paired_difference(np.array(values)).estimate
+    ends = "" if math.isnan(found.low) else f" [{100 * found.low:z.1f}, {100 * found.high:z.1f}]"
+    return f"{100 * found.value:+.1f}{ends}"
 
 
 def finished(study: str) -> Iterator[tuple[Planned, Path]]:

@@ -101,6 +101,11 @@ def tune(request: TuneRequest) -> None:
     def other(algo: str) -> "Candidate":
         return _candidate(algo, {}, [*without, f"algo={algo}"], request.config_dir)
 
+    for key in (word.lstrip("+~").partition("=")[0] for word in plain_words):
+        if key.partition(".")[0] in ("seed", "benchmark", "eval"):  # a preset may set them for the runs
+            raise ConfigError(
+                f"{key} has no effect in libero tune; leave it out: see --seeds, --suite and --stream"
+            )
     config, choices = compose_run(plain_words, request.config_dir)
     plain = plain_data(config)
     checked = Configuration(plain)

@@ -87,6 +87,8 @@ def embed(
     """
     if isinstance(texts, str):
         raise LanguageError("embed takes a list of texts, not one text; write [text]")
+    if dim is not None and model != "onehot":
+        raise LanguageError(f"dim is of onehot; embeddings of {model} have a length of their own")
     if numbered:
         texts = [f"Task {number}" for number in range(1, len(texts) + 1)]
     if model == "onehot":

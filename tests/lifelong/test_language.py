@@ -73,6 +73,8 @@ def test_onehot() -> None:
     assert torch.equal(embed(TEXTS, "onehot", dim=5), torch.eye(5)[:2])
     with pytest.raises(LanguageError, match="2 or more"):
         embed(TEXTS, "onehot", dim=1)
+    with pytest.raises(LanguageError, match="dim is of onehot"):
+        embed(TEXTS, "minilm", dim=5)
 
 
 @pytest.fixture(scope="module")

@@ -30,8 +30,9 @@ TUNED = {
 }
 STREAM = BenchmarkSettings("libero_90", tasks=[61, 62]).sequence()
 FAST = ("--steps", "2", "--stream", "61,62", "--beside")
+TRAINED = [word for word in TINY if not word.startswith(("benchmark", "eval", "seed"))]
 WORDS = [
-    *TINY,
+    *TRAINED,
     "policy/head=deterministic_small",
     "algo=ewc",
     "algo.estimator.windows=2",
@@ -263,7 +264,7 @@ def test_lists_of_values_are_found_and_others_are_left() -> None:
     (["algo=ewc", "algo.strength=[1"], "["),
 ])  # fmt: skip
 def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> None:
-    assert tune(*TINY, *words, "--steps", "1", "--beside", "--out", str(tmp_path)) != 0
+    assert tune(*TRAINED, *words, "--steps", "1", "--beside", "--out", str(tmp_path)) != 0
     error = capsys.readouterr().err
     assert told in error and len(error.strip().splitlines()) == 1
 
@@ -281,6 +282,9 @@ def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> 
     (["tracker=wandb"], "tracker"),
     (["eval.episodes=1,2"], "eval.episodes"),
     (["seed=1,2"], "seed"),
+    (["seed=3"], "seed"),
+    (["benchmark=libero_goal"], "benchmark"),
+    (["eval.episodes=3"], "eval.episodes"),
 ])  # fmt: skip
 def test_what_no_trial_obeys_is_refused_by_name(words, key, capsys, tmp_path, fake_streams) -> None:
     assert tune(*WORDS, "threads=1", "progress=false", *words, *FAST, "--out", str(tmp_path)) != 0
