@@ -53,7 +53,10 @@ def records(path: Path) -> list[dict]:
 
 
 def test_smoke_from_the_command_line_to_a_report(home, tmp_path):
-    command = ("preset=smoke", "algo=er", "data.demos=5", "eval.curve=none", "eval.select=last")
+    command = (
+        *("preset=smoke", "algo=er", "data.demos=5", "eval.curve=none", "eval.select=last"),
+        "eval.horizon=90",
+    )
     output = finish(start(home, tmp_path, *command))
     path = run_dir(tmp_path)
     assert path == tmp_path / "first_steps" / "er" / "bc_transformer_small_seed1"

@@ -303,12 +303,12 @@ def build(path: Path, counter: Path) -> None:
 @pytest.mark.slow
 def test_one_of_several_processes_writes(path: Path, tmp_path: Path) -> None:
     counter, context = tmp_path / "written", multiprocessing.get_context("spawn")
-    processes = [context.Process(target=build, args=(path, counter)) for _ in range(3)]
+    processes = [context.Process(target=build, args=(path, counter)) for _ in range(2)]
     for process in processes:
         process.start()
     for process in processes:
         process.join(120)
-    assert [p.exitcode for p in processes] == [0, 0, 0]
+    assert [p.exitcode for p in processes] == [0, 0]
     assert counter.read_text() == "written\n"
 
 
