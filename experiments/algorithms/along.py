@@ -3,7 +3,7 @@
     python experiments/algorithms/along.py libero_130     # the finished runs of a stream of the study
 
 Prints Markdown tables, a column for each method, means over its seeds. Plasticity is the success just after learning.
-Forgotten is that success less the success after a later task, over all measured cells of which the task was learned.
+Forgotten is the share of it that is gone after a later task: 1 - sum(later) / sum(just learned), over measured cells.
 """
 
 import argparse
@@ -19,7 +19,6 @@ from lifelong.language.encoder import embed
 from lifelong.results.log import ResultLog
 from lifelong.results.results import Results
 
-LEARNED = 0.5  # success just after learning, from which on a task can be forgotten
 DISTANCES = (1, 2, 4, 10, 30, 60, 130)  # tasks learned since; ends of bins
 SIMILARITIES = (-1.0, 0.5, 0.7, 0.8, 0.9, 1.01)  # largest cosine to the instructions learned since
 MOMENTS = (10, 30, 90, 130)  # tasks learned, at which cost is shown
@@ -32,26 +31,31 @@ def plasticity(results: Results) -> Iterator[tuple[str, float]]:
         yield f"tasks {part[0] + 1} to {part[-1] + 1}", float(np.nanmean(learned[part]))
 
 
-def cells(results: Results) -> Iterator[tuple[int, int, float]]:
-    """Yield (last task learned, earlier task, success lost since it was learned) of the measured cells."""
+def cells(results: Results) -> Iterator[tuple[int, int, tuple[float, float]]]:
+    """Yield (last task learned, earlier task, its success just learned and then) of the measured cells."""
     matrix, _ = results.success_matrix()
     for i, k in zip(*np.tril_indices(len(matrix), -1), strict=True):
-        if matrix[k, k] >= LEARNED and not np.isnan(matrix[i, k]):
-            yield int(i), int(k), float(matrix[k, k] - matrix[i, k])
+        if not np.isnan(matrix[i, k]):
+            yield int(i), int(k), (float(matrix[k, k]), float(matrix[i, k]))
+
+
+def forgotten(pairs: list[tuple[float, float]]) -> float:
+    """Return the share of the success just learned that is gone; of all cells together, as one has few episodes."""
+    learned, later = (sum(values) for values in zip(*pairs, strict=True)) if pairs else (0.0, 0.0)
+    return 1 - later / learned if learned else float("nan")
 
 
 def binned(
-    values: list[tuple[float, float]], ends: tuple[float, ...], name: Callable
+    values: list[tuple[float, tuple[float, float]]], ends: tuple[float, ...], name: Callable
 ) -> Iterator[tuple[str, float]]:
-    """Yield the mean loss of the cells between two ends."""
+    """Yield what is forgotten in the cells between two ends."""
     for low, high in zip(ends[:-1], ends[1:], strict=True):
-        inside = [lost for at, lost in values if low <= at < high]
-        yield name(low, high), float(np.mean(inside)) if inside else float("nan")
+        yield name(low, high), forgotten([pair for at, pair in values if low <= at < high])
 
 
 def by_distance(results: Results) -> Iterator[tuple[str, float]]:
     """Yield what was lost by the number of tasks learned since."""
-    values = [(i - k, lost) for i, k, lost in cells(results)]
+    values = [(float(i - k), pair) for i, k, pair in cells(results)]
     yield from binned(values, DISTANCES, lambda low, high: f"{low} to {high - 1} tasks since")
 
 
@@ -61,15 +65,14 @@ def by_similarity(results: Results) -> Iterator[tuple[str, float]]:
     texts = embed(run.instructions).numpy()
     texts /= np.linalg.norm(texts, axis=1, keepdims=True)
     cosine, found = texts @ texts.T, list(cells(results))
-    values = [(float(cosine[k, k + 1 : i + 1].max()), lost) for i, k, lost in found]
+    values = [(float(cosine[k, k + 1 : i + 1].max()), pair) for i, k, pair in found]
     yield from binned(
         values, SIMILARITIES, lambda low, high: f"nearest instruction {low:g} to {min(high, 1):g}"
     )
     scenes = [scene.group() if (scene := re.match(r"[A-Z_]+_SCENE\d+", name)) else None for name in run.tasks]
-    again = [(scenes[k] in scenes[k + 1 : i + 1], lost) for i, k, lost in found if scenes[k] is not None]
+    again = [(scenes[k] in scenes[k + 1 : i + 1], pair) for i, k, pair in found if scenes[k] is not None]
     for same, title in ((True, "its scene was seen again"), (False, "its scene was not seen again")):
-        lost = [value for is_same, value in again if is_same == same]
-        yield title, float(np.mean(lost)) if lost else float("nan")
+        yield title, forgotten([pair for is_same, pair in again if is_same == same])
 
 
 def costs(results: Results) -> Iterator[tuple[str, str]]:

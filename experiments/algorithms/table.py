@@ -197,7 +197,8 @@ def main() -> None:
     text = readme.read_text(encoding="utf-8")
     for path in sorted(HERE.glob("*/comparison.json")):
         for name, lines in tables(path.parent.name, json.loads(path.read_text(encoding="utf-8"))):
-            text = insert(text, f"{path.parent.name}: {name}", lines)
+            if f"<!-- {path.parent.name}: {name} -->" in text:  # of costs only the costs
+                text = insert(text, f"{path.parent.name}: {name}", lines)
     readme.write_text(text, encoding="utf-8")
 
 
