@@ -92,10 +92,9 @@ LONG = (
     *("benchmark=libero_130", "data.demos=20", "train.steps_per_epoch=75", "eval.episodes=2"),
     *("eval.cells=sampled", "eval.cells_share=0.02", "eval.curve=none", "eval.horizon=300"),
 )
-SMALL = (
-    *("train.steps_per_epoch=75", "eval.episodes=10", "eval.every=8"),
-    *("eval.cells=sampled", "eval.cells_share=0.3"),
-)
+SMALL = ("train.steps_per_epoch=75", "eval.episodes=10")
+SAMPLED = ("eval.every=8", "eval.cells=sampled", "eval.cells_share=0.3")
+ENDS = ("eval.cells=diagonal_and_last_row", "eval.curve=none")  # just learned and final; neither NBT nor AUC
 BRIEF = (  # of which only costs are read
     *("benchmark=libero_goal", "benchmark.tasks=3", "data.demos=20"),
     *("train.epochs=2", "train.steps_per_epoch=75", "eval.episodes=1"),
@@ -109,7 +108,7 @@ STUDIES = (
         "goal",
         _plain(*TEN),
         5,
-        GOAL,
+        (*GOAL, *SAMPLED),
         shifts=("instruction=0.6", "camera=0.2"),
         shifted=("er", "lora", "iscil", "dmpel"),
     ),
@@ -117,13 +116,13 @@ STUDIES = (
         "memory",
         {name: words for size in (0.1, 1.0, 10.0) for name, words in _memories(size).items()},
         3,
-        GOAL,
+        (*GOAL, *ENDS),
     ),
     Study(
         "ten_demonstrations",
         _plain("sequential", "er", "packnet", "lora", "single_task", "iscil"),
         3,
-        ("benchmark=libero_object", "data.demos=10", *SMALL),
+        ("benchmark=libero_object", "data.demos=10", *SMALL, *SAMPLED),
     ),
     Study(
         "libero_130",
