@@ -12,7 +12,7 @@ class CompressedER(Rehearsal):
 
     The loss and the draws are those of experience replay (Chaudhry et al. 2019): `ratio` windows of earlier tasks join
     each of the batch. What differs is what is kept. `CompressedMemory` has the frames themselves, as WebP of a
-    twenty-fifth of their size, so the state is all that later tasks need: demonstrations of earlier tasks may be gone.
+    twentieth of their size, so the state is all that later tasks need: demonstrations of earlier tasks may be gone.
     """
 
     state_form = {"memory": COMPRESSED_FORM}

@@ -29,10 +29,10 @@ class DMPEL(RoutedExperts):
     arXiv:2506.05985: layers compute `W x + (alpha / rank) sum_i c_i B_i A_i x` with W frozen; the coefficients c come
     from a router that takes the context (instruction, images, proprioception), not the task's number; layers form
     groups with coefficients of their own. As in the authors' code, c_i is `2 sigmoid` of expert i's own logit, of which
-    the best `top_k` count; every task starts with a new router at c = 1 / `top_k`, which is learned with the newest
-    experts; and after the task it learns to recall, by squared error, the coefficients that earlier tasks ended with
-    on stored contexts, which are far smaller than demonstrations. Where experts compete in a softmax instead, the first
-    steps of a task can take all weight from the newest one, which then never learns.
+    the best `top_k` count; every task starts with a new router at c = 1 / min(`top_k`, experts), which is learned
+    with the newest experts; and after the task it learns to recall, by squared error, the coefficients that earlier
+    tasks ended with on stored contexts, which are far smaller than demonstrations. Where experts compete in a softmax
+    instead, the first steps of a task can take all weight from the newest one, which then never learns.
 
     Departures:
 

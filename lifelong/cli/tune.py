@@ -54,7 +54,7 @@ class TuneRequest:
         steps: Optimiser steps a task.
         held_out: Share of the demonstrations that is measured on.
         beside: Algorithms to compare with.
-        out: Folder of table, picture and measurements.
+        out: Folder of numbers, picture and measurements.
         config_dir: A folder of configuration files to be added.
         write: Folder of configuration files in which tuned/HEAD/ALGO.yaml gets the chosen value (ALGO_own.yaml where
             the package has such a file).

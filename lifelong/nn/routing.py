@@ -19,9 +19,10 @@ _SAMPLES = 64  # of a step of an autoencoder
 class SigmoidRouter(nn.Module):
     """Network from a query to a coefficient of each expert in each group of layers, `2 sigmoid(logit)`.
 
-    Experts do not compete: the coefficient of one does not depend on that of another. All start near 1 / `top_k`.
-    Queries are brought to length one. An optimiser that follows the gradient's signs would otherwise move a hidden
-    unit by the rate times the sum of a query's hundreds of entries at every step, and all coefficients with it.
+    Experts do not compete: the coefficient of one does not depend on that of another. All start near
+    1 / min(`top_k`, experts). Queries are brought to length one. An optimiser that follows the gradient's signs would
+    otherwise move a hidden unit by the rate times the sum of a query's hundreds of entries at every step, and all
+    coefficients with it.
 
     Args:
         weights: `enter` (hidden, Q), `middle` (hidden, hidden), `leave` (G N, hidden), `bias` (G, N).

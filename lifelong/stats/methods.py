@@ -106,7 +106,7 @@ def paired_difference(differences: Floats, margin: float = MARGIN) -> Difference
 
 
 def welch_difference(first: Floats, second: Floats, margin: float = MARGIN) -> Difference:
-    """Test two methods without common seeds by Welch's t (Biometrika 1947), with Satterthwaite's degrees of freedom.
+    """Test two methods that share too few seeds by Welch's t (Biometrika 1947), with Satterthwaite's degrees.
 
     Args:
         first: (R,) the metric of the first method with each seed.
@@ -218,7 +218,7 @@ def statistics(
         ],
         "statistics": {
             "interval": "Student's t over seeds (or orders, demonstrations), not narrower than Wilson's over episodes",
-            "tests": "paired by seed, Student's t; Welch's t without common seeds",
+            "tests": "paired by seed, Student's t; Welch's t with too few common ones",
             "family": "all pairs" if all_pairs else list(references),
             "correction": "Holm, over the pairs of a metric",
             "equivalence": "two one-sided t tests",
