@@ -31,6 +31,7 @@ from lifelong.stats.sequential import anytime_interval
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
 UNMEASURED = (
+    "digest",
     "actions",
     "limits_reached",
     "failures",
@@ -54,6 +55,7 @@ class TaskResult(Episodes):
     Attributes:
         task: Id of the task, such as `libero_goal/3`.
         instruction: Instruction that the policy received.
+        digest: Digest of the task, see `libero_env.tasks.Task.digest`; empty where it was not recorded.
         errors: Error of each episode that the protocol counts as a failure, or None; empty if there are none.
         actions: Digest of the actions of each episode, by which episodes can be compared to the bit; empty if they
             were not recorded.
@@ -74,6 +76,7 @@ class TaskResult(Episodes):
     task: _Id
     name: _Name
     instruction: str
+    digest: str = ""
     errors: tuple[str | None, ...] = ()
     actions: tuple[str, ...] = ()
     attempts: tuple[tuple[Count, ...], ...] = ()
@@ -115,7 +118,7 @@ class TaskResult(Episodes):
         limits = sum((Counter(dict(part.limits_reached)) for part in parts), Counter[str]())
         rows["limits_reached"] = tuple(sorted(limits.items()))
         first = parts[0]
-        return cls(first.task, first.name, first.instruction, atoms=first.atoms, **rows)
+        return cls(first.task, first.name, first.instruction, first.digest, atoms=first.atoms, **rows)
 
     def of_starts(self, starts: Collection[int]) -> "TaskResult":
         """Return the results of the episodes from some of the starts."""

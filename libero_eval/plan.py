@@ -3,7 +3,7 @@
 import io
 import re
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +19,7 @@ from libero_env.perturbations import format_perturbations, parse_perturbations
 from libero_env.sim.backend import Backend
 from libero_env.tasks import Task
 from libero_env.tasks.published import require_available
+from libero_env.tasks.task import FILE
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, permission_names
@@ -73,6 +74,11 @@ def evaluate(
         print(
             f"note: {store.path}: units that are done are of another source of this package ({', '.join(others)}; "
             f"here {here}), as the result will say; --again repeats them",
+            file=sys.stderr,
+        )
+    if any(unit.name in done and not evaluation.is_filmed(unit) for unit in units):
+        print(
+            f"note: {store.path}: some of the episodes to be filmed are done, and are not filmed; --again repeats them",
             file=sys.stderr,
         )
     if evaluation.starts_needed(done):
@@ -146,6 +152,11 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
         raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
     require_available(tasks)
     protocol = resolve_protocol(request, policy.protocol(base), tasks)
+    if not protocol.world.delta and _kind(request.policy_name) in ("expert", "run"):
+        raise ConfigError(
+            f"{request.policy_name} moves relative to the present pose; protocol {protocol.name} has absolute actions "
+            "(world.delta: false)"
+        )
     Clock.read(protocol.action.clock).check(policy.chunk, policy.inpaints)
     events = parse_perturbations(protocol.world.perturb, events=True)
     if not policy.hears and (told := [str(one) for one in events if one.name.startswith("goal@")]):
@@ -159,14 +170,21 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
         init_states = choose_init_states(request.starts, _episodes(request, tasks), policy.selection)
     else:
         init_states = earlier.init_states
-        check_same(earlier, evaluated=identity, protocol=protocol, versions=versions, despite=request.despite)
+        tasks_here = {f"task {task.id}": task.digest for task in tasks}
+        here = {**identity, **versions, **tasks_here, "protocol": protocol.digest}
+        check_same(earlier, here, request.despite)
     tasks = tuple(dict.fromkeys(tasks))
     ids = [task.id for task in tasks]
+    if twice := [task.name for task in tasks if ids.count(task.id) > 1]:
+        raise ConfigError(
+            f"{' and '.join(twice)}: task files are evaluated one by one; name one with --suite"
+        )
     until = StoppingRule.read(request.until, protocol, ids, init_states) if request.until else None
     return Evaluation(
         identity=identity,
         tasks=tasks,
         until=until,
+        stopped=earlier.stopped if earlier else None,
         init_states=init_states,
         protocol=protocol,
         out=request.out or policy.out,
@@ -300,12 +318,42 @@ def _check_options(request: EvalRequest, earlier: EvaluationResult | None) -> No
     Raises:
         ConfigError: One is; the message says what it is of.
     """
-    if request.after is not None and _kind(request.policy_name) != "run":
-        raise ConfigError(f"--after is of runs, and {request.policy} is none")
-    if request.control_freq not in (None, CONTROL_HZ) and _kind(request.policy_name) == "expert":
+    kind = _kind(request.policy_name)
+    for name, of in _OF_KIND.items():
+        if of != kind and (given := _given(request, (name,))):
+            raise ConfigError(f"{given[0]} is of {_KINDS[of]}, and {request.policy} is {_KINDS[kind]}")
+    if request.allow and kind != "run" and earlier is None:
+        raise ConfigError("--allow is of runs, and of results that are run again")
+    if request.perturb_seed and request.perturb is None and not request.event and earlier is None:
+        raise ConfigError("--perturb-seed draws what --perturb and --event ask for, and neither is given")
+    if request.control_freq not in (None, CONTROL_HZ) and kind == "expert":
         raise ConfigError(f"--control-freq {request.control_freq}: the expert acts at {CONTROL_HZ} Hz only")
     if request.despite and earlier is None:
         raise ConfigError(f"--despite is of results that are run again, and {request.policy} is none")
+
+
+def _given(request: EvalRequest, names: Iterable[str]) -> list[str]:
+    """Return the options of these names that have other values than the defaults."""
+    plain = EvalRequest()
+    return [f"--{name.replace('_', '-')}" for name in names if getattr(request, name) != getattr(plain, name)]
+
+
+_KINDS = {
+    "run": "a run",
+    "module": "a policy of your own",
+    "server": "a policy server",
+    "expert": "the expert",
+}
+_OF_KIND = {
+    **{"after": "run", "device": "run"},
+    **{"names": "module", "size": "module"},
+    **{"timeout": "server", "in_flight": "server"},
+}
+# What a result states, so that it is run again with this
+_STATED = (
+    *("after", "starts", "episodes", "protocol", "perturb", "perturb_seed", "event", "clock", "horizon"),
+    *("control_freq", "size", "names", "name", "seed", "robot", "unit_starts", "until"),
+)
 
 
 class _Evaluated(TypedDict, total=False):
@@ -349,6 +397,13 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
         raise ConfigError(
             f"--backend {asked}: the result is of backend={result.backend}, which it is repeated with"
         )
+    if given := _given(request, _STATED):
+        raise ConfigError(f"{', '.join(given)}: the result is run again as it was; leave this out")
+    own = [task.name for task in result.tasks if task.suite == FILE]
+    if own and not request.suite:
+        raise ConfigError(f"the result is of a task file, {own[0]}; name the file with --suite")
+    if request.suite and not own:
+        raise ConfigError("--suite: the result is run again on its own tasks; leave this out")
     threads = result.environment.get("policy_threads") if result.evaluated.get("run") else None
     if not (isinstance(threads, int) and 1 <= threads <= 1024):
         threads = None
@@ -359,17 +414,9 @@ def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
         names=evaluated.get("names"),
         name=evaluated.get("name"),
         seed=evaluated.get("seed", 0),
-        suite=tuple(task.task for task in result.tasks),
+        suite=request.suite or tuple(task.task for task in result.tasks),
         unit_starts=result.unit_starts or len(result.init_states),
         policy_threads=request.policy_threads or threads,
-        horizon=None,
-        control_freq=None,
-        robot=None,
-        perturb=None,
-        clock=None,
-        event=(),
-        size=None,
-        until=None,
         out=request.out or (path if path.is_dir() else path.parent) / "again",
     )
 
@@ -385,27 +432,18 @@ def _check_allowed(policy: str, request: EvalRequest) -> None:
         )
 
 
-def check_same(
-    result: EvaluationResult,
-    *,
-    evaluated: Mapping[str, Any],
-    protocol: EvalProtocol,
-    versions: Mapping[str, str],
-    despite: Sequence[str],
-) -> None:
+def check_same(result: EvaluationResult, now: Mapping[str, Any], despite: Sequence[str]) -> None:
     """Check that an evaluation is the one of a result.
 
     Args:
-        evaluated: What identifies the policy now.
-        protocol: Protocol now.
-        versions: Versions now.
+        now: What identifies the policy now, versions, and digests of the protocol and of each task.
         despite: Names of differences that the user accepts.
 
     Raises:
         ConfigError: Something differs; the message names both values of each.
     """
     then = {**result.evaluated, **result.versions, "protocol": result.protocol.get("digest")}
-    now = {**evaluated, **versions, "protocol": protocol.digest}
+    then |= {f"task {task.task}": task.digest for task in result.tasks if task.digest}
     wrong = [
         f"{name}: {then[name]} in the result, {now[name]} here"
         for name in then

@@ -3,11 +3,12 @@
 import ast
 import hashlib
 import importlib
+import inspect
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 from typing import Annotated, Any
@@ -27,7 +28,7 @@ from libero_eval.protocols.clock import Planner
 from libero_eval.protocols.environment import OBSERVATIONS
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
-from lifelong.errors import LifelongError, MissingObservationError, PolicyError
+from lifelong.errors import ConfigError, LifelongError, MissingObservationError, PolicyError
 from lifelong.evaluation.environments import Obs
 from lifelong.settings.configuration import require_same_module
 
@@ -57,6 +58,10 @@ class UserPolicy(PolicyUnderTest):
         super().__init__(request)
         name = request.policy_name
         self.policy = load_callable(name)
+        if request.seed and not _takes_seeds(self.policy):
+            raise ConfigError(
+                f"--seed {request.seed}: {name} draws by itself; its reset would get seeds with an argument `seeds`"
+            )
         self.cameras = self._attribute("cameras", Cameras, DEFAULT_CAMERAS)
         self.observations = self._attribute("observations", tuple[str, ...], OBSERVATIONS)
         named = self._attribute("identity", dict[str, Any], {})
@@ -78,10 +83,13 @@ class UserPolicy(PolicyUnderTest):
         """Yield what gives the policy its observations under the names it takes."""
         views = tuple(map(view_of, self.cameras or ()))
         names = self.request.names or ("native" if protocol.pixels.orientation == "upright" else "original")
+        words = self.seeds(task, states)
+        seeds = tuple(int(np.random.SeedSequence(one).generate_state(1)[0]) for one in words)
         if names == "protocol":
-            yield ProtocolActor(self.policy, views, ProtocolAdapter(protocol, task), protocol.action.replan)
+            adapter = ProtocolAdapter(protocol, task)
+            yield ProtocolActor(self.policy, views, adapter, protocol.action.replan, seeds=seeds)
         else:
-            yield CallableActor(self.policy, views, protocol.prompt(task), names == "original")
+            yield CallableActor(self.policy, views, protocol.prompt(task), names == "original", seeds=seeds)
 
     def _attribute(self, name: str, kind: Any, default: Any) -> Any:
         """Return an attribute of the policy, or the default where it has none.
@@ -91,6 +99,14 @@ class UserPolicy(PolicyUnderTest):
         """
         value = getattr(self.policy, name, default)
         return validate(kind, value, prefix=(f"the policy's {name}",), error=PolicyError)
+
+
+def _takes_seeds(policy: Any) -> bool:
+    """Return whether an object's `reset` has an argument `seeds`."""
+    try:
+        return "seeds" in inspect.signature(policy.reset).parameters
+    except (AttributeError, TypeError, ValueError):  # no reset, or not one that can be looked into
+        return False
 
 
 class Observations(dict[str, Any]):
@@ -122,10 +138,12 @@ class _UserActor:
     Attributes:
         policy: The object.
         views: Names of the observed images that recorded rollouts show.
+        seeds: A seed for each simulation, for an object whose `reset` takes them.
     """
 
     policy: Any
     views: tuple[str, ...]
+    seeds: tuple[int, ...] = field(default=(), kw_only=True)
     action_dim, observes = ACTION_DIM, "asked"
 
     def _name(self, method: str) -> str:
@@ -134,7 +152,8 @@ class _UserActor:
     def _reset(self, instruction: str, num_envs: int) -> None:
         if hasattr(self.policy, "reset"):
             with code_of(f"the policy's {self._name('reset')}"):
-                self.policy.reset(instruction, num_envs)
+                more = {"seeds": list(self.seeds)} if _takes_seeds(self.policy) else {}
+                self.policy.reset(instruction, num_envs, **more)
 
     def _predict(self, observations: Observations, shape: tuple[int, ...] | str) -> np.ndarray:
         """Return what the object predicts, finite numbers of a shape; where that is a text, the caller checks it.
@@ -157,7 +176,8 @@ class CallableActor(_UserActor):
     `predict` receives the observations of `libero_env.envs.batch.BatchEnv`, (B, ...) arrays by name, with upright
     images, and the instruction as text under "instruction". Finished episodes keep their rows; actions for them are
     ignored. It returns (B, 7) actions; the gripper opens at -1 and closes at +1. An optional
-    `reset(instruction, num_envs)` is called before each task's episodes.
+    `reset(instruction, num_envs)` is called before each task's episodes; if it has an argument `seeds`, with a seed for
+    each simulation, which follows from `--seed`, the task and the initial state.
 
     Attributes:
         instruction: Instruction that the object receives.

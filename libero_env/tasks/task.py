@@ -1,11 +1,14 @@
 """The dataclasses `Task` and `Suite`."""
 
+import hashlib
 from dataclasses import dataclass
 
 from libero_env.errors import InvalidInputError, require_known
+from libero_env.objects import folder
 from libero_env.storage import read_yaml
 from libero_env.tasks import bddl
 from libero_env.tasks.problem import Problem
+from libero_env.workspaces import find_workspace
 
 FILE = "file"  # suite of a task that was read from a file on its own
 MAX_NAME_BYTES = 200  # of a task or suite; names of files made of them are a little longer
@@ -82,6 +85,14 @@ class Task:
     def bddl_text(self) -> str:
         """Text of the task file in BDDL, generated from `problem`."""
         return bddl.write(self.problem)
+
+    @property
+    def digest(self) -> str:
+        """Digest, 16 hex digits, of its text and of the user's objects and workspaces in it."""
+        categories = sorted({*self.problem.fixtures.values(), *self.problem.objects.values()})
+        found = (folder.find(name) or find_workspace(name) for name in categories)
+        parts = [self.bddl_text, *(folder.digest(directory) for directory in found if directory)]
+        return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)

@@ -53,16 +53,15 @@ def compare(
     first_twice = _single_groups(control) if control else None
     pair = (first_twice[0], first_twice[1]) if first_twice else None
     comparison = compare_groups(groups, control=pair, allow=allow, alpha=alpha)
-    lines, data, status, page = [render(comparison, tasks=tasks)], comparison.to_plain(), 0, None
-    if gate is not None:
-        found = judge(comparison, gate)
+    lines, status, page = [render(comparison, tasks=tasks)], 0, None
+    found = None if gate is None else judge(comparison, gate)
+    if found:
         lines += ["", gate_text(found, comparison)]
-        data["gate"] = {**asdict(found), "verdict": found.verdict}
         status = {"regression": 1, "no regression": 0, "undecided": UNDECIDED}[found.verdict]
     if out:
-        lines += ["", str(write_comparison(comparison, out / "compare.json"))]
+        lines += ["", str(write_comparison(comparison, out / "compare.json", found))]
         page = write_page(comparison, out / "compare.html")
-    return Answer("\n".join(lines), data, page, status)
+    return Answer("\n".join(lines), comparison.to_plain(found), page, status)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,6 +97,13 @@ def power(options: PowerOptions) -> None:
 
     if options.discordance is not None and options.correlation is not None:
         raise ConfigError("--correlation stands for --discordance; give one of them")
+    if options.episodes and options.difference is not None:
+        raise ConfigError("--episodes asks which difference is shown; leave --difference out")
+    of_one = options.difference is not None or options.results or options.episodes
+    if not of_one and (options.discordance is not None or options.correlation is not None):
+        raise ConfigError(
+            "--discordance and --correlation are of one case; name it with --difference or --episodes"
+        )
     question = _question(options)
     if options.episodes:
         print(power_text.shown(question, options.episodes))
@@ -189,9 +195,11 @@ def export(
 def _question(options: PowerOptions) -> "Question":
     from lifelong.stats.power import Question, discordance_of
 
-    usual = _observed(options.results) if options.results else (0.9, 0.03, None)
+    usual = _observed(options.results) if options.results else (0.9, None, None)
     base = usual[0] if options.base is None else options.base
     gap = usual[1] if options.difference is None else options.difference
+    if gap is None or options.episodes:  # which is asked for
+        gap = -base / 1000
     discordance = usual[2] if options.discordance is None else options.discordance
     if gap > 0 and base + gap > 1:
         raise ConfigError(
@@ -202,7 +210,7 @@ def _question(options: PowerOptions) -> "Question":
     return Question(base, gap, discordance, options.power, options.alpha, options.tests)
 
 
-def _observed(words: Sequence[str]) -> tuple[float, float, float]:
+def _observed(words: Sequence[str]) -> tuple[float, float | None, float | None]:
     """Return the success of the first of two results, the second's minus it, and their discordance."""
     from libero_eval.judging.comparability import match
     from lifelong.stats.episodes import count

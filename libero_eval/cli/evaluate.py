@@ -3,13 +3,14 @@
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from libero_env.cli.options import Answer, FilePath
 from libero_env.storage import read_json
 from libero_eval.requests import EvalRequest, RobustnessRequest
+from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
     from libero_eval.evaluation_file import EvaluationResult, TaskResult
@@ -62,6 +63,8 @@ def evaluate(options: EvalOptions) -> Answer:
         "success": result.success,
         "suites": result.suites,
         "tasks": {task.task: task.success for task in result.tasks},
+        "episodes": {task.task: len(task.successes) for task in result.tasks},
+        "stopped": result.stopped and asdict(result.stopped),
         "result": file,
     }
     return Answer("", data, write_evaluation_page(result, evaluation.out))
@@ -91,7 +94,7 @@ class RobustnessOptions(RobustnessRequest):
 
     Attributes:
         beside: Other policies' folders, NAME=DIR, which are drawn beside it.
-        report: Only write the page of the first folder, NAME=DIR, with the others beside it.
+        report: Only write the page of the first folder, NAME=DIR, with the others beside it; of other options, --out.
     """
 
     beside: tuple[str, ...] = ()
@@ -100,14 +103,20 @@ class RobustnessOptions(RobustnessRequest):
 
 def robustness(options: RobustnessOptions) -> Answer:
     """Evaluate all conditions, print the table, and write the page."""
-    from libero_eval.robustness.study import study_robustness
+    from libero_eval.robustness.study import conditions_of, read_study, study_robustness
 
     if options.report:
+        given = [f.name for f in fields(options) if getattr(options, f.name) != f.default]
+        if useless := [name for name in given if name not in ("report", "out")]:
+            names = ", ".join(n if n == "policy" else f"--{n.replace('_', '-')}" for n in useless)
+            raise ConfigError(f"--report only writes the page of what is there; leave out {names}")
         folder = options.out or Path(options.report[0].rpartition("=")[2])
         return _finish([_read(word) for word in options.report], folder)
     beside = [_read(word) for word in options.beside]  # before hours of work
+    _check_labels([options.name or options.policy_name, *(policy.label for policy in beside)])
     name, folder = study_robustness(options, _print_condition)
-    return _finish([_read(f"{options.name or name}={folder}"), *beside], folder)
+    own = read_study(folder, options.name or name, conditions_of(options))
+    return _finish([own, *beside], folder)
 
 
 def _print_condition(condition: str, result: "EvaluationResult", done: int, count: int) -> None:
@@ -127,9 +136,18 @@ def _read(word: str) -> "Robustness":
     return read_study(Path(folder), name)
 
 
+def _check_labels(labels: "Sequence[str]") -> None:
+    if twice := [label for label in labels if labels.count(label) > 1]:
+        raise ConfigError(f"two policies are named {twice[0]}; give each a name of its own, NAME=DIR")
+
+
 def _finish(policies: "Sequence[Robustness]", folder: Path) -> Answer:
     """Return the table of the first policy, and write the page."""
     from libero_eval.robustness.page import render, write_robustness
+    from libero_eval.robustness.results import differences
 
+    _check_labels([policy.label for policy in policies])
+    for line in differences(policies):
+        print(f"note: {line}", file=sys.stderr)
     page = write_robustness(policies, folder)
     return Answer(f"\n{render(policies[0])}\n", read_json(page.with_suffix(".json")), page)

@@ -50,7 +50,9 @@ class Matched:
 
 
 def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list[str]:
-    """Compare protocols, tasks and environments of all results with those of the first.
+    """Compare protocols, tasks and environments of all results.
+
+    Each is compared with the first; a task that this has not, with the first result that has it.
 
     Args:
         groups: Policies to be compared.
@@ -58,7 +60,8 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
             `environment.robot`, `tasks`.
 
     Returns:
-        Remarks on what differs and was allowed, or does not matter much.
+        Remarks on what differs and was allowed, or does not matter much, on episodes that ended with errors, and on
+        results that were stopped.
 
     Raises:
         ComparisonError: A setting differs; the message names both values. Backends are never mixed.
@@ -66,17 +69,18 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
     rows = [(s.label, r) for s in groups for r in s.results]
     base_label, base = rows[0]
     check_same_back_end({label: result.backend for label, result in rows})
-    expected, refused, notes = settings(base), {}, {}
+    expected, refused, notes = {key: (base_label, value) for key, value in settings(base).items()}, {}, {}
     for label, result in rows[1:]:
         others = settings(result)
         for key in sorted(expected.keys() | others.keys()):
             if key.startswith("tasks.") and not (key in expected and key in others):
                 continue  # a task of one of them only: its episodes have no partner
-            values = expected.get(key, UNKNOWN), others.get(key, UNKNOWN)
+            first_label, value = expected.get(key, (base_label, UNKNOWN))
+            values = value, others.get(key, UNKNOWN)
             if values[0] == values[1]:
                 continue
             one, other = (shorten(str(value), 60) for value in values)
-            text = f"{key}: {one} in {base_label}, {other} in {label}"
+            text = f"{key}: {one} in {first_label}, {other} in {label}"
             if UNKNOWN in values and key.startswith("environment."):
                 notes[key] = f"{text}; taken to be the same"
             elif any(key == a or key.startswith(a + ".") for a in allow):
@@ -85,6 +89,8 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
                 refused[key] = text
         for key, pair in _lesser_differences(base, result).items():
             notes[key] = f"{key}: {pair[0]} in {base_label}, {pair[1]} in {label}"
+        tasks = {key: (label, value) for key, value in others.items() if key.startswith("tasks.")}
+        expected = tasks | expected
     if refused:
         names = " ".join(f"--allow {key}" for key in refused)
         lines = "\n  ".join(refused.values())
@@ -92,13 +98,22 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
             f"these results cannot be compared, as they were made differently:\n  {lines}\n"
             f"evaluate again with the same settings, or compare nevertheless with {names}"
         )
-    return list(notes.values())
+    remarks = [f"{label}, {t.task}: {t.error_note}" for label, r in rows for t in r.tasks if t.error_note]
+    remarks += [
+        f"{label}: {result.stop_note}; of all tests only the sequential one allows for that"
+        for label, result in rows
+        if result.stopped
+    ]
+    return [*notes.values(), *remarks]
 
 
 def settings(result: EvaluationResult) -> dict[str, Any]:
     """Return everything that must be equal, flat, by dotted name: protocol, environment, instructions of the tasks."""
     world = {k: v for k, v in result.environment.items() if k.partition("_")[0] in WORLD and v is not None}
-    tasks = {r.task: {"name": r.name, "instruction": r.instruction} for r in result.tasks}
+    tasks = {
+        r.task: {"name": r.name, "instruction": r.instruction} | ({"digest": r.digest} if r.digest else {})
+        for r in result.tasks
+    }
     protocol = {k: v for k, v in result.protocol.items() if k != "digest"}  # it follows from the others
     return flatten(plain({"protocol": protocol, "environment": world, "tasks": tasks}))
 

@@ -154,9 +154,11 @@ class Comparison:
     alpha: float = ALPHA
     backend: str = MUJOCO
 
-    def to_plain(self) -> dict[str, Any]:
-        """Return everything as plain data for JSON."""
+    def to_plain(self, gate: Gate | None = None) -> dict[str, Any]:
+        """Return everything as plain data for JSON, with what a gate says."""
         plain = json_safe({"format": FORMAT, **asdict(self)})
+        if gate:
+            plain["gate"] = {**json_safe(asdict(gate)), "verdict": gate.verdict}
         if self.groups:
             plain["groups"]["improvement"] = [
                 {"of": a, "over": b, **asdict(e)} for (a, b), e in self.groups.improvement.items()
@@ -190,19 +192,6 @@ def compare_groups(
     if twice := sorted({name for name in labels if labels.count(name) > 1}):
         raise ConfigError(f"two policies are called {', '.join(twice)}; write NAME=RESULT to name them")
     notes = check_comparable([*groups, *(control or ())], allow)
-    notes += [
-        f"{group.label}, {task.task}: {task.error_note}"
-        for group in groups
-        for result in group.results
-        for task in result.tasks
-        if task.error_note
-    ]
-    notes += [
-        f"{group.label}: {result.stop_note}; of what follows only the sequential test allows for that"
-        for group in groups
-        for result in group.results
-        if result.stopped
-    ]
     rivals: list[tuple[Group, Group]] = []
     controls = [control] if control else []
     for a, b in combinations(groups, 2):
@@ -234,14 +223,14 @@ def compare_groups(
     )
 
 
-def write_comparison(comparison: Comparison, path: Path) -> Path:
+def write_comparison(comparison: Comparison, path: Path, gate: Gate | None = None) -> Path:
     """Write everything as JSON, in one step; numbers that are not finite become null.
 
     Raises:
         ResultsError: The file cannot be written.
     """
     with writing(path, "the comparison"):
-        write_json(path, comparison.to_plain())
+        write_json(path, comparison.to_plain(gate))
     return path
 
 

@@ -41,7 +41,6 @@ class Simulation:
         models_digest: Digest that the models must have, as `libero assets info` prints it.
         drawing: How images are drawn, see `libero_env.sim.scene`.
         robot: Model of the arm, see `libero_env.assets.robot`.
-        task_files: Digest of the task files; null: those of the benchmark, whose digests each result has.
         init_states: `original`: the 50 states of each task that LIBERO publishes, where the user has them; `builtin`:
             those that this package made for its models.
         environments: Whether one environment is `reused` for a task's episodes, or `rebuilt` for each.
@@ -64,7 +63,6 @@ class Simulation:
     models_digest: str | None
     drawing: Literal["faithful", "fast"]
     robot: Literal["libero", "robosuite-1.4.1"] | None
-    task_files: str | None
     init_states: Literal["original", "builtin"]
     environments: Literal["reused", "rebuilt"] | None
     fixture_poses: Literal["drawn", "stored"]
@@ -432,6 +430,11 @@ class EvalProtocol:
         """
         if self.episode.success == "final":
             raise ProtocolError(f"protocol {self.name} cannot be run: episodes end at success, not `final`")
+        if self.action.ensembling not in (None, "none"):
+            raise ProtocolError(
+                f"protocol {self.name} cannot be run: answers are not combined, and action.ensembling is "
+                f"{self.action.ensembling}"
+            )
         needed = ["episode.settle_steps", "episode.horizon", "pixels.render_size", "pixels.orientation"]
         needed += ["pixels.resize", "proprioception.source", "action.gripper"]
         needed += ["episode.settle_action"] if self.episode.settle_steps else []

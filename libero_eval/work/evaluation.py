@@ -16,6 +16,8 @@ from typing import Any
 
 from libero_env.errors import LiberoError
 from libero_env.expert.expert import solved_from_events
+from libero_env.perturbations import parse_perturbations
+from libero_env.perturbations.events import NEVER
 from libero_env.tasks import Task
 from libero_env.text import json_safe
 from libero_eval.evaluation_file import EvaluationResult, Stopped, TaskResult
@@ -59,6 +61,7 @@ class Evaluation:
             not one of this package, or runs elsewhere. Whoever runs the evaluation sets it.
         lease: Time after which a unit of a silent process is given to another, [s].
         until: When it may stop before all episodes are run.
+        stopped: How the result was stopped that is run again; None where this is not one, or it was not.
     """
 
     identity: Mapping[str, Any]
@@ -79,6 +82,7 @@ class Evaluation:
     policy_threads: int | None = None
     lease: float = LEASE
     until: StoppingRule | None = None
+    stopped: Stopped | None = None
 
     @cached_property
     def units(self) -> tuple[Unit, ...]:
@@ -165,11 +169,23 @@ class Evaluation:
                 if not has_worked and len(errors) == len(unit.init_states) - 1 and all(errors):
                     raise
                 atoms = tuple(getattr(env, "atoms", ()))
-                none = (False,) * len(atoms)
-                parts.append(Rollouts((Episode(start, False, 0, none, none, none),), 0.0, atoms))
+                parts.append(Rollouts((self._failed(start, len(atoms)),), 0.0, atoms))
                 errors.append(describe(error))
         done = Rollouts(tuple(p.episodes[0] for p in parts), sum(p.seconds for p in parts), parts[0].atoms)
         return self._unit_result(unit, done, env, started, tuple(errors))
+
+    def _failed(self, start: int, atoms: int) -> Episode:
+        """Return an episode that ended with an error, with columns as wide as those of the others."""
+        perturbations = parse_perturbations(self.protocol.world.perturb, events=True)
+        never = (NEVER,) * sum(bool(one.trigger) for one in perturbations)
+        none = (False,) * atoms
+        return Episode(
+            *(start, False, 0, none, none, none),
+            attempts=(0,) * len(perturbations),
+            began=never,
+            solved=never,
+            timing=(0, 0, 0) if self.protocol.action.clock else (),
+        )
 
     def task_result(self, task: Task, done: Mapping[str, UnitResult]) -> TaskResult | None:
         """Return the results of a task from those of its units, or None while some are missing."""
@@ -218,7 +234,7 @@ class Evaluation:
                 f"simulation errors ended all episodes of {lost.task}, which has no success: "
                 f"{lost.simulation_errors[0][1]}"
             )
-        stopped = None
+        stopped = self.stopped
         if self.until is not None:
             planned = len(self.tasks) * len(self.init_states)
             stopped = Stopped(self.until.text, self.until.verdict(tasks, starts), planned)
@@ -269,6 +285,7 @@ class Evaluation:
             task=unit.task.id,
             name=unit.task.name,
             instruction=_instruction(env, unit),
+            digest=unit.task.digest,
             errors=kept if any(kept) else (),
             actions=tuple(e.actions for e in done.counted),
             attempts=attempts if any(attempts) else (),
@@ -294,6 +311,12 @@ class Evaluation:
             },
             "processes": len({r.process for r in results}),
         }
+
+    def is_filmed(self, unit: Unit) -> bool:
+        """Return whether the episodes of a unit that are to be filmed have been."""
+        starts, folder = {*unit.init_states} & {*self.init_states[: self.videos]}, self.out / "videos"
+        name = f"{unit.task.suite}_{unit.task.index:02d}_start_"
+        return all(any(folder.glob(f"{name}{start:02d}_*")) for start in starts)
 
     def _save_videos(self, unit: Unit, done: Rollouts) -> None:
         folder, seconds = self.out / "videos", self.record_every / self.protocol.world.control_freq

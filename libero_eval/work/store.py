@@ -296,7 +296,7 @@ class WorkStore:
                 )
 
     def _digest(self, unit: Unit) -> str:
-        parts = [self._plan, unit.task.bddl_text, unit.init_states]
+        parts = [self._plan, unit.task.digest, unit.init_states]
         return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
     def _read_unit(self, unit: Unit) -> UnitResult:

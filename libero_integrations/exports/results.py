@@ -88,13 +88,14 @@ def export_eval_results(result: EvaluationResult, folder: Path, dataset: str, so
         raise ConfigError(f"the data set of the benchmark is {dataset!r}; expected ORG/NAME, as on the Hub")
     if not re.fullmatch(r"(https?://\S+)?", source):
         raise ConfigError(f"the source is {source!r}; expected an address that begins with https://")
-    paths = []
+    paths, names = [], ("protocol", "models", "robot", "perturbed by", "clock")
     for suite, tasks in _by_suite(result).items():
         success, described = overall(tasks), dict(facts(result))
         about = [
             f"success in percent over {sum(len(task.successes) for task in tasks)} episodes of {len(tasks)} tasks",
             f"95 % interval {100 * success.low:.1f} to {100 * success.high:.1f}",
-            *(f"{name} {described[name]}" for name in ("protocol", "models", "robot") if name in described),
+            *(f"{name} {described[name]}" for name in names if name in described),
+            *([result.stop_note] if result.stopped else []),
         ]
         entry = {
             "dataset": {"id": dataset, "task_id": suite},

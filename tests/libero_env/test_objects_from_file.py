@@ -375,8 +375,17 @@ def test_the_command_adds_lists_shows_renders_and_removes(tmp_path, capsys):
     assert "4.0 x 5.0 x 6.0 cm" in said and "100 g" in said and "stands    yes" in said
     assert main(["objects", "add", path, "--name", "red_block"]) == 2
     assert "--replace" in capsys.readouterr().err
+    task = make_task(
+        scene="kitchen",
+        objects=["red_block", "plate"],
+        place={"red_block": (0, 0), "plate": (0, 0.2)},
+        goal="On red_block_1 plate_1",
+        language="lift it",
+    )
+    before = task.digest
     assert main(["objects", "add", path, "--name", "red_block", "--mass", "0.2", "--replace"]) == 0
     assert "200 g" in capsys.readouterr().out
+    assert task.digest != before, "results of the task with the old one are of another"
     assert main(["objects", "list"]) == 0 and capsys.readouterr().out.startswith("red_block ")
     assert main(["objects", "show", "red_block", "basket"]) == 0
     assert "contain_region" in capsys.readouterr().out

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from libero_env.cli.main import main
+from libero_eval.evaluation_file import Stopped
 from libero_eval.judging.board import make_board, write_board
-from libero_eval.judging.comparability import Group
+from libero_eval.judging.comparability import Group, check_comparable
 from libero_eval.judging.evaluation_page import write_evaluation_page
 from lifelong.errors import ComparisonError
 from lifelong.stats.intervals import wilson_interval
@@ -19,8 +20,9 @@ def entry(label: str, result) -> Group:
     return Group(label, (result,), (f"{label}/eval.json",))
 
 
-def won(label: str, successes, task: str = "libero_goal/0", **changes) -> Group:
-    return entry(label, result_of(task_result(task, successes), policy=f"{label}:make", **changes))
+def won(label: str, successes, task: str = "libero_goal/0", digest: str = "", **changes) -> Group:
+    row = task_result(task, successes, digest=digest)
+    return entry(label, result_of(row, policy=f"{label}:make", **changes))
 
 
 def first(count: int, of: int = 100) -> np.ndarray:
@@ -53,6 +55,30 @@ def test_results_of_one_policy_on_other_suites_are_a_row():
     assert row.episodes == 200 and row.paths == ("a/eval.json", "a2/eval.json")
     assert {name: e.value for name, e in row.suites.items()} == {"libero_goal": 0.5, "libero_object": 1.0}
     assert board.shared == 100 and row.success.value == pytest.approx(1.0), "the first 50 starts of each"
+
+
+def test_instructions_of_a_task_that_the_first_lacks_and_other_task_files_are_compared():
+    one = [task_result("libero_goal/0", first(50))]
+    ours, theirs = (
+        [*one, task_result("libero_goal/1", first(50), instruction=text)] for text in ("do it", "do that")
+    )
+    with pytest.raises(ComparisonError, match=r"tasks.libero_goal/1.instruction: do it in b, do that in c"):
+        check_comparable(
+            [entry(n, result_of(*tasks)) for n, tasks in zip("abc", (one, ours, theirs), strict=True)]
+        )
+    files = [won(label, first(50), "file/0", digest=label) for label in "ab"]
+    with pytest.raises(ComparisonError, match=r"tasks.file/0.digest: a in a, b in b"):
+        check_comparable(files)
+
+
+def test_the_board_says_what_was_stopped_and_what_ended_with_errors():
+    stopped = won("a", first(50), stopped=Stopped("width=0.2", "known", 100))
+    failed = entry("b", result_of(task_result("libero_goal/0", first(50), errors=("E: x", *[None] * 99))))
+    notes = make_board([stopped, failed], ["starts"]).notes
+    assert [n for n in notes if "a: stopped after 100 of 100" in n]
+    assert [n for n in notes if n.startswith("b, libero_goal/0: ")] or not failed.results[0].tasks[
+        0
+    ].error_note
 
 
 MODELS = [{"environment": ENVIRONMENT | {"models_digest": digest}} for digest in ("11", "22")]

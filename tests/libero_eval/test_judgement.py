@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from libero_env.cli.main import main  # noqa: E402
+from libero_eval.evaluation_file import Stopped  # noqa: E402
 from libero_eval.judging.comparability import Group, check_comparable, match, settings  # noqa: E402
 from libero_eval.judging.comparison import Comparison, compare_groups, gate, write_comparison  # noqa: E402
 from libero_eval.judging.group_scores import group_scores  # noqa: E402
@@ -315,6 +316,16 @@ def test_exports_to_model_cards_are_entries_as_the_hub_documents_them(tmp_path):
     }
     assert "over 3 episodes of 1 tasks, 95 % interval 20.8 to 93.9" in notes
     assert "protocol openpi, models builtin fa0e" in notes
+    changed = replace(
+        result,
+        protocol={"name": "libero", "world": {"perturb": "gain=0.5"}, "action": {"clock": "latency=100ms"}},
+        stopped=Stopped("width=0.9", "known", 20),
+    )
+    (entry, *_) = yaml.safe_load(export_eval_results(changed, tmp_path, "org/libero")[0].read_text())
+    assert (
+        "perturbed by gain=0.5, clock latency=100ms, stopped after 7 of 20; width=0.9: known"
+        in entry["notes"]
+    )
     bare = export_eval_results(replace(result, times={}), tmp_path, "org/libero")
     assert not {"date", "source"} & yaml.safe_load(bare[1].read_text())[0].keys()
 
@@ -337,6 +348,8 @@ def test_commands(tmp_path, monkeypatch, capsys):
     assert main(["power", "--difference", "0.03", "--correlation", "0.3", "--tests", "4"]) == 0
     assert "over 4 comparisons" in capsys.readouterr().out
     assert main(["power", "--episodes", "500"]) == 0 and "worse by" in capsys.readouterr().out
+    assert main(["power", "--base", "0.99"]) == main(["power", "--base", "0.99", "--episodes", "100"]) == 0
+    assert "--difference 0.03" not in capsys.readouterr().err
     assert main(["results", "export", "a", "--as", "lerobot", "--out", "x"]) == 0
     assert capsys.readouterr().out.strip() == "x/eval_info.json"
     assert main(["results", "export", "a", "--as", "eval-results", "--dataset", "org/libero"]) == 0
@@ -366,8 +379,9 @@ def test_a_gate_says_what_it_decided_and_why(
     assert main(["compare", "old", "new", "--gate", str(margin)]) == status
     line = capsys.readouterr().out.splitlines()[-1]
     assert line.startswith(f"{verdict}: new loses +{failures}.0 [") and "in 100 starts" in line
-    assert main(["compare", "old", "new", "--gate", str(margin), "--json"]) == status
+    assert main(["compare", "old", "new", "--gate", str(margin), "--json", "--out", "page"]) == status
     said = json.loads(capsys.readouterr().out)["gate"]
+    assert json.loads(Path("page/compare.json").read_text())["gate"] == said
     assert said["verdict"] == verdict and said["loss"]["value"] == pytest.approx(failures / 100)
     assert ("would decide" in line) == (verdict == "undecided" and failures != 5), (
         "with a loss that is the margin, more episodes do not help"
@@ -414,6 +428,9 @@ def test_a_gate_judges_a_policy_against_its_own_earlier_result():
     (["results", "export", "a", "--as", "eval-results", "--dataset", "a/b", "--source", "x"], "the source is 'x'"),
     (["results", "export", "a", "--as", "vla-eval", "--out", "/dev/full"], "_aggregate.json: the result"),
     (["power", "--difference", "0.05", "--discordance", "0.01"], "is impossible"),
+    (["power", "--difference", "0.05", "--episodes", "100"], "leave --difference out"),
+    (["power", "--discordance", "0.1"], "of one case; name it"),
+    (["power", "--correlation", "0.1"], "of one case; name it"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(words, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

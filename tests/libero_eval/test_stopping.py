@@ -99,7 +99,7 @@ def test_it_stops_when_it_is_decided_against_a_result(tmp_path):
         Group("a", (replace(result, evaluated={"policy": "a"}),)),
         Group("b", (EvaluationResult.read(tmp_path / "all"),)),
     ]
-    assert any("only the sequential test allows for that" in note for note in compare_groups(groups).notes)
+    assert any("only the sequential one allows for that" in note for note in compare_groups(groups).notes)
 
 
 @pytest.mark.parametrize(

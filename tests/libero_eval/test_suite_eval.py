@@ -16,8 +16,8 @@ from libero_env import memory
 from libero_env.cli import main as cli
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_task
-from libero_eval.evaluation_file import EvaluationResult, overall
-from libero_eval.plan import choose_init_states, plan_evaluation
+from libero_eval.evaluation_file import EvaluationResult, Stopped, overall
+from libero_eval.plan import choose_init_states, plan_evaluation, repeated
 from libero_eval.plan import evaluate as evaluate_request
 from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
@@ -33,6 +33,7 @@ from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolErr
 from lifelong.results.run_directory import CheckpointFolder
 from lifelong.stats.intervals import wilson_interval
 from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate, evaluation
+from tests.harness.results import result_of, task_result
 from tests.harness.runs import make_run
 
 MODULE = """
@@ -43,8 +44,11 @@ class Policy:
     observations = ("proprioception", "ee_quat")
     calls = []
 
-    def reset(self, instruction, num_envs):
+    seeds = []
+
+    def reset(self, instruction, num_envs, seeds):
         self.calls.append((instruction, num_envs))
+        self.seeds.append(seeds)
 
     def predict(self, observations):
         up = np.zeros((len(observations[{key!r}]), 7))
@@ -133,7 +137,7 @@ def test_what_an_evaluation_is_asked_for_is_part_of_it(learned, policy, change, 
     """A folder of one's own is refused to another evaluation; equal ones and larger ones go on in it."""
     names = {"run": str(learned), "expert": "expert"}
     suite = ("libero_object/0", "libero_object/1")
-    words = {"policy": names[policy], "suite": suite, "episodes": 2, "device": "cpu", "out": tmp_path}
+    words = {"policy": names[policy], "suite": suite, "episodes": 2, "out": tmp_path}
 
     def join(**more):
         more = {key: names.get(value, value) if key == "policy" else value for key, value in more.items()}
@@ -145,6 +149,79 @@ def test_what_an_evaluation_is_asked_for_is_part_of_it(learned, policy, change, 
         join(**change)
     join(workers=2, retries=3, threads=1)
     join(episodes=4, suite=(*suite, "libero_object/2"))
+
+
+OPTIONS = {
+    "names": "original", "size": 64, "timeout": 3.0, "in_flight": 2, "device": "cuda:9", "after": 0, "allow": ("foo",),
+    "perturb_seed": 3, "seed": 4
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("policy", "options"), [
+    ("expert", ("names", "size", "timeout", "in_flight", "device", "after", "allow", "perturb_seed")),
+    ("run", ("names", "size", "timeout", "in_flight", "perturb_seed")),
+    ("os:getcwd", ("timeout", "in_flight", "device", "after", "allow", "perturb_seed")),
+])  # fmt: skip
+def test_an_option_that_a_policy_does_not_obey_is_refused_by_name(learned, policy, options):
+    words = {"policy": str(learned) if policy == "run" else policy, "suite": ("libero_goal/0",)}
+    for name in options:
+        with pytest.raises(ConfigError, match=f"--{name.replace('_', '-')} "):
+            plan_evaluation(EvalRequest(**words, **{name: OPTIONS[name]}))
+
+
+def test_what_moves_relative_to_its_pose_is_refused_absolute_actions(learned, tmp_path):
+    (tmp_path / "own.yaml").write_text("extends: libero\nworld: {delta: false}\n")
+    for policy in ("expert", str(learned)):
+        with pytest.raises(ConfigError, match="own has absolute actions"):
+            plan_evaluation(
+                EvalRequest(policy=policy, suite=("libero_goal/0",), protocol=str(tmp_path / "own.yaml"))
+            )
+
+
+@pytest.mark.parametrize("changes", [
+    {"episodes": 3}, {"horizon": 50}, {"seed": 7}, {"perturb": "camera=0.5"}, {"starts": "selection"},
+    {"protocol": "openpi"}, {"until": "width=0.5"}, {"name": "mine"}, {"unit_starts": 3}, {"suite": ("libero_10",)},
+])  # fmt: skip
+def test_a_result_is_run_again_as_it_was_and_in_no_other_way(changes, tmp_path):
+    file = result_of(task_result("libero_goal/0", [True]), policy="expert").write(tmp_path / "eval.json")
+    request = EvalRequest(policy=str(file), **changes)
+    with pytest.raises(ConfigError, match=f"--{next(iter(changes)).replace('_', '-')}.*is run again"):
+        repeated(request, EvaluationResult.read(file))
+
+
+def test_task_files_are_evaluated_one_by_one_and_named_again(tmp_path):
+    files = [tmp_path / f"{name}.bddl" for name in ("one", "two")]
+    for file in files:
+        file.write_text(TASKS[0].bddl_text)
+    with pytest.raises(ConfigError, match="one and two: task files are evaluated one by one"):
+        plan_evaluation(EvalRequest(policy="expert", suite=tuple(map(str, files)), out=tmp_path))
+    plan = plan_evaluation(EvalRequest(policy="expert", suite=(str(files[0]),), out=tmp_path))
+    task = task_result("file/0", [True], name="one", digest=plan.tasks[0].digest)
+    values = {
+        "evaluated": dict(plan.identity),
+        "protocol": plan.protocol.resolved(),
+        "versions": dict(plan.versions),
+    }
+    path = str(result_of(task, **values).write(tmp_path / "eval.json"))
+    with pytest.raises(ConfigError, match="of a task file, one; name the file with --suite"):
+        plan_evaluation(EvalRequest(policy=path))
+    again = plan_evaluation(EvalRequest(policy=path, suite=(str(files[0]),)))
+    assert again.tasks[0].digest == task.digest
+    files[0].write_text(TASKS[1].bddl_text)
+    with pytest.raises(ConfigError, match="task file/0: "):
+        plan_evaluation(EvalRequest(policy=path, suite=(str(files[0]),)))
+
+
+def test_a_result_that_was_stopped_stays_one_when_it_is_run_again(tmp_path):
+    stopped = Stopped("width=0.5", "known", 100)
+    assert evaluate(tmp_path, stopped=stopped).stopped == stopped == EvaluationResult.read(tmp_path).stopped
+
+
+def test_episodes_that_were_not_filmed_are_told(tmp_path, capsys):
+    request = EvalRequest(policy="expert")
+    evaluate_request(request, evaluation(tmp_path))
+    evaluate_request(request, evaluation(tmp_path, videos=1))
+    assert "to be filmed are done, and are not filmed; --again" in capsys.readouterr().err
 
 
 def test_other_weights_in_the_same_run_are_another_policy(learned, tmp_path):
@@ -302,6 +379,8 @@ def test_a_result_is_run_again_from_its_file(module, tmp_path, capsys):
     assert cli.main(["eval", "found/eval.json", "--threads", "1", "--allow", module]) == 0
     first, again = EvaluationResult.read("found"), EvaluationResult.read("found/again")
     assert (first.outcomes, first.actions) == (again.outcomes, again.actions)
+    seeds = sys.modules[module].Policy.seeds
+    assert len(set(seeds[0])) == 2 and seeds[0] == seeds[1]
     assert (first.evaluated, first.protocol, first.init_states) == (
         again.evaluated,
         again.protocol,
@@ -459,6 +538,13 @@ def test_at_sigterm_a_unit_is_given_back_and_the_same_command_goes_on(module, tm
     assert not list((tmp_path / "found" / "claims").iterdir())
     assert len(list((tmp_path / "found" / "units").iterdir())) == 1
     assert cli.main(command) == 0 and len(asked) == 5
+
+
+def test_a_seed_is_refused_where_nothing_takes_it(module, tmp_path):
+    file = tmp_path / f"{module}.py"
+    file.write_text(file.read_text().replace(", seeds)", ")").replace("self.seeds.append(seeds)", ""))
+    with pytest.raises(ConfigError, match="--seed 7: .* an argument `seeds`"):
+        UserPolicy(EvalRequest(policy=f"{module}:make", seed=7))
 
 
 def test_the_source_of_a_policy_is_part_of_its_identity(module, tmp_path):

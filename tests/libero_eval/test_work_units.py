@@ -30,7 +30,7 @@ from libero_eval.work.store import Unit, partition
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError, EvaluationIncompleteError, LifelongError, ResultsError
 from tests.harness.drawing import draw
-from tests.harness.evaluations import TASKS, Countdown, Still, evaluate, evaluation
+from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate, evaluation
 
 STARTS = (3, 4, 9, 20)
 TWO = {"unit_starts": 2}  # four units
@@ -309,6 +309,11 @@ def test_errors_are_failures_only_where_the_protocol_says_so(tmp_path):
             obs, info = super().reset(seed=seed, options=options)
             return {"x": np.where(self.goal == 9, -1.0, 0.0)[:, None]}, info
 
+        def _info(self):
+            attempts = {"attempts": np.ones((self.num_envs, 1), int)} if perturbed else {}
+            return super()._info() | attempts
+
+    perturbed = False
     changes = {"env": lambda task, count: Falling(count), "unit_starts": 4}
     with pytest.raises(RuntimeError, match="lost the cup"):
         evaluate(tmp_path / "strict", Stumbling(), **changes)
@@ -320,6 +325,10 @@ def test_errors_are_failures_only_where_the_protocol_says_so(tmp_path):
         tmp_path / "alone", Stumbling(), errors_are_failures=True, **changes | {"unit_starts": 1}
     )
     assert alone.outcomes == result.outcomes
+    perturbed = True
+    changes |= {"protocol": QUICK.changed({"world.perturb": "gain=0.5"})}
+    failed = evaluate(tmp_path / "p", Stumbling(), errors_are_failures=True, **changes | {"unit_starts": 1})
+    assert failed.tasks[0].attempts == ((1,), (1,), (0,), (1,))
     with pytest.raises(RuntimeError, match="socket"):  # no episode has ever run: that is no failed one
         evaluate(tmp_path / "down", Raising(0, 1), errors_are_failures=True)
 
