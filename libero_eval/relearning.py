@@ -15,7 +15,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -36,6 +35,7 @@ from lifelong.results.records import RelearnRecord, back_limit
 from lifelong.results.relearning import FILE_NAME
 from lifelong.seeding import RELEARN
 from lifelong.sequence.learning import meet
+from lifelong.sequence.measuring import digest
 from lifelong.settings import Configuration
 from lifelong.streams import StageData, StreamSettings
 from lifelong.training.fit import EpochEnd, fit
@@ -92,7 +92,7 @@ def failure_share(policy: Policy, run: LoadedRun, task: int, env: VectorEnv, epi
     return 1 - done.rate
 
 
-def relearn(request: RelearnRequest, initial: Policy) -> Path:
+def relearn(request: RelearnRequest, initial: Policy) -> list[RelearnRecord]:
     """Measure the steps until tasks of a finished run are back, and record them in its directory.
 
     What is recorded already under the same settings is not measured again, so a killed call goes on where it was. The
@@ -103,7 +103,7 @@ def relearn(request: RelearnRequest, initial: Policy) -> Path:
         initial: Policy with the weights that the run began with; it is not changed.
 
     Returns:
-        The file with the records.
+        The records under these settings, also those of tasks that were measured before.
 
     Raises:
         LifelongError: The run is not finished, a position is not one of its tasks, or demonstrations are missing.
@@ -115,9 +115,15 @@ def relearn(request: RelearnRequest, initial: Policy) -> Path:
             f"{request.run} is not finished: {run.learned + 1} of {len(run.tasks)} tasks are learned"
         )
     config = read_config(run.path / "config.yaml", allow)
-    rate, log = config.build("train").lr, ResultLog(run.path / FILE_NAME)
+    rate, weights = config.build("train").lr, digest({}, initial)
+    log = ResultLog(run.path / FILE_NAME)
+
+    def recorded() -> list[RelearnRecord]:
+        return [r for r in log.read().of(RelearnRecord) if _repeats(r, request, rate, weights)]
+
     for task in _chosen(run, request.tasks):
-        starts = [start for start in STARTS if not _recorded(log, task, start, request, rate)]
+        known = {(r.task, r.start) for r in recorded()}
+        starts = [start for start in STARTS if (task, start) not in known]
         if not starts:
             continue
         before = restore(
@@ -134,8 +140,9 @@ def relearn(request: RelearnRequest, initial: Policy) -> Path:
             for start in starts:
                 acting = run.acting(run.tasks[task]) if start == "final" else None
                 with acting or nullcontext(_met(run, initial, task, config)) as policy:
-                    log.append(_relearned(run, policy, start, trial, learned, request, config))
-    return log.path
+                    record = _relearned(run, policy, start, trial, learned, request, config)
+                    log.append(replace(record, weights=weights if start == "initial" else ""))
+    return recorded()
 
 
 def _met(run: LoadedRun, initial: Policy, task: int, config: Configuration) -> Policy:
@@ -259,14 +266,14 @@ def _chosen(run: LoadedRun, tasks: Sequence[int]) -> list[int]:
     return sorted(set(tasks))
 
 
-def _recorded(log: ResultLog, task: int, start: str, request: RelearnRequest, rate: float) -> bool:
-    """Return whether a measurement is recorded that these settings would repeat."""
-    wanted = task, start, request.tolerance, request.demos_held_out, request.episodes, rate
-    return any(
-        (r.task, r.start, r.tolerance, r.held_out, r.episodes, r.rate) == wanted
+def _repeats(r: RelearnRecord, request: RelearnRequest, rate: float, weights: str) -> bool:
+    """Return whether a request would repeat a measurement."""
+    wanted = request.tolerance, request.demos_held_out, request.episodes, rate
+    return (
+        (r.tolerance, r.held_out, r.episodes, r.rate) == wanted
+        and (r.start == "final" or r.weights == weights)
         and r.steps == tuple(range(0, r.steps[-1] + 1, request.every))
         and (r.needed is not None or r.steps[-1] >= request.steps)
-        for r in log.read().of(RelearnRecord)
     )
 
 

@@ -35,6 +35,7 @@ EVENTS = (
     *("object@step20", "receptacle@lifted", "distractor@step20"),
 )
 EVENT_SEVERITIES = (0.3, 0.6, 1.0)
+HELD_OUT = 5  # demonstrations that relearning is measured on
 CLOCK = "clock="  # beginning of a condition that is no perturbation
 PAIRS = ("camera=0.4,light=0.4", "camera=0.4,robot=0.4", "light=0.4,noise=0.4")
 
@@ -162,29 +163,17 @@ class RobustnessRequest(Request):
     Attributes:
         episodes: Number of the starts, from the first on.
         kinds: Kinds of perturbations, see `libero perturb list`; those that begin later with their trigger:
-            camera@lifted; clock, whose severity is the latency in seconds.
-        events: By default events during the episodes instead: six, at severities 0.3, 0.6 and 1, without pairs.
-        severities: Severities above 0, at most 1.
-        pairs: Two perturbations at once, of kinds and severities that are also run alone.
+            camera@lifted; clock, whose severity is the latency in seconds (default: twelve kinds).
+        severities: Severities above 0, at most 1 (default: 0.2 0.4 0.6 0.8 1).
+        pairs: Two perturbations at once, of kinds and severities that are also run alone (default: three pairs).
+        events: Other defaults: six events during the episodes, at severities 0.3 0.6 1, without pairs.
     """
 
     episodes: Positive | None = 10
-    kinds: tuple[str, ...] = KINDS
-    severities: tuple[Annotated[float, Field(ge=0, le=1)], ...] = SEVERITIES
-    pairs: tuple[str, ...] = PAIRS
+    kinds: tuple[str, ...] | None = None
+    severities: tuple[Annotated[float, Field(ge=0, le=1)], ...] | None = None
+    pairs: tuple[str, ...] | None = None
     events: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.events:  # other defaults
-            defaults = {
-                "kinds": (KINDS, EVENTS),
-                "severities": (SEVERITIES, EVENT_SEVERITIES),
-                "pairs": (PAIRS, ()),
-            }
-            for name, (default, of_events) in defaults.items():
-                if getattr(self, name) == default:
-                    object.__setattr__(self, name, of_events)
 
     def condition(self, text: str, out: Path) -> EvalRequest:
         """Return the evaluation under some perturbations, or a latency, in a folder of its own."""
@@ -217,7 +206,7 @@ class RelearnRequest(_Checked):
         every: Steps between measurements.
         tolerance: Share by which the error may exceed that just after learning, or the difference by which success may
             fall short of it.
-        held_out: Demonstrations to measure the error on, after those that were learned from.
+        held_out: Demonstrations to measure the error on, after those that were learned from (default: 5).
         episodes: Rollouts to measure success by, instead of the error; 0: the error.
         initial: The pretrained weights that the run began with: a finished run, or one of its checkpoints.
         device: auto, cpu, cuda, cuda:1.
@@ -233,16 +222,23 @@ class RelearnRequest(_Checked):
     steps: Positive = 400
     every: Positive = 20
     tolerance: Annotated[float, Field(ge=0, le=10)] = 0.05
-    held_out: Annotated[int, Field(ge=1, le=1000)] = 5
+    held_out: Annotated[int, Field(ge=1, le=1000)] | None = None
     episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
     initial: FilePath | None = None
     device: Device = "auto"
     allow: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.episodes and self.held_out:
+            raise ConfigError(
+                "--held-out is of the error, and --episodes measures success instead; leave one of them out"
+            )
+
     @property
     def demos_held_out(self) -> int:
         """Number of demonstrations to measure on; none where rollouts are measured."""
-        return 0 if self.episodes else self.held_out
+        return 0 if self.episodes else self.held_out or HELD_OUT
 
 
 @dataclass(frozen=True, kw_only=True)

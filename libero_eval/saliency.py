@@ -12,6 +12,7 @@ episode of a run.
 """
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -231,8 +232,8 @@ def draw_saliency(request: SaliencyRequest) -> Path:
         request: Run, task and moments; these are evenly distributed over the episode from its first step on.
 
     Returns:
-        The contact sheet, `saliency/task_<k>_after_<l>.png` in the run's directory, with its caption in a text file
-        beside it.
+        The contact sheet, `saliency/task_<k>_after_<l>_start_<s>.png` in the run's directory, with its caption in a
+        text file beside it.
 
     Raises:
         ConfigError: The task does not exist, or the folder is a link that leads out of the run.
@@ -245,6 +246,8 @@ def draw_saliency(request: SaliencyRequest) -> Path:
     require_own_folders(run.path, "saliency", error=ConfigError)
     frames, success = _run_episode(run, task, request.start, request.horizon)
     steps = sorted({round(i) for i in np.linspace(0, len(frames) - 1, request.moments)})
+    if len(steps) < request.moments:
+        print(f"note: {len(steps)} moments, as the rollout has no more steps", file=sys.stderr)
     language = run.embed(run.learned_task(task)).to(run.device)
     with run.acting(run.tasks[task]) as policy:
         windows = [window_at(frames, step, policy.spec.seq_len) for step in steps]
@@ -254,12 +257,13 @@ def draw_saliency(request: SaliencyRequest) -> Path:
     enlarge = -(-SHEET_HEIGHT // pictures[0].shape[1])
     folder = run.path / "saliency"
     folder.mkdir(exist_ok=True)
-    path = folder / f"task_{task:02d}_after_{run.learned:02d}.png"
+    path = folder / f"task_{task:02d}_after_{run.learned:02d}_start_{request.start:02d}.png"
     with atomic_path(path) as part:
         Image.fromarray(contact_sheet(pictures, heats, enlarge)).save(part, "PNG")
     outcome = "success" if success else "failure"
     caption = f"{run.learned_task(task).language}: {outcome}, after learning {run.learned + 1} tasks"
-    atomic_write_text(path.with_suffix(".txt"), f"{caption}; steps {', '.join(map(str, steps))}\n")
+    caption += f"; start {request.start}, steps {', '.join(map(str, steps))}"
+    atomic_write_text(path.with_suffix(".txt"), f"{caption}\n")
     return path
 
 

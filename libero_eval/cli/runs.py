@@ -57,10 +57,9 @@ def relearn(request: RelearnRequest) -> Answer:
     from libero_eval.relearning import relearn as measure
     from lifelong.pretraining import initial_policy
     from lifelong.report.page import write_report
-    from lifelong.results.relearning import by_measure, read_relearning, savings, savings_tables
+    from lifelong.results.relearning import by_measure, savings, savings_tables
 
-    measure(request, initial_policy(request.run, weights=request.initial, allow=request.allow))
-    records = read_relearning(request.run)
+    records = measure(request, initial_policy(request.run, weights=request.initial, allow=request.allow))
     rows = [{**asdict(row), "share": row.share} for part in by_measure(records) for row in savings(part)]
     return Answer(savings_tables(records), rows, write_report([request.run]))
 

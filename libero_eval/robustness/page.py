@@ -15,7 +15,7 @@ from libero_env.perturbations import KINDS
 from libero_env.storage import write_json
 from libero_env.text import text_table
 from libero_eval.judging.page import interval_text, p_text
-from libero_eval.robustness.results import Axis, EventRow, Outcomes, Robustness, name_of
+from libero_eval.robustness.results import Axis, EventRow, Outcomes, Robustness, differences, name_of
 from lifelong.errors import writing
 from lifelong.report.figures import (
     INK,
@@ -124,6 +124,7 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
             ("control steps at most", _horizons_text(policies)),
         ],
         verdict=verdict(first),
+        differences=differences(policies),
         policies=policies,
         units=units,
         curves=as_svg(curves_figure(axes, units)),
@@ -168,9 +169,20 @@ def _lost_text(outcomes: Outcomes) -> str:
 
 
 def _horizons_text(policies: Sequence[Robustness]) -> str:
-    if len({policy.horizon for policy in policies}) == 1:
-        return str(policies[0].horizon)
-    return ", ".join(f"{policy.horizon} ({policy.label})" for policy in policies)
+    texts = [_horizon_text(policy) for policy in policies]
+    if len(set(texts)) == 1:
+        return texts[0]
+    return ", ".join(f"{text} ({policy.label})" for text, policy in zip(texts, policies, strict=True))
+
+
+def _horizon_text(policy: Robustness) -> str:
+    """Return the control steps of a policy's episodes, by suite where there are several."""
+    if not isinstance(policy.horizon, Mapping):
+        return str(policy.horizon)
+    suites = dict.fromkeys(task.partition("/")[0] for task in policy.outcomes.tasks)
+    values = policy.horizon.values()  # variants have those of their base task's suite
+    steps = {suite: policy.horizon.get(suite, f"{min(values)} to {max(values)}") for suite in suites}
+    return " / ".join(f"{count} {suite}" if len(steps) > 1 else str(count) for suite, count in steps.items())
 
 
 def _severities_text(e: Estimate) -> str:

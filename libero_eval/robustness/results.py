@@ -7,13 +7,17 @@ have Wilson's intervals instead, and to other variances that of one start is add
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from libero_env.text import flatten, plain, shorten
 from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.judging.comparability import settings
+from libero_eval.protocols.clock import Clock, Latency
 from lifelong.errors import ResultsError
 from lifelong.stats.episodes import Counts, mcnemar_exact, score_interval
 from lifelong.stats.intervals import UNKNOWN, Estimate, Floats, combine_intervals, holm, wilson_interval
@@ -21,6 +25,7 @@ from lifelong.stats.intervals import UNKNOWN, Estimate, Floats, combine_interval
 DRAWS, SEED, CONFIDENCE = 2000, 2023, 0.95
 ONE_EPISODE = 0.96  # z²/4 at 95 %: the variance that Wilson's interval adds, in units of one episode
 PLAIN = "without perturbations"
+LATENCY = "clock"  # the kind that is no perturbation, but a setting of the protocol
 Condition = tuple[tuple[str, float], ...]  # (kind, severity) of each perturbation, by kind; () is the base
 
 
@@ -91,7 +96,8 @@ class Outcomes:
             results: Result of each condition, the base, (), among them.
 
         Raises:
-            ResultsError: There is no base, or a condition was not run in the same episodes.
+            ResultsError: There is no base, or a condition was not run in the same episodes, with the same policy and
+                under the same settings.
         """
         if () not in results:
             raise ResultsError("there is no result without perturbations, with which the others are compared")
@@ -109,6 +115,11 @@ class Outcomes:
             if episodes != {(task, tuple(sorted(base.init_states))) for task in tasks}:
                 raise ResultsError(
                     f"{name_of(condition)} was not run in the same tasks and starts as the base: they cannot be paired"
+                )
+            if odd := _odd_settings(base, results[condition], condition):
+                raise ResultsError(
+                    f"{name_of(condition)} was run under other settings than the base ({'; '.join(odd)}): run all "
+                    "conditions again with --again, or these with an --out of their own"
                 )
         won = [
             {
@@ -246,7 +257,8 @@ class Robustness:
         paths: Folders of the results.
         redrawn: Number of draws that were given up, by condition.
         events: By condition with an event, whether it began in each episode, and whether the expert solves the rest.
-        horizon: Control steps after which an episode ends.
+        horizon: Control steps after which an episode ends, or these by suite.
+        settings: Everything else that policies beside each other should have in common, flat, by dotted name.
     """
 
     label: str
@@ -254,7 +266,8 @@ class Robustness:
     paths: tuple[str, ...] = ()
     redrawn: Mapping[str, int] = field(default_factory=dict)
     events: Mapping[Condition, Mapping[tuple[str, int], tuple[bool, bool]]] = field(default_factory=dict)
-    horizon: int = 0
+    horizon: int | Mapping[str, int] = 0
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
     def event_rows(self) -> tuple[EventRow, ...]:
@@ -301,6 +314,46 @@ class Robustness:
     def at(axis: Axis, severity: float) -> Estimate | None:
         """Return the success of a kind at a severity; None if it was not measured."""
         return dict(zip(axis.severities, axis.success, strict=True)).get(severity)
+
+
+def differences(policies: Sequence[Robustness]) -> list[str]:
+    """Return a line for each difference of the tasks, starts and settings of policies from those of the first."""
+    first, *others = policies
+    lines = []
+    for other in others:
+        a, b = (_compared(policy) for policy in (first, other))
+        for key in sorted(a.keys() | b.keys()):
+            if key.startswith("tasks.") and not (key in a and key in b):
+                continue  # "tasks" says it
+            one, two = (str(values.get(key, "none")) for values in (a, b))
+            if one != two:
+                lines.append(
+                    f"{key}: {shorten(one, 60)} in {first.label}, {shorten(two, 60)} in {other.label}"
+                )
+    return lines
+
+
+def _compared(policy: Robustness) -> dict[str, Any]:
+    outcomes = policy.outcomes
+    return {
+        **policy.settings,
+        "tasks": ", ".join(sorted(outcomes.tasks)),
+        "starts": ", ".join(map(str, sorted(outcomes.starts))),
+    }
+
+
+def _odd_settings(base: EvaluationResult, result: EvaluationResult, condition: Condition) -> list[str]:
+    """Return where a condition's policy and settings are not the base's, apart from what the condition changes."""
+    a, b = (settings(one) | flatten(plain({"evaluated": one.evaluated})) for one in (base, result))
+    changed, clock = ("tasks.", "protocol.sources.", "protocol.world.perturb"), "protocol.action.clock"
+    if LATENCY in dict(condition):
+        for values in (a, b):
+            values[clock] = str(replace(Clock.read(values.get(clock, "")), latency=Latency()))
+    return [
+        f"{key}: {shorten(str(b.get(key)), 60)} instead of {shorten(str(a.get(key)), 60)}"
+        for key in sorted(a.keys() | b.keys())
+        if a.get(key) != b.get(key) and not key.startswith(changed)
+    ]
 
 
 def name_of(condition: Condition) -> str:

@@ -10,10 +10,19 @@ from pathlib import Path
 from libero_env.perturbations import format_perturbations, parse_perturbations
 from libero_env.storage import require_own_folders
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
+from libero_eval.judging.comparability import settings
 from libero_eval.plan import further_process, load_policy, plan_evaluation, policy_threads
 from libero_eval.policies import PolicyUnderTest
-from libero_eval.requests import CLOCK, PAIRS, RobustnessRequest
-from libero_eval.robustness.results import Outcomes, Robustness, events_of, name_of
+from libero_eval.requests import (
+    CLOCK,
+    EVENT_SEVERITIES,
+    EVENTS,
+    KINDS,
+    PAIRS,
+    SEVERITIES,
+    RobustnessRequest,
+)
+from libero_eval.robustness.results import LATENCY, Condition, Outcomes, Robustness, events_of, name_of
 from libero_eval.work.evaluation import Evaluation
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError
@@ -42,6 +51,12 @@ def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_:
     )
     request = replace(request, out=out)
     evaluations = _plan(request, policy, conditions)
+    clock = evaluations[""].protocol.action.clock
+    if clock and request.clock is None and any(one.startswith(CLOCK) for one in conditions):
+        raise ConfigError(
+            f"--kinds clock: protocol {request.protocol} has the clock {clock}; say with --clock what of it holds for "
+            "all latencies, such as wait=hold"
+        )
     if request.again:
         for evaluation in evaluations.values():
             evaluation.store.clear()
@@ -103,55 +118,96 @@ def conditions_of(request: RobustnessRequest) -> list[str]:
     """Return the texts of all conditions, the one without perturbations first.
 
     Raises:
-        LiberoError: A kind does not exist, or a text is not valid.
+        LiberoError: A kind does not exist, a text is not valid, two differ in their seeds alone, or there are none.
     """
     seed = request.perturb_seed
+    defaults = (EVENTS, EVENT_SEVERITIES, ()) if request.events else (KINDS, SEVERITIES, PAIRS)
+    kinds = defaults[0] if request.kinds is None else request.kinds
+    severities = defaults[1] if request.severities is None else request.severities
+    pairs = defaults[2] if request.pairs is None else request.pairs
     conditions = []
-    for kind, at, trigger in (kind.partition("@") for kind in request.kinds):
-        for severity in sorted(request.severities):
+    for kind, at, trigger in (kind.partition("@") for kind in kinds):
+        for severity in sorted(severities):
             text = f"{kind}={severity:g}{at}{trigger}"
             if text.startswith(CLOCK) and not at:
                 conditions.append(text if severity else "")
             else:
                 conditions.append(format_perturbations(parse_perturbations(text, seed, events=True)))
-    for text in request.pairs:
+    for text in pairs:
         pair = parse_perturbations(text, seed, events=True)
         if len(pair) != 2:
             raise ConfigError(f"--pairs {text}: expected two perturbations, such as camera=0.4,light=0.4")
-        if all(one.name in request.kinds and one.severity in request.severities for one in pair):
+        if all(one.name in kinds and one.severity in severities for one in pair):
             conditions.append(format_perturbations(pair))
-        elif request.pairs != PAIRS:  # those that were named
+        elif request.pairs is not None:
             raise ConfigError(
                 f"--pairs {text}: each must also be run alone; name its kind in --kinds and its severity in "
                 "--severities"
             )
-    return list(dict.fromkeys(("", *conditions)))
+    found: dict[Condition, str] = {}
+    for text in ("", *conditions):
+        known = found.setdefault(_condition(text), text)
+        if known != text:
+            raise ConfigError(
+                f"--kinds and --pairs name {known} and {text}, which differ in their seeds alone; run one of them with "
+                "an --out of its own"
+            )
+    if len(found) == 1:
+        raise ConfigError("--kinds and --severities name no condition; name a kind, and a severity above 0")
+    return list(found.values())
 
 
-def read_study(folder: Path, name: str = "") -> Robustness:
+def _condition(text: str) -> Condition:
+    """Return the condition of a text of `conditions_of`, without the seeds."""
+    if text.startswith(CLOCK):
+        return ((LATENCY, float(text.removeprefix(CLOCK))),)
+    return tuple((one.name, one.severity) for one in parse_perturbations(text, events=True))
+
+
+def read_study(folder: Path, name: str = "", conditions: Sequence[str] | None = None) -> Robustness:
     """Return the outcomes in a folder of this command.
 
+    Args:
+        folder: The folder.
+        name: Name of the policy (default: that of the folder).
+        conditions: Texts of the conditions to read, from `conditions_of` (default: all that are finished).
+
     Raises:
-        ConfigError: It holds no finished conditions.
+        ConfigError: It holds no finished conditions, or two that differ in their seeds alone.
+        ResultsError: A condition was run in other episodes, with another policy or under other settings than the base.
     """
     results, redrawn, events = {}, {}, {}
-    for path in sorted((folder / CONDITIONS).glob(f"*/{FILE_NAME}")):
-        result = EvaluationResult.read(path)
-        perturbations = parse_perturbations(result.protocol.get("world", {}).get("perturb", ""), events=True)
-        condition = tuple((one.name, one.severity) for one in perturbations)
-        if (text := path.parent.name).startswith(CLOCK):
-            condition = (("clock", float(text.removeprefix(CLOCK))),)
+    folders: dict[Condition, str] = {}
+    seeds = set[int]()
+    paths = sorted((folder / CONDITIONS).glob(f"*/{FILE_NAME}"))
+    if conditions is not None:
+        paths = [folder / CONDITIONS / (one or "none") / FILE_NAME for one in conditions]
+    for path in paths:
+        result, text = EvaluationResult.read(path), path.parent.name
+        perturb = result.protocol.get("world", {}).get("perturb", "")
+        perturbations = parse_perturbations(perturb, events=True)
+        condition = _condition(text if text.startswith(CLOCK) else perturb)
+        if (known := folders.setdefault(condition, text)) != text:
+            raise ConfigError(
+                f"{folder / CONDITIONS} holds {name_of(condition)} twice, {known} and {text}; move one of them to "
+                "another folder"
+            )
         results[condition] = result
+        seeds |= {one.seed for one in perturbations}
         if any(one.trigger for one in perturbations):
             events[condition] = events_of(result)
         else:
             redrawn[name_of(condition)] = sum(sum(row) for task in result.tasks for row in task.attempts)
-    if not results:
+    if not any(len(condition) == 1 for condition in results):  # one perturbation by itself
         raise ConfigError(
             f"{folder} holds no finished conditions; `libero robustness POLICY --out {folder}` makes them"
         )
-    outcomes, horizon = Outcomes.of(results), results[()].protocol["episode"]["horizon"]
-    return Robustness(name or folder.name, outcomes, (str(folder),), redrawn, events, horizon)
+    outcomes, base = Outcomes.of(results), results[()]
+    words = ("protocol.sources.", "protocol.title")
+    common = {k: v for k, v in settings(base).items() if not k.startswith(words)}
+    common["seeds of perturbations"] = ", ".join(map(str, sorted(seeds)))
+    horizon = base.protocol["episode"]["horizon"]
+    return Robustness(name or folder.name, outcomes, (str(folder),), redrawn, events, horizon, common)
 
 
 def _name(policy: PolicyUnderTest) -> str:

@@ -296,6 +296,7 @@ class RelearnRecord:
             was back, or where it was given up.
         errors: What was measured after these steps.
         episodes: Number of rollouts; 0 where the error was measured.
+        weights: Digest of the initial weights, where it began with them; otherwise empty.
     """
 
     kind: Literal["relearn"] = "relearn"
@@ -309,6 +310,7 @@ class RelearnRecord:
     errors: tuple[Number, ...]
     seconds: Number
     episodes: Count = 0
+    weights: str = ""
 
     def __post_init__(self) -> None:
         if not len(self.steps) == len(self.errors) > 0:

@@ -53,23 +53,35 @@ def read_relearning(run: Path) -> list[RelearnRecord]:
 
 
 def by_measure(records: Sequence[RelearnRecord]) -> list[list[RelearnRecord]]:
-    """Part records of errors from those of rollouts; without what there is none of."""
-    parts = [[r for r in records if bool(r.episodes) == rollouts] for rollouts in (False, True)]
-    return [part for part in parts if part]
+    """Part records by their settings and their initial weights, errors before rollouts; without what is not paired."""
+    parts = []
+    for setting in sorted({_setting(r) for r in records if r.start == "final"}):
+        same = [r for r in records if _setting(r) == setting]
+        for weights in sorted({r.weights for r in same if r.start == "initial"}) or [""]:
+            parts.append([r for r in same if r.start == "final" or r.weights == weights])
+    return parts
+
+
+def _setting(record: RelearnRecord) -> tuple[float, ...]:
+    return record.episodes, record.held_out, record.tolerance, record.rate
 
 
 def savings(records: Sequence[RelearnRecord]) -> list[Savings]:
-    """Pair the starts of each task, the latest of each under the same conditions.
+    """Pair the starts of each task, the latest of each.
 
     Args:
-        records: From `read_relearning`, in the order they were written.
+        records: One part of `by_measure`, in the order they were written.
     """
     found = []
     for task in sorted({r.task for r in records}):
         last = next((r for r in reversed(records) if (r.task, r.start) == (task, "final")), None)
         if last is None:
             continue
-        rivals = [r for r in records if (r.task, r.start) == (task, "initial") and _like(r, last)]
+        rivals = [
+            r
+            for r in records
+            if (r.task, r.start) == (task, "initial") and r.learned_error == last.learned_error
+        ]
         first = rivals[-1] if rivals else None
         tried = max(last.steps[-1], first.steps[-1] if first else 0)
         needed = first.needed if first else None
@@ -77,23 +89,25 @@ def savings(records: Sequence[RelearnRecord]) -> list[Savings]:
     return found
 
 
-def _like(a: RelearnRecord, b: RelearnRecord) -> bool:
-    names = ("learned_error", "tolerance", "held_out", "episodes", "rate")
-    return all(getattr(a, name) == getattr(b, name) for name in names)
-
-
 def savings_heads(records: Sequence[RelearnRecord]) -> tuple[str, ...]:
-    """Return the heads of the columns of `savings_rows`, for records of one measure."""
-    what = "success" if records[0].episodes else "error"
-    return "task", f"{what} just learned", f"{what} at the end", "steps again", "steps at first", "savings"
+    """Return the heads of the columns of `savings_rows`, for one part of `by_measure`."""
+    one = records[0]
+    what, on = (
+        ("success", f"{one.episodes} rollouts") if one.episodes else ("error", f"{one.held_out} held out")
+    )
+    again = f"steps again (tolerance {one.tolerance:g}, {on})"
+    weights = next((f" (weights {r.weights[:8]})" for r in records if r.weights), "")
+    return "task", f"{what} just learned", f"{what} at the end", again, f"steps at first{weights}", "savings"
 
 
 def savings_rows(records: Sequence[RelearnRecord]) -> list[tuple[str, ...]]:
-    """Return the savings of records of one measure as text, a row for each task, counted from 1."""
+    """Return the savings of one part of `by_measure` as text, a row for each task, counted from 1."""
     shown = _percent if records[0].episodes else "{:.3f}".format
+    started = {r.task for r in records if r.start == "initial"}
     rows: list[tuple[str, ...]] = []
     for row in savings(records):
-        first, again = _steps(row.first, row.tried), _steps(row.again, row.tried)
+        first = _steps(row.first, row.tried) if row.task in started else "–"
+        again = _steps(row.again, row.tried)
         share = "–" if row.share is None else f"{100 * row.share:.0f} %".replace("-", "−")
         measured = shown(row.learned_error), shown(row.final_error)
         rows.append((str(row.task + 1), *measured, again, first, share))
@@ -101,7 +115,7 @@ def savings_rows(records: Sequence[RelearnRecord]) -> list[tuple[str, ...]]:
 
 
 def savings_tables(records: Sequence[RelearnRecord]) -> str:
-    """Return what was measured as tables in plain text, one for each measure."""
+    """Return what was measured as tables in plain text, one for each part of `by_measure`."""
     return "\n\n".join(
         text_table([savings_heads(part), *savings_rows(part)], left=0) for part in by_measure(records)
     )

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from libero_eval import relearning
+from libero_eval.cli import runs
 from libero_eval.relearning import Trial, error_on, failure_share, relearn, steps_until
 from libero_eval.requests import RelearnRequest
 from lifelong.algorithms import Sequential
@@ -22,7 +23,14 @@ from lifelong.evaluation.settings import EvalSettings
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.records import RelearnRecord, from_line, to_line
-from lifelong.results.relearning import FILE_NAME, read_relearning, savings, savings_rows, savings_tables
+from lifelong.results.relearning import (
+    FILE_NAME,
+    by_measure,
+    read_relearning,
+    savings,
+    savings_rows,
+    savings_tables,
+)
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Batch
@@ -143,13 +151,32 @@ def test_savings_pair_the_starts_of_each_task() -> None:
         record(3, "initial", (0.5, 0.1)),
         record(4, "initial", (0.5, 0.1)),
     ]
+    (records,) = by_measure(records)
     found = savings(records)
     assert [(s.task, s.again, s.first, s.share) for s in found] == [
         (0, 10, 40, 0.75), (1, 20, 10, -1.0), (2, 0, None, None), (3, None, 10, None)
     ]  # fmt: skip
     assert savings_rows(records)[0] == ("1", "0.100", "0.300", "10", "40", "75 %")
+    assert savings_rows(records)[2][3:] == ("0", "–", "–"), "the first was not measured"
     assert savings_rows(records)[3][3:] == ("> 10", "10", "–")
     assert savings_tables(records).count("\n") == 4
+
+
+def test_settings_and_initial_weights_do_not_share_a_table() -> None:
+    final = record(0, "final", (0.3, 0.1))
+    initial = replace(record(0, "initial", (0.5, 0.1)), weights="0123456789abcdef")
+    loose = [replace(r, tolerance=1.0, errors=(0.15,), steps=(0,)) for r in (final, initial)]
+    other = replace(record(0, "initial", (0.6, 0.5, 0.1)), weights="fedcba9876543210")
+    parts = by_measure([final, initial, *loose, other])
+    assert [[(s.again, s.first) for s in savings(part)] for part in parts] == [
+        [(10, 10)],
+        [(10, 20)],
+        [(0, 0)],
+    ]
+    text = savings_tables([final, initial, *loose, other])
+    assert text.count("steps again (tolerance 0.05, 5 held out)") == 2
+    assert text.count("steps again (tolerance 1, 5 held out)") == 1
+    assert text.count("(weights 01234567)") == 2 and text.count("(weights fedcba98)") == 1
 
 
 def test_records_are_read_back_and_refuse_what_does_not_fit(tmp_path) -> None:
@@ -172,9 +199,8 @@ def test_success_is_back_where_it_falls_short_by_the_tolerance_at_most() -> None
     assert savings_rows(found) == [("1", "90 %", "10 %", "10", "20", "50 %")]
     text = savings_tables([record(0, "final", (0.3, 0.1)), *found])
     assert text.index("error just learned") < text.index("success just learned")
-    assert [s.first for s in savings([record(0, "initial", (0.1,)), found[0]])] == [None], (
-        "measures do not mix"
-    )
+    (part,) = by_measure([record(0, "initial", (0.1,)), found[0]])
+    assert [s.first for s in savings(part)] == [None], "measures do not mix"
 
 
 def test_the_page_of_a_run_shows_them_and_its_records_stay(tmp_path) -> None:
@@ -280,6 +306,28 @@ def test_a_killed_measurement_goes_on_and_changes_nothing_else(finished, monkeyp
         assert all(torch.equal(value, state[name]) for name, value in end.state_dict().items())
 
 
+def test_the_command_prints_what_it_is_asked_for(finished, monkeypatch) -> None:
+    """Other settings, and other initial weights, have been measured before."""
+    folder, _ = finished
+    monkeypatch.setattr(
+        "lifelong.pretraining.initial_policy", lambda run, *, weights, allow: policy(bool(weights))
+    )
+    monkeypatch.setattr("lifelong.report.page.write_report", lambda runs: runs[0])
+
+    def said(**changes) -> str:
+        return runs.relearn(replace(SETTINGS, run=folder, tasks=(0,), steps=10, **changes)).text
+
+    first, loose, other, fine = said(), said(tolerance=1.0), said(initial=Path("other")), said(every=2)
+    assert len({first, loose, other, fine}) == 4 and len(outcome(folder)) == 7
+    assert (said(), said(tolerance=1.0), said(initial=Path("other")), said(every=2)) == (
+        first,
+        loose,
+        other,
+        fine,
+    )
+    assert len(outcome(folder)) == 7, "all of it was recorded"
+
+
 @pytest.mark.parametrize("kind", ["first", "latest", "seen", "stream"])
 def test_initial_weights_are_normalised_as_the_run_was_when_it_met_the_task(
     tmp_path, kind, monkeypatch
@@ -343,6 +391,10 @@ def test_tasks_that_do_not_exist_and_settings_that_make_no_sense_are_refused(fin
     for change in ({"every": 0}, {"steps": 0}, {"tolerance": -0.1}, {"held_out": 0}, {"episodes": 51}):
         with pytest.raises(ConfigError, match=f"relearn.{next(iter(change))} is"):
             RelearnRequest(run=folder, **change)
+    with pytest.raises(ConfigError, match="--held-out is of the error, and --episodes measures success"):
+        RelearnRequest(run=folder, held_out=10, episodes=5)
+    asked = (RelearnRequest(run=folder, episodes=n).demos_held_out for n in (0, 5))
+    assert tuple(asked) == (5, 0)
 
 
 def test_a_run_that_is_not_finished_is_refused(finished, monkeypatch) -> None:

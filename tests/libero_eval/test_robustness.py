@@ -9,8 +9,16 @@ import pytest
 
 from libero_eval.evaluation_file import EvaluationResult, TaskResult
 from libero_eval.robustness.page import curves_figure, radar_figure, render, verdict, write_robustness
-from libero_eval.robustness.results import Condition, Outcomes, Robustness, half_severity, name_of
-from lifelong.errors import ResultsError
+from libero_eval.robustness.results import (
+    Condition,
+    Outcomes,
+    Robustness,
+    differences,
+    half_severity,
+    name_of,
+)
+from libero_eval.robustness.study import read_study
+from lifelong.errors import ConfigError, ResultsError
 
 TASKS, STARTS = ("libero_goal/0", "libero_goal/1"), tuple(range(10))
 A, B = (("camera", 0.5),), (("camera", 1.0),)
@@ -100,6 +108,73 @@ def test_results_are_paired_by_task_and_start() -> None:
         Outcomes.of({(): result(8), B: result(2, tuple(range(1, 11)))})
     with pytest.raises(ResultsError, match="without perturbations"):
         Outcomes.of({B: result(2)})
+
+
+@pytest.mark.parametrize(("condition", "base", "other", "told"), [
+    (B, {"world": {"perturb": ""}}, {"world": {"perturb": "camera=1"}}, ""),
+    (B, {"episode": {"horizon": 5}}, {"episode": {"horizon": 6}}, "protocol.episode.horizon: 6 instead of 5"),
+    (B, {"action": {"clock": ""}}, {"action": {"clock": "latency=50ms"}}, "protocol.action.clock: latency=50ms"),
+    ((("clock", 0.05),), {"action": {"clock": ""}}, {"action": {"clock": "latency=50ms"}}, ""),
+    ((("clock", 0.05),), {}, {"action": {"clock": "latency=50ms,wait=hold"}}, "protocol.action.clock"),
+])  # fmt: skip
+def test_conditions_have_the_settings_of_the_base(condition, base, other, told) -> None:
+    results = {(): replace(result(8), protocol=base), condition: replace(result(2), protocol=other)}
+    if not told:
+        assert Outcomes.of(results).conditions == ((), condition)
+        return
+    with pytest.raises(ResultsError, match=told):
+        Outcomes.of(results)
+
+
+def test_conditions_are_of_one_policy() -> None:
+    with pytest.raises(ResultsError, match=r"camera=1 .* \(evaluated.run: other instead of r\)"):
+        Outcomes.of({(): result(8), B: replace(result(2), evaluated={"run": "other"})})
+
+
+def test_only_the_conditions_that_are_asked_for_are_read(tmp_path) -> None:
+    def write(name: str, perturb: str, wins: int, horizon: int = 5) -> None:
+        (tmp_path / "conditions" / name).mkdir(parents=True)
+        protocol = {"world": {"perturb": perturb}, "episode": {"horizon": horizon}}
+        replace(result(wins), protocol=protocol).write(tmp_path / "conditions" / name / "eval.json")
+
+    write("none", "", 10)
+    with pytest.raises(ConfigError, match="holds no finished conditions"):
+        read_study(tmp_path)
+    write("gain=0.4", "gain=0.4", 6)
+    write("latency=0.4", "latency=0.4", 3, horizon=6)
+    with pytest.raises(ResultsError, match=r"latency=0.4 .*horizon: 6 instead of 5"):
+        read_study(tmp_path)
+    write("gain=0.4@3", "gain=0.4@3", 2)
+    with pytest.raises(ConfigError, match=r"holds gain=0.4 twice, gain=0.4 and gain=0.4@3"):
+        read_study(tmp_path)
+    for one, rate in (("gain=0.4", 0.6), ("gain=0.4@3", 0.2)):
+        found = read_study(tmp_path, conditions=["", one])
+        assert found.outcomes.rates.tolist() == [1, rate] and len(found.axes) == 1
+
+
+def test_policies_beside_each_other_tell_what_differs_besides(tmp_path) -> None:
+    found = outcomes({(): 10, A: 6})
+    base = {"protocol.episode.horizon": 5, "tasks.libero_goal/0.digest": "a"}
+    first = Robustness("a", found, settings=base)
+    assert differences([first, Robustness("b", found, settings=base)]) == []
+    tasks, other = ("libero_goal/0", "libero_goal/7"), {**base, "tasks.libero_goal/7.digest": "b"}
+    second = Robustness("b", replace(found, tasks=tasks), settings={**other, "protocol.episode.horizon": 6})
+    third = Robustness("c", replace(found, starts=tuple(range(1, 11))), settings=base)
+    assert differences([first, second, third]) == [
+        "protocol.episode.horizon: 5 in a, 6 in b",
+        "tasks: libero_goal/0, libero_goal/1 in a, libero_goal/0, libero_goal/7 in b",
+        "starts: 0, 1, 2, 3, 4, 5, 6, 7, 8, 9 in a, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10 in c",
+    ]
+    assert "horizon: 5 in a, 6 in b" in write_robustness([first, second], tmp_path).read_text()
+
+
+def test_control_steps_by_suite_are_those_of_the_suites_that_were_run(tmp_path) -> None:
+    steps, found = {"libero_goal": 300, "libero_10": 520}, outcomes({(): 10, A: 6})
+    page = write_robustness([Robustness("a", found, horizon=steps)], tmp_path).read_text()
+    assert "<dd>300</dd>" in page
+    both = replace(found, tasks=("libero_goal/0", "libero_10/0"))
+    page = write_robustness([Robustness("a", both, horizon=steps)], tmp_path).read_text()
+    assert "<dd>300 libero_goal / 520 libero_10</dd>" in page
 
 
 def test_a_start_from_which_a_simulation_error_ended_an_episode_is_left_out_of_all_conditions_and_told(

@@ -8,7 +8,7 @@ import pytest
 
 from libero_env.cli.main import main
 from libero_eval.evaluation_file import EvaluationResult
-from libero_eval.requests import RobustnessRequest
+from libero_eval.requests import KINDS, PAIRS, SEVERITIES, RobustnessRequest
 from libero_eval.robustness.study import conditions_of
 
 pytestmark = pytest.mark.sim
@@ -27,21 +27,23 @@ class Still:
 def make():
     return Still()
 """
+LATE = "{extends: libero, name: late, title: late, action: {clock: 'latency=50ms,wait=hold'}}"
 WORDS = [
     "still_policy:make", "--suite", "libero_goal/1", "--episodes", "2", "--horizon", "2", "--threads", "1"
 ]  # fmt: skip
-KINDS = ["--kinds", "noise", "robot", "--severities", "1", "0.5", "--pairs", "noise=0.5,robot=0.5"]
+TWO = ["--kinds", "noise", "robot", "--severities", "1", "0.5", "--pairs", "noise=0.5,robot=0.5"]
 
 
 @pytest.fixture
 def still(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "still_policy.py").write_text(POLICY)
+    (tmp_path / "late.yaml").write_text(LATE)
     return tmp_path
 
 
 def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> None:
-    assert main(["robustness", *WORDS, *KINDS, "--out", "found"]) == 0
+    assert main(["robustness", *WORDS, *TWO, "--out", "found"]) == 0
     said = capsys.readouterr().out
     assert "nan" not in said
     page = (still / "found" / "robustness.html").read_text()
@@ -60,13 +62,27 @@ def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> N
         assert result.protocol["world"]["perturb"] == perturb and len(result.tasks[0].successes) == 2
 
     before = {path: path.stat().st_mtime_ns for path in still.glob("found/conditions/*/units/*")}
-    assert main(["robustness", *WORDS, *KINDS, "--out", "found"]) == 0, "what is done is not run again"
+    assert main(["robustness", *WORDS, *TWO, "--out", "found"]) == 0, "what is done is not run again"
     assert before == {path: path.stat().st_mtime_ns for path in still.glob("found/conditions/*/units/*")}
 
     assert main(["robustness", "--report", "first=found", "second=found", "--out", "both"]) == 0
     assert "first" in (still / "both" / "robustness.html").read_text()
     labels = [p["label"] for p in json.loads((still / "both" / "robustness.json").read_text())["policies"]]
     assert labels == ["first", "second"]
+    assert main(["robustness", "--report", "found", "found", "--out", "both"]) == 2
+    assert "two policies are named found" in capsys.readouterr().err
+
+    others = ["--kinds", "noise", "--severities", "1", "--pairs", "--perturb-seed", "3", "--out", "found"]
+    assert main(["robustness", *WORDS, *others]) == 0
+    record = json.loads((still / "found" / "robustness.json").read_text())["policies"][0]
+    assert [*record["outcomes"]] == ["without perturbations", "noise=1"], "only what is asked for"
+    assert main(["robustness", "--report", "found"]) == 2
+    assert "holds noise=1 twice, noise=1 and noise=1@3" in capsys.readouterr().err
+
+
+def test_a_report_has_no_other_options(capsys) -> None:
+    assert main(["robustness", "expert", "--report", "a=b", "--kinds", "camera", "--horizon", "9"]) == 2
+    assert "leave out policy, --horizon, --kinds" in capsys.readouterr().err
 
 
 def test_latency_is_a_kind_whose_severity_is_in_seconds(still, capsys) -> None:
@@ -101,6 +117,8 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
     assert "<h2>Events</h2>" in (still / "found" / "robustness.html").read_text()
     conditions = conditions_of(RobustnessRequest(events=True))
     assert len(conditions) == 19 and {"object=0.6@step20", "camera=1@lifted"} <= {*conditions}
+    named = conditions_of(RobustnessRequest(events=True, severities=SEVERITIES))
+    assert "camera=0.2@lifted" in named and len(named) == 31, "what is named is not replaced"
 
 
 @pytest.mark.parametrize(("words", "told"), [
@@ -111,6 +129,10 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
     (["--severities", "2"], "--severities"),
     (["--kinds", "noise", "--severities", "1", "--pairs", "noise=1,robot=1"], "must also be run alone"),
     (["--pairs", "noise=1"], "expected two perturbations"),
+    (["--kinds", "noise", "--pairs", "camera=0.4,light=0.4"], "must also be run alone"),
+    (["--kinds", "noise", "noise@3"], "differ in their seeds alone"),
+    (["--kinds"], "name no condition"),
+    (["--kinds", "clock", "--pairs", "--protocol", "late.yaml"], "has the clock latency=50ms,wait=hold"),
     (["--beside", "other=nowhere"], "nowhere holds no finished conditions"),
 ])  # fmt: skip
 def test_mistakes_take_one_line_before_anything_is_run(still, words, told, capsys) -> None:
@@ -135,7 +157,7 @@ def test_nothing_is_removed_where_a_link_leads(still, link, capsys) -> None:
     path = still / "eval" / "still_policy.make" / link
     path.parent.mkdir(parents=True)
     path.symlink_to(still / "mine")
-    assert main(["robustness", *WORDS, *KINDS, "--again"]) == 2
+    assert main(["robustness", *WORDS, *TWO, "--again"]) == 2
     assert "link that leads out of" in capsys.readouterr().err and (still / "mine" / "units").is_dir()
 
 
@@ -143,12 +165,11 @@ def test_default_kinds_and_pairs_exist() -> None:
     from libero_env.perturbations import KINDS as ALL
     from libero_env.perturbations import parse_perturbations
 
-    request = RobustnessRequest()
-    assert set(request.kinds) <= set(ALL) and len(request.kinds) == 12
-    for text in request.pairs:
+    assert set(KINDS) <= set(ALL) and len(KINDS) == 12
+    for text in PAIRS:
         pair = parse_perturbations(text)
-        assert {one.kind for one in pair} <= set(request.kinds)
-        assert {one.severity for one in pair} <= set(request.severities)
+        assert {one.kind for one in pair} <= set(KINDS)
+        assert {one.severity for one in pair} <= set(SEVERITIES)
 
 
 def test_worker_processes_find_the_same_conditions() -> None:

@@ -1,5 +1,6 @@
 """Saliency maps against a policy whose input is known."""
 
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -110,6 +111,29 @@ def test_windows_end_at_the_step():
     frames = [{"x": torch.full((1, 1, 1), float(step))} for step in range(5)]
     assert window_at(frames, 3, 2)["x"].flatten().tolist() == [2, 3]
     assert window_at(frames, 1, 4)["x"].flatten().tolist() == [0, 1]
+
+
+def test_sheets_of_two_starts_stand_beside_each_other_and_name_them(tmp_path, monkeypatch, capsys):
+    policy = OnePatch(SPEC).eval()
+    run = SimpleNamespace(
+        path=tmp_path,
+        tasks=["task"],
+        learned=1,
+        device="cpu",
+        learned_task=lambda task: SimpleNamespace(language="do it"),
+        embed=lambda task: torch.zeros(3),
+        acting=lambda task: nullcontext(policy),
+    )
+    seen = window().observation
+    frames = [{"images": seen.images[:, :1], "x": seen.proprio["x"][:, :1]}] * 3
+    monkeypatch.setattr("libero_eval.saliency.restore", lambda *_, **__: run)
+    monkeypatch.setattr("libero_eval.saliency._run_episode", lambda *_: (frames, False))
+    for start, moments in ((2, 6), (3, 3)):
+        path = draw_saliency(SaliencyRequest(run=tmp_path, start=start, moments=moments, stride=64))
+        assert path.name == f"task_00_after_01_start_0{start}.png" and path.is_file()
+        caption = f"do it: failure, after learning 2 tasks; start {start}, steps 0, 1, 2\n"
+        assert path.with_suffix(".txt").read_text() == caption
+        assert capsys.readouterr().err.count("note: 3 moments, as the rollout has no more") == (moments > 3)
 
 
 def test_what_is_written_into_a_run_follows_no_link_out_of_it(tmp_path, monkeypatch):

@@ -78,11 +78,11 @@ def test_saliency_sheet_of_a_run(tmp_path):
     make_run(tmp_path / "run")
     request = SaliencyRequest(run=tmp_path / "run", task=1, moments=3, horizon=4, stride=43)
     path = draw_saliency(request)
-    assert path == tmp_path / "run" / "saliency" / "task_01_after_01.png"
+    assert path == tmp_path / "run" / "saliency" / "task_01_after_01_start_00.png"
     with Image.open(path) as sheet:
         assert sheet.size == (3 * (128 + 4), 4 * (128 + 4))
         assert np.asarray(sheet).std() > 10
-    assert "failure, after learning 2 tasks; steps 0, 2, 3" in path.with_suffix(".txt").read_text()
+    assert "failure, after learning 2 tasks; start 0, steps 0, 2, 3" in path.with_suffix(".txt").read_text()
     with pytest.raises(ConfigError, match="tasks 0 to 1"):
         draw_saliency(replace(request, task=2))
 
