@@ -15,6 +15,7 @@ from libero_env.demos.record import RecordingReport
 from tests.harness.demos import wander
 
 pytestmark = pytest.mark.sim
+GENERATE = ["generate", "--task", "libero_goal/3", "--n", "1"]
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +51,14 @@ def test_images_have_the_size_that_a_run_reads():
     assert config.camera_size == (64, 64)
     (config,) = cli_demos.demo_configs(replace(request, size=(32, 48)))
     assert config.camera_size == (32, 48)
+
+
+@pytest.mark.parametrize(("given", "robot"), [(None, "robosuite-1.4.1"), ("libero", "libero")])
+def test_the_robot_is_that_of_a_run_unless_it_is_given(given, robot):
+    training = ("preset=laptop", "data.robot=robosuite-1.4.1")
+    request = cli_demos.RecordingRequest(task="libero_goal/3", training=training, robot=given)
+    (config,) = cli_demos.demo_configs(request)
+    assert config.robot == robot
 
 
 def test_every_tool_runs(file, tmp_path, capsys):
@@ -109,9 +118,16 @@ def test_sizes_are_one_number_or_two():
 
 @pytest.mark.parametrize(("argv", "hint"), [
     (["generate", "--task", "libero_goal/99", "--n", "1"], "index of libero_goal"),
-    (["generate", "--task", "libero_goal/3", "--n", "1", "--cameras", "agentveiw"], "Did you mean 'agentview'?"),
+    ([*GENERATE, "--cameras", "agentveiw"], "Did you mean 'agentview'?"),
     (["generate", "--bddl", "nowhere.bddl", "--n", "1"], "nowhere.bddl"),
+    ([*GENERATE, "--variation", "style", "--noise", "0"], "--noise cannot be used without"),
+    ([*GENERATE, "--variation", "none", "style"], "none stands alone"),
+    ([*GENERATE, "--no-images", "--cameras", "birdview", "--size", "64", "--depth"],
+     "--cameras, --size, --depth cannot be used with --no-images"),
+    ([*GENERATE, "--no-images", "--segmentation", "class"], "--segmentation cannot"),
     (["replay", "nowhere.hdf5"], "nowhere.hdf5"),
+    (["replay", "a.hdf5", "--cameras", "top", "--size", "64"], "--cameras, --size cannot be used without --video"),
+    (["rerender", "a.hdf5", "b.hdf5", "--perturb-seed", "0"], "--perturb-seed cannot be used without --perturb"),
     (["filter", "nowhere.hdf5", "b.hdf5"], "nowhere.hdf5"),
     (["export", "nowhere.hdf5", "--out", "set"], "nowhere.hdf5"),
     (["export", "a.hdf5", "--out", "set", "--as", "rlsd"], "Did you mean 'rlds'?"),
@@ -125,6 +141,15 @@ def test_invalid_input_gives_one_line_and_a_status(argv, hint, tmp_path, monkeyp
     err = capsys.readouterr().err
     lines = [line for line in err.splitlines() if line.startswith("error:")]
     assert len(lines) == 1 and hint in lines[0]
+
+
+@pytest.mark.parametrize(
+    "words", ["generate --task nowhere/0", "replay a.hdf5 --video a.gif", "rerender a b"]
+)
+def test_cameras_have_names(words, capsys):
+    with pytest.raises(SystemExit):
+        cli.main(["demos", *words.split(), "--cameras"])
+    assert "cameras are missing" in capsys.readouterr().err
 
 
 def test_images_can_be_left_out_and_rendered_later(tmp_path, monkeypatch):

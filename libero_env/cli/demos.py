@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 Drawing = Literal["fast", "faithful"]
 ActionKind = Literal["delta", "absolute", "joint"]
+Cameras = Annotated[tuple[str, ...], Field(min_length=1)]
 Files = Positional[tuple[FilePath, ...]]
 SHOWN_REASONS = 3  # most frequent reasons of failure that are listed for a task
 
@@ -50,12 +51,12 @@ class RecordingRequest:
         size: Size of the images, 128 or 120x160 (default: 128, or that of --for).
         training: Overrides of libero train, such as preset=laptop: size, drawing and robot are those of this run.
         cameras: Cameras to render: names, or texts such as "top,pos=0.4 0 1.6,lookat=0 0 0.9,fovy=60,body=world",
-            each of which adds a camera.
+            each of which adds a camera (default: agentview robot0_eye_in_hand).
         no_images: Record states, proprioception and actions only; `rerender` can add images later.
         drawing: How images are drawn (default: that of the models).
         depth: Record depth too, in metres.
         segmentation: Record a segmentation too.
-        robot: Model of the arm, libero or robosuite-1.4.1.
+        robot: Model of the arm, libero or robosuite-1.4.1 (default: libero, or that of --for).
         backend: Physics, mujoco, or warp on a GPU, as in warp,device=cuda:1.
         seed: Seed of starts, motion styles and action noise.
         reserved: Start from the 50 stored states, which evaluation uses.
@@ -72,12 +73,12 @@ class RecordingRequest:
     n: Positive = 50
     size: Size | None = None
     training: Annotated[tuple[str, ...], arg(name="for", metavar="OVERRIDE ...")] = ()
-    cameras: tuple[str, ...] = ("agentview", "robot0_eye_in_hand")
+    cameras: Cameras | None = None
     no_images: bool = False
     drawing: Drawing | None = None
     depth: bool = False
     segmentation: Segmentation | None = None
-    robot: str = "libero"
+    robot: str | None = None
     backend: str = "mujoco"
     seed: Seed = 0
     reserved: bool = False
@@ -110,7 +111,7 @@ def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
     """Return the configurations of the demonstrations that a request asks for, one per task.
 
     Raises:
-        InvalidInputError: Not exactly one of suite, task and task file is given.
+        InvalidInputError: Not exactly one of suite, task and task file is given, or options exclude each other.
     """
     from libero_env.demos.config import DemoConfig
     from libero_env.sim.backend import Backend
@@ -125,11 +126,14 @@ def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
     else:
         tasks = (read_task(Path(str(request.bddl))),)
     shown = () if request.no_images else modalities(depth=request.depth, segmentation=request.segmentation)
+    if request.no_images:
+        images = {"size": request.size, "depth": request.depth, "segmentation": request.segmentation}
+        refuse("with --no-images", cameras=request.cameras, **images)
     size, drawing, robot = request.size or DemoConfig.camera_size, request.drawing, request.robot
     if request.training:
         data = importlib.import_module("lifelong.cli.runs").data_settings(request.training)
         size, drawing = request.size or (data.image_size, data.image_size), drawing or data.drawing
-        robot = data.robot if robot == DemoConfig.robot else robot
+        robot = robot or data.robot
     return [
         DemoConfig(
             task,
@@ -138,20 +142,41 @@ def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
             request.pairing,
             disturb=bool({"noise", "pushes"} & set(request.variation)),
             variation=variation(request),
-            cameras=() if request.no_images else request.cameras,
+            cameras=() if request.no_images else request.cameras or DemoConfig.cameras,
             modalities=shown,
             drawing=drawing,
-            robot=robot,
+            robot=robot or DemoConfig.robot,
             backend=Backend.read(request.backend),
         )
         for task in tasks
     ]
 
 
+def refuse(condition: str, **options: Any) -> None:
+    """Refuse options of a command that have no effect under a condition.
+
+    Raises:
+        InvalidInputError: One of them is given: neither None nor False.
+    """
+    given = [f"--{name}" for name, value in options.items() if value is not None and value is not False]
+    if given:
+        names, they = ", ".join(given).replace("_", "-"), "them" if len(given) > 1 else "it"
+        raise InvalidInputError(f"{names} cannot be used {condition}; leave {they} out")
+
+
 def variation(request: RecordingRequest) -> "Variation":
-    """Return how the demonstrations differ from each other."""
+    """Return how the demonstrations differ from each other.
+
+    Raises:
+        InvalidInputError: `none` does not stand alone, or the noise is given and does not vary.
+    """
     from libero_env.demos.config import Variation
 
+    if "none" in request.variation and len(request.variation) > 1:
+        words = " ".join(request.variation)
+        raise InvalidInputError(f"--variation {words}: none stands alone; leave it out, or the others")
+    if "noise" not in request.variation:
+        refuse("without noise in --variation", noise=request.noise)
     default = Variation()
     noise = default.noise if request.noise is None else request.noise
     return Variation(
@@ -282,8 +307,8 @@ def replay_file(
     actions: ActionKind = "delta",
     demo: tuple[Natural, ...] = (),
     video: FilePath | None = None,
-    cameras: tuple[str, ...] = ("agentview",),
-    size: Size = (256, 256),
+    cameras: Cameras | None = None,
+    size: Size | None = None,
     assets: str | None = None,
     bddl: FilePath | None = None,
 ) -> Answer:
@@ -295,8 +320,8 @@ def replay_file(
         actions: As recorded: delta, or goals of the hand, absolute, or of the joints, joint, by their controllers.
         demo: Numbers of demonstrations (default: all).
         video: Video to write, .mp4, .webp or .gif.
-        cameras: Cameras of the video, as of `demos generate`.
-        size: Size of the video, 128 or 120x160.
+        cameras: Cameras of the video, as of `demos generate` (default: agentview).
+        size: Size of each picture of the video, 128 or 120x160 (default: 256).
         assets: Where models come from: builtin, original, or a folder with the original's.
         bddl: Task file of what was recorded (default: the task that the file states).
     """
@@ -306,11 +331,13 @@ def replay_file(
 
     if video:
         check_video_path(video)
+    else:
+        refuse("without --video", cameras=cameras, size=size)
     demos = [f"demo_{number}" for number in demo] if demo else None
     results, lost = [], 0
-    task, shown = task_of(bddl), cameras if video else ()
-    how: dict[str, Any] = {"by": by, "actions": actions, "demos": demos, "cameras": shown, "size": size}
-    for result in replay(file, **how, assets=assets, task=task):
+    how: dict[str, Any] = {"by": by, "actions": actions, "demos": demos, "size": size or (256, 256)}
+    shown = (cameras or ("agentview",)) if video else ()
+    for result in replay(file, **how, cameras=shown, assets=assets, task=task_of(bddl)):
         lost += result.recorded and not result.success
         outcome = "success" if result.success else "no success"
         drift = f"objects {1000 * result.drift.max():.2f} mm, arm {1000 * result.arm_drift.max():.2f} mrad"
@@ -356,9 +383,9 @@ def rerender_file(
     out: Positional[FilePath],
     *,
     perturb: Annotated[str | None, arg(metavar="KIND=SEVERITY,...")] = None,
-    perturb_seed: Seed = 0,
+    perturb_seed: Seed | None = None,
     size: Size | None = None,
-    cameras: tuple[str, ...] | None = None,
+    cameras: Cameras | None = None,
     drawing: Drawing | None = None,
     depth: bool = False,
     segmentation: Segmentation | None = None,
@@ -372,7 +399,7 @@ def rerender_file(
         out: The new file.
         perturb: Perturbations that change what is seen or said, such as camera=0.3,light=0.5, sampled for each
             demonstration. Size, cameras and drawing are then by default those of the file.
-        perturb_seed: Seed of the samples.
+        perturb_seed: Seed of the samples (default: 0).
         size: Size of the images, 128 or 120x160 (default: 128).
         cameras: Cameras to render, as of `demos generate` (default: agentview robot0_eye_in_hand).
         drawing: How images are drawn (default: that of the models).
@@ -388,8 +415,10 @@ def rerender_file(
     from libero_env.perturbations import parse_perturbations
 
     config = RenderConfig(drawing=drawing)
-    if perturb is not None:
-        config = replace(recorded_rendering(file), perturb=parse_perturbations(perturb, perturb_seed))
+    if perturb is None:
+        refuse("without --perturb", perturb_seed=perturb_seed)
+    else:
+        config = replace(recorded_rendering(file), perturb=parse_perturbations(perturb, perturb_seed or 0))
     chosen: dict[str, Any] = {"cameras": cameras, "size": size, "drawing": drawing}
     if depth or segmentation or perturb is None:
         chosen["modalities"] = modalities(depth=depth, segmentation=segmentation)

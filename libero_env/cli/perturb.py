@@ -4,10 +4,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-from libero_env.cli.options import Answer, Field, FilePath, Positional, ProcessesOrAll, Seed, Share, Side, arg
+from libero_env.cli.options import Answer, Field, FilePath, Positional, ProcessesOrAll, Seed, Side, arg
 from libero_env.parallel import cpu_count
 
 Perturb = Annotated[str, arg(metavar="KIND=SEVERITY,...")]
+Severities = Annotated[tuple[Annotated[float, Field(gt=0, le=1)], ...], Field(min_length=1)]
 
 
 def list_kinds() -> None:
@@ -40,21 +41,20 @@ def show(
     """
     from libero_env.design.preview import compare_starts
     from libero_env.perturbations import parse_perturbations
-    from libero_env.tasks import find_tasks
+    from libero_env.tasks import get_task
 
     perturbations = parse_perturbations(perturb, seed)
-    for one in find_tasks([task]):
-        changed = compare_starts(one, perturbations, out, start=start, size=size)
-        for perturbation in perturbations:
-            print(f"{perturbation!s:22} {perturbation.amount:g} {perturbation.definition.unit}")
-        print(f"{changed.language}\n{out}")
+    changed = compare_starts(get_task(task), perturbations, out, start=start, size=size)
+    for perturbation in perturbations:
+        print(f"{perturbation!s:22} {perturbation.amount:g} {perturbation.definition.unit}")
+    print(f"{changed.language}\n{out}")
 
 
 def certify(
     tasks: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
     *,
     kinds: tuple[str, ...] = (),
-    severities: tuple[Share, ...] = (0.2, 0.4, 0.6, 0.8, 1.0),
+    severities: Severities = (0.2, 0.4, 0.6, 0.8, 1.0),
     starts: Annotated[int, Field(ge=1, le=50)] = 10,
     redraws: Annotated[int, Field(ge=0, le=20)] = 3,
     seed: Seed = 0,
@@ -70,7 +70,7 @@ def certify(
     Args:
         tasks: Such as libero_goal/3, or a suite.
         kinds: Kinds (default: all that change physics, start or actions).
-        severities: Severities of each kind.
+        severities: Severities of each kind, above 0.
         starts: Initial states of each task.
         redraws: Further samples after a failure.
         seed: Seed of what is sampled.
@@ -86,7 +86,8 @@ def certify(
     from libero_env.tasks import find_tasks
 
     names = kinds or [name for name, kind in KINDS.items() if kind.physical]
-    perturbations = [Perturbation(kind, s, seed) for kind in dict.fromkeys(names) for s in severities if s]
+    amounts = dict.fromkeys(severities)
+    perturbations = [Perturbation(kind, s, seed) for kind in dict.fromkeys(names) for s in amounts]
     certificates = certify_perturbed(
         find_tasks(tasks),
         perturbations,

@@ -73,6 +73,8 @@ def init_states(
     from libero_env.tasks.suites import ENDINGS, is_published
 
     if suite.endswith(ENDINGS) and not out:
+        if jobs:
+            raise InvalidInputError("--jobs cannot be used with a file without --out; leave it out")
         for task in find_tasks([suite]):
             print(cache_init_states(task))
         return

@@ -144,7 +144,7 @@ def filter_demos(
         count += 1
     if not count:
         raise DemoError(f"{file}: no demonstration is successful; nothing to write")
-    return examine(writer.finish())
+    return examine(writer.finish(), threshold=threshold)
 
 
 def find_demo_files(paths: Sequence[Path]) -> list[Path]:

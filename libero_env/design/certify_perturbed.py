@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.assets.pack import select_pack
 from libero_env.demos.config import GENERATOR
 from libero_env.design.certify import NO_HORIZON
 from libero_env.envs.batch import BatchEnv
@@ -22,6 +23,7 @@ from libero_env.mujoco_compat import mujoco
 from libero_env.parallel import progress_bar, run_each
 from libero_env.perturbations.kinds import trying
 from libero_env.perturbations.perturbation import Perturbation
+from libero_env.sim.scene import build_scene
 from libero_env.storage import read_json, write_json
 from libero_env.tasks import Task
 
@@ -191,12 +193,17 @@ def shares_table(
 
 
 def _path(folder: Path, task: Task, one: Perturbation) -> Path:
-    return folder / task.suite / f"{task.index:02d}" / f"{one}.json"
+    return folder / task.suite / task.name / f"{one}.json"
 
 
 def _digest(task: Task, one: Perturbation, starts: int, redraws: int) -> str:
-    kind = one.definition
-    parts = (_FORMAT, task.bddl_text, str(one), kind.at_one, starts, redraws, GENERATOR, mujoco.__version__)
+    pack = select_pack()
+    try:
+        scene = build_scene(task.problem, pack).digest
+    except LiberoError as error:
+        scene = str(error)
+    what = (_FORMAT, task.bddl_text, scene, pack.name, str(one), one.definition.at_one)
+    parts = (*what, starts, redraws, GENERATOR, mujoco.__version__)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 

@@ -1,6 +1,7 @@
 """Certificates of perturbations: what the expert does not solve is drawn again, counted, and kept."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,9 @@ from libero_env.cli.main import main
 from libero_env.design import certify_perturbed
 from libero_env.design.certify_perturbed import REDRAWS, attempt_perturbed, shares_table
 from libero_env.errors import LiberoError
+from libero_env.objects import builtin, catalog, register_object
 from libero_env.perturbations import Perturbation, kinds
+from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task
 
 pytestmark = pytest.mark.sim
@@ -90,6 +93,34 @@ def test_results_are_on_disk_and_are_not_run_again(expert, tmp_path, capsys, mon
     assert main(words) == 2 and "not a certificate" in capsys.readouterr().err
 
 
+def test_results_of_other_models_are_not_taken(monkeypatch):
+    monkeypatch.setattr(catalog, "_registered", {})
+    task, digests = get_task("libero_object/0"), []
+    for category in ("milk", "ketchup"):
+        register_object("milk", lambda category=category: replace(builtin.build(category), category="milk"))
+        digests.append(certify_perturbed._digest(task, ROBOT, 2, REDRAWS))
+    scene = build_scene(task.problem)
+    monkeypatch.setattr(certify_perturbed, "build_scene", lambda *_: scene)
+    monkeypatch.setattr(certify_perturbed, "select_pack", lambda: SimpleNamespace(name="another"))
+    digests.append(certify_perturbed._digest(task, ROBOT, 2, REDRAWS))
+    assert len(set(digests)) == 3
+
+
+def test_results_of_tasks_of_files_are_kept_apart(tmp_path):
+    tasks = [replace(task, suite="file", index=0) for task in get_suite("libero_goal").tasks[:2]]
+    assert len({certify_perturbed._path(tmp_path, task, ROBOT) for task in tasks}) == 2
+
+
+def test_a_severity_counts_once_and_is_above_0(expert, tmp_path, capsys):
+    words = ["perturb", "certify", "libero_goal/3", "--kinds", "gain", "--starts", "1", "--jobs", "1"]
+    words += ["--out", str(tmp_path), "--severities"]
+    assert main([*words, "0.4", "0.4"]) == 0 and capsys.readouterr().out.count("gain=0.4") == 1
+    for wrong, said in ((["0.4", "0"], "--severities 0.0"), ([], "severities are missing")):
+        with pytest.raises(SystemExit):
+            main([*words, *wrong])
+        assert said in capsys.readouterr().err
+
+
 def test_a_task_that_cannot_be_perturbed_is_told(expert):
     found = attempt_perturbed(get_suite("libero_90").tasks[12], Perturbation("objects", 1.0), range(2))
     assert "no object" in found.impossible and found.starts == 0
@@ -104,6 +135,8 @@ def test_a_picture_shows_both(tmp_path):
     )
     picture = np.asarray(Image.open(out))
     assert picture.shape == (64, 64, 3) and not np.array_equal(picture[:, :32], picture[:, 32:])
+    words = ["perturb", "show", "libero_goal", "--perturb", "light=1", "--out", str(tmp_path / "b.png")]
+    assert main(words) == 2 and not (tmp_path / "b.png").exists()
     with pytest.raises(LiberoError, match="ends in"):
         from libero_env.design.preview import compare_starts
 

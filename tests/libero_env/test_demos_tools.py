@@ -76,6 +76,11 @@ def test_filtering_keeps_the_chosen_steps_unchanged(path, tmp_path):
         assert [handle[f"data/demo_{i}"].attrs["source_demo"] for i in range(2)] == ["demo_0", "demo_2"]
 
 
+def test_no_ops_of_a_copy_are_those_of_the_given_threshold(path, tmp_path):
+    stats = filter_demos(path, tmp_path / "b.hdf5", threshold=1.0)
+    assert stats.noops == examine(path, threshold=1.0).noops > examine(path).noops
+
+
 def test_filtering_nothing_changes_nothing(path, tmp_path):
     filter_demos(path, tmp_path / "b.hdf5")
     for a, b in zip(read_episodes(path), read_episodes(tmp_path / "b.hdf5"), strict=True):
