@@ -193,7 +193,9 @@ class Job:
         file = Path(hydra_config.runtime.output_dir) / JOB_FILE
         key = config_digest(plain_data(config))
         record = JobRecord(int(hydra_config.job.num), key, tuple(hydra_config.overrides.task), "running")
-        done = run_job(file, record, learn, _report_line, again=ranks.size > 1)
+        # a finished run returns at once, or is evaluated under another shift
+        again = ranks.size > 1 or not config.resume or config.eval.shift is not None
+        done = run_job(file, record, learn, _report_line, again=again)
         if done.exit_status and ranks.size > 1:
             raise SystemExit(done.exit_status)
         return Path(done.run) if done.run else None

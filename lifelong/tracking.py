@@ -1,5 +1,7 @@
 """Optional copies of a run's metrics in Weights & Biases, TensorBoard or trackio."""
 
+import hashlib
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -55,8 +57,13 @@ class WandB(Tracker):
         """Start a run; see `Tracker`."""
         import wandb
 
-        # an identifier of W&B has no slash
-        options: dict[str, Any] = {"id": name.replace("/", "-"), "resume": "allow", "dir": directory}
+        # an identifier of W&B has no slash; runs of one name in two folders are two
+        mark = hashlib.sha256(os.path.abspath(directory).encode()).hexdigest()[:8]
+        options: dict[str, Any] = {
+            "id": f"{name.replace('/', '-')}-{mark}",
+            "resume": "allow",
+            "dir": directory,
+        }
         try:
             self._run = wandb.init(
                 mode=self.mode,

@@ -25,6 +25,7 @@ from libero_env.errors import SimulationError
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.tasks import Task, get_suite, read_task, suite_names
+from lifelong.errors import ConfigError
 from lifelong.evaluation.environments import Obs
 from lifelong.evaluation.rollout import Episode, run_episodes
 from lifelong.seeding import seeded
@@ -82,6 +83,11 @@ def evaluate_one_task_success(
     """
     total = int(cfg.eval.n_eval)
     apart = selecting and cfg.eval.get("selection", "reporting") == "apart"
+    if apart and 2 * total > NUM_INIT_STATES:
+        raise ConfigError(
+            f"eval.n_eval is {total}: with eval.selection=apart at most half of the {NUM_INIT_STATES} states can be "
+            "those of selection"
+        )
     first = max(NUM_INIT_STATES - total, 0) if apart else 0
     rows = [(first + i) % NUM_INIT_STATES for i in range(total)]
     episodes = rollouts(cfg, algo, task, task_emb, task_id, rows, sim_states=sim_states)

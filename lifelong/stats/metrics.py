@@ -82,7 +82,8 @@ class Scores:
         matrix: (K, K) c[i,j], success on task j after learning task i; NaN above the diagonal.
         episodes: (K, K) number of rollouts of each cell, 0 above the diagonal.
         group_sizes: Number of tasks of each group that was learned together; () for one task at a time. K is then
-            the number of groups, and each group counts as one task whose success is the mean over its tasks.
+            the number of groups, and each group counts as one task whose success is the mean over its tasks; only
+            final success and that just learned count tasks.
         transfer: Estimate of forward transfer, see the module.
         sampled: Whether the matrix is `estimate_cells` of a sample, so that only what is linear in it means something.
     """
@@ -160,12 +161,13 @@ def lifelong_metrics(scores: Scores, confidence: float = 0.95) -> Metrics:
 def metric_values(scores: Scores) -> dict[str, float]:
     """Return the value of every metric; NaN where it is undefined."""
     fwt, matrix = forward_transfer(scores.curves, scores.transfer), scores.matrix
+    sizes = scores.group_sizes or None  # success is that of all tasks, the others are of groups
     return {
         "fwt": float(fwt.mean()),
         "nbt": float(negative_backward_transfer(matrix).mean()),
         "auc": float(area_under_curve(fwt, matrix).mean()),
-        "final_success": float(matrix[-1].mean()),
-        "just_learned": float(np.diag(matrix).mean()),
+        "final_success": float(np.average(matrix[-1], weights=sizes)),
+        "just_learned": float(np.average(np.diag(matrix), weights=sizes)),
     }
 
 

@@ -332,6 +332,7 @@ def _check_obeyed(one: Candidate) -> None:
     """Raise an error for a setting that no trial obeys."""
     tops = {key: key.lstrip("+").partition(".")[0] for key in one.settings}
     unused = [key for key, top in tops.items() if top in one.config and top not in _GROUPS]
+    unused += [key for key in tops if key == "train.steps_per_epoch"]  # a trial has --steps
     for key, agreed in _UNUSED.items():
         group, _, name = key.rpartition(".")
         value = (one.config[group] if group else one.config).get(name)

@@ -182,6 +182,9 @@ def test_er_replays_a_sample_of_each_task(files, succeed, monkeypatch):
     assert (embs[:4] == data[1].task_emb).all() and (embs[4:] == data[0].task_emb).all()
     algo.end_task(data[1], 1, Tasks())
     assert algo.hooks.memory.shares == {0: 3, 1: 3}
+    assert algo.hooks.memory._shares({0: 1, 1: 3}) == {0: 1, 1: 3}, (
+        "a task gets no more where another has fewer"
+    )
     batches = cycle(DataLoader(data[0], 2))
     pair = [next(batches) for _ in range(2)]
     joined = merge_datas(*pair)

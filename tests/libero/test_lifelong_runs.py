@@ -18,6 +18,7 @@ from libero.lifelong.run import run
 from libero_env.init_states.pickles import write_states
 from libero_env.tasks import get_task
 from lifelong import checkpoints
+from lifelong.errors import ConfigError
 from tests.harness.facade_learning import (
     LANGUAGE,
     SIZE,
@@ -191,6 +192,9 @@ def test_success_is_measured_from_the_first_states(acting, monkeypatch):
     cfg.eval.selection, cfg.eval.use_mp = "apart", False
     assert metric.evaluate_multitask_training_success(cfg, algo, suite, [0]).tolist() == [0.0]
     assert begun[2:] == [[47], [48], [49]], "one by one, in states that no report uses"
+    cfg.eval.n_eval = 26
+    with pytest.raises(ConfigError, match=r"eval.n_eval is 26: .* at most half"):
+        metric.evaluate_multitask_training_success(cfg, algo, suite, [0])
 
 
 def test_success_is_counted(acting, monkeypatch):

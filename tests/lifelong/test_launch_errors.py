@@ -5,6 +5,7 @@ import io
 import itertools
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -186,6 +187,21 @@ def test_lines_of_the_jobs_of_a_sweep_have_their_names(here, monkeypatch, capsys
     for name in ("[1/2 seed=3] ", "[2/2 seed=4] "):
         assert f"{name}Task 1/2: a\n{name}  epoch 0: success 0%\n" in out
         assert f"{name}error: a run begins\n" in err
+
+
+@pytest.mark.parametrize(("word", "again"), [
+    ("progress=false", False), ("resume=false", True), ("eval.shift={light:0.5}", True)
+])  # fmt: skip
+def test_a_sweep_runs_again_what_is_asked_for_again(word, again, here, monkeypatch):
+    seen = []
+
+    def run(file, record, learn, report, *, again):
+        seen.append(again)
+        return replace(record, status="failed", exit_status=2)
+
+    monkeypatch.setattr("lifelong.launch.run_job", run)
+    main(["train", "-m", "seed=1,2", word])
+    assert seen == [again] * 2
 
 
 @pytest.mark.parametrize(("words", "noted"), [

@@ -53,6 +53,14 @@ def test_worked_example():
     assert average_success(scores.matrix) == pytest.approx([0.8, 0.45, 1 / 3])
 
 
+def test_success_counts_tasks_where_groups_are_learned_together():
+    """A base of six tasks at 100 %, and four more at 0: six tenths of all, not a fifth."""
+    matrix = np.where(np.tri(5, dtype=bool), [1.0, 0, 0, 0, 0], NAN)
+    scores = Scores((curve(1.0),) * 5, matrix, np.tril(np.full((5, 5), 10)), group_sizes=(6, 1, 1, 1, 1))
+    found = lifelong_metrics(scores)
+    assert found.final_success.value == found.just_learned.value == pytest.approx(0.6)
+
+
 def test_other_conventions_of_a_published_matrix():
     """RoboCasa365 (ICLR 2026), success after each of four phases [%], worked out by hand."""
     c = np.full((4, 4), NAN)

@@ -283,6 +283,7 @@ def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> 
     (["eval.episodes=1,2"], "eval.episodes"),
     (["seed=1,2"], "seed"),
     (["seed=3"], "seed"),
+    (["train.steps_per_epoch=10,400"], "train.steps_per_epoch"),
     (["benchmark=libero_goal"], "benchmark"),
     (["eval.episodes=3"], "eval.episodes"),
 ])  # fmt: skip

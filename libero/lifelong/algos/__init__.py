@@ -26,6 +26,13 @@ def cycle(dl: Iterable[Any]) -> Iterator[Any]:
         yield from dl
 
 
+class _MemoryOfTasks(ReplayMemory):
+    """As many windows of each task, drawn uniformly, and no more of one where another has fewer."""
+
+    def _shares(self, sizes: Mapping[int, int]) -> dict[int, int]:
+        return dict(sizes)
+
+
 class ER(Sequential):
     """Joins to every batch as many windows of earlier tasks; see `lifelong.algorithms.ER`.
 
@@ -33,19 +40,14 @@ class ER(Sequential):
     """
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
-        return algorithms.ER(memory=ReplayMemory(cfg.lifelong.n_memories))
-
-    def end_task(self, dataset: Dataset, task_id: int, benchmark: Any, env: Any = None) -> None:
-        """Add the task's windows to the memory, whose native budget is that of all tasks together."""
-        self.hooks.memory.budget = self.cfg.lifelong.n_memories * (task_id + 1)
-        super().end_task(dataset, task_id, benchmark, env)
+        return algorithms.ER(memory=_MemoryOfTasks(cfg.lifelong.n_memories))
 
 
 class AGEM(ER):
     """Projects out of the gradient what would raise the loss on ER's memory; see `lifelong.algorithms.AGEM`."""
 
     def make_hooks(self, cfg: Any) -> algorithms.Algorithm:
-        return algorithms.AGEM(memory=ReplayMemory(cfg.lifelong.n_memories))
+        return algorithms.AGEM(memory=_MemoryOfTasks(cfg.lifelong.n_memories))
 
 
 class EWC(Sequential):
