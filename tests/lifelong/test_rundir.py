@@ -131,6 +131,6 @@ def test_wandb_keeps_the_steps_in_the_directory_of_the_run(tmp_path, monkeypatch
     tracker = WandB(mode="offline")
     tracker.start("libero_object/er", str(tmp_path), {"seed": 1})
     tracker.log({"loss/0": 0.5}, 3)
-    assert tracker._run.step == 3 and tracker._run.id == "libero_object-er"
+    assert tracker._run.step == 3 and tracker._run.id.startswith("libero_object-er-")
     tracker.finish()
     assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))
