@@ -93,7 +93,17 @@ def report(
     from lifelong.report.comparison import Plan
     from lifelong.report.page import comparison_text, shift_text, write_report
 
-    page = write_report(run_dirs, out, Plan(reference, all_pairs, margin, other_worlds))
+    plan = Plan(reference, all_pairs, margin, other_worlds)
+    if len(run_dirs) == 1 and plan != Plan():
+        given = {
+            "--reference": reference,
+            "--all-pairs": all_pairs,
+            "--margin": margin != Plan().margin,
+            "--other-worlds": other_worlds,
+        }
+        names = ", ".join(name for name, value in given.items() if value)
+        raise ConfigError(f"{names}: a single run is not compared; name several runs, or leave this out")
+    page = write_report(run_dirs, out, plan)
     lines = comparison_text(page) if len(run_dirs) > 1 else shift_text(run_dirs[0])
     file = page.parent / "comparison.json" if len(run_dirs) > 1 else run_dirs[0] / "results.json"
     return Answer("\n".join(lines), read_json(file) if file.is_file() else None, page)

@@ -3,14 +3,14 @@
 Intervals and tests are those of `lifelong.stats.methods`.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from lifelong.errors import ComparisonError
-from lifelong.report.runs import Group, Run, check_same_world, unlike
+from lifelong.report.runs import Group, Run, algorithm_of, check_same_world, settings_of, stage_of, unlike
 from lifelong.results.provenance import few_of
 from lifelong.stats.intervals import mean_and_half_width
 from lifelong.stats.methods import MARGIN, MethodRun, spreads, statistics
@@ -141,36 +141,53 @@ def _known(value: float | None) -> bool:
     return value is not None and bool(np.isfinite(value))
 
 
-# (seed, data_seed), or None for all together -> task -> success
-_Rates = Mapping[tuple[int, int | None] | None, Mapping[str, float]]
+# settings -> (seed, data_seed), or None for all together -> task -> success
+_Rates = Mapping[Hashable, Mapping[tuple[int, int | None] | None, Mapping[str, float]]]
 
 
 def _reference(measured: Mapping[str, Sequence[Run]]) -> _Rates:
-    """Return the mean success on each task of policies that learned it alone, or with all others; {} without such."""
-    for algo in ("single_task", "multitask"):
-        found: dict[tuple[int, int | None] | None, dict[str, list[float]]] = {}
-        for run in (run for runs in measured.values() for run in runs if run.record.algo == algo):
-            matrix = run.results.success_matrix()[0]
-            rates = matrix[-1] if algo == "multitask" else np.diag(matrix)
+    """Return the mean success on each task of policies that learned it alone, or else with all others."""
+    rates: dict[Hashable, dict[tuple[int, int | None] | None, dict[str, float]]] = {}
+    for algo in ("multitask", "singletask"):
+        found: dict[Hashable, dict[tuple[int, int | None] | None, dict[str, list[float]]]] = {}
+        for run in (run for runs in measured.values() for run in runs if algorithm_of(run) == algo):
+            of_settings = found.setdefault(_besides_algorithm(run), {})
             for key in ((run.record.seed, run.record.data_seed), None):
-                for name, rate in zip(run.record.tasks, rates, strict=True):
-                    found.setdefault(key, {}).setdefault(name, []).append(float(rate))
-        if found:
-            return {k: {name: float(np.mean(rates)) for name, rates in v.items()} for k, v in found.items()}
-    return {}
+                for name, rate in zip(run.record.tasks, _just_learned(run), strict=True):
+                    of_settings.setdefault(key, {}).setdefault(name, []).append(rate)
+        rates |= {
+            settings: {
+                key: {name: float(np.mean(values)) for name, values in by_task.items()}
+                for key, by_task in by_seed.items()
+            }
+            for settings, by_seed in found.items()
+        }
+    return rates
+
+
+def _besides_algorithm(run: Run) -> Hashable:
+    return tuple(item for item in settings_of(run).items() if item[0].partition(".")[0] != "algo")
+
+
+def _just_learned(run: Run) -> list[float]:
+    """Return the success on each task after the stage that learned it."""
+    matrix = run.results.success_matrix()[0]
+    return [float(matrix[stage_of(run, task)[-1], task]) for task in range(len(matrix))]
 
 
 def _conventions(runs: Sequence[Run], reference: _Rates) -> dict[str, dict[str, float]]:
     """Return what other papers print, by its name in `lifelong.stats.metrics`, over the runs.
 
-    Intransigence is that against the reference of a run's own seeds, where there is one, else against all.
+    Intransigence is that against the reference of the same settings: of a run's own seeds, where there is one, else of
+    all.
     """
     rows = []
     for run in runs:
-        paired = reference.get((run.record.seed, run.record.data_seed), reference.get(None, {}))
+        fitting = reference.get(_besides_algorithm(run), {})
+        paired = fitting.get((run.record.seed, run.record.data_seed), fitting.get(None, {}))
         alone = [paired.get(name, np.nan) for name in run.record.tasks[: run.learned]]
-        whole = run.results.success_matrix()[0][: run.learned, : run.learned]
-        rows.append(run.results.other_conventions() | {"intransigence": intransigence(whole, alone)})
+        learned = np.diag(_just_learned(run)[: run.learned])
+        rows.append(run.results.other_conventions() | {"intransigence": intransigence(learned, alone)})
     means = {name: _mean([row[name] for row in rows]) for name in (rows[0] if rows else {})}
     return {name: mean for name, mean in means.items() if np.isfinite(mean["mean"])}
 
@@ -231,7 +248,7 @@ def costs_of(runs: Sequence[Run]) -> dict[str, float]:
 
     Costs that no run recorded are omitted.
     """
-    tables = [list(run.results.costs_by_task().values()) for run in runs]
+    tables = [_costs_by_task(run) for run in runs]
     by_task, last = [row for rows in tables for row in rows], [row for rows in tables for row in rows[-1:]]
     reduced: dict[str, tuple[list[dict[str, float]], Callable[[Any], Any]]] = {
         "stored_bytes": (last, np.mean),
@@ -245,6 +262,15 @@ def costs_of(runs: Sequence[Run]) -> dict[str, float]:
         values = [row[name] for row in rows if name in row]
         found[name] = float(reduce(values)) if values else float("nan")
     return found
+
+
+def _costs_by_task(run: Run) -> list[dict[str, float]]:
+    """Return the costs of every task; tasks that are learned together have equal parts of their times."""
+    rows = []
+    for task, costs in run.results.costs_by_task().items():
+        count = len(stage_of(run, task))
+        rows += [{k: v / count if k.endswith("_seconds") else v for k, v in costs.items()}] * count
+    return rows
 
 
 def _mean(values: Sequence[float]) -> dict[str, float]:

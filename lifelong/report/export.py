@@ -1,6 +1,7 @@
 """Runs as a table for other programs: a pandas DataFrame, CSV, Parquet, and LaTeX for a paper."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from glob import glob
 from pathlib import Path
@@ -10,7 +11,7 @@ from libero_env.storage import atomic_path
 from libero_env.text import flatten
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import compare, costs_of
-from lifelong.report.runs import Run, group_runs, load_run
+from lifelong.report.runs import Group, Run, group_runs, load_run
 from lifelong.results.summary import summarize
 from lifelong.stats.metrics import METRIC_NAMES
 
@@ -23,8 +24,9 @@ _TITLES = {"final_success": "final", "just_learned": "just learned"}
 def load_runs(*patterns: str | Path) -> "pd.DataFrame":
     """Return a table of runs, a row each.
 
-    Columns: `path`, `method` (the label of the reports), `algo`, `benchmark`, `policy`, `preset`, `seed`, `finished`,
-    `tasks`, `tasks_learned`; the metrics `fwt`, `nbt`, `auc`, `final_success`, `just_learned`, each with `_low` and
+    Columns: `path`, `method` (the label of the reports), `algo`, `benchmark`, `policy`, `preset`, `seed`, `counted`
+    (whether reports count it: not a further run of a seed, nor one behind others of its method), `finished`, `tasks`,
+    `tasks_learned`; the metrics `fwt`, `nbt`, `auc`, `final_success`, `just_learned`, each with `_low` and
     `_high` of its interval, and those of other conventions; `cost.NAME`, the costs of the reports (bytes, seconds,
     parameters, FLOPs); `config.KEY` for every key of the configuration.
 
@@ -37,16 +39,26 @@ def load_runs(*patterns: str | Path) -> "pd.DataFrame":
     import pandas as pd
 
     runs = find_runs(patterns)
-    labels = {run.path: group.label for group in group_runs(runs) for run in (*group.runs, *group.repeats)}
-    return pd.DataFrame([_row(run, labels[run.path]) for run in runs])
+    groups = {
+        run.path: group for group in group_runs(runs) for run in (*group.runs, *group.repeats, *group.behind)
+    }
+    return pd.DataFrame([_row(run, groups[run.path]) for run in runs])
 
 
 def find_runs(patterns: Sequence[str | Path]) -> list[Run]:
-    """Return the runs that patterns name, in the order of their paths; see `load_runs`."""
+    """Return the runs that patterns name, in the order of their paths; see `load_runs`.
+
+    Those that `resume=false` moved aside (`.old1`) are left out, unless one is named itself.
+    """
     found: dict[Path, None] = {}
     for pattern in map(str, patterns):
         folders = [Path(name) for name in sorted(glob(pattern))] or [Path(pattern)]
-        inside = [log.parent for folder in folders for log in sorted(folder.rglob("results.jsonl"))]
+        logs = [log for folder in folders for log in sorted(folder.rglob("results.jsonl"))]
+        inside = [
+            run
+            for log in logs
+            if (run := log.parent) == Path(pattern) or not re.search(r"\.old\d+$", run.name)
+        ]
         if not inside:
             raise LifelongError(f"{pattern}: no run directory is there (with a file results.jsonl)")
         found |= dict.fromkeys(inside)
@@ -78,12 +90,13 @@ def export_runs(
     return target
 
 
-def _row(run: Run, label: str) -> dict[str, object]:
+def _row(run: Run, group: Group) -> dict[str, object]:
     record = run.record
     row: dict[str, object] = {
         "path": str(run.path),
-        "method": label,
+        "method": group.label,
         **{name: getattr(record, name) for name in ("algo", "benchmark", "policy", "preset", "seed")},
+        "counted": run in group.runs,
         "finished": run.results.finished,
         "tasks": len(record.tasks),
         "tasks_learned": run.learned,
@@ -103,7 +116,8 @@ def _row(run: Run, label: str) -> dict[str, object]:
 
 def _latex(runs: Sequence[Run]) -> str:
     found = compare(group_runs(runs))
-    lines = [rf"\begin{{tabular}}{{l{'r' * (1 + len(METRIC_NAMES))}}}", r"\toprule"]
+    lines = [f"% {' '.join(text.split())}" for text in found["conditions"]]
+    lines += [rf"\begin{{tabular}}{{l{'r' * (1 + len(METRIC_NAMES))}}}", r"\toprule"]
     lines.append(
         " & ".join(["method", "seeds", *(_TITLES.get(name, name.upper()) for name in METRIC_NAMES)]) + r" \\"
     )

@@ -194,18 +194,19 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
     save(forgetting_figure(lines), folder / "forgetting")
     if stored := _stored(found):
         save(storage_figure(stored), folder / "storage")
-    benchmarks = sorted({r.record.benchmark for r in runs})
+    counted = [run for group in groups for run in group.runs]
+    benchmarks = sorted({r.record.benchmark for r in counted})
     texts: dict[str, str] = {}
-    for run in (run for group in groups for run in group.runs):
+    for run in counted:
         texts |= dict(zip(run.record.tasks, short_labels(run.record.instructions), strict=True))
     return {
         "title": f"{len(groups)} methods on {', '.join(benchmarks)}" if len(groups) > 1 else groups[0].label,
         "facts": [
-            ("runs", sum(len(g.runs) for g in groups)),
-            ("seeds", ", ".join(map(str, sorted({r.record.seed for r in runs})))),
+            ("runs", len(counted)),
+            ("seeds", ", ".join(map(str, sorted({r.record.seed for r in counted})))),
             *[
                 ("tasks learned together first", n)
-                for n in sorted({_base_tasks(r.record) for r in runs})
+                for n in sorted({_base_tasks(r.record) for r in counted})
                 if n
             ],
         ],
@@ -218,7 +219,7 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         + found["conditions"],
         "groups": _group_rows({label: group["metrics"] for label, group in found["groups"].items()}, found),
         "later_groups": _group_rows(later["metrics"], found) if later else [],
-        "metric_texts": _metric_texts(runs),
+        "metric_texts": _metric_texts(counted),
         "other_conventions": _forgotten(found, "other_conventions"),
         "spreads": [
             (label, group["spreads"])
@@ -235,7 +236,7 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
             for label, group in found["groups"].items()
             if np.isfinite(group["published"]["fwt"])
         ],
-        "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[r.results.transfer] for r in runs)),
+        "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[r.results.transfer] for r in counted)),
         "forgotten_tasks": _forgotten(found, "forgetting_by_task", texts),
         "forgotten_subgoals": _forgotten(found, "subgoals"),
         "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),

@@ -3,34 +3,31 @@
 import math
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from libero_env.errors import InvalidInputError
 from libero_env.storage import MAX_YAML_BYTES, parse_yaml_text, read_bounded
-from libero_env.text import flatten
 from lifelong.errors import ComparisonError, LifelongError, ResultsError
 from lifelong.results.log import ResultLog
-from lifelong.results.provenance import few_of, resume_notes
+from lifelong.results.provenance import few_of, result_relevant, resume_notes
 from lifelong.results.records import RunRecord, TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.stats.metrics import Metrics, lifelong_metrics
 
-_TOLD = ("packnet", "lora", "omla", "single_task")
+_TOLD = ("packnet", "lora", "omla", "singletask")
 _BASICS = ("algo", "benchmark", "policy", "preset")
-# of keys that change no result by themselves
+# of keys that change no result by themselves, besides those of `lifelong.results.provenance.VOLATILE`
 _IGNORED = (
     "benchmark.order",
     "benchmark.order_seed",
     "benchmark.horizon",
-    "language.cache_dir",
-    "data.memory",
     "data.seed",
+    "eval.record_every",
     "eval.reuse",
     "eval.transfer",
-    "eval.shift",
 )
 # sections of the config
 _COMPARED = (
@@ -66,13 +63,15 @@ class Group:
 
     Attributes:
         label: Name of the method.
-        runs: One run of each.
+        runs: One run of each, of those that have learned most tasks.
         repeats: Further runs of these, which add no evidence and are not counted.
+        behind: Runs that have learned fewer tasks, which are not counted.
     """
 
     label: str
     runs: tuple[Run, ...]
     repeats: tuple[Run, ...] = ()
+    behind: tuple[Run, ...] = ()
 
     @property
     def labels(self) -> list[str]:
@@ -85,8 +84,8 @@ class Group:
     @property
     def told_task(self) -> bool:
         """Whether its policies are told the number of the task at test time, which most methods are not."""
-        settings = dict(_identity(self.runs[0]))
-        return settings["algo"] in _TOLD and settings.get("algo.adapters", "own") == "own"
+        adapters = settings_of(self.runs[0]).get("algo.adapters", "own")
+        return algorithm_of(self.runs[0]) in _TOLD and adapters == "own"
 
 
 def load_run(path: Path) -> Run:
@@ -151,7 +150,7 @@ def group_runs(runs: Sequence[Run]) -> list[Group]:
     """Group runs that differ only in seed and order of tasks; the labels name what differs between groups."""
     groups: dict[tuple[tuple[str, Any], ...], list[Run]] = {}
     for run in runs:
-        groups.setdefault(_identity(run), []).append(run)
+        groups.setdefault(tuple(settings_of(run).items()), []).append(run)
     identities = [dict(key) for key in groups]
     short = [_label(identity, identities) for identity in identities]
     whole = [_label(identity, identities, whole=True) for identity in identities]
@@ -164,8 +163,12 @@ def _one_of_each(label: str, members: Sequence[Run]) -> Group:
     kept: dict[tuple[Any, ...], Run] = {}
     for run in sorted(members, key=lambda r: (r.learned, r.record.started)):
         kept[*_factors(run), str(run.config.get("init_from"))] = run
-    counted = [run for run in members if any(run is k for k in kept.values())]
-    return Group(label, tuple(counted), tuple(run for run in members if not any(run is k for k in counted)))
+    most = max(run.learned for run in members)
+    kinds: dict[str, list[Run]] = {"runs": [], "repeats": [], "behind": []}
+    for run in members:
+        one_of_each = any(run is k for k in kept.values())
+        kinds["repeats" if not one_of_each else "runs" if run.learned == most else "behind"].append(run)
+    return Group(label, *map(tuple, kinds.values()))
 
 
 def _factors(run: Run) -> tuple[Any, ...]:
@@ -200,8 +203,14 @@ def unlike(groups: Sequence[Group]) -> list[str]:
     return [
         *(
             f"Runs differ in {text}."
-            for text in _unlike_facts(groups, (*_WORLD, "source", "estimate of FWT"))
+            for text in _unlike_facts(groups, (*_WORLD, "source", "estimate of FWT", "tasks learned"))
         ),
+        *(
+            f"{group.label} seed {run.record.seed} has learned {_progress(run)} tasks; it is not counted."
+            for group in groups
+            for run in group.behind
+        ),
+        *_unlike_draws(groups),
         *_unlike_demonstrations(groups),
         *_unlike_settings(groups),
     ]
@@ -228,12 +237,42 @@ def _unlike_facts(groups: Sequence[Group], names: Sequence[str], *, unknown: boo
     for name in names:
         found: dict[str, list[str]] = {}
         for label, run in ((group.label, run) for group in groups for run in group.runs):
-            facts = {**run.record.versions, **run.record.conditions, "estimate of FWT": run.results.transfer}
+            facts = {
+                **run.record.versions,
+                **run.record.conditions,
+                "estimate of FWT": run.results.transfer,
+                "tasks learned": _progress(run),
+            }
             value = facts.get(name.replace(" ", "_"), facts.get(name))
             if value is not None or unknown:
                 found.setdefault(value or "unknown", []).append(f"{label} seed {run.record.seed}")
         if len(found) > 1:
             lines.append(f"{name} ({'; '.join(f'{value}: {few_of(runs)}' for value, runs in found.items())})")
+    return lines
+
+
+def _progress(run: Run) -> str:
+    return f"{run.learned} of {len(run.record.tasks)}"
+
+
+def _unlike_draws(groups: Sequence[Group]) -> list[str]:
+    """Return a sentence where methods were run with other orders of tasks, or other seeds of demonstrations."""
+    draws: dict[str, Callable[[RunRecord], Any]] = {
+        "tasks or their orders": lambda record: record.tasks,
+        "seeds of the demonstrations (data.seed)": lambda record: record.data_seed,
+    }
+    lines = []
+    for name, drawn in draws.items():
+        sets: dict[Any, dict[Any, list[str]]] = {}
+        for group in groups:
+            first = group.runs[0].record  # other benchmarks and lengths are told elsewhere
+            alike = sets.setdefault((first.benchmark, len(first.tasks)), {})
+            alike.setdefault(frozenset(drawn(r.record) for r in group.runs), []).append(group.label)
+        lines += [
+            f"The {name} differ between methods: {' against '.join(map(few_of, alike.values()))}."
+            for alike in sets.values()
+            if len(alike) > 1
+        ]
     return lines
 
 
@@ -252,7 +291,7 @@ def _unlike_demonstrations(groups: Sequence[Group]) -> list[str]:
                 continue
             counts = tuple(sorted(zip(run.record.tasks, found.counts, strict=True)))
             digests = tuple(sorted(zip(run.record.tasks, found.digests, strict=True)))
-            data = tuple(item for item in _identity(run) if item[0].startswith("data."))
+            data = tuple(item for item in settings_of(run).items() if item[0].startswith("data."))
             alike = sets.setdefault((run.record.benchmark, run.record.data_seed, counts, data), {})
             alike.setdefault(digests, []).append(name)
     lines = (
@@ -270,16 +309,20 @@ def _unlike_demonstrations(groups: Sequence[Group]) -> list[str]:
 
 def _unlike_settings(groups: Sequence[Group]) -> list[str]:
     """Return a sentence with the settings that differ between methods, and that their names do not tell."""
-    known = [(group.label, dict(_identity(group.runs[0]))) for group in groups]
-    shared = set[str].intersection(*(set(settings) for _, settings in known)) - set(_BASICS)
+    known = [(group.label, settings_of(group.runs[0])) for group in groups if group.runs[0].config]
+    keys = {key for _, settings in known for key in settings} - set(_BASICS)
     # keys of another policy mean something else
     one_policy = len({settings["policy"] for _, settings in known}) == 1
     untold = []
-    for key in sorted(shared):
+    for key in sorted(keys):
         found: dict[Any, list[str]] = {}
         for label, settings in known:
-            found.setdefault(settings[key], []).append(label)
-        told = all(f"{key.rpartition('.')[2]} {settings[key]}" in label for label, settings in known)
+            found.setdefault(settings.get(key), []).append(label)
+        told = all(
+            f"{key.rpartition('.')[2]} {settings[key]}" in label
+            for label, settings in known
+            if key in settings
+        )
         if (
             len(found) > 1
             and not told
@@ -291,11 +334,21 @@ def _unlike_settings(groups: Sequence[Group]) -> list[str]:
     return [f"Settings differ that no method's name tells: {few_of(untold, 6)}."] if untold else []
 
 
-def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
+def algorithm_of(run: Run) -> str:
+    """Return the class of a run's algorithm as one word in lower case; its name where no configuration tells that."""
+    return str(settings_of(run).get("algo.", run.record.algo)).replace("_", "").lower()
+
+
+def stage_of(run: Run, task: int) -> range:
+    """Return the positions of the tasks that are learned together with a task."""
+    return range(len(run.record.tasks)) if algorithm_of(run) == "multitask" else run.record.group(task)
+
+
+def settings_of(run: Run) -> dict[str, Any]:
     """Return what two runs of one method have in common: names and settings, without seeds, orders and places."""
     record = run.record
     settings: dict[str, Any] = {}
-    for key, value in flatten({k: v for k, v in run.config.items() if k in _COMPARED}).items():
+    for key, value in result_relevant({k: v for k, v in run.config.items() if k in _COMPARED}).items():
         section, _, name = key.rpartition(".")
         if key in _IGNORED or name == "_partial_" or not section:
             continue
@@ -306,7 +359,7 @@ def _identity(run: Run) -> tuple[tuple[str, Any], ...]:
         settings["eval.backend"] = record.backend
     if init_from := run.config.get("init_from"):  # each seed may start from a run of the same seed
         settings["init_from"] = re.sub(r"seed\d+", "seed", str(init_from))
-    return tuple(({n: getattr(record, n) for n in _BASICS} | dict(sorted(settings.items()))).items())
+    return {n: getattr(record, n) for n in _BASICS} | dict(sorted(settings.items()))
 
 
 def _load_config(path: Path) -> tuple[dict[str, Any], str, list[str]]:

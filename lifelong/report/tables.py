@@ -13,7 +13,7 @@ from libero_env.text import duration, quantity
 from lifelong.errors import writing
 from lifelong.report.comparison import costs_of
 from lifelong.report.figures import cell_colours
-from lifelong.report.runs import Run
+from lifelong.report.runs import Run, stage_of
 from lifelong.results.failures import FailureScore, Tally
 from lifelong.results.results import Results
 from lifelong.results.shifts import ShiftScore
@@ -111,9 +111,13 @@ def cost_table(rows: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, Any
 
 
 def task_costs(run: Run, labels: Sequence[str]) -> dict[str, Any] | None:
-    """Return the costs of every task of a run, and their average."""
-    rows = [(f"{t + 1}  {labels[t]}", costs) for t, costs in run.results.costs_by_task().items()]
-    return cost_table([*rows, ("average; largest memory", costs_of([run]))]) if rows else None
+    """Return the costs of every task of a run, of tasks that are learned together in one row, and their average."""
+    rows = []
+    for last, costs in run.results.costs_by_task().items():
+        first = stage_of(run, last)[0]
+        name = f"{last + 1}  {labels[last]}" if first == last else f"{first + 1} to {last + 1}, together"
+        rows.append((name, costs))
+    return cost_table([*rows, ("average of a task; largest memory", costs_of([run]))]) if rows else None
 
 
 def atom_rows(found: Subgoals, labels: Sequence[str]) -> list[dict[str, Any]]:

@@ -1,18 +1,19 @@
 """What a run leaves for others: `results.json`, and every episode of one or several runs as a table, and back.
 
 results.json     the success matrix, learning curves, metrics and times of a run
-episodes.csv.gz  one row an episode: the method's label, seeds of the run and its demonstrations, its order, `transfer`
-                 (how its forward transfer is estimated), `together` (numbers of tasks learned together), which
-                 `cells` of the matrix were measured and their share, the evaluation (`phase` curve or matrix, `row`:
-                 position of the task learned last, `epoch` trained on it), the task (`position` in the sequence, and
-                 its name), `start` (initial state), `success` (0 or 1), `length` [control steps]; episodes that a
-                 simulation error ended are left out
+episodes.csv.gz  one row an episode: the method's label, the run's number among those of its method, seeds of the run
+                 and its demonstrations, its order, `transfer` (how its forward transfer is estimated), `together`
+                 (numbers of tasks learned together), which `cells` of the matrix were measured and their share, the
+                 evaluation (`phase` curve or matrix, `row`: position of the task learned last, `epoch` trained on it),
+                 the task (`position` in the sequence, and its name), `start` (initial state), `success` (0 or 1),
+                 `length` [control steps]; episodes that a simulation error ended are left out
 """
 
 import csv
 import gzip
 import io
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -33,7 +34,7 @@ from lifelong.stats.intervals import wilson_interval
 from lifelong.stats.metrics import METRIC_NAMES, Metrics, lifelong_metrics
 
 COLUMNS = (
-    *("method", "seed", "data_seed", "order", "transfer", "together", "cells", "cells_share"),
+    *("method", "run", "seed", "data_seed", "order", "transfer", "together", "cells", "cells_share"),
     *("phase", "row", "epoch", "position", "task", "start", "success", "length"),
 )
 _OF_EPISODES = (
@@ -153,22 +154,24 @@ def write_episodes(path: Path, runs: Iterable[tuple[str, Results]]) -> Path:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     orders: dict[tuple[str, ...], int] = {}
+    numbers = Counter[str]()
     for method, results in runs:
         order = orders.setdefault(results.run.tasks, len(orders))
-        writer.writerows(_rows(method, order, results))
+        numbers[method] += 1
+        writer.writerows(_rows(method, numbers[method], order, results))
     content = text.getvalue().encode()
     with writing(path, "the episodes"), atomic_path(path) as part:
         part.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
     return path
 
 
-def _rows(method: str, order: int, results: Results) -> Iterator[tuple[Any, ...]]:
+def _rows(method: str, number: int, order: int, results: Results) -> Iterator[tuple[Any, ...]]:
     run = results.run
     together = " ".join(str(len(group)) for group in run.groups)
-    of_run = (method, run.seed, run.data_seed, order, results.transfer, together, run.cells, run.cells_share)
+    seeds, kind = (run.seed, run.data_seed), (results.transfer, together, run.cells, run.cells_share)
     for record in results.evaluations():
         task = run.tasks[record.task] if record.task < len(run.tasks) else ""
-        key = (*of_run, record.phase, record.learned)
+        key = (method, number, *seeds, order, *kind, record.phase, record.learned)
         for start, won, length in zip(record.init_states, record.successes, record.lengths, strict=True):
             yield (*key, record.epoch, record.task, task, start, int(won), length)
 
@@ -187,7 +190,7 @@ def read_episodes(path: Path) -> list[tuple[str, Results]]:
             raise ResultsError(f"{path} is no table of episodes; expected the columns {', '.join(COLUMNS)}")
         runs: dict[tuple[str, ...], list[dict[str, str]]] = {}
         for row in reader:
-            runs.setdefault(tuple(row[c] for c in COLUMNS[:4]), []).append(row)
+            runs.setdefault((row["method"], row["run"]), []).append(row)
         return [(key[0], _results(rows)) for key, rows in runs.items()]
     except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
         raise ResultsError(f"{path}: the episodes cannot be read ({error})") from error

@@ -192,8 +192,12 @@ def statistics(
         `metrics` by label, `differences`, `statistics`: how they were computed. NaN where something is unknown.
 
     Raises:
-        ValueError: A reference is not a method, or the margin is not between 0 and 1.
+        ValueError: A reference is not a method, or given with `all_pairs`; or the margin is not between 0 and 1.
     """
+    if all_pairs and references:
+        raise ValueError(
+            f"--all-pairs and --reference {' '.join(references)} name different pairs to compare; leave one out"
+        )
     if unknown := [name for name in references if name not in methods]:
         raise ValueError(f"{unknown[0]!r} is not a method; there are {', '.join(methods)}")
     if not 0 < margin < 1:

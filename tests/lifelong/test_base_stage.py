@@ -116,7 +116,7 @@ def test_metrics_count_the_base_stage_as_one_task_and_the_later_tasks_are_measur
         [found.fwt.value, found.nbt.value, found.auc.value], [v.mean() for v in (fwt, nbt, auc)]
     )
     np.testing.assert_allclose(found.nbt_by_task, np.repeat(nbt, (3, 1, 1)))
-    np.testing.assert_allclose(found.final_success.value, (0.2 + 0.6 + 1.0) / 3)
+    np.testing.assert_allclose(found.final_success.value, (3 * 0.2 + 0.6 + 1.0) / 5)  # of all tasks
 
     later = results.after_base_stage()
     assert later is not None

@@ -1,5 +1,6 @@
 """Runs as tables: values are those of results.json and of the reports."""
 
+import shutil
 from pathlib import Path
 
 import pandas
@@ -46,6 +47,14 @@ def test_latex_has_a_row_for_each_method(tmp_path, capsys):
     (row,) = [line for line in lines if line.startswith("packnet")]
     assert row.endswith(r"& $0.0$ & $0.0$ & $0.0$ & $0.0$ $[0.0, 49.0]$ & $0.0$ $[0.0, 49.0]$ \\")
     assert len({line.count(" & ") for line in lines if " & " in line}) == 1
+
+
+def test_runs_moved_aside_are_left_out(tmp_path):
+    for name in ("seed1", "seed1.old1"):
+        shutil.copytree(RUNS / "er", tmp_path / name)
+    for pattern in (tmp_path, f"{tmp_path}/*", tmp_path / "seed1"):
+        assert list(lifelong.load_runs(pattern).path) == [str(tmp_path / "seed1")]
+    assert list(lifelong.load_runs(tmp_path / "seed1.old1").path) == [str(tmp_path / "seed1.old1")]
 
 
 def test_text_of_a_label_is_never_markup():

@@ -90,6 +90,8 @@ def test_each_method_is_compared_with_the_references_and_no_others():
     assert "--reference" in findings(statistics(methods), {"auc": "AUC"})[0]
     with pytest.raises(ValueError, match="'lwf' is not a method; there are er, ewc, si"):
         statistics(methods, ["lwf"])
+    with pytest.raises(ValueError, match="--all-pairs and --reference er si name different pairs"):
+        statistics(methods, ["er", "si"], all_pairs=True)
 
 
 def test_other_methods_in_the_table_do_not_change_what_two_differ_in():

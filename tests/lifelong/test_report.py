@@ -16,11 +16,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from omegaconf import DictConfig
 from PIL import Image
 
+from libero_env.cli.main import main
 from libero_env.sim.causes import Failure
 from libero_env.tasks import get_suite
 from libero_env.text import json_safe
 from lifelong.errors import LifelongError
-from lifelong.report.comparison import Plan
+from lifelong.report.comparison import Plan, compare
+from lifelong.report.export import export_runs, load_runs
 from lifelong.report.figures import (
     LINE_MARKERS,
     Line,
@@ -31,7 +33,7 @@ from lifelong.report.figures import (
     storage_figure,
 )
 from lifelong.report.page import comparison_text, write_report
-from lifelong.report.runs import group_runs, load_run, short_labels
+from lifelong.report.runs import group_runs, load_run, short_labels, unlike
 from lifelong.report.tables import triangle
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record
@@ -154,6 +156,19 @@ def _evaluation(
         atoms_at_end=tuple((bool(w), bool(w), True) for w in wins),
         failures=tuple(None if w else DROPPED if u else AWAY for w, u in zip(wins, lifted, strict=True)),
     )
+
+
+def configure(run: Path, **values: object) -> Path:
+    """Set keys of a run's configuration, with two underscores for each dot, as if it had been run with them."""
+    config = yaml.safe_load((run / "config.yaml").read_text())
+    for key, value in values.items():
+        *sections, name = key.split("__")
+        node = config
+        for section in sections:
+            node = node.setdefault(section, {})
+        node[name] = value
+    (run / "config.yaml").write_text(yaml.safe_dump(config))
+    return run
 
 
 def add_video(folder: Path, name: str = "task_01_success") -> None:
@@ -483,6 +498,51 @@ def test_conventions_of_other_papers_are_compared(tmp_path: Path, monkeypatch: p
     assert "relative nbt" in Page(out.read_text()).text
 
 
+def test_intransigence_is_against_runs_of_the_same_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(CHARACTERS, "my_own", (0.8, 1.0))
+    runs = [make_run(tmp_path / a, a, tasks=2) for a in ("er", "my_own")]
+    target = "lifelong.algorithms.single_task.SingleTask"
+    configure(runs[1], algo___target_=target, train__epochs=99)
+    er = group_runs([load_run(run) for run in runs])
+    assert "intransigence" not in compare(er)["groups"]["er"]["other_conventions"]
+    assert {group.label: group.told_task for group in er} == {"er": False, "my_own": True}
+    configure(runs[1], train__epochs=10)
+    again = compare(group_runs([load_run(run) for run in runs]))["groups"]
+    assert "intransigence" in again["er"]["other_conventions"]
+    assert again["my_own"]["other_conventions"]["intransigence"]["mean"] == 0
+
+
+def together(
+    folder: Path, algo: str, rates: dict[tuple[int, int], float], sizes: tuple[int, ...] = ()
+) -> Path:
+    """Write a run of four tasks with the given success (row, task), and 60 s of training for each row."""
+    log, rng = ResultLog(folder / "results.jsonl"), np.random.default_rng(0)
+    names = [f"put_it_there_{n}" for n in range(4)]
+    facts = {"benchmark": "goal", "policy": "p", "preset": "x", "config": {}}
+    log.append(start_record(algo=algo, seed=1, tasks=names, instructions=names, group_sizes=sizes, **facts))
+    for (row, task), rate in rates.items():
+        log.append(replace(_evaluation(rng, "matrix", row, 1, task, rate), seconds=0.0))
+    for row in sorted({row for row, _ in rates}):
+        log.append(LossRecord(task=row, epoch=1, loss=1.0, seconds=60.0))
+        log.append(CostRecord(task=row, costs={"parameters": 10.0 * (row + 1)}))
+        log.append(TaskEndRecord(task=row, best_epoch=1, seconds=60.0))
+    return folder
+
+
+def test_tasks_that_are_learned_together_share_their_costs_and_have_an_intransigence(tmp_path: Path):
+    pairs = {(1, 0): 1.0, (1, 1): 0.0} | {(3, task): 1.0 for task in range(4)}
+    runs = [
+        together(tmp_path / "er", "er", pairs, (2, 2)),
+        together(tmp_path / "multitask", "multitask", {(3, task): 1.0 for task in range(4)}),
+    ]
+    found = compare(group_runs([load_run(run) for run in runs]))["groups"]
+    assert found["er"]["other_conventions"]["intransigence"]["mean"] == 1 / 4
+    assert found["er"]["costs"]["training_seconds"] == 30 and found["er"]["costs"]["parameters"] == 30
+    assert found["multitask"]["costs"]["training_seconds"] == 15
+    text = [Page(write_report([run]).read_text()).text for run in runs]
+    assert "1 to 2, together 1 min 00 s" in text[0] and "1 to 4, together 1 min 00 s" in text[1]
+
+
 def test_auc_stands_against_what_is_stored():
     points = {str(n): (1e3 * n, Estimate(0.5, 0.4, 0.6)) for n in range(20)}
     figure = storage_figure(points)
@@ -605,6 +665,42 @@ def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Pat
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("key", ["open_environments", "sim_threads", "record_every", "shift"])
+def test_keys_that_change_no_result_make_no_method(key: str, tmp_path: Path):
+    runs = [make_run(tmp_path / str(seed), "er", seed, tasks=1, epochs=(0, 1)) for seed in (1, 2)]
+    value = {"camera": 1} if key == "shift" else 7
+    configure(runs[0], **{f"eval__{key}": value}, data__folder="elsewhere", language__cache_dir="x")
+    assert len(group_runs([load_run(run) for run in runs])) == 1
+
+
+def test_runs_of_one_seed_from_two_starts_are_two_in_the_table_of_episodes(tmp_path: Path):
+    runs = [make_run(tmp_path / str(n), "er", 1, tasks=1, epochs=(0, 1)) for n in (1, 2)]
+    for number, run in enumerate(runs):
+        configure(run, init_from=f"runs/seed{number}")
+    page = write_report(runs, tmp_path / "out")
+    again = [results.success_matrix()[1] for _, results in read_episodes(page.parent / "episodes.csv.gz")]
+    assert again == [[[20]], [[20]]]
+
+
+@pytest.mark.parametrize(
+    "words, message",
+    [
+        (["--reference", "er", "--margin", "0.2"], "--reference, --margin: a single run"),
+        (["--all-pairs"], "--all-pairs: a single run"),
+        (["--other-worlds"], "--other-worlds: a single run"),
+        (
+            ["OTHER", "--all-pairs", "--reference", "er"],
+            "--all-pairs and --reference er name different pairs",
+        ),
+    ],
+)
+def test_options_of_a_comparison_without_effect_are_refused(words, message, finished: Path, tmp_path, capsys):
+    other = make_run(tmp_path / "ewc", "ewc", tasks=4)
+    words = [str(other) if word == "OTHER" else word for word in words]
+    assert main(["report", str(finished), *words, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err and not (tmp_path / "out" / "report.html").exists()
+
+
 def test_no_two_methods_have_one_label(tmp_path: Path):
     """Or one would take the place of the other in every table."""
     runs = []
@@ -654,6 +750,60 @@ def test_runs_of_different_progress_and_length_compare(tmp_path: Path):
     runs.append(make_run(tmp_path / "c", "ewc", 1, tasks=3, done=0))
     page = Page(write_report(runs, tmp_path / "out.html").read_text())
     assert "1 of 3" in page.text and "0 of 3" in page.text
+
+
+def test_a_run_behind_the_others_of_its_method_is_not_counted(tmp_path: Path):
+    runs = [make_run(tmp_path / f"{a}{s}", a, s, tasks=2) for a, s in (("er", 1), ("ewc", 1), ("ewc", 2))]
+    runs.append(make_run(tmp_path / "er2", "er", 2, tasks=2, done=1))
+    page = write_report(runs, tmp_path / "out")
+    line = "er seed 2 has learned 1 of 2 tasks; it is not counted."
+    found = json.loads((page.parent / "comparison.json").read_text())
+    assert line in comparison_text(page) and line in page.read_text() and line in found["conditions"]
+    er = found["groups"]["er"]
+    assert er["seeds"] == [1] and er["metrics"]["auc"]["values"] == [load_run(runs[0]).metrics.auc.value]
+    assert len(read_episodes(page.parent / "episodes.csv.gz")) == 3
+    latex = export_runs([tmp_path], "latex", tmp_path / "runs.tex").read_text()
+    assert f"% {line}\n" in latex and "er & 1 & " in latex
+    table = load_runs(tmp_path)
+    assert [Path(path).name for path in table.path[~table.counted]] == ["er2"]
+    told = comparison_text(write_report(runs[1:], tmp_path / "apart"))
+    assert "Runs differ in tasks learned (1 of 2: er seed 2; 2 of 2: ewc seed 1, ewc seed 2)." in told
+
+
+@pytest.mark.parametrize(
+    "key, value, told",
+    [
+        ("benchmark__order", 1, "The tasks or their orders differ between methods: er against ewc."),
+        (
+            "data__seed",
+            5,
+            "The seeds of the demonstrations (data.seed) differ between methods: er against ewc.",
+        ),
+        ("init_from", "runs/base", "init_from (None of er, runs/base of ewc)"),
+        ("data__perturb", {"camera": 0.5}, "data.perturb.camera (None of er, 0.5 of ewc)"),
+        ("stream__perturb", {"light": 1}, "stream.perturb.light (None of er, 1 of ewc)"),
+        ("eval__select", None, None),
+    ],
+)
+def test_what_differs_between_all_runs_of_two_methods_is_told(
+    key: str, value, told: str | None, tmp_path: Path
+):
+    facts = {key.split("__")[1]: value} if key == "benchmark__order" else {}
+    facts |= {"data_seed": value} if key == "data__seed" else {}
+    runs = [make_run(tmp_path / f"er{s}", "er", s, tasks=2) for s in (1, 2)]
+    runs += [
+        configure(make_run(tmp_path / f"ewc{s}", "ewc", s, tasks=2, **facts), **{key: value}) for s in (1, 2)
+    ]
+    groups = group_runs([load_run(configure(run, data__memory=str(n))) for n, run in enumerate(runs)])
+    lines = [line for line in unlike(groups) if not line.startswith("No record tells")]
+    assert len(lines) == bool(told) and (told or "") in "".join(lines)
+
+
+def test_the_start_of_a_run_that_its_methods_name_tells_is_not_told_again(tmp_path: Path):
+    runs = [make_run(tmp_path / name, "er", 1, tasks=2) for name in "ab"]
+    groups = group_runs([load_run(runs[0]), load_run(configure(runs[1], init_from="base"))])
+    assert [group.label for group in groups] == ["er", "er (init_from base)"]
+    assert not any("Settings" in line for line in unlike(groups))
 
 
 def test_long_sequences_fit(tmp_path: Path):
