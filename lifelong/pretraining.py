@@ -123,6 +123,7 @@ def pretraining_context(
         demos=(settings.demos or context.data.demos,) * len(tasks),
         algorithm=Multitask(),
         fit=replace(context.fit, epochs=settings.epochs or context.fit.epochs),
+        eval=replace(context.eval, unseen="none"),
         stream=StreamSettings(),
         perturb=(),
         shift=None,

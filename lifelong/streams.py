@@ -68,8 +68,16 @@ class StreamSettings:
 
         Args:
             sizes: Number of tasks in each group, from `group_sizes`.
+
+        Raises:
+            ConfigError: All tasks are in one group, which is without perturbations.
         """
         largest, last = self._largest_perturbations(), max(1, len(sizes) - 1)
+        if largest and len(sizes) == 1:
+            raise ConfigError(
+                "stream.perturb has no effect on one group of tasks, which is without perturbations; "
+                "use eval.shift or data.perturb"
+            )
         return tuple(
             tuple(
                 replace(one, severity=round(one.severity * number / last, _SEVERITY_DIGITS))
@@ -163,13 +171,25 @@ def plan_tasks(config: Configuration) -> TaskPlan:
     """Return the tasks of a run's configuration.
 
     Raises:
-        ConfigError: They cannot be divided into groups as the configuration says.
+        ConfigError: They cannot be divided into groups as the configuration says, the stream perturbs or blurs what has
+            only one group or stage, or it rewords instructions of tasks that are known by their position.
         UnknownNameError: A suite, an order or a task does not exist.
     """
     benchmark, stream = config.build("benchmark"), config.build("stream")
     tasks, before = benchmark.sequence(), config.build("pretrain").sequence()
     groups = stream.group_sizes(len(tasks), benchmark.group_size)
-    return TaskPlan(before, tasks, stream, groups, stream.perturbations(groups))
+    plan = TaskPlan(before, tasks, stream, groups, stream.perturbations(groups))
+    reworded = plan.instructions[len(before) :] != tuple(task.language for task in tasks)
+    if reworded and config.build("language").by_position:
+        raise ConfigError(
+            "stream.perturb changes instructions, and this language encoder knows tasks by their position; choose "
+            "another, such as language=minilm"
+        )
+    if stream.blur and len(config.build("algo").stages(len(groups))) == 1:
+        raise ConfigError(
+            "stream.blur has no effect on one stage, which has no neighbours; use stream.blur=0"
+        )
+    return plan
 
 
 def learning_stages(algorithm: Algorithm, sizes: Sequence[int]) -> Stages:

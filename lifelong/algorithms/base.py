@@ -25,7 +25,7 @@ The hooks from `begin_task` to `end_task` are called for every task, or for ever
 `task_index` is that of its last task.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -109,7 +109,7 @@ class Algorithm:
     augment: Augmentation | None = None
     state_form: ClassVar[Any] = {}
     acts_by_weights: ClassVar[bool] = False
-    tuned: ClassVar[Mapping[str, tuple[float, ...]]] = {}
+    tuned: Mapping[str, tuple[float, ...]] = {}
     plain_start: ClassVar[bool] = False
     draws_after_backward: ClassVar[bool] = False
 
@@ -153,6 +153,10 @@ class Algorithm:
     def rate_factors(self, policy: Policy) -> Mapping[str, float]:
         """Return factors of the learning rate: beginning of parameters' names -> factor. By default the policy's."""
         return policy.rate_factors() if isinstance(policy, Policy) else {}
+
+    def named_parameters(self, policy: Policy) -> Iterable[tuple[str, nn.Parameter]]:
+        """Return the parameters that `trained` chooses from, with the names that `rate_factors` refers to."""
+        return policy.named_parameters()
 
     def mode_train(self, policy: Policy) -> None:
         """Put the policy in training mode; an algorithm may keep some layers in evaluation mode."""

@@ -85,7 +85,8 @@ class DMPEL(RoutedExperts):
             pool: Side, in pixels, to which images are reduced for the router.
             recall_steps: Number of steps of the recall after each task.
             recall_lr: Learning rate of the recall.
-            replay_size: Number of contexts stored of each task.
+            replay_size: Number of contexts stored of each task, at most as many as it has demonstrations; one with
+                more windows in the task is chosen with higher probability.
             base_tasks: Number of tasks that train the whole policy, which is frozen afterwards; 0 for a pretrained
                 policy.
         """
@@ -129,9 +130,11 @@ class DMPEL(RoutedExperts):
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
         """Store some of the task's contexts with their coefficients, and let the router recall all stored ones."""
-        queries = self.episodes["queries"]
-        chosen = torch.randperm(len(queries), generator=generator)[: self.replay_size]
-        queries = queries[chosen.to(queries.device)]
+        queries, of_window = self.episodes["queries"], self.episodes["of_window"].sort().values
+        count = min(self.replay_size, len(of_window.unique()))
+        start = torch.randint(len(of_window), (1,), generator=generator)
+        places = (torch.arange(count) * len(of_window) + start) // count  # windows at equal distances
+        queries = queries[of_window[places.to(of_window.device)]]
         if self.router is None:
             groups = len(_groups(adapted_layers(policy, self.adapted)))
             coefficients = queries.new_zeros(len(queries), groups, 0)

@@ -42,6 +42,11 @@ class FrozenBase(Algorithm):
         """Draw the seed of the next task's experts."""
         self.seed = int(torch.randint(2**62, (), generator=generator))
 
+    def named_parameters(self, policy: Policy) -> Iterable[tuple[str, nn.Parameter]]:
+        """Return the policy's parameters, and each expert's with the name of its layer or weight."""
+        pairs = [item for of_task in self.library.values() for item in of_task.items()]
+        return [*policy.named_parameters(), *((name, p) for name, pair in pairs for p in pair.values())]
+
     def mode_train(self, policy: Policy) -> None:
         """Set training mode, with running statistics frozen with the base."""
         policy.train()

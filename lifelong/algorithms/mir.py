@@ -41,7 +41,8 @@ class MIR(ER):
         Args:
             memory: Memory of earlier tasks' windows.
             ratio: Number of windows replayed for each window of the present task.
-            candidates: Number of windows that are drawn for each one that is replayed; 5 in the paper (50 for 10).
+            candidates: Number of windows that are drawn for each one that is replayed, as far as the memory has them;
+                5 in the paper (50 for 10).
             rate: Length of the virtual step as a factor of the gradient; 0.05 in the paper.
         """
         super().__init__(memory=memory, ratio=ratio)
@@ -58,7 +59,8 @@ class MIR(ER):
         if not len(self.memory) or self._policy is None:
             return super().mix(batch, generator)
         wanted = max(1, round(self.ratio * len(batch)))
-        drawn = self.memory.sample(round(self.candidates * wanted), generator).to(batch.actions.device)
+        count = max(wanted, min(round(self.candidates * wanted), len(self.memory)))  # beyond it they repeat
+        drawn = self.memory.sample(count, generator).to(batch.actions.device)
         harm = interference(self._policy, batch, drawn, self.rate)
         return batch.join(drawn.rows(harm.topk(min(wanted, len(drawn))).indices.to(drawn.actions.device)))
 

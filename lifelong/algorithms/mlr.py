@@ -4,9 +4,10 @@ import math
 from collections.abc import Mapping
 from functools import cache
 from itertools import combinations
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -62,7 +63,7 @@ class MLR(Algorithm):
         self,
         *,
         budget: Count = 10_000,
-        keep: Share = 1.0,
+        keep: Annotated[float, Field(gt=0, le=1)] = 1.0,
         ratio: Positive = 1.0,
         adjustment: NonNegative = 0.1,
         margin: Share = 0.72,

@@ -6,6 +6,7 @@ from lifelong.algorithms.base import Algorithm
 from lifelong.data.compressed import CompressedMemory
 from lifelong.data.memory import MEMORY_FORM, ReplayMemory
 from lifelong.data.windows import TaskWindows
+from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
 from lifelong.types import Batch
 
@@ -21,9 +22,19 @@ class Rehearsal(Algorithm):
 
         Args:
             memory: Memory of earlier tasks' windows.
-            ratio: Number of windows drawn for each window of a batch.
+            ratio: Number of windows drawn for each window of a batch; 1 where the memory has a batch size of its own.
+
+        Raises:
+            ConfigError: The memory has a batch size, and the ratio is not 1.
         """
         self.memory, self.ratio = memory, ratio
+        if getattr(memory, "batch_size", None) is not None:
+            if ratio != 1:
+                raise ConfigError(
+                    "algo.ratio has no effect with algo.memory.batch_size; leave it at 1, or set "
+                    "algo.memory.batch_size=null"
+                )
+            self.tuned = {key: values for key, values in self.tuned.items() if key != "ratio"}
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
         """Return the batch followed by `ratio` times as many windows of earlier tasks."""

@@ -47,12 +47,15 @@ def find_demos(
         DataError: A named file or folder does not exist, or demonstrations that are there cannot be used.
         DemoError: A file is broken, or demonstrations cannot be recorded.
     """
-    folder, required = check_folder(data), dict(zip([task.id for task in tasks], counts, strict=True))
+    folder, required = check_folder(data), dict[str, int]()
+    for task, count in zip(tasks, counts, strict=True):  # a task may occur again, with fewer of them
+        required[task.id] = max(count, required.get(task.id, 0))
+    by_id = {task.id: task for task in tasks}
     files = _named_files(tasks, required, data)
     if folder is not None:
-        files = _files_in(folder, [task for task in tasks if task.id not in files], required, data) | files
+        files = _files_in(folder, [t for t in by_id.values() if t.id not in files], required, data) | files
     for count in sorted(set(counts), reverse=True):
-        missing = [t for t in tasks if required[t.id] == count and t.id not in files]
+        missing = [t for t in by_id.values() if required[t.id] == count and t.id not in files]
         if not missing:
             continue
         paths = ensure_demos(
@@ -102,8 +105,8 @@ def _files_in(
     for task in tasks:
         file = folder / task.suite / f"{task.name}_demo.hdf5"
         if file.is_file():
-            if (available := len(demo_lengths(file, required[task.id]))) < required[task.id]:
-                raise DataError(f"{file} {_too_few(available, required[task.id])}")
+            if reason := _misfit(file, required[task.id], data):
+                raise DataError(f"data.folder: {file} {reason}")
             files[task.id] = file
     if not (left := [task for task in tasks if task.id not in files]):
         return files
@@ -149,10 +152,6 @@ def _stated_tasks(folder: Path) -> list[tuple[Path, Task]]:
     return stated
 
 
-def _too_few(available: int, required: int) -> str:
-    return f"has {available} demonstrations and {required} are required; use data.demos={available}"
-
-
 def _misfit(file: Path, required: int, data: DataSettings) -> str:
     """Return why a file cannot be learned from with these settings, to follow its name; "" where it can."""
     header, size = read_header(file), data.image_size
@@ -168,7 +167,7 @@ def _misfit(file: Path, required: int, data: DataSettings) -> str:
         return f"is drawn {header.get('drawing', FAST)}; data.drawing is {data.drawing}"
     available = len(demo_lengths(file, required))
     if available < required:
-        return _too_few(available, required)
+        return f"has {available} demonstrations and {required} are required; use data.demos={available}"
     with open_demo_file(file) as handle:
         obs = handle["data"][demo_names(handle, file)[0]].get("obs", {})
         shapes = {view: tuple(obs[view].shape[1:3]) for view in data.views if view in obs}

@@ -6,7 +6,14 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from lifelong.data.windows import JoinedWindows, KeptWindows, TaskWindows, count_frames, gripper_phases
+from lifelong.data.windows import (
+    JoinedWindows,
+    KeptWindows,
+    TaskWindows,
+    count_frames,
+    gripper_phases,
+    tasks_of,
+)
 from lifelong.errors import DataError
 from lifelong.types import Batch, Count
 
@@ -100,7 +107,7 @@ class ReplayMemory(TaskMemory[Tensor]):
         """
         task = dataset.task_id
         self._require_new(task)
-        order = self._order(dataset, generator)[: self.budget]
+        order = self._order(dataset, generator)
         shares = self._shares({**self.shares, task: len(order)})
         for other, held in self._held.items():
             self._hold(other, held.first(shares[other]) if shares[other] < len(held) else held)
@@ -200,6 +207,8 @@ class PhaseMemory(ReplayMemory):
 class FirstWindows(ReplayMemory):
     """The first windows of each past task, in the order of its file: the memory of LIBERO's code.
 
+    Of tasks that are learned together, the first ones of each are kept.
+
     A thousand of them are the first eight or so demonstrations, not a sample of the task. With `batch_size` they come
     as from its loader: in passes in which no window repeats, whose last batch is short. A pass ends with the epoch
     here, so that an epoch can be repeated; there it goes on.
@@ -236,10 +245,11 @@ class FirstWindows(ReplayMemory):
     def add(self, dataset: TaskWindows, generator: torch.Generator) -> None:
         """Add a task; see `ReplayMemory.add`. The shares of the other tasks stay as they are."""
         super().add(dataset, generator)
-        self.budget = self.per_task * len(self.tasks)
+        self.budget = max(self.budget, len(self))
 
     def _order(self, dataset: TaskWindows, generator: torch.Generator) -> Tensor:
-        return torch.arange(min(self.per_task, len(dataset)))
+        tasks = tasks_of(dataset)
+        return torch.cat([(tasks == task).nonzero()[: self.per_task, 0] for task in tasks.unique()])
 
     def _shares(self, sizes: Mapping[int, int]) -> dict[int, int]:
         return dict(sizes)

@@ -272,6 +272,15 @@ def gripper_phases(dataset: WindowDataset) -> Tensor:
     return passed - passed[first]
 
 
+def tasks_of(dataset: WindowDataset) -> Tensor:
+    """Return the task that each window is of, (W,) int64, also where windows of several are learned as one task's."""
+    if isinstance(dataset, JoinedWindows):
+        return torch.cat([tasks_of(part) for part in dataset.datasets])
+    if isinstance(dataset, WindowSubset):
+        return tasks_of(dataset.dataset)[dataset.chosen]
+    return torch.full((len(dataset),), dataset.task_id)  # type: ignore[attr-defined]
+
+
 def count_frames(dataset: WindowDataset, indices: Tensor) -> int:
     """Count the frames that some windows cover, a frame of several windows once.
 

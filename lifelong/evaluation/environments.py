@@ -154,8 +154,8 @@ def held_out_shift(
     words = [_instruction(task, found, data) for task, found in zip(tasks, perturb, strict=True)]
     if words == said:
         return HeldOutShift(format_perturbations(shift), perturb, languages)
-    found = embed(words)
-    if found.shape[1] != languages.shape[1]:
+    again, found = embed([*said, *words]).split(len(said))
+    if not torch.equal(again, languages):  # the same texts, at other positions
         raise ConfigError(
             f"eval.shift={format_perturbations(shift)} changes instructions, and this language encoder knows tasks by "
             "their position; choose another, such as language=minilm"

@@ -48,7 +48,7 @@ class EvalSettings:
             or of the `last`.
         transfer: Estimate of forward transfer. `unbiased`: where the best epoch is kept, it is chosen without the start
             that measures it, and where the last one is, none is held. `published`: eq. 3 as written, which holds the
-            largest of the measured points.
+            largest of the measured points; so does `unbiased` where the best of points of one rollout is kept.
         precision: Precision of the policy, see `FitSettings`.
         record_every: Number of control steps between two frames of the recorded rollouts; 0 records none.
         open_environments: Number of environments kept open, of different tasks.
@@ -105,9 +105,9 @@ class EvalSettings:
     @property
     def transfer_estimate(self) -> Transfer:
         """Estimate of forward transfer by its name in `lifelong.stats.metrics`."""
-        if self.transfer == "published":
-            return "published"
-        return "plain" if self.select == "last" else "cross_fitted"
+        if self.transfer == "unbiased" and self.select == "last":
+            return "plain"
+        return "published" if self.transfer == "published" or self.curve_episodes == 1 else "cross_fitted"
 
     def shift_perturbations(self) -> tuple[Perturbation, ...]:
         """Return the perturbations of the held-out shift; none without one.

@@ -49,6 +49,11 @@ class LanguageEncoder:
     numbered: bool = False
     pad_to: Annotated[int, Field(ge=0, le=512)] = 0
 
+    @property
+    def by_position(self) -> bool:
+        """Whether an embedding depends on the position of a text only, not on its words."""
+        return self.model == "onehot" or self.numbered
+
     def embed(self, texts: Sequence[str]) -> Tensor:
         """Return the embeddings of N texts, (N, L) float32."""
         folder = self.cache_dir or paths.cache_dir() / "language"

@@ -97,8 +97,15 @@ def training_phases(context: RunContext, stage: Sequence[int]) -> list[TrainingP
 
 
 def missing_points(context: RunContext, stage: Sequence[int], results: Results) -> list[int]:
-    """Return the epochs whose points of the learning curve on a stage are not recorded."""
-    return [epoch for phase in training_phases(context, stage) for epoch in phase.missing_points(results)]
+    """Return the epochs whose points of the learning curve on a stage are not recorded.
+
+    What is measured before the first stage counts as its epoch 0, once its row is measured: pretraining has none.
+    """
+    found = [epoch for phase in training_phases(context, stage) for epoch in phase.missing_points(results)]
+    measured = 0 in stage and context.eval.unseen != "none" and results.task_end(stage[-1]) is not None
+    untrained = range(len(context.tasks)) if measured else ()
+    lost = any(results.evaluation("initial", 0, task) is None for task in untrained)
+    return [0, *found] if lost and 0 not in found else found
 
 
 def lacks_row(context: RunContext, stage: Sequence[int], results: Results) -> bool:

@@ -132,6 +132,13 @@ class PretrainSettings:
     demos: Annotated[int, Field(ge=1, le=100_000)] | None = None
     epochs: Count | None = None
 
+    def __post_init__(self) -> None:
+        for key in ("tasks", "demos", "epochs"):
+            if self.suite is None and getattr(self, key) is not None:
+                raise ConfigError(
+                    f"pretrain.{key} has no effect without pretrain.suite; leave it out, or use pretrain=libero_90"
+                )
+
     def sequence(self) -> tuple[Task, ...]:
         """Return the tasks; none without pretraining.
 

@@ -103,7 +103,8 @@ def fit(
     if not len(dataset):
         raise TrainingError("the dataset has no windows: check that its demonstrations are not empty")
     device, size = device_of(policy), settings.batch_size
-    optimizer = _make_optimizer(algorithm.trained(policy), settings, policy, algorithm.rate_factors(policy))
+    trained, factors = algorithm.trained(policy), algorithm.rate_factors(policy)
+    optimizer = _make_optimizer(trained, settings, algorithm.named_parameters(policy), factors)
     default_step = Step(policy, algorithm, optimizer, settings, augment, ranks)
     step, load = step or default_step, load or partial(batches_in_order, dataset)
     steps, windows = _epoch_size(len(dataset), settings)
@@ -164,7 +165,7 @@ def _rates(epoch: int, steps: int, settings: FitSettings) -> Iterator[float]:
 
 
 def learning_rate(step: int, total: int, settings: FitSettings, epoch_start: int = 0) -> float:
-    """Return the learning rate of a step: linear warm-up, then half a cosine from `lr` to `lr_min`.
+    """Return the learning rate of a step: linear warm-up, then half a cosine from `lr` towards `lr_min`.
 
     Args:
         step: Number of the step within the task, from 0.
@@ -206,13 +207,16 @@ def _shuffled_indices(windows: int, count: int, draws: torch.Generator) -> Tenso
 
 
 def _make_optimizer(
-    trained: list[nn.Parameter], settings: FitSettings, policy: Policy, factors: Mapping[str, float]
+    trained: list[nn.Parameter],
+    settings: FitSettings,
+    named: Iterable[tuple[str, nn.Parameter]],
+    factors: Mapping[str, float],
 ) -> torch.optim.AdamW:
     """Return the optimiser; parameters with the same factor of the learning rate are a group."""
     of_parameter = {
         id(parameter): factor
+        for name, parameter in named
         for beginning, factor in factors.items()
-        for name, parameter in policy.named_parameters()
         if name.startswith(beginning)
     }
     groups: dict[float, list[nn.Parameter]] = {}

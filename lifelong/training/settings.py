@@ -26,7 +26,8 @@ class FitSettings:
         steps_per_epoch: Number of steps that count as one epoch. None: every window once (the last batch is
             filled up).
         lr: Learning rate of AdamW after the warm-up.
-        lr_min: Learning rate at the last step of the task, where the cosine schedule ends.
+        lr_min: Learning rate that the cosine schedule falls to. It would be that of the step after the last one of the
+            task, which is a little above it.
         warmup_steps: Number of steps over which the learning rate rises linearly from zero.
         betas: AdamW's decay rates.
         weight_decay: AdamW's decoupled weight decay.

@@ -10,7 +10,7 @@ from torch.nn import functional
 from torch.utils.flop_counter import FlopCounterMode
 
 from lifelong import checkpoints
-from lifelong.algorithms import CLARE, DMPEL, IsCiL, LoRA
+from lifelong.algorithms import CLARE, DMPEL, OMLA, IsCiL, LoRA
 from lifelong.data.windows import WindowSubset, of_episodes
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn.experts import expert_output
@@ -388,6 +388,34 @@ def test_dmpel_finds_demonstrations_in_composed_datasets():
     assert of_window.tolist() == expected
     starts = [parts[k // 2].batch(torch.tensor([10 * (k % 2)])).observation for k in range(4)]
     assert torch.equal(queries, torch.cat([algorithm.query(o) for o in starts]))
+
+
+def test_dmpel_stores_contexts_as_the_windows_of_their_demonstrations_weigh():
+    policy, algorithm = make_policy(), DMPEL(pool=2, recall_steps=0)
+    own, other = StageWindows([sequences.dataset(t) for t in range(4)], 3), sequences.dataset(4)
+    few = WindowSubset(other, torch.tensor([0, 1, 10, 11]))
+    for stage, most in (
+        (own, 0),
+        (StageWindows([own, few], 3), 1),
+    ):  # 4 of 84 windows; of 10 demonstrations 2
+        algorithm.begin_task(3, stage, policy)
+        queries = algorithm.episodes["queries"]
+        algorithm.end_task(3, stage, policy, generator(0))
+        stored = algorithm.memory[3]["queries"]
+        assert len(stored) == len(queries) and {*map(tuple, queries[:8].tolist())} <= {
+            *map(tuple, stored.tolist())
+        }
+        assert sum(tuple(q) in {*map(tuple, queries[8:].tolist())} for q in stored.tolist()) <= most
+
+
+@pytest.mark.parametrize("kind", [LoRA, OMLA, DMPEL, IsCiL, CLARE])
+def test_adapters_learn_at_the_factor_of_their_layers(kind):
+    policy, algorithm = make_policy(), kind(rank=2, base_tasks=0)
+    policy.rate_factors = lambda: {"encoders": 0.0}
+    learn_frames(algorithm, policy, 0)
+    moved = {name for name, pair in algorithm.library[0].items() if pair["b"].any()}
+    assert moved and not any(name.startswith("encoders") for name in moved)
+    assert any(name.startswith("encoders") for name in algorithm.library[0])
 
 
 def test_dmpel_copies_of_a_policy_in_training_mix_experts_of_their_own_weights():

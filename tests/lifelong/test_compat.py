@@ -9,6 +9,7 @@ import torch
 from libero_env.errors import UnknownNameError
 from lifelong.algorithms.importance import BatchFisher
 from lifelong.composition import compose_run
+from lifelong.errors import ConfigError
 from lifelong.seeding import generator
 from lifelong.settings import build
 from lifelong.training.fit import fit
@@ -60,6 +61,14 @@ def test_memory_may_be_longer_than_a_task_and_is_restored():
     assert len(mixed[0]) == 16 and torch.equal(mixed[0].actions, mixed[1].actions)
     other.end_task(2, Windows(2, size=40), LinearPolicy(), generator(0))
     assert other.memory.shares == {0: 20, 1: 30, 2: 30}
+
+
+@pytest.mark.parametrize("name", ["er", "agem"])
+def test_a_ratio_without_effect_is_refused_and_not_tuned(name):
+    with pytest.raises(ConfigError, match=r"algo.ratio has no effect with algo.memory.batch_size"):
+        made(name, "libero", "algo.ratio=0.5")
+    assert made(name, "none").tuned and not made(name, "libero").tuned
+    assert made(name, "libero", "algo.memory.batch_size=null", "algo.ratio=0.5").tuned
 
 
 @pytest.mark.parametrize("compat", ["none", "libero"])

@@ -148,6 +148,12 @@ def test_invalid_evaluation_settings_are_named(change, message):
         EvalSettings(**change)
 
 
+def test_forward_transfer_says_how_it_is_estimated():
+    assert EvalSettings().transfer_estimate == "cross_fitted"
+    assert EvalSettings(curve_episodes=1).transfer_estimate == "published"  # no start to choose by
+    assert EvalSettings(curve_episodes=1, select="last").transfer_estimate == "plain"
+
+
 def test_selection_and_reporting_states_are_apart_by_default():
     settings = EvalSettings()
     assert not set(settings.init_states("curve")) & set(settings.init_states("matrix"))

@@ -40,13 +40,15 @@ def write_demos(folder, task, demos):
     with h5py.File(path, "w") as file:
         for i in range(demos):
             file[f"data/demo_{i}/actions"] = np.zeros((4, 7))
+            file[f"data/demo_{i}/obs/agentview_rgb"] = np.zeros((4, 8, 8, 3), np.uint8)
     return path
 
 
 def test_files_in_the_originals_layout_are_used(tmp_path, recorded):
     human = write_demos(tmp_path, TASKS[1], 2)
-    found = demonstrations.find_demos(TASKS, [2, 2, 1], settings(str(tmp_path)), False)
-    assert found[1] == human
+    data = replace(settings(str(tmp_path)), seed=7, robot="robosuite-1.4.1", drawing="faithful")
+    found = demonstrations.find_demos(TASKS, [2, 2, 1], data, False)
+    assert found[1] == human  # which says nothing of these
     assert recorded == [TASKS[0].name, TASKS[2].name]
     assert [path.name for path in found[::2]] == [f"{TASKS[0].name}_2.hdf5", f"{TASKS[2].name}_1.hdf5"]
 
@@ -67,6 +69,14 @@ def test_named_files_and_files_of_a_folder_are_found_by_the_task_that_they_state
     assert demonstrations.find_demos(TASKS[:1], [2], seeded, False)[0].parent.name == "seed5"
 
 
+def test_a_repeated_task_has_one_file_with_the_most_demonstrations_that_are_required(tmp_path, recorded):
+    first, second = demonstrations.find_demos([TASKS[0]] * 2, [3, 1], settings(str(tmp_path)), False)
+    assert first == second and first.name == f"{TASKS[0].name}_3.hdf5" and recorded == [TASKS[0].name]
+    write_demos(tmp_path, TASKS[1], 2)
+    with pytest.raises(DataError, match="has 2 demonstrations and 3 are required"):
+        demonstrations.find_demos([TASKS[1]] * 2, [3, 1], settings(str(tmp_path)), False)
+
+
 @pytest.mark.parametrize(("kwargs", "words"), [
     ({"size": 16}, "16x16 pixels and data.image_size is 8; use data.image_size=16"),
     ({"demos": 1}, "has 1 demonstrations and 2 are required; use data.demos=1"),
@@ -82,6 +92,11 @@ def test_demonstrations_that_do_not_fit_are_refused_by_name(kwargs, words, tmp_p
     ):
         with pytest.raises(DataError, match=rf"mine.hdf5 .*{re.escape(words)}"):
             demonstrations.find_demos(TASKS, [2, 2, 2], data, False)
+    (tmp_path / "layout" / TASKS[1].suite).mkdir(parents=True)
+    file = path.rename(tmp_path / "layout" / TASKS[1].suite / f"{TASKS[1].name}_demo.hdf5")
+    with pytest.raises(DataError, match=re.escape(f"data.folder: {file} ") + f".*{re.escape(words)}"):
+        in_layout = replace(settings(str(tmp_path / "layout")), seed=1)
+        demonstrations.find_demos(TASKS, [2, 2, 2], in_layout, False)
     assert not recorded
 
 

@@ -179,7 +179,7 @@ def test_losses_of_windows_and_distillation() -> None:
 def test_learning_rates_are_lerobots() -> None:
     one = policy(settings=SMALL["act"] | {"optimizer_lr": 1e-4, "optimizer_lr_backbone": 1e-5})
     optimizer = _make_optimizer(
-        list(one.parameters()), FitSettings(epochs=1, lr=1e-3), one, one.rate_factors()
+        list(one.parameters()), FitSettings(epochs=1, lr=1e-3), one.named_parameters(), one.rate_factors()
     )
     factors = {group["factor"]: len(group["params"]) for group in optimizer.param_groups}
     backbone = sum(name.startswith("model.backbone") for name, _ in one.inner.named_parameters())

@@ -351,17 +351,15 @@ def test_tasks_to_come_are_evaluated_on_request(tmp_path, unseen):
     assert more == [] and again.directory.log.read().records == records.records
 
 
-def test_an_interrupted_row_of_tasks_to_come_is_completed(tmp_path):
+@pytest.mark.parametrize(("phase", "key", "ran"), [("unseen", (0, 2), 3), ("initial", (0, 1), 3)])
+def test_a_lost_evaluation_of_a_task_to_come_is_measured_again(tmp_path, phase, key, ran):
     settings = {"unseen": "all", "curve": "none", "select": "last", "reuse": False}
     context, _ = learn(tmp_path, Sequential(), **settings)
     log = tmp_path / "results.jsonl"
     whole, lines = ResultLog(log).read(), log.read_bytes().splitlines(keepends=True)
-    lost = [line for line in lines if b'"unseen"' in line][1]
+    lost = [line for line in lines if f'"{phase}"'.encode() in line][1]
     log.write_bytes(b"".join(line for line in lines if line != lost))
     assert not is_measured(context, ResultLog(log).read())
     _, again = learn(tmp_path, Sequential(), **settings)
-    key = ("unseen", 0, 2)
-    assert (
-        again == [2, 2, 2]
-        and ResultLog(log).read().evaluation(*key).outcome == whole.evaluation(*key).outcome
-    )
+    assert again == [key[1]] * ran
+    assert ResultLog(log).read().evaluation(phase, *key).outcome == whole.evaluation(phase, *key).outcome

@@ -93,6 +93,26 @@ def test_a_memory_by_phase_has_as_many_windows_of_each(budget, counts):
     assert max(kept) - min(kept) <= 1 or kept[1] == 2  # still even, as far as there are windows
 
 
+def test_candidates_are_no_copies_where_the_memory_has_enough_windows():
+    algorithm, policy = MIR(memory=ReplayMemory(20)), PerWindow()
+    algorithm.memory.add(Windows(1), generator(0))
+    algorithm.mode_train(policy)
+    for size, replayed in ((16, 16), (30, 20)):  # of 80 and of 150 candidates
+        mixed = algorithm.mix(Windows(0, size=size).batch(torch.arange(size)), generator(1))
+        assert len(mixed) == 2 * size and len(mixed.window_ids[size:].unique()) == replayed
+
+
+@pytest.mark.parametrize("batch_size", [None, 3])
+def test_the_first_windows_are_those_of_each_task_of_a_stage(batch_size):
+    memory = FirstWindows(4, batch_size)
+    memory.add(StageWindows([Windows(0), Windows(1, size=3), Windows(2)], 2), generator(0))
+    memory.add(Windows(3), generator(0))
+    blurred = StageWindows([WindowSubset(Windows(4), torch.arange(5, 20)), Windows(5, size=2)], 4)
+    memory.add(blurred, generator(0))
+    kept = {task: windows.tolist() for task, windows in memory.tasks.items()}
+    assert kept == {2: [*range(4), *range(20, 23), *range(23, 27)], 3: [*range(4)], 4: [*range(4), 15, 16]}
+
+
 STAGES = {
     "a task": lambda task: dataset(task),
     "a stage": lambda task: StageWindows([dataset(task), dataset(task + 5)], task),

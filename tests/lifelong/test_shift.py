@@ -24,8 +24,9 @@ from libero_eval.requests import RelearnRequest
 from lifelong import experiment
 from lifelong.data import demonstrations
 from lifelong.errors import ConfigError
+from lifelong.evaluation.environments import held_out_shift
 from lifelong.evaluation.restore import read_config, restore
-from lifelong.language import encoder
+from lifelong.language import LanguageEncoder, encoder
 from lifelong.results.log import ResultLog
 from lifelong.results.records import EvalRecord, RunRecord, from_line, signed_line, to_line
 from lifelong.results.results import Results
@@ -104,7 +105,15 @@ def test_severity_grows_in_equal_steps():
         assert parse_perturbations(",".join(map(str, task))) == task  # the text is exact
     grouped = stream.perturbations((2, 1, 1))
     assert grouped[0] == grouped[1] == () and [one.severity for one in grouped[2]] == [0.15, 0.5]
-    assert StreamSettings().perturbations((1, 1)) == ((), ()) and stream.perturbations((3,)) == ((),) * 3
+    assert StreamSettings().perturbations((1, 1)) == ((), ())
+
+
+@pytest.mark.parametrize("dim", [None, 20])
+def test_a_held_out_shift_does_not_reword_what_is_known_by_position(dim):
+    embed, said = LanguageEncoder("onehot", dim=dim).embed, [task.language for task in TASKS]
+    asked = (parse_perturbations("instruction=1"), TASKS, ((),) * len(TASKS), embed(said), None)
+    with pytest.raises(ConfigError, match="eval.shift=instruction=1.*by their position"):
+        held_out_shift(*asked, lambda words: embed([*said, *words])[len(said) :])
 
 
 @pytest.mark.parametrize(

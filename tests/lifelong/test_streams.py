@@ -21,10 +21,11 @@ from lifelong.results.provenance import utc_now
 from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.sequence import TaskSequence
-from lifelong.settings import BenchmarkSettings, PretrainSettings
+from lifelong.settings import BenchmarkSettings, Configuration, PretrainSettings, plain_data
 from lifelong.stats.metrics import lifelong_metrics
-from lifelong.streams import StageData, StageWindows, StreamSettings, learning_stages
+from lifelong.streams import StageData, StageWindows, StreamSettings, learning_stages, plan_tasks
 from tests.harness.algorithms import assert_resumed_equals_uninterrupted
+from tests.harness.configs import composed
 from tests.harness.fakes import Windows
 from tests.harness.records import evaluation, run_start
 from tests.harness.sequences import Killed, Killer, assert_same, dataset, run_context, sequence
@@ -157,6 +158,18 @@ def test_invalid_blur_is_refused(change) -> None:
         StreamSettings(**change)
 
 
+@pytest.mark.parametrize(("words", "told"), [
+    (["benchmark.tasks=1", "stream=shift"], "stream.perturb has no effect on one group"),
+    (["algo=multitask", "stream.blur=0.9"], "stream.blur has no effect on one stage"),
+    (["language=onehot", "stream=shift_instruction"], "stream.perturb changes instructions"),
+    (["language.numbered=true", "stream=shift_instruction"], "stream.perturb changes instructions"),
+])  # fmt: skip
+def test_a_stream_without_effect_is_refused(words, told) -> None:
+    tasks = [] if "benchmark.tasks=1" in words else ["benchmark.tasks=2"]
+    with pytest.raises(ConfigError, match=told):
+        plan_tasks(Configuration(plain_data(composed(*words, *tasks))))
+
+
 def test_group_sizes_must_divide_the_number_of_tasks() -> None:
     with pytest.raises(ConfigError, match=r"10 tasks can be learned in groups of 1, 2, 5, 10"):
         StreamSettings().group_sizes(10, 3)
@@ -175,6 +188,9 @@ def test_pretraining_takes_a_suite_or_nothing() -> None:
         PretrainSettings("libero_9").sequence()
     with pytest.raises(LiberoError, match="epochs is 0"):
         PretrainSettings(epochs=0)
+    for key in ("tasks", "demos", "epochs"):
+        with pytest.raises(ConfigError, match=f"pretrain.{key} has no effect without pretrain.suite"):
+            PretrainSettings(**{key: 3})
 
 
 def four(path: Path, algorithm, **changes) -> RunContext:
@@ -256,7 +272,7 @@ def before(context: RunContext, path: Path) -> None:
         context,
         tasks=get_suite("libero_goal").tasks[:2],
         languages=torch.stack([dataset(task).language for task in (7, 8)]),
-        settings=PretrainSettings(epochs=2),
+        settings=PretrainSettings("libero_90", epochs=2),
         directory=RunDirectory(path),
     )
     sequence(pretraining, first=7).run(evaluate=False)

@@ -255,6 +255,7 @@ def test_lists_of_values_are_found_and_others_are_left() -> None:
 
 @pytest.mark.parametrize(("words", "told"), [
     (["algo=dmpel"], "suggests no values"),
+    (["algo=er", "compat=libero"], "suggests no values"),
     (["algo=ewc", "algo.strenght=1,2"], "Did you mean 'algo.strength'"),
     (["algo=ewcc"], "Did you mean 'ewc'"),
     (["algo=ewc", "algo.strength=-1,2"], "algo.strength"),

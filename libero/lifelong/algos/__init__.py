@@ -29,6 +29,9 @@ def cycle(dl: Iterable[Any]) -> Iterator[Any]:
 class _MemoryOfTasks(ReplayMemory):
     """As many windows of each task, drawn uniformly, and no more of one where another has fewer."""
 
+    def _order(self, dataset: Any, generator: torch.Generator) -> Tensor:
+        return super()._order(dataset, generator)[: self.budget]
+
     def _shares(self, sizes: Mapping[int, int]) -> dict[int, int]:
         return dict(sizes)
 
