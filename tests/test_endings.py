@@ -270,7 +270,7 @@ def test_numbers_out_of_range_are_one_line(words, capsys):
 @pytest.mark.parametrize(("words", "message"), [
     (["tasks", "show", "a\0"], "null character"),
     (["tasks", "show", ""], "the word after show is empty"),
-    (["eval", "ending_policy:make", "--suite", "libero_goal/0", "--after", "9"], "--after is of runs"),
+    (["eval", "ending_policy:make", "--suite", "libero_goal/0", "--after", "9"], "--after is of a run, and"),
     (["eval", "ending_policy:make", "--suite", "libero_goal/0", "--despite", "x"], "--despite is of results"),
     (["tasks", "preview", "libero_goal/3", "--out", "a.zzz"], "the name of a picture ends in .png"),
     (["objects", "preview", "plate", "--out", "a.zzz"], "the name of a picture ends in .png"),

@@ -125,7 +125,8 @@ def start(args: argparse.Namespace, out: Path) -> subprocess.Popen:
         out,
     ]
     command += ["--episodes", args.episodes, "--unit-starts", args.unit_starts, "--threads", 1]
-    command += ["--horizon", args.horizon, "--device", "cpu"]
+    command += ["--horizon", args.horizon]
+    command += ["--device", "cpu"] if Path(args.policy).is_dir() else []
     command += ["--clock", args.clock] if args.clock else []
     command += ["--event", *args.event] if args.event else []
     paths = [str(HERE), str(ROOT), os.environ.get("PYTHONPATH", "")]

@@ -189,10 +189,11 @@ def test_success_is_measured_from_the_first_states(acting, monkeypatch):
     )
     rate = metric.evaluate_one_task_success(cfg, algo, suite.get_task(1), suite.get_task_emb(1), 1)
     assert (rate, begun) == (0.0, [[0, 1], [2]])
-    cfg.eval.selection, cfg.eval.use_mp = "apart", False
+    monkeypatch.setitem(cfg.eval, "selection", "apart")
+    monkeypatch.setitem(cfg.eval, "use_mp", False)
     assert metric.evaluate_multitask_training_success(cfg, algo, suite, [0]).tolist() == [0.0]
     assert begun[2:] == [[47], [48], [49]], "one by one, in states that no report uses"
-    cfg.eval.n_eval = 26
+    monkeypatch.setitem(cfg.eval, "n_eval", 26)
     with pytest.raises(ConfigError, match=r"eval.n_eval is 26: .* at most half"):
         metric.evaluate_multitask_training_success(cfg, algo, suite, [0])
 
@@ -200,7 +201,8 @@ def test_success_is_measured_from_the_first_states(acting, monkeypatch):
 def test_success_is_counted(acting, monkeypatch):
     """The goal is made to hold in two of three episodes."""
     algo, cfg, suite = acting
-    cfg.eval.use_mp, cfg.eval.num_procs = True, 3
+    monkeypatch.setitem(cfg.eval, "use_mp", True)
+    monkeypatch.setitem(cfg.eval, "num_procs", 3)
     step = metric.BatchEnv.step
 
     def succeeded(self, actions):
