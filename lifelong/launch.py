@@ -104,16 +104,18 @@ def _launch(options: argparse.Namespace, ranks: Ranks) -> int:
     """Run the jobs of the command line, several after `-m`; return the worst exit status."""
     folders = config_folders(None if options.config_dir is None else Path(options.config_dir))
     words, sweep = list(options.overrides), None
-    config = compose_first(words, folders)
+    lists = swept(words, folders)
+    # a plain run's configuration is composed by Hydra alone
+    config = compose_first(words, folders) if options.multirun or options.cfg else DictConfig({})
     job = Job(ranks, [word for word in words if not word.startswith("hydra")])
     if options.multirun:
+        folder = config.hydra.sweep.dir
         if not any(word.startswith("hydra.sweep.dir=") for word in words):
             # a folder of its own, by which the same command finds it again
-            words.append(
-                f"hydra.sweep.dir='{config.runs_dir}/{FOLDER}/{sweep_name(sorted(words), list(swept(words)))}'"
-            )
-        sweep = Path(compose_first(words, folders).hydra.sweep.dir).resolve()
-        jobs = math.prod(len(values) for values in swept(words, folders).values())
+            folder = f"{config.runs_dir}/{FOLDER}/{sweep_name(sorted(words), list(lists))}"
+            words.append(f"hydra.sweep.dir='{folder}'")
+        sweep = Path(folder).resolve()
+        jobs = math.prod(map(len, lists.values()))
         # another sweeper chooses as it goes, so that their number is not known
         chooses = "BasicSweeper" not in config.hydra.sweeper._target_
         if ranks.first and not (options.cfg or options.info):

@@ -225,15 +225,15 @@ def test_an_algorithm_of_the_user_shows_its_own_frames(here, monkeypatch, capsys
 def test_closed_streams_lead_nowhere(here):
     """Files that are opened would take their numbers; the status is that of the command, as in a cron job."""
     command = [sys.executable, "-m", "libero_env.cli"]
-    for closed in (">&-", "2>&-", "<&- >&- 2>&-"):
-        for words, status in ((["protocols", "list"], 0), (["eval", "nowhere", "--out", "out"], 2)):
-            line = " ".join(["exec", '"$@"', closed])
-            environment = os.environ | {"PYTHONPATH": str(ROOT)}
-            done = subprocess.run(
-                ["sh", "-c", line, "sh", *command, *words], env=environment, capture_output=True
-            )
-            assert done.returncode == status, done
-            assert b"Traceback" not in done.stdout + done.stderr
+    right, wrong = (["protocols", "list"], 0), (["eval", "nowhere", "--out", "out"], 2)
+    for closed, (words, status) in ((">&-", right), ("2>&-", wrong), ("<&- >&- 2>&-", wrong)):
+        line = " ".join(["exec", '"$@"', closed])
+        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        done = subprocess.run(
+            ["sh", "-c", line, "sh", *command, *words], env=environment, capture_output=True
+        )
+        assert done.returncode == status, done
+        assert b"Traceback" not in done.stdout + done.stderr
     assert not Path("out").exists()
 
 

@@ -15,7 +15,11 @@ ROOT = Path(__file__).parents[1]
 # pictures that each draws
 PICTURES = {"1_quick_walkthrough": 6, "2_scenes_and_tasks": 2, "3_custom_objects": 3, "4_algorithms": 1}
 LARGEST = 300_000  # bytes
-SHORTER = {"data.demos=40": "data.demos=4", "train.epochs=4": "train.epochs=1"}  # than for a reader
+SHORTER = {  # than for a reader
+    "data.demos=40": "data.demos=4",
+    '"train.epochs=4",': '"train.epochs=1", "train.steps_per_epoch=20",',
+    '"eval.curve=none",': '"eval.curve=none", "eval.horizon=60",',
+}
 
 
 def test_every_notebook_is_listed():

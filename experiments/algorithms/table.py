@@ -4,6 +4,7 @@ python experiments/algorithms/table.py          # reads STUDY/comparison.json, w
 """
 
 import argparse
+import functools
 import json
 import math
 import statistics
@@ -18,7 +19,9 @@ from libero_env.text import duration, quantity
 from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
 from lifelong.results.shifts import shift_scores
-from lifelong.stats.methods import paired_difference
+from lifelong.stats.intervals import Estimate
+from lifelong.stats.methods import paired_difference, welch_difference
+from lifelong.stats.metrics import metric_values
 
 HERE = Path(__file__).parent
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "nbt": "NBT", "auc": "AUC"}
@@ -167,9 +170,77 @@ def shifts(study: str, order: list[str], told: dict[str, bool]) -> Iterator[tupl
         yield f"under {shift}", table([*heads, f"lost, less {REFERENCES[0]}'s"], rows)
 
 
+def by_bytes() -> Iterator[tuple[str, list[str]]]:
+    """Final success of replay with each memory, compressed and not, in the same bytes; less that with 247 MB."""
+    by_method, largest = measures("memory", "final_success"), measures("goal", "final_success").get("er", {})
+    sizes = dict.fromkeys(method.partition(" ")[2] for method in by_method)
+    rows = []
+    for size in sizes:
+        plain, compressed = (by_method.get(f"{name} {size}", {}) for name in ("er", "compressed_er"))
+        both = sorted(plain.keys() & compressed.keys())
+        less = [compressed[seed] - plain[seed] for seed in both]
+        means = (f"{statistics.mean(v.values()):.2f}" if v else "–" for v in (plain, compressed))
+        rows.append(
+            [
+                *(size, str(len(both)), *means, _plain_difference(less)),
+                ", ".join(f"{100 * v:+.1f}" for v in less),
+                *(
+                    _plain_difference([v[s] - largest[s] for s in sorted(v.keys() & largest.keys())])
+                    for v in (plain, compressed)
+                ),
+            ]
+        )
+    heads = ["memory", "seeds", "`er`", "`compressed_er`", "`compressed_er` less `er`", "each seed"]
+    if rows:
+        yield (
+            "memory: by bytes",
+            table([*heads, "`er` less 247 MB", "`compressed_er` less 247 MB of `er`"], rows),
+        )
+
+
+def together(studies: tuple[str, str]) -> Iterator[tuple[str, list[str]]]:
+    """A metric of each algorithm less that of the first reference in two streams, and the mean of both effects.
+
+    The interval of the mean is Welch's: of two independent means with deviations of their own.
+    """
+    for name, title in COMPARED.items():
+        found = [measures(study, name) for study in studies]
+        rows = []
+        for label in (label for label in found[1] if label != REFERENCES[0] and label in found[0]):
+            effects = [
+                np.array([values[label][s] - values[REFERENCES[0]][s] for s in sorted(values[label])])
+                for values in found
+            ]
+            mean = welch_difference(effects[0] / 2, -effects[1] / 2).estimate
+            rows.append([label, *(_plain_difference(list(e)) for e in effects), _estimate(mean)])
+        if rows:
+            heads = [f"less {REFERENCES[0]}, `{study}`" for study in studies]
+            yield f"together: {title}", table(["algorithm", *heads, "mean of both"], rows)
+
+
+def measures(study: str, name: str) -> dict[str, dict[int, float]]:
+    """A metric of each finished run, by method and seed."""
+    return {
+        method: {seed: values[name] for seed, values in runs.items()}
+        for method, runs in _metrics(study).items()
+    }
+
+
+@functools.cache
+def _metrics(study: str) -> dict[str, dict[int, dict[str, float]]]:
+    found: dict[str, dict[int, dict[str, float]]] = {}
+    for run, folder in finished(study):
+        scores = ResultLog(folder / "results.jsonl").read().scores()
+        found.setdefault(run.method, {})[run.seed] = metric_values(scores)
+    return found
+
+
 def _plain_difference(values: list[float]) -> str:
     """The mean of differences in points, with Student's interval of these alone."""
-    found = paired_difference(np.array(values)).estimate
+    return _estimate(paired_difference(np.array(values)).estimate) if values else "–"
+
+
+def _estimate(found: Estimate) -> str:
     ends = "" if math.isnan(found.low) else f" [{100 * found.low:z.1f}, {100 * found.high:z.1f}]"
     return f"{100 * found.value:+.1f}{ends}"
 
@@ -194,11 +265,14 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     ).parse_args()
     readme = HERE / "README.md"
-    text = readme.read_text(encoding="utf-8")
+    text, found = readme.read_text(encoding="utf-8"), dict[str, list[str]]()
     for path in sorted(HERE.glob("*/comparison.json")):
         for name, lines in tables(path.parent.name, json.loads(path.read_text(encoding="utf-8"))):
-            if f"<!-- {path.parent.name}: {name} -->" in text:  # of costs only the costs
-                text = insert(text, f"{path.parent.name}: {name}", lines)
+            found[f"{path.parent.name}: {name}"] = lines
+    found |= {**dict(by_bytes()), **dict(together(("goal", "ten_demonstrations")))}
+    for name, lines in found.items():
+        if f"<!-- {name} -->" in text:  # of costs only the costs
+            text = insert(text, name, lines)
     readme.write_text(text, encoding="utf-8")
 
 

@@ -131,7 +131,7 @@ class SpatialSoftmax(nn.Module):
         super().__init__()
         self.temperature = temperature
         self.heat = nn.Linear(channels, keypoints)
-        rows, cols = (torch.linspace(-1.0, 1.0, n) for n in size)
+        rows, cols = (torch.linspace(-1.0, 1.0, n, device="cpu") for n in size)  # see sinusoidal_positions
         grid = torch.stack(torch.meshgrid(cols, rows, indexing="xy"), dim=-1)  # (H, W, 2): x, y
         self.register_buffer("grid", grid.reshape(-1, 2).T.contiguous(), persistent=False)
 

@@ -42,14 +42,14 @@ from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 from lifelong.types import Batch, PolicySpec
 from tests.harness import sequences
-from tests.harness.configs import CONFIGS, composed
+from tests.harness.configs import CONFIGS, chosen, composed
 from tests.harness.policies import small_rnn, small_transformer, small_vilt
 
 GPU = torch.device("cuda")
 ALGORITHMS = sorted(file.stem for file in CONFIGS.glob("algo/*.yaml"))
 # policy -> a function that builds it, and the augmentation
 POLICIES: dict[str, tuple[Callable[..., Policy], str]] = {
-    "bc_mlp_small": (lambda spec: build(composed("policy=bc_mlp_small").policy, spec=spec), "shift_jitter"),
+    "bc_mlp_small": (lambda spec: build(chosen("policy", "bc_mlp_small"), spec=spec), "shift_jitter"),
     "bc_transformer": (partial(small_transformer, head="gmm", stochastic=True), "libero"),
     "bc_rnn": (partial(small_rnn, head="gmm", stochastic=True), "libero"),
     "bc_transformer_flow": (partial(small_transformer, head="flow"), "shift_jitter"),
@@ -177,15 +177,14 @@ def _save_and_die(
 def _sequence(folder: Path, algorithm: str, policy: str, device: torch.device) -> sequences.TaskSequence:
     """Return the tasks, of which the windows of the first are on the device and those of the others are not."""
     make, augmentation = POLICIES[policy]
-    config = composed(f"algo={algorithm}", f"augmentation={augmentation}", *SHORT.get(algorithm, []))
     with seeded(1):
         built = make(spec=sequences.SPEC).to(device)
     context = sequences.run_context(folder, "sequential", TASKS)
     context = replace(
         context,
         policy=built,
-        algorithm=build(config.algo),
-        augment=build(config.augmentation),
+        algorithm=build(chosen("algo", algorithm, *SHORT.get(algorithm, []))),
+        augment=build(chosen("augmentation", augmentation)),
         device=device,
         fit=_FIT,
         eval=replace(context.eval, curve="none", select="last", episodes=2, horizon=3),

@@ -19,7 +19,7 @@ from lifelong.settings import build
 from lifelong.training.distributed import Ranks, process_group
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences
-from tests.harness.configs import CONFIGS, composed
+from tests.harness.configs import CONFIGS, chosen
 from tests.harness.gpu_learning import SHORT
 from tests.harness.policies import small_transformer
 
@@ -30,7 +30,7 @@ CHANGING_GRADIENTS = [
     for algo in ALGORITHMS
     if any(
         name in vars(kind)
-        for kind in type(build(composed(f"algo={algo}").algo)).__mro__[:-1]
+        for kind in type(build(chosen("algo", algo))).__mro__[:-1]
         if kind is not Algorithm
         for name in ("after_backward", "after_step")
     )
@@ -40,7 +40,7 @@ STEPS, TASKS = 4, 2
 FIT = FitSettings(
     epochs=STEPS, steps_per_epoch=1, batch_size=7, lr=3e-3, warmup_steps=2, grad_clip=1.0, precision="fp32"
 )
-EVAL = EvalSettings(episodes=2, curve_episodes=2, every=STEPS, horizon=3, settle_steps=0, precision="fp32")
+EVAL = EvalSettings(episodes=2, curve="none", select="last", horizon=3, settle_steps=0, precision="fp32")
 
 
 def learn(
@@ -50,7 +50,7 @@ def learn(
 
     The masks of dropout are each rank's own, so losses are those of one process without it.
     """
-    sequences.ALGORITHMS[algo] = lambda: build(composed(f"algo={algo}", *SHORT.get(algo, [])).algo)
+    sequences.ALGORITHMS[algo] = lambda: build(chosen("algo", algo, *SHORT.get(algo, [])))
     with seeded(7):
         policy = small_transformer(sequences.SPEC, dropout=dropout)
     context = replace(

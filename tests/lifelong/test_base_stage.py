@@ -21,7 +21,7 @@ from lifelong.stats.metrics import Curve, Scores, lifelong_metrics
 from lifelong.streams import StreamSettings
 from tests.harness import sequences
 from tests.harness.algorithms import assert_resumed_equals_uninterrupted
-from tests.harness.configs import FILES, composed
+from tests.harness.configs import FILES, chosen
 from tests.harness.records import evaluation, run_start
 
 STREAM = StreamSettings(base_tasks=2)
@@ -43,7 +43,7 @@ def context(path: Path, algorithm, tasks: int = 4) -> RunContext:
 
 
 def algorithm(name: str):
-    return instantiate(composed(f"algo={name}").algo, _convert_="all")
+    return instantiate(chosen("algo", name), _convert_="all")
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -191,7 +191,7 @@ def test_records_keep_the_sizes_of_groups() -> None:
 
 
 def test_the_preset_of_the_stream_is_the_published_one() -> None:
-    stream = instantiate(composed("stream=pretrained6").stream, _convert_="all")
+    stream = instantiate(chosen("stream", "pretrained6"), _convert_="all")
     assert stream.group_sizes(10) == (6, 1, 1, 1, 1)
     assert stream.demos(50, 10, first=6) == (50,) * 6 + (10,) * 4
     assert stream.blur == 0
