@@ -16,6 +16,7 @@ from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
     from libero_env.tasks import Task
+    from lifelong.settings import Configuration
     from lifelong.tuning.proxy import Candidate
 
 SUITE, STEPS, HELD_OUT = "libero_90", 160, 0.25  # the defaults
@@ -90,25 +91,38 @@ def tune(request: TuneRequest) -> None:
     """Measure all values and write table, picture, JSON file and the chosen value."""
     import torch
 
-    from lifelong.composition import compose_run, config_folder
+    from lifelong.composition import compose_run, config_folder, swept
     from lifelong.settings import Configuration, plain_data
     from lifelong.tuning.frontier import draw_frontier, render, write_frontier, write_tuned
-    from lifelong.tuning.proxy import ProxySettings, measure_frontier
+    from lifelong.tuning.proxy import ProxySettings, check_obeyed, measure_frontier
 
-    candidates, plain_words, default = _candidates(request.overrides, request.config_dir)
-    without = [word for word in plain_words if not word.startswith(("algo", "tuned@algo"))]
-
-    def other(algo: str) -> "Candidate":
-        return _candidate(algo, {}, [*without, f"algo={algo}"], request.config_dir)
-
-    for key in (word.lstrip("+~").partition("=")[0] for word in plain_words):
+    lists = swept(request.overrides)
+    words = [word for word in request.overrides if word.partition("=")[0] not in lists]
+    for key in (word.lstrip("+~").partition("=")[0] for word in words):
         if key.partition(".")[0] in ("seed", "benchmark", "eval"):  # a preset may set them for the runs
             raise ConfigError(
                 f"{key} has no effect in libero tune; leave it out: see --seeds, --suite and --stream"
             )
-    config, choices = compose_run(plain_words, request.config_dir)
+    config, choices = compose_run(words, request.config_dir)
     plain = plain_data(config)
+    check_obeyed(plain, lists)
     checked = Configuration(plain)
+    lists = lists or _suggested(checked)
+    values = [dict(zip(lists, chosen, strict=True)) for chosen in itertools.product(*lists.values())]
+    candidates = [
+        _candidate(
+            _label(value.values()),
+            value,
+            [*words, *(f"{k}={v}" for k, v in value.items())],
+            request.config_dir,
+        )
+        for value in values
+    ]
+    without = [word for word in words if not word.startswith(("algo", "tuned@algo"))]
+
+    def other(algo: str) -> "Candidate":
+        return _candidate(algo, {}, [*without, f"algo={algo}"], request.config_dir)
+
     if threads := checked.settings().threads:
         torch.set_num_threads(threads)
     beside = [other(algo) for algo in request.beside if algo != choices["algo"]]
@@ -117,6 +131,7 @@ def tune(request: TuneRequest) -> None:
 
     algo, head = choices["algo"], choices.get("policy/head", choices["policy"])
     keys = ", ".join(candidates[0].settings)
+    default = _label(str(_value_at(plain, key)) for key in lists)
     print(f"\n{keys} of {algo}: {MEASUREMENT}\n\n{render(frontier, default)}\n")
     best = frontier.chosen
     print("chosen: " + " ".join(f"{key}={value}" for key, value in best.settings.items()))
@@ -136,33 +151,16 @@ def tune(request: TuneRequest) -> None:
         print(f"written: {path}, for libero train --config-dir {request.write} algo={algo} tuned@algo={name}")
 
 
-def _candidates(
-    words: Sequence[str], config_dir: Path | None
-) -> tuple[list["Candidate"], list[str], str | None]:
-    """Return a candidate for each combination of values, the words that are not swept, and the default's label."""
-    from lifelong.composition import compose_run, swept
-    from lifelong.settings import Configuration, plain_data
-
-    lists = swept(words)
-    rest = [word for word in words if word.partition("=")[0] not in lists]
-    plain = plain_data(compose_run(rest, config_dir)[0])
-    if not lists:
-        tuned = Configuration(plain).build("algo").tuned
-        if not tuned:
-            raise ConfigError(
-                "this algorithm suggests no values; name a key with several, such as algo.KEY=V1,V2 or "
-                "train.lr=1e-3,2e-3"
-            )
-        key = next(iter(tuned))
-        lists = {f"algo.{key}": [f"{value:g}" for value in tuned[key]]}
-    values = [dict(zip(lists, chosen, strict=True)) for chosen in itertools.product(*lists.values())]
-    candidates = [
-        _candidate(
-            _label(value.values()), value, [*rest, *(f"{k}={v}" for k, v in value.items())], config_dir
+def _suggested(config: "Configuration") -> dict[str, list[str]]:
+    """Return the values that the algorithm suggests for its first key to be tuned."""
+    tuned = config.build("algo").tuned
+    if not tuned:
+        raise ConfigError(
+            "this algorithm suggests no values; name a key with several, such as algo.KEY=V1,V2 or "
+            "train.lr=1e-3,2e-3"
         )
-        for value in values
-    ]
-    return candidates, rest, _label(str(_value_at(plain, key)) for key in lists)
+    key = next(iter(tuned))
+    return {f"algo.{key}": [f"{value:g}" for value in tuned[key]]}
 
 
 def _candidate(

@@ -6,7 +6,7 @@ What is measured is kept, so a sweep that was stopped goes on.
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -300,7 +300,7 @@ def measure_frontier(
     """
     everyone = (fine_tuning, *others, *candidates)
     for one in everyone:
-        _check_obeyed(one)
+        check_obeyed(one.config, one.settings)
     errors: dict[str, list[Errors]] = {one.label: [] for one in everyone}
     places = [(stream, seed) for stream in proxy.streams for seed in proxy.seeds]
     total, done = len(places) * len(everyone), 0
@@ -328,14 +328,18 @@ def measure_frontier(
     return Frontier(tuple(map(outcome, candidates)), tuple(map(outcome, (fine_tuning, *others))))
 
 
-def _check_obeyed(one: Candidate) -> None:
-    """Raise an error for a setting that no trial obeys."""
-    tops = {key: key.lstrip("+").partition(".")[0] for key in one.settings}
-    unused = [key for key, top in tops.items() if top in one.config and top not in _GROUPS]
+def check_obeyed(config: Mapping[str, Any], keys: Iterable[str]) -> None:
+    """Check that trials obey a configuration, and the keys that are varied.
+
+    Raises:
+        ConfigError: A setting has no effect on the trials.
+    """
+    tops = {key: key.lstrip("+").partition(".")[0] for key in keys}
+    unused = [key for key, top in tops.items() if top in config and top not in _GROUPS]
     unused += [key for key in tops if key == "train.steps_per_epoch"]  # a trial has --steps
     for key, agreed in _UNUSED.items():
         group, _, name = key.rpartition(".")
-        value = (one.config[group] if group else one.config).get(name)
+        value = (config[group] if group else config).get(name)
         if value is not None and value not in agreed:
             unused.append(key)
     if unused:
