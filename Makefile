@@ -22,7 +22,7 @@ WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || ec
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help setup gl assets train test lint audit fuzz lerobot docs release clean
+.PHONY: help setup gl assets train test pytest lint audit fuzz lerobot docs release clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -76,7 +76,10 @@ $(ASSETS_STAMP): $(STAMP)
 train: setup
 	$(BIN)/python train.py algo=ewc benchmark=libero_object $(ARGS)
 
-test: setup lint $(PEERS_STAMP) $(BROWSER_STAMP)
+test: setup $(PEERS_STAMP) $(BROWSER_STAMP)
+	@$(MAKE) --no-print-directory -j2 lint pytest
+
+pytest:
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist=worksteal $(ARGS)
 
 lint: $(STAMP)

@@ -121,12 +121,13 @@ class TaskResult(Episodes):
         return cls(first.task, first.name, first.instruction, first.digest, atoms=first.atoms, **rows)
 
     def of_starts(self, starts: Collection[int]) -> "TaskResult":
-        """Return the results of the episodes from some of the starts."""
+        """Return the results of the episodes from some of the starts; which limits these reached is not known."""
         kept = [start in starts for start in self.init_states]
         rows = ("init_states", "successes", "lengths", *self.OPTIONAL, *self.OF_ATOMS)
         changes: dict[str, Any] = {name: tuple(compress(getattr(self, name), kept)) for name in rows}
         errors = tuple(one for one in self.simulation_errors if one[0] in starts)
-        return replace(self, **changes, simulation_errors=errors)
+        limits = self.limits_reached if all(kept) else ()
+        return replace(self, **changes, simulation_errors=errors, limits_reached=limits)
 
     @property
     def starts(self) -> tuple[int, ...]:

@@ -126,9 +126,13 @@ class StreamSettings:
             first: Number of tasks of the first stage.
 
         Raises:
-            ConfigError: `demos_later` is a list of the wrong length.
+            ConfigError: `demos_later` is a list of the wrong length, or no task comes later.
         """
         later, rest = self.demos_later, tasks - first
+        if later is not None and not rest:
+            raise ConfigError(
+                "stream.demos_later has no effect: all tasks are in the first stage; leave it out"
+            )
         if later is None:
             counts = [full] * rest
         elif isinstance(later, int | float):

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from libero_env.cli.options import (
     Answer,
@@ -158,19 +158,20 @@ def lint(
     Args:
         tasks: Such as libero_goal/3, a suite, or a file that ends in .bddl or .yaml.
         assets: builtin, original, or the folder of the original's models.
-        level: Lowest level that is printed.
+        level: Lowest level that is printed, or in the JSON.
         starts: Initial states to check; 0 simulates nothing.
     """
-    found, number = list["Finding"](), 0
+    found, shown, number = list["Finding"](), list[dict[str, Any]](), 0
     for findings in _lint(tasks, assets, starts):
         number += 1
         found += findings
         for finding in findings:
             if LEVELS.index(finding.level) <= LEVELS.index(level):
+                shown.append(asdict(finding))
                 print(finding, flush=True)
     counts = Counter(finding.level for finding in found)
     text = f"{number} tasks: {counts['error']} errors, {counts['warning']} warnings, {counts['info']} notes"
-    return Answer(text, [asdict(finding) for finding in found], status=int(counts["error"] > 0))
+    return Answer(text, shown, status=int(counts["error"] > 0))
 
 
 def _lint(names: Sequence[str], assets: str | None, starts: int) -> "Iterator[list[Finding]]":

@@ -1,5 +1,6 @@
 """The linter finds every fault that is put into a correct task, on its line, and none in the benchmark's tasks."""
 
+import json
 import math
 import re
 import subprocess
@@ -202,6 +203,8 @@ def test_the_command_prints_findings_and_its_status_counts_errors(tmp_path, caps
     assert cli.main(["tasks", "lint", str(good), str(bad), "--starts", "0", "--level", "error"]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == 2 and lines[0].startswith(f"{bad}:") and "[unknown-category]" in lines[0]
+    cli.main(["tasks", "lint", str(good), str(bad), "--starts", "0", "--level", "error", "--json"])
+    assert [one["level"] for one in json.loads(capsys.readouterr().out)] == ["error"]
     assert cli.main(["tasks", "lint", "libero_objet/1"]) == 2
     assert cli.main(["tasks", "lint", str(tmp_path / "none.bddl")]) == 2
 

@@ -348,6 +348,10 @@ class Limited(Countdown):
 def test_limits_that_the_solver_reached_are_counted_and_change_no_outcome(tmp_path):
     result = evaluate(tmp_path / "it", env=lambda task, count: Limited(count), **TWO)
     assert [dict(task.limits_reached) for task in result.tasks] == [{"ITERATIONS": 4 + 10}] * 2
+    task = result.tasks[0]
+    assert (
+        task.of_starts(task.init_states) == task and not task.of_starts(task.init_states[:1]).limits_reached
+    )
     assert result.outcomes == evaluate(tmp_path / "without", **TWO).outcomes
     assert EvaluationResult.read(tmp_path / "it") == result
 

@@ -152,6 +152,11 @@ def test_invalid_numbers_of_demonstrations_are_refused(later) -> None:
         StreamSettings(demos_later=later).demos(50, 3)
 
 
+def test_fewer_demonstrations_later_need_a_later_task() -> None:
+    with pytest.raises(ConfigError, match="no effect: all tasks are in the first stage"):
+        StreamSettings(demos_later=5).demos(50, 3, first=3)
+
+
 @pytest.mark.parametrize("change", [{"blur": 1.0}, {"blur": -0.1}, {"blur_reach": 0}])
 def test_invalid_blur_is_refused(change) -> None:
     with pytest.raises(LiberoError, match=f"{next(iter(change))} is .*expected (at least|below)"):
