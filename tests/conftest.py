@@ -88,13 +88,14 @@ def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Collect without looking for garbage, and look later only among what tests make: a quarter of the time."""
+    """Collect without looking for garbage, and look later only among what tests make, and less often."""
     gc.disable()
     try:
         return (yield)
     finally:
         gc.enable()
         gc.freeze()
+        gc.set_threshold(10_000)
 
 
 @pytest.hookimpl(tryfirst=True)
