@@ -75,6 +75,7 @@ def test_a_task_is_shown_as_bddl(capsys):
     (["tasks", "show", "libero_goa"], "unknown suite 'libero_goa'. Did you mean 'libero_goal'? Valid: li"),
     (["tasks", "certify", "libero-goal"], "unknown suite 'libero-goal'. Did you mean 'libero_goal'?"),
     (["tasks", "init-states", "a.yaml", "--jobs", "2"], "--jobs cannot be used with a file without --out"),
+    (["doctor", "--gl", "--gpu"], "--gl and --gpu each check one thing only; give one of them"),
     (["tasks", "lint", "LIBERO_GOAL"], "Did you mean 'libero_goal'?"),
     (["perturb", "certify", "libero_gola"], "Did you mean 'libero_goal'?"),
     (["robustness", "expert", "--suite", "libero_gaol"], "Did you mean 'libero_goal'?"),

@@ -2,7 +2,6 @@
 
 import importlib.util
 import inspect
-import itertools
 import re
 import shlex
 import tomllib
@@ -133,10 +132,10 @@ def test_the_object_and_the_task_of_the_guide(monkeypatch):
 
 @cache
 def composes(*overrides: str) -> None:
-    for values in itertools.product(*swept(overrides).values()):  # of a sweep, each job
-        chosen = dict(zip(swept(overrides), values, strict=True))
-        single = [word for word in overrides if word.split("=")[0] not in chosen]
-        compose_run([*single, *(f"{key}={value}" for key, value in chosen.items())])
+    lists = swept(overrides)
+    single = [word for word in overrides if word.split("=")[0] not in lists]
+    for i in range(max(map(len, lists.values()), default=1)):  # of a sweep each value, not each job
+        compose_run([*single, *(f"{key}={values[i % len(values)]}" for key, values in lists.items())])
 
 
 def check_line(line: str) -> None:

@@ -31,12 +31,11 @@ JUDGING_SIDE = sorted(module.name for module in pkgutil.walk_packages(libero_eva
 THEIRS = re.compile(r"/__pycache__|/matplotlib|/\.(config|cache)$")
 THEIR_VARIABLES = ("PYGAME_HIDE_SUPPORT_PROMPT",)
 
-# Imports the modules it is given and tells what that changed. The audit hook sees every file opened for writing and
-# every socket, whoever asks for it.
+# Imports groups of modules and tells what each changed; each time as if nothing of ours were there yet. The audit hook
+# sees every file opened for writing and every socket, whoever asks for it.
 _PROBE = """
 import importlib, json, os, random, sys
-names = json.loads(sys.argv[1])
-before = dict(os.environ)
+groups, found = json.loads(sys.argv[1]), []
 deeds = []
 
 def watch(event, args):
@@ -51,13 +50,18 @@ def watch(event, args):
 
 sys.addaudithook(watch)
 import numpy
-state = (numpy.random.get_state()[1].tolist(), random.getstate())
-for name in names:
-    importlib.import_module(name)
-deeds += [f"set {name}" for name in os.environ.keys() | before if os.environ.get(name) != before.get(name)]
-if state != (numpy.random.get_state()[1].tolist(), random.getstate()):
-    deeds.append("touched the global random state")
-print(json.dumps({"deeds": deeds, "loaded": sorted(sys.modules)}))
+for names in groups:
+    for module in [one for one in sys.modules if one.startswith(("libero", "lifelong"))]:
+        del sys.modules[module]
+    before, deeds[:] = dict(os.environ), []
+    state = (numpy.random.get_state()[1].tolist(), random.getstate())
+    for name in names:
+        importlib.import_module(name)
+    deeds += [f"set {name}" for name in os.environ.keys() | before if os.environ.get(name) != before.get(name)]
+    if state != (numpy.random.get_state()[1].tolist(), random.getstate()):
+        deeds.append("touched the global random state")
+    found.append({"deeds": [*deeds], "loaded": sorted(sys.modules)})
+print(json.dumps(found))
 """
 
 # Windows as far as it can be pretended: other packages may import what they like, as they ask `sys.platform`.
@@ -97,12 +101,12 @@ with LiberoEnv("libero_object/0", cameras=()) as env:
 """
 
 
-def import_in_fresh_process(names: list[str], home: Path) -> dict:
-    """What importing the modules did in a process that knew nothing."""
+def import_in_fresh_process(home: Path, *groups: list[str]) -> list[dict]:
+    """What importing each group of modules did in a process that knew nothing."""
     env = {
         "PATH": os.environ["PATH"], "HOME": str(home), "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"
     }  # fmt: skip
-    command = [sys.executable, "-W", "error", "-c", _PROBE, json.dumps(names)]
+    command = [sys.executable, "-W", "error", "-c", _PROBE, json.dumps(groups)]
     done = subprocess.run(
         command, env=env, cwd=home, capture_output=True, text=True, timeout=300, check=False
     )
@@ -112,13 +116,16 @@ def import_in_fresh_process(names: list[str], home: Path) -> dict:
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize(
-    "names",
-    [ENV_SIDE, FACADE, LEARNING_SIDE, JUDGING_SIDE],
-    ids=["libero_env", "libero", "lifelong", "libero_eval"],
-)
-def test_importing_does_nothing(names, tmp_path):
-    done = import_in_fresh_process(names, tmp_path)
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory) -> dict[str, dict]:
+    groups = {"libero_env": ENV_SIDE, "libero": FACADE, "libero_eval": JUDGING_SIDE, "lifelong": LEARNING_SIDE}
+    found = import_in_fresh_process(tmp_path_factory.mktemp("home"), *groups.values())
+    return dict(zip(groups, found, strict=True))
+
+
+@pytest.mark.parametrize("package", ["libero_env", "libero", "lifelong", "libero_eval"])
+def test_importing_does_nothing(package, imported):
+    done = imported[package]
     theirs = {f"set {name}" for name in THEIR_VARIABLES}
     ours = [deed for deed in done["deeds"] if deed not in theirs and not THEIRS.search(deed)]
     assert ours == []
@@ -133,12 +140,12 @@ def test_nothing_needs_what_windows_lacks(tmp_path):
     subprocess.run(command, env=env, cwd=tmp_path, timeout=300, check=True)
 
 
-def test_the_environment_loads_nothing_of_learning(tmp_path):
-    loaded = import_in_fresh_process(ENV_SIDE, tmp_path)["loaded"]
+def test_the_environment_loads_nothing_of_learning(imported):
+    loaded = imported["libero_env"]["loaded"]
     assert not {"lifelong", "warp", "torch", "hydra", "omegaconf", "robosuite", "matplotlib"} & set(loaded)
 
 
 def test_the_command_line_starts_light(tmp_path):
     """`libero --help` must not wait for PyTorch or MuJoCo."""
-    loaded = import_in_fresh_process(["libero_env.cli.main"], tmp_path)["loaded"]
+    ((_, loaded),) = (done.values() for done in import_in_fresh_process(tmp_path, ["libero_env.cli.main"]))
     assert not {"torch", "mujoco", "hydra", "transformers", "matplotlib", "numba"} & set(loaded)

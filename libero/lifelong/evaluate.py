@@ -8,7 +8,7 @@ from typing import Literal
 from pydantic.dataclasses import dataclass
 
 from libero.scripts.command import script
-from libero_env.cli.options import parse
+from libero_env.cli.options import Positive, parse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,7 +23,7 @@ class Evaluation:
         policy: Policy of the run.
         seed: Seed of the run.
         ep: Epoch of a multitask run's checkpoint (default: the last).
-        load_task: Last task before the checkpoint (default: task_id).
+        load_task: Last task before the checkpoint of another run (default: task_id).
         run: Number of the run (default: the newest).
         device_id: Number of the GPU, if there is one.
         n_eval: Number of episodes (default: as in the run).
@@ -39,10 +39,10 @@ class Evaluation:
     seed: int
     ep: int | None = None
     load_task: int | None = None
-    run: int | None = None
+    run: Positive | None = None
     device_id: int = 0
-    n_eval: int | None = None
-    max_steps: int | None = None
+    n_eval: Positive | None = None
+    max_steps: Positive | None = None
     save_videos: bool = False
 
 

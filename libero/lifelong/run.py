@@ -10,7 +10,7 @@ config.json              the configuration
 import json
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from libero._adapters.batches import DictWindows
-from libero._adapters.config import Config, notes, plain
+from libero._adapters.config import NO_EFFECT, Config, notes, plain
 from libero.libero import get_libero_path
 from libero.libero.benchmark import get_benchmark
 from libero.lifelong.algos import Multitask, Sequential, get_algo_class
@@ -36,13 +36,18 @@ from libero.lifelong.utils import (
     torch_load_model,
 )
 from libero_env.demos.generate import ensure_demos
-from libero_env.storage import atomic_path
+from libero_env.storage import atomic_path, read_json
 from lifelong import checkpoints
 from lifelong.algorithms.base import load_algorithm
 from lifelong.errors import ConfigError
 from lifelong.tracking import Tracker, WandB
 
 DEMOS = 50  # demonstrations of each task, where they are generated
+MAY_CHANGE = {  # in a run that is resumed: where it is, and how fast
+    *("bddl_folder", "demonstrations", "experiment_dir", "experiment_name", "folder", "init_states_folder"),
+    *("device", "eval.num_procs", "eval.num_workers", "eval.use_mp", "train.num_workers"),
+    *("train.resume", "train.resume_path", "use_wandb", "wandb_project"),
+}
 RESULTS = ("L_conf_mat", "S_conf_mat", "L_fwd", "S_fwd")
 
 
@@ -143,10 +148,33 @@ def _open_folder(cfg: Any) -> int:
     else:
         create_experiment_dir(cfg)
     folder, done = Path(cfg.experiment_dir), 0
-    (folder / "config.json").write_text(json.dumps(plain(cfg), indent=1), encoding="utf-8")
+    text = json.dumps(plain(cfg), indent=1)
+    if cfg.train.resume and (folder / "config.json").exists():
+        _require_same(read_json(folder / "config.json"), json.loads(text), folder)
+    (folder / "config.json").write_text(text, encoding="utf-8")
     while (folder / f"task{done}_state.safetensors").exists():
         done += 1
     return done
+
+
+def _values(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the keys of a configuration with points between, and their values."""
+    for key, value in node.items():
+        if isinstance(value, dict):
+            yield from _values(value, f"{path}{key}.")
+        else:
+            yield f"{path}{key}", value
+
+
+def _require_same(stored: Mapping[str, Any], present: Mapping[str, Any], folder: Path) -> None:
+    """Raise a ConfigError where a run would go on with what its finished tasks were not learned with."""
+    began, now = dict(_values(stored)), dict(_values(present))
+    for key in sorted({*began, *now} - {*MAY_CHANGE, *NO_EFFECT}):
+        if began.get(key) != now.get(key):
+            raise ConfigError(
+                f"train.resume: {key} is {now.get(key)!r:.80}, but {folder} began with {began.get(key)!r:.80}; give "
+                "that, or begin a run with train.resume=false"
+            )
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from libero.lifelong.evaluate import Evaluation
 from libero.lifelong.metric import evaluate_loss, rollouts
 from libero.lifelong.run import fill_in
 from libero.lifelong.utils import control_seed, get_task_embs, latest_run, safe_device, torch_load_model
+from libero_env.errors import InvalidInputError
 from lifelong.errors import CheckpointError
 from lifelong.stats.intervals import wilson_interval
 
@@ -69,7 +70,12 @@ def checkpoint_path(request: Evaluation) -> Path:
 
     Raises:
         CheckpointError: There is no such run or file.
+        InvalidInputError: An option names a checkpoint that runs of this algorithm do not have.
     """
+    option, value = ("load_task", request.load_task) if request.algo == "multitask" else ("ep", request.ep)
+    if value is not None:
+        named = "its epoch, --ep" if option == "load_task" else "the last task before it, --load_task"
+        raise InvalidInputError(f"--{option}: a checkpoint of {request.algo} is named by {named}")
     cfg = load_config(f"lifelong={request.algo}", f"policy={request.policy}")
     name = f"{cfg.lifelong.algo}/{cfg.policy.policy_type}_seed{request.seed}"
     runs = sorted(p for p in Path(request.experiment_dir).glob(f"*/{name}") if p.is_dir())

@@ -123,9 +123,11 @@ def create_dataset(
         dataset_path: Folder.
         dataset_name: File in the folder (default: SUITE/TASK_demo.hdf5).
         no_proprio: Leave out joints, gripper and end effector.
-        use_depth: Draw depth, too.
+        use_depth: Draw the depth of the cameras, too.
         size: Size of the pictures, pixels.
     """
+    if use_depth and not use_camera_obs:
+        raise LiberoError("--use_depth draws the depth of the cameras; add --use_camera_obs")
     task = recorded_task(demo_file)
     name = dataset_name or f"{task.suite}/{task.name}_demo.hdf5"
     target = dataset_path / (name if name.endswith(".hdf5") else f"{name}.hdf5")

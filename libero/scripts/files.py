@@ -91,6 +91,8 @@ def shasum_files(paths: Positional[tuple[Path, ...]] = (), *, check: Path | None
         check: Compare with a list that was printed before.
     """
     if check:
+        if paths:
+            raise LiberoError("--check compares the files that its list names; leave out the others")
         return _compare(check)
     roots = paths or [datasets_folder()]
     all_files = [f for root in roots for f in (root, *sorted(root.rglob("*"))) if f.is_file()]

@@ -96,6 +96,8 @@ def render_single_task(
         out: Folder.
     """
     states: Sequence[np.ndarray] | None = None  # to be sampled
+    if bddl_file and (benchmark_name or task_id is not None):
+        raise LiberoError("--bddl_file and a task of a benchmark are both given; give one of them")
     if bddl_file:
         file = bddl_file
     elif benchmark_name and task_id is not None:

@@ -18,7 +18,7 @@ from libero_env.assets.pack import BUILTIN, VARIABLE, chosen_assets, facade_asse
 from libero_env.assets.published import find_distribution
 from libero_env.assets.robot import ROBOSUITE_VERSION, installed_robot, robot_cache
 from libero_env.cli.options import Answer
-from libero_env.errors import LiberoError
+from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.paths import cache_dir, config_file, demos_dir, read_config
 from libero_env.storage import check_trusted
 from libero_env.text import show_bytes
@@ -335,6 +335,8 @@ def doctor(*, gl: bool = False, gpu: bool = False) -> Answer:
         gpu: Only check the GPU, some minutes: driver, renderers that draw at once, MuJoCo Warp, PyTorch; 1 is returned
             where there is none.
     """
+    if gl and gpu:
+        raise InvalidInputError("--gl and --gpu each check one thing only; give one of them")
     findings = examine_gpu() if gpu else examine(gl_only=gl)
     if not (gl or gpu) and importlib.util.find_spec("lifelong"):
         findings += importlib.import_module("lifelong.cli.runs").examine()

@@ -180,12 +180,15 @@ def _lint(names: Sequence[str], assets: str | None, starts: int) -> "Iterator[li
     from libero_env.design.lint.checks import lint_file, lint_task, lint_text
     from libero_env.tasks import find_tasks
 
-    pack = select_pack(assets)
+    pack, seen = select_pack(assets), set[str]()
     for name in dict.fromkeys(names):
         if name.endswith(".bddl"):
             yield lint_file(name, pack, starts=starts)
             continue
         for task in find_tasks([name]):
+            if task.suite != "file" and task.id in seen:
+                continue
+            seen.add(task.id)
             if task.suite == "file":  # line numbers refer to the text that `libero tasks show` prints
                 yield lint_text(task.bddl_text, name, task, pack, starts=starts)
             else:
@@ -266,10 +269,12 @@ def preview(
 
     chosen = get_task(task)
     path = out or Path(f"{chosen.name}.png")
+    file = None if video is None else path.with_suffix(f".{(*video, 'webp')[0]}")
+    if file == path:
+        raise InvalidInputError(f"--out {path} would be both the pictures and the video; name a .png")
     print(contact_sheet(chosen, path, starts=starts, cameras=cameras or CAMERAS, size=size))
-    if video is None:
+    if file is None:
         return 0
-    file = path.with_suffix(f".{(*video, 'webp')[0]}")
     done, reason = expert_video(chosen, file, size=size)
     print(f"{file}: the expert {'reaches the goal' if done else f'does not reach the goal: {reason}'}")
     return int(not done)

@@ -21,10 +21,10 @@ class InputOptions:
         camera: Camera shown while recording.
         screen: Where it is shown.
         device: Input device.
-        pos_sensitivity: Factor on translations.
+        pos_sensitivity: Factor on translations; keys are at full speed from 0.27 on.
         rot_sensitivity: Factor on rotations.
-        vendor_id: USB vendor of the 3D mouse.
-        product_id: USB product of the 3D mouse.
+        vendor_id: USB vendor of the 3D mouse (default: 9583).
+        product_id: USB product of the 3D mouse (default: 50741).
     """
 
     seed: Seed = 0
@@ -33,8 +33,8 @@ class InputOptions:
     device: Literal["keyboard", "spacemouse"] = "keyboard"
     pos_sensitivity: Sensitivity = 1.0
     rot_sensitivity: Sensitivity = 1.0
-    vendor_id: UsbId = 9583
-    product_id: UsbId = 50741
+    vendor_id: UsbId | None = None
+    product_id: UsbId | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,12 +72,16 @@ def teleop(request: TeleopRequest) -> int:
         task = read_task(request.bddl)
     else:
         raise InvalidInputError("give a task, such as libero_goal/3, or --bddl FILE")
+    numbers = {"vendor_id": request.vendor_id, "product_id": request.product_id}
+    mouse_ids = {name: number for name, number in numbers.items() if number is not None}
+    if mouse_ids and request.device != "spacemouse":
+        raise InvalidInputError("--vendor-id and --product-id name a 3D mouse; add --device spacemouse")
     out = request.out or Path(f"{task.name}_demo.hdf5")
     sensitivity = request.pos_sensitivity, request.rot_sensitivity
     device, reader = Keyboard(*sensitivity), None
     if request.device == "spacemouse":
         device = mouse = SpaceMouse(*sensitivity)
-        reader = MouseReader(mouse, request.vendor_id, request.product_id)
+        reader = MouseReader(mouse, **mouse_ids)
     print(f"{task.language}\n{HELP}")
     screen = open_screen(request.screen, device, request.camera, reader)
     try:

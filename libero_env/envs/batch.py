@@ -27,7 +27,7 @@ from libero_env.init_states.store import load_init_states
 from libero_env.memory import require_memory
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.episodes import TRIES
-from libero_env.perturbations.events import NEVER, has_begun
+from libero_env.perturbations.events import NEVER, has_begun, require_moment
 from libero_env.perturbations.kinds import start_name
 from libero_env.sim.engine import Goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
@@ -36,7 +36,7 @@ from libero_env.sim.scene import BUFFER_SIDE, InitialStates
 from libero_env.sim.simulation import Indices, Watch
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.tasks import Task
-from libero_env.tasks.problem import Atom, Expression
+from libero_env.tasks.problem import And, Atom, Expression, Or
 from libero_env.timing import CONTROL_HZ, PHYSICS_HZ
 from libero_env.validation import validate
 
@@ -167,10 +167,8 @@ class BatchEnv(LiberoVectorEnv):
         self.goals = Goals(goal, every, self.views, config.semantics)
         self._later_goals = None if later is None else Goals(later, every, self.views, config.semantics)
         self._histories = [one.history for one in (self.goals, self._later_goals) if one is not None]
-        if self.reward.kind == "staged" and self.goals.history.memory.size:
-            raise InvalidInputError(
-                f"reward=staged is of goals of states, and {goal} is over time; leave reward=sparse"
-            )
+        if self.reward.kind == "staged":
+            _require_stages(goal if later is None else later, changes=later is not None)
         controller = self.simulations.controller_state.controller
         self.single_observation_space = self.observer.space()
         self.single_action_space = spaces.Box(
@@ -183,7 +181,10 @@ class BatchEnv(LiberoVectorEnv):
         self._steps, self._errors = np.zeros(num, np.int64), dict[int, str]()
         self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
         self._progress = np.zeros((num, len(self.atoms)), bool)
-        self._watched = bool(self.perturbed is not None and self.perturbed.events)
+        triggers = [one.trigger for one in self.perturbed.perturbations] if self.perturbed is not None else []
+        self._watched = any(triggers)
+        for trigger in triggers:
+            require_moment(trigger, config.horizon)
         self._moved = np.zeros(num, bool)
         self.event_states: dict[tuple[int, int], np.ndarray] = {}
 
@@ -586,6 +587,16 @@ class BatchEnv(LiberoVectorEnv):
             info["began"] = self.perturbed.began.copy()
             info["moved"] = self._moved.copy()
         return {**info, "errors": dict(self._errors)} if self._errors else info
+
+
+def _require_stages(goal: Expression, changes: bool) -> None:
+    """Raise unless the atoms of a goal that hold are stages on the way to it."""
+    staged = goal.fold(lambda node, parts: isinstance(node, Atom | And | Or) and all(parts))
+    if changes or not staged:
+        what = f"an event makes {goal} the goal" if changes else f"{goal} is more than atoms, And and Or"
+        raise InvalidInputError(
+            f"reward=staged counts the atoms of one goal that hold, but {what}; leave reward=sparse"
+        )
 
 
 def _check_range(states: np.ndarray, task: Task) -> None:

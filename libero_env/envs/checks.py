@@ -176,7 +176,12 @@ class ResetRequest:
         values = checked_options(options, valid)
         mask = np.ones(num_envs, bool)
         if "reset_mask" in values:
-            mask = checked_numbers(values["reset_mask"], "reset_mask", ((num_envs,),)) != 0
+            chosen = values["reset_mask"]
+            mask = checked_numbers(chosen, "reset_mask", ((num_envs,),)) != 0
+            if np.asarray(chosen).dtype != bool:
+                raise InvalidInputError(
+                    f"reset_mask={shown(chosen)}: expected {num_envs} times True or False, not indices"
+                )
         init_states = starts = None
         if "init_state" in values:
             chosen = values["init_state"]

@@ -12,12 +12,14 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.errors import InvalidInputError, require_known
+from libero_env.perturbations.appearance import CAMERA
 from libero_env.perturbations.episodes import checked_perturbations
+from libero_env.perturbations.perturbation import Perturbation
 from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
-from libero_env.tasks.cameras import camera_text, distinct_cameras
+from libero_env.tasks.cameras import camera_name, camera_text, distinct_cameras
 from libero_env.text import shown
 from libero_env.timing import CONTROL_HZ, PHYSICS_HZ, ControlFreq
 from libero_env.validation import checked
@@ -101,7 +103,7 @@ class EnvConfig:
             default is none.
 
     Raises:
-        InvalidInputError: A value is of another kind or outside of its range.
+        InvalidInputError: A value is of another kind or outside of its range, or a perturbation does not fit them.
         UnknownNameError: The semantics, the drawing, the robot, the backend or the time of observation do not exist.
     """
 
@@ -130,6 +132,18 @@ class EnvConfig:
                 f"control_freq {self.control_freq} there are not as many: expected at most "
                 f"{_LARGEST_OBSERVED_WITHIN}, or observed={AFTER}"
             )
+        is_seen = not self.cameras or CAMERA in map(camera_name, self.cameras)
+        for one in (one for one in self.perturb if isinstance(one, Perturbation)):
+            if one.kind in ("camera", "fov") and not is_seen:
+                raise InvalidInputError(
+                    f"perturb={one} changes the camera {CAMERA}, which is not among cameras={', '.join(self.cameras)}; "
+                    "add it, or leave the perturbation out"
+                )
+            if one.layer == "action" and not self.control_delta:
+                raise InvalidInputError(
+                    f"perturb={one} changes how far relative actions move the arm; with control_delta=False they are "
+                    "goals: leave control_delta=True"
+                )
 
     @property
     def pack(self) -> Pack:

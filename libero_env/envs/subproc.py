@@ -44,8 +44,8 @@ class WorkerError(LiberoError):
             remedy = "Nothing was started. Fix the arguments above; if the machine was only slow, raise start_timeout="
         else:
             remedy = (
-                f"The others work. Reset these, options={{'reset_mask': ...}} with {sorted(failed)}, to continue; "
-                "if they were only slow, raise timeout="
+                f"The others work. Reset these, with True at {sorted(failed)} in options={{'reset_mask': ...}}, to "
+                "continue; if they were only slow, raise timeout="
             )
         super().__init__("\n".join([*lines, remedy]))
         self.failed, self.outcome = dict(failed), outcome
@@ -110,6 +110,17 @@ class SubprocEnv(LiberoVectorEnv):
             if not (callable(spec) or isinstance(spec, Mapping)):
                 raise InvalidInputError(
                     f"{shown(spec)} is not an environment; expected a dictionary or a function"
+                )
+        if (config is not None or options) and all(map(callable, specs)):
+            raise InvalidInputError(
+                f"{', '.join([*['config'] * (config is not None), *options])}: for environments that are dictionaries; "
+                "these are functions, which configure theirs themselves"
+            )
+        for spec in specs:
+            if options and isinstance(spec, Mapping) and "config" in spec:
+                raise InvalidInputError(
+                    f"{', '.join(options)}: a dictionary has a config of its own, which would replace them; name them "
+                    "in it"
                 )
         common = {"config": EnvConfig.from_options(config, options)}
         self.metadata = {**self.metadata, "render_fps": common["config"].control_freq}

@@ -363,7 +363,8 @@ def start_errors(view: StateView, only_places: bool = False) -> list[str]:
     """
     faults = []
     for atom in view.scene.problem.init:
-        if atom.args[0] in view.scene.fixtures or (only_places and atom.predicate not in BUILTIN_PREDICATES):
+        stands = atom.args[0] in view.scene.fixtures and atom.predicate in ("On", "In")
+        if stands or (only_places and atom.predicate not in BUILTIN_PREDICATES):
             continue
         region = view.scene.problem.region(atom.args[-1])
         if atom.predicate == "On" and region is not None:

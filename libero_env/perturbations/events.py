@@ -7,14 +7,14 @@ object that the goal is about: `touched`, `lifted` or `over_goal`. Before it, no
 import re
 from collections.abc import Sequence
 
-from libero_env.errors import UnknownNameError
+from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.sim.state import StateView
 from libero_env.sim.watch import EpisodeWatch, over
 from libero_env.tasks.problem import Atom
 
 PHASES = ("touched", "lifted", "over_goal")
 NEVER = -1  # step of an event that has not happened
-_AT = re.compile(r"step\d{1,9}|(100|[1-9]?\d)%")
+_AT = re.compile(r"step\d{1,9}|[1-9]?\d%")
 
 
 def checked_trigger(text: str) -> str:
@@ -26,6 +26,14 @@ def checked_trigger(text: str) -> str:
     if text and text not in PHASES and not _AT.fullmatch(text):
         raise UnknownNameError("trigger", text, (*PHASES, "step40", "25%"))
     return text
+
+
+def require_moment(trigger: str, horizon: int) -> None:
+    """Raise an `InvalidInputError` where a trigger is a step that no episode has."""
+    if trigger.startswith("step") and int(trigger.removeprefix("step")) >= horizon:
+        raise InvalidInputError(
+            f"event @{trigger}: an episode has the steps 0 to {horizon - 1}; expected one of these, or a longer horizon"
+        )
 
 
 def has_begun(trigger: str, steps: int, horizon: int, watch: EpisodeWatch, i: int) -> bool:

@@ -54,6 +54,8 @@ class Backend:
         for setting in settings:
             key, _, text = setting.partition("=")
             require_known("setting of a backend", key, _SETTINGS)
+            if key in found:
+                raise InvalidInputError(f"backend={value}: {key} is given twice; expected it once")
             found[key] = text
         if name == MUJOCO and found:
             raise InvalidInputError(

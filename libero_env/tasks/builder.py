@@ -130,17 +130,18 @@ def make_task(name: str | None = None, **definition: Any) -> Task:
     return task_from_definition({**definition, **({"name": name} if name else {})}, Source("task"))
 
 
-def task_from_definition(definition: Values, source: Source) -> Task:
+def task_from_definition(definition: Values, source: Source, *, shares_with: bool = False) -> Task:
     """Return the task of a definition; see `make_task`.
 
     Args:
         definition: Content of a YAML file.
         source: Where it stands.
+        shares_with: Whether its parameters are also those of other tasks, so that it need not use all of them.
 
     Raises:
         LiberoError: The definition is not valid; the message starts with file and line and lists the valid names.
     """
-    name, problem = _build(definition, source, check_models=True)
+    name, problem = _build(definition, source, check_models=True, shares_with=shares_with)
     return Task(FILE, 0, name, problem.language, problem.language, problem)
 
 
@@ -194,17 +195,26 @@ def model_regions(category: str) -> tuple[str, ...]:
     )
 
 
-def _build(definition: Values, source: Source, *, check_models: bool) -> tuple[str, Problem]:
+def _build(
+    definition: Values, source: Source, *, check_models: bool, shares_with: bool = False
+) -> tuple[str, Problem]:
     """Return the name and the problem of a task's definition.
 
     Args:
         definition: Keys and values.
         source: Where it stands.
         check_models: Whether categories must be those of objects, and undeclared regions are looked up in their models.
+        shares_with: See `task_from_definition`.
     """
     check_keys(definition, source)
     merge = _Merge(Trace(source), check_models)
     content = merge.content({k: v for k, v in definition.items() if v is not None}, {}, source)
+    for parameter in () if shares_with else definition.get("with") or ():
+        if parameter not in merge.parameters:
+            raise InvalidInputError(
+                f"{source.at('with', parameter)}: neither the task nor its scene uses the parameter {parameter}; "
+                f"leave it out.{suggest(parameter, merge.parameters)}"
+            )
     language = content.texts.get("language") or language_from_name(content.texts.get("name", ""))
     name = content.texts.get("name") or re.sub(r"\W+", "_", language.strip().lower()).strip("_")
     if not language:
@@ -263,10 +273,14 @@ class _Merge:
     Args:
         trace: Notes where atoms and regions come from.
         check_models: Whether models of objects are asked for, see `_build`.
+
+    Attributes:
+        parameters: Parameters that the definitions use.
     """
 
     def __init__(self, trace: Trace, check_models: bool):
         self.trace, self._check_models = trace, check_models
+        self.parameters: set[str] = set()
 
     def content(self, definition: Values, inherited: Values, source: Source) -> _Content:
         """Return the content of a definition with that of its scene.
@@ -289,6 +303,8 @@ class _Merge:
         content = self._scene(definition, parameters, source)
         plain = {key: value for key, value in definition.items() if key not in ("scene", "with")}
         keys: Values = check_definition(_fill(plain, _with_entries(parameters), source.name), source)
+        for used in re.findall(r"\$\{?(\w+)", repr(plain)):
+            self.parameters.add(used if used in parameters else used.rpartition("_")[0])
         for name, category in keys.get("fixtures", {}).items():
             self._check_category("fixture", category, source, "fixtures", name)
             content.fixtures[name] = category
@@ -297,7 +313,7 @@ class _Merge:
         for target, regions in keys.get("regions", {}).items():
             known = content.regions.setdefault(target, {})
             for name, region in regions.items():
-                known[name] = None if region is None else {**(known.get(name) or {}), **region}
+                known[name] = None if region is None else _replaced(known.get(name) or {}, region)
                 self.trace.note(f"{target}_{name}", source, "regions", target, name)
         placed = self._place(keys.get("place", {}), content, source)
         init = self._atoms(keys, "init", source) if "init" in keys else content.init
@@ -502,15 +518,24 @@ def _rectangle(place: Values, kind: str) -> dict[str, Any]:
     return region
 
 
+def _replaced(known: Values, own: Values) -> dict[str, Any]:
+    """Return the keys of a scene's region with a task's: `at` replaces `ranges`, and `ranges` replaces `at`."""
+    gone = ("ranges",) if "at" in own else ("at", "half") if "ranges" in own else ()
+    return {**{key: value for key, value in known.items() if key not in gone}, **own}
+
+
 def _region(name: str, target: str, keys: Values, trace: Trace) -> Region:
     """Return the region of its keys."""
     where = trace.at(f"{target}_{name}", "regions", target, name)
     ranges = [tuple(row) for row in keys.get("ranges", ())]
+    if ("at" in keys) != ("half" in keys):
+        has, lacks, such = ("at", "half", "0.02") if "at" in keys else ("half", "at", "[0, 0.2]")
+        raise InvalidInputError(
+            f"{where}: {target}_{name}: it has {has}, but no {lacks}; add such as {lacks}: {such}, metres"
+        )
     if "at" in keys:
-        if "half" not in keys:
-            raise InvalidInputError(
-                f"{where}: {target}_{name}: it has at, but no half; add such as half: 0.02, metres"
-            )
+        if ranges:
+            raise InvalidInputError(f"{where}: {target}_{name}: it has both at and ranges; leave out one")
         (x, y), (half_x, half_y) = keys["at"], keys["half"]
         ranges.append((x - half_x, y - half_y, x + half_x, y + half_y))
     yaw = (tuple(keys["yaw"]),) if "yaw" in keys else ()

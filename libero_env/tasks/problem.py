@@ -194,7 +194,7 @@ class Never(_OfOne):
 class Count(_OfOne):
     """Repetition: holds if the part has become true at least so often in the episode; at the start does not count."""
 
-    number: Annotated[int, Field(ge=1, le=1000)]
+    number: Annotated[int, Field(ge=1, le=999)]
     part: Expression
 
     def __str__(self) -> str:
@@ -423,6 +423,10 @@ def _region(problem: Problem, region: Region, is_used: bool, count: int) -> Iter
         what = f": ranges are for the workspace only, but {region.target} is {_article(kind)}"
         valid = f"a fixture of {', '.join(WORKSPACES)}, or no :ranges, which is the site of that name"
         yield "region-ranges", what, valid
+    if len(region.yaw) > 1:
+        yield "region-yaw", f" has {len(region.yaw)} ranges of yaw", "one"
+    elif region.yaw and not region.ranges:
+        yield "region-yaw", " has a yaw, but no rectangle in which something is turned", "no yaw"
 
 
 def _atom(
@@ -471,7 +475,7 @@ def _names(count: int) -> str:
 
 
 def _places(problem: Problem) -> Iterator[Violation]:
-    """Check that nothing is placed twice or, by way of others, on itself."""
+    """Check that fixtures stand on the workspace, and nothing is placed twice or, by way of others, on itself."""
     placing = [
         (i, atom) for i, atom in enumerate(problem.init) if atom.predicate in _PLACING and len(atom.args) == 2
     ]
@@ -484,6 +488,9 @@ def _places(problem: Problem) -> Iterator[Violation]:
             yield Violation("placed-twice", what, "one atom that places it", ":init", i)
         region = problem.region(place)
         carriers[name] = place if region is None else region.target
+        if problem.kind_of(name) == "fixture" and not (atom.predicate == "On" and region and region.ranges):
+            what = f"{atom} does not place it: a fixture stands on a rectangle of the workspace"
+            yield Violation("kind", what, "such as [0, 0.2] or, in BDDL, a region with :ranges", ":init", i)
     for i, atom in placing:
         seen, name = set[str](), atom.args[0]
         while name in carriers and name not in seen:

@@ -69,7 +69,11 @@ def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
         if not isinstance(own, dict) or not all(isinstance(key, str) for key in own):
             raise InvalidInputError(f"{source.at('tasks', i)}: expected keys such as name, goal and language")
         place = replace(source, line_of=source.shared_with(list(own), i))
-        made.append(task_from_definition({**shared, **own}, place))
+        made.append(task_from_definition({**shared, **own}, place, shares_with="with" not in own))
+        if made[-1].name in [task.name for task in made[:-1]]:
+            raise InvalidInputError(
+                f"{source.at('tasks', i)}: two tasks are named {made[-1].name}; give each a name or language of its own"
+            )
     return tuple(made)
 
 

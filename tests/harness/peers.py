@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sysconfig
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -95,6 +96,7 @@ def lerobot() -> Peer:
     return Peer(found, (str(ROOT), _installed(found, "lerobot_env_libero_lifelong")))
 
 
+@cache
 def _installed(python: Path, name: str) -> str:
     """Return a folder with one of our distributions as pip installs it: its metadata are what others look for."""
     folder = python.parents[1] / "integrations"

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from libero_env.demos.config import GENERATOR
+from lifelong.launch import main
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -27,6 +28,15 @@ def home(tmp_path_factory, demos) -> Path:
     folder = tmp_path_factory.mktemp("home")
     (folder / "demos").symlink_to(demos)
     return folder
+
+
+@pytest.fixture
+def here(home, monkeypatch) -> Path:
+    """The home, where the process of the tests is as one that was started there."""
+    monkeypatch.chdir(home)
+    monkeypatch.setenv("LIBERO_DEMOS", str(home / "demos"))
+    monkeypatch.setattr(sys, "argv", ["train.py"])
+    return home
 
 
 def start(home: Path, runs: Path, *overrides: str) -> subprocess.Popen:
@@ -53,9 +63,9 @@ def records(path: Path) -> list[dict]:
     return [json.loads(line) for line in lines]
 
 
-def test_smoke_from_the_command_line_to_a_report(home, tmp_path):
+def test_smoke_from_the_command_line_to_a_report(home, here, tmp_path, capsys):
     command = (
-        *("preset=smoke", "algo=er", "data.demos=5", "eval.curve=none", "eval.select=last"),
+        *("preset=smoke", "algo=er", "data.demos=3", "train.epochs=2", "eval.curve=none", "eval.select=last"),
         "eval.horizon=90",
     )
     output = finish(start(home, tmp_path, *command))
@@ -75,11 +85,11 @@ def test_smoke_from_the_command_line_to_a_report(home, tmp_path):
     kept = {p.name for p in (path / "checkpoints").iterdir()}
     assert {"task_0.safetensors", "task_1.safetensors"} <= kept
     assert sorted(p.name for p in home.iterdir()) == ["demos"]  # nothing else is left where it was started
-    assert "is finished" in finish(start(home, tmp_path, *command))
-    process = start(home, tmp_path, *command, "train.lr=0.5")
-    output, _ = process.communicate(timeout=300)
-    assert process.returncode == 2
-    assert "train.lr 0.003 -> 0.5" in output and "run_id=" in output and "Traceback" not in output
+    command = (*command, f"runs_dir={tmp_path}")
+    assert main([*command]) == 0 and "is finished" in capsys.readouterr().out
+    assert main([*command, "train.lr=0.5"]) == 2
+    told = capsys.readouterr().err
+    assert "train.lr 0.003 -> 0.5" in told and "run_id=" in told and "Traceback" not in told
 
 
 def test_a_sweep_of_algorithms_ends_with_a_comparison_report(home, tmp_path):
@@ -103,11 +113,12 @@ def test_errors_of_the_command_line_are_one_line(home, tmp_path):
     assert not list(tmp_path.rglob("config.yaml")), "nothing stands in the way of the mended command"
 
 
-def test_rollouts_of_another_back_end_are_named(home, tmp_path):
+def test_rollouts_of_another_back_end_are_named(here, tmp_path, capsys):
     pytest.importorskip("mujoco_warp")
     short = ("benchmark.tasks=1", "algo=sequential", "eval.curve=none", "eval.select=last", "eval.horizon=4")
-    output = finish(start(home, tmp_path, *TINY, *short, "train.epochs=1", 'eval.backend="warp,device=cpu"'))
+    other = ('eval.backend="warp,device=cpu"', f"runs_dir={tmp_path}")
+    assert main([*TINY, *short, "train.epochs=1", *other]) == 0
     path = run_dir(tmp_path)
-    assert "1 tasks learned" in output
+    assert "1 tasks learned" in capsys.readouterr().out
     assert records(path)[0]["backend"] == "warp"
     assert "simulated by" in (path / "report.html").read_text()

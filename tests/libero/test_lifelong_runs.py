@@ -82,6 +82,8 @@ def test_a_run_and_the_evaluation_of_its_checkpoint(folder, capsys):
         "the same weights, the same masks"
     )
     assert len(list((path / "task1_model_on0_videos").iterdir())) == 2
+    assert evaluate.main([*arguments, "--ep", "3"]) == 2
+    assert "--ep: a checkpoint of packnet is named by the last task before it" in capsys.readouterr().err
     assert evaluate.main([*arguments[:-1], "7"]) == 2
     assert "task0_model.pth, task1_model.pth" in capsys.readouterr().err
 
@@ -91,6 +93,10 @@ def test_an_interrupted_run_resumes_to_the_same_weights(folder):
     first = run(config(folder, "lifelong=er", "eval.eval=false"))
     for name in ("task1_state.safetensors", "task1_model.pth"):
         (first / name).unlink()
+    with pytest.raises(
+        ConfigError, match=r"train.resume: lifelong.n_memories is 7, but .* began with \d+; give that"
+    ):
+        run(config(folder, "lifelong=er", "eval.eval=false", "train.resume=true", "lifelong.n_memories=7"))
     second = run(config(folder, "lifelong=er", "eval.eval=false", "train.resume=true"))
     assert second == first
     states = [checkpoints.load(path / "task1_state.safetensors") for path in (whole, second)]

@@ -145,6 +145,8 @@ def test_a_user_defined_benchmark(monkeypatch):
             self._make_benchmark()
 
     assert benchmark.get_benchmark("mine")().get_task_names() == names
+    with pytest.raises(UnknownNameError, match="task order of mine 5. Valid: 0"):
+        Mine(5)  # the published orders are of ten tasks
 
 
 @pytest.fixture

@@ -93,6 +93,8 @@ def test_create_dataset(collected, tmp_path, capsys):
         assert "robot_states" not in acted["data/demo_1"]
         # the first actions act from the recorded state: positions to the bit, the arm's goals are forgotten between
         assert np.allclose(acted["data/demo_1/states"], before["data/demo_1/states"], atol=1e-6)
+    assert demonstrations.create_dataset([*argv, "--use-depth"]) == 2
+    assert "add --use_camera_obs" in capsys.readouterr().err
     assert demonstrations.create_dataset(["--demo-file", str(tmp_path / "none.hdf5")]) == 2
     assert "error: create_dataset.py: " in capsys.readouterr().err
 
@@ -233,6 +235,8 @@ def test_render_single_task(collected, tmp_path, capsys):
     assert stored.std() > 10
     assert tasks.render_single_task([*argv, "--demo_file", str(collected)]) == 0
     assert (np.asarray(Image.open(path)) != stored).any()
+    assert tasks.render_single_task([*argv, "--bddl_file", "mine.bddl"]) == 2
+    assert "give one of them" in capsys.readouterr().err
     assert tasks.render_single_task(["--task_id", "1"]) == 2
     assert "which task?" in capsys.readouterr().err
     assert tasks.render_single_task(["--benchmark_name", "libero_goal", "--task_id", "10"]) == 2
@@ -246,6 +250,7 @@ def test_shasum_files(tmp_path, capsys):
     assert line == f"2cf24dba5fb0a30e26e83b2ac5b9e29e1b161e5c1fa7425e73043362938b9824  {tmp_path / 'a.txt'}\n"
     (tmp_path / "sums").write_text(line)
     assert files.shasum_files(["--check", str(tmp_path / "sums")]) == 0
+    assert files.shasum_files([str(tmp_path / "b.txt"), "--check", str(tmp_path / "sums")]) == 2
     (tmp_path / "a.txt").write_text("goodbye")
     assert files.shasum_files(["--check", str(tmp_path / "sums")]) == 1
     assert "a.txt: FAILED" in capsys.readouterr().out

@@ -14,7 +14,7 @@ from libero_env.cli.main import main
 from libero_env.design.preview import contact_sheet
 from libero_env.design.template import task_template
 from libero_env.envs.env import LiberoEnv
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, PlacementError, UnknownNameError
 from libero_env.init_states import store as init_states
 from libero_env.sim.scene import build_scene
 from libero_env.storage import read_yaml
@@ -178,6 +178,11 @@ def test_a_scene_may_be_a_file_beside_the_task(tmp_path):
     ({"goal": "On plate_1 cup_1"}, "cup_1"),
     ({"goal": None}, "it has no goal"),
     ({"language": None}, "neither a name nor a language"),
+    ({"with": {"x": 1}}, "neither the task nor its scene uses the parameter x; leave it out"),
+    ({"with": {"thre": 1, "there": [0, 0]}, "place": {**FACTS["place"], "akita_black_bowl_1": "$there"}}, "'there'?"),
+    ({"regions": {"kitchen_table": {"mat": {"half": 0.1}}}}, "it has half, but no at; add such as at: \\[0, 0.2\\]"),
+    ({"regions": {"kitchen_table": {"mat": {"at": [0, 0], "half": 0.1, "ranges": [[0, 0, 1, 1]]}}}}, "both at and"),
+    ({"place": {**FACTS["place"], "plate_1": {"ranges": [[0, 0, 0.1, 0.1]], "half": 0.3}}}, "it has half, but no at"),
 ])  # fmt: skip
 def test_errors_state_what_is_valid(changes, message):
     with pytest.raises(LiberoError, match=message):
@@ -280,6 +285,32 @@ def test_starts_of_a_file_are_kept_by_what_it_says(tmp_path, monkeypatch):
     paths = [init_states.cache_init_states(t) for t in (task, replace(task, suite="own", index=3), moved)]
     assert paths[0] == paths[1] != paths[2] and made == ["one", "one"]
     assert init_states.load_init_states(task, build_scene(task.problem)).shape[0] == 50
+
+
+@pytest.mark.parametrize(
+    "keys", [{"at": [0.3, 0.3], "half": 0.1}, {"ranges": [[0.2, 0.2, 0.4, 0.4]]}], ids=str
+)
+@pytest.mark.parametrize("own", [{"at": [0, 0], "half": 0.1}, {"ranges": [[-0.1, -0.1, 0.1, 0.1]]}], ids=str)
+def test_a_region_of_a_task_replaces_that_of_its_scene(keys, own):
+    scene = {"scene": "kitchen", "regions": {"kitchen_table": {"mat": keys}}}
+    problem = make_task(**said(scene=scene, regions={"kitchen_table": {"mat": own}})).problem
+    assert problem.region("kitchen_table_mat").ranges == ((-0.1, -0.1, 0.1, 0.1),)
+
+
+@pytest.mark.sim
+def test_what_init_says_of_a_fixture_holds_at_the_start():
+    task = make_task(**said(init_also=["Up wooden_cabinet_1"]))
+    with (
+        LiberoEnv(task, cameras=()) as env,
+        pytest.raises(PlacementError, match="Up wooden_cabinet_1.* does not hold"),
+    ):
+        env.reset(seed=0)
+
+
+def test_the_video_does_not_replace_the_pictures(tmp_path, capsys):
+    path = tmp_path / "a.webp"
+    assert main(["tasks", "preview", "libero_object/0", "--out", str(path), "--video"]) == 2
+    assert "would be both the pictures and the video" in capsys.readouterr().err and not path.exists()
 
 
 @pytest.mark.sim

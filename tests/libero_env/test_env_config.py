@@ -6,7 +6,7 @@ import inspect
 import pytest
 
 from libero_env.envs import BatchEnv, EnvConfig, LiberoEnv, SubprocEnv
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 
 TASK = "libero_object/0"
 FIELDS = [field.name for field in dataclasses.fields(EnvConfig)]
@@ -35,6 +35,34 @@ def test_the_signature_shows_the_options_with_their_default_values(environment):
 def test_an_unknown_option_is_an_error_that_names_the_nearest(make):
     with pytest.raises(UnknownNameError, match="camera_siz'.*'camera_size'.*control_delta"):
         make(camera_siz=(64, 64))
+
+
+@pytest.mark.parametrize("perturb", ["delay=1", "noise=1,gain=0.5", "action_noise=1@step3"])
+def test_perturbed_actions_are_relative(perturb):
+    with pytest.raises(InvalidInputError, match="moves? the arm; with control_delta=False they are goals"):
+        EnvConfig(perturb=perturb, control_delta=False)
+
+
+@pytest.mark.parametrize("perturb", ["camera=1", "fov=0.5@step3"])
+def test_a_camera_that_is_perturbed_is_seen(perturb):
+    with pytest.raises(
+        InvalidInputError, match="changes the camera agentview, which is not among cameras=birdview; add"
+    ):
+        EnvConfig(perturb=perturb, cameras=("birdview",))
+    for cameras in ((), ("birdview", "agentview")):
+        assert EnvConfig(perturb=perturb, cameras=cameras)
+
+
+def test_an_event_at_a_step_that_no_episode_has_is_refused(closing):
+    with pytest.raises(InvalidInputError, match="event @step5: an episode has the steps 0 to 4"):
+        LiberoEnv(TASK, cameras=(), horizon=5, perturb="noise=1@step5")
+    closing(LiberoEnv(TASK, cameras=(), horizon=6, perturb="noise=1@step5"))
+
+
+@pytest.mark.parametrize("specs", [[dict], [{"task": TASK, "config": EnvConfig(horizon=3)}]], ids=str)
+def test_options_that_no_environment_would_have_are_refused(specs):
+    with pytest.raises(InvalidInputError, match="cameras: "):
+        SubprocEnv(specs, cameras=())
 
 
 @pytest.mark.sim

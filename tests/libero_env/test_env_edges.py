@@ -147,7 +147,8 @@ def test_refused_resets_change_nothing(env, batch):
                 one.reset(seed=5, options=options)
         assert digest(one) == before
     wide = len(batch.get_state(0))
-    others = {"reset_mask": ([True], "ab", [0.5, np.nan], [[True, False]]), "outdated_controller": (1, "no")}
+    masks = ([True], "ab", [0.5, np.nan], [[True, False]], [0, 1])
+    others = {"reset_mask": masks, "outdated_controller": (1, "no")}
     others["start"] = (3, "a", np.zeros((2, 3)), np.full((2, wide), np.nan), [[1], [1, 2]])
     for name, values in others.items():
         for value in values:

@@ -166,7 +166,7 @@ def test_the_text_of_events():
     ("text", "error", "message"),
     [
         ("camera=0.5@lift", UnknownNameError, "unknown trigger 'lift'. Did you mean 'lifted'?"),
-        ("camera=0.5@101%", UnknownNameError, "unknown trigger '101%'"),
+        ("camera=0.5@100%", UnknownNameError, "unknown trigger '100%'"),
         ("camera=0.5@step", UnknownNameError, "unknown trigger 'step'"),
         ("layout=1@step4", InvalidInputError, "layout cannot begin during an episode"),
         ("goal=1@step4,goal=1@lifted", InvalidInputError, "goal cannot be combined with goal"),

@@ -205,6 +205,8 @@ def test_the_command_prints_findings_and_its_status_counts_errors(tmp_path, caps
     assert len(lines) == 2 and lines[0].startswith(f"{bad}:") and "[unknown-category]" in lines[0]
     cli.main(["tasks", "lint", str(good), str(bad), "--starts", "0", "--level", "error", "--json"])
     assert [one["level"] for one in json.loads(capsys.readouterr().out)] == ["error"]
+    cli.main(["tasks", "lint", "libero_object/0", "libero_object-0", "--starts", "0"])
+    assert capsys.readouterr().out.startswith("1 tasks: "), "each once, whatever it is called"
     assert cli.main(["tasks", "lint", "libero_objet/1"]) == 2
     assert cli.main(["tasks", "lint", str(tmp_path / "none.bddl")]) == 2
 

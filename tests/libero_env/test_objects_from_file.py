@@ -15,7 +15,7 @@ from libero_env.design.objects import add_object, register_object_file
 from libero_env.design.objects.collision import boxes_of, collision_pieces, is_closed, volume_filled
 from libero_env.design.objects.mesh_file import bounds, read_mesh
 from libero_env.design.objects.mesh_object import DENSITY, merge_vertices
-from libero_env.errors import LiberoError
+from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.objects import folder, get_object, object_names
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
@@ -366,6 +366,14 @@ def test_a_stored_object_that_is_broken_is_named(tmp_path):
     (place / "object.yaml").write_text("name: brick\n")
     with pytest.raises(LiberoError, match="bottom_offset is missing"):
         get_object("brick")
+
+
+def test_replacing_removes_objects_only(tmp_path):
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "thesis.txt").write_text("all of it")
+    with pytest.raises(InvalidInputError, match="notes is not the folder of an object"):
+        add_object(box(tmp_path / "block.stl"), name="notes", out=tmp_path, replace=True)
+    assert (tmp_path / "notes" / "thesis.txt").exists()
 
 
 def test_the_command_adds_lists_shows_renders_and_removes(tmp_path, capsys):

@@ -1,5 +1,6 @@
 """Goals over time: what Then, Never and Count mean, what an environment remembers of them, and who deals with them."""
 
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -97,6 +98,8 @@ def test_what_is_none_is_refused_in_one_line(text, message):
 
 
 def test_in_python_too():
+    with pytest.raises(InvalidInputError, match="number is 1000; expected at most 999"):
+        Count(1000, A)
     with pytest.raises(InvalidInputError, match="parts"):
         Then((A,))
     with pytest.raises(InvalidInputError, match="number"):
@@ -111,8 +114,8 @@ def aside(view, name: str, metres: float):
     return view.eef_pos[1] > metres
 
 
-@pytest.fixture(scope="module", autouse=True)
-def own_predicate():
+@contextmanager
+def own():
     register_predicate("aside", aside)
     yield
     KINDS.pop("Aside")
@@ -120,7 +123,12 @@ def own_predicate():
         table.pop("Aside")
 
 
-register_predicate("aside", aside)
+@pytest.fixture(scope="module", autouse=True)
+def own_predicate():
+    with own():
+        yield
+
+
 PLACES = {
     "scene": "kitchen",
     "objects": ["butter", "plate"],
@@ -128,7 +136,8 @@ PLACES = {
     "language": "wave over the plate and the butter",
 }
 LEFT, RIGHT = "(Aside plate_1 0.03)", "(Not (Aside plate_1 -0.03))"
-STEPS = make_task(**PLACES, goal=f"(Then {LEFT} {RIGHT})")
+with own():  # not longer: the workers of all tests would import this module
+    STEPS = make_task(**PLACES, goal=f"(Then {LEFT} {RIGHT})")
 
 
 def moves(*ways):
@@ -265,9 +274,15 @@ def test_an_unknown_predicate_in_a_never_is_refused_by_name():
         env.reset(seed=0)
 
 
-def test_no_staged_reward():
-    with pytest.raises(InvalidInputError, match="reward=staged is of goals of states, and"):
-        BatchEnv(STEPS, 1, cameras=(), reward="staged")
+@pytest.mark.parametrize(("task", "options"), [
+    (STEPS, {}),
+    (make_task(**STOVE, goal="(And (Turnon flat_stove_1) (Not (Up plate_1)))"), {}),  # rewards what must not be
+    (make_task(**STOVE, goal="(ForAll (?x - plate) (Up ?x))"), {}),  # has no atoms to reward
+    ("libero_goal/6", {"perturb": "goal=1@step40"}),  # has those of both goals
+], ids=str)  # fmt: skip
+def test_no_staged_reward(task, options):
+    with pytest.raises(InvalidInputError, match="reward=staged counts the atoms of one goal that hold, but "):
+        BatchEnv(task, 1, cameras=(), reward="staged", **options)
 
 
 def test_the_original_refuses_them_and_lint_and_certify_say_so(tmp_path, capsys):

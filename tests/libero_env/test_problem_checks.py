@@ -70,6 +70,10 @@ FAULTS = [  # old, new, line, message
     ("(plate_place (:target kitchen_table) (:ranges ((0.04 0.18 0.06 0.22))))", "(plate_place (:target kitchen_table))",
      5, "has no extent"),
     ("(:target wooden_cabinet_1)", "(:target wooden_cabinet_1) (:rgba (0 0 1 1))", 0, ""),
+    ("((0 pi/2))", "((0 pi/2) (1 2))", 4, "has 2 ranges of yaw; expected one"),
+    ("(:target wooden_cabinet_1)", "(:target wooden_cabinet_1) (:yaw_rotation ((0 1)))", 7, "but no rectangle"),
+    ("1 kitchen_table_cabinet_place)", "1 plate_1)", 14, "does not place it: a fixture stands on a rectangle"),
+    ("(On wooden_cabinet_1 kitchen", "(In wooden_cabinet_1 kitchen", 14, "a fixture stands on a rectangle"),
 ]  # fmt: skip
 NAMES = (
     *("robot0_base", "robot", "world", "gripper0", "mount0_x", "ee", "a/b", "../x", "x" * 200),

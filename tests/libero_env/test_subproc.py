@@ -129,7 +129,9 @@ def test_the_others_continue_when_a_worker_fails(envs, fault, says):
     env.timeout = 1.0 if fault == "hang" else 60.0
     with pytest.raises(WorkerError, match=says) as caught:
         env.step(np.ones((3, 2)))
-    assert "worker 1 (make)" in str(caught.value) and "reset_mask" in str(caught.value)
+    assert "worker 1 (make)" in str(caught.value) and "True at [1] in options={'reset_mask'" in str(
+        caught.value
+    )
     seen, rewards, _, truncated, _ = caught.value.outcome
     assert list(caught.value.failed) == [1]
     assert seen["count"].tolist() == [3, 0, 3] and rewards.tolist() == [2, 0, 2]

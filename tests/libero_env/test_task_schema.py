@@ -60,6 +60,7 @@ BAD = [  # old, new, line, message
     ("Put the bowl on the plate", "x\nfixtures: {x: nothing}", 17, "fixture category"),
     ("Put the bowl on the plate", "x\ntasks: 5", 17, "expected a list of at most 1000 tasks"),
     ("Put the bowl on the plate", "x\ntasks: [{goal: Up plate_1}, {goal: 5}]", 17, "goal is 5; expected"),
+    ("Put the bowl on the plate", "x\ntasks: [{name: a}, {name: a, init: []}]", 17, "two tasks are named a; give each"),
     ("{floor: light-gray}", "[light-gray]", 17, "scene_properties is ['light-gray']"),
     ("scene: kitchen", "scene: kitchen\nscene: floor", 2, "the key scene occurs twice"),
     ("scene: kitchen", "5: kitchen", 1, "the key 5 is not a text"),

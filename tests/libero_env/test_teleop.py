@@ -66,6 +66,9 @@ def test_taps_and_held_keys():
     assert keyboard.action()[0] == 0.0, "opposite keys cancel"
     keyboard.press("m")
     assert keyboard.command is None
+    full = Keyboard(pos_sensitivity=0.27)  # as the help of --pos-sensitivity says
+    full.press("d")
+    assert full.action()[1] == 1.0
 
 
 def test_gripper_and_commands():
@@ -231,6 +234,11 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert cli.main(["teleop", TASK, "--out", str(out), "--pos-sensitivity", "0.1", "--size", "16"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"{out}: 1 of 1 demonstrations"
     assert len(read_demos(out)) == 1
+
+
+def test_the_numbers_of_a_mouse_need_one(capsys):
+    assert cli.main(["teleop", TASK, "--vendor-id", "1133"]) == 2
+    assert "--vendor-id and --product-id name a 3D mouse; add --device spacemouse" in capsys.readouterr().err
 
 
 def test_a_status_reads_as_a_line():

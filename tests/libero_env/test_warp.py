@@ -23,7 +23,6 @@ from libero_env.tasks.problem import And, Atom, ForAll, Not, Or
 wp = pytest.importorskip("warp")
 mjw = pytest.importorskip("mujoco_warp")
 warp_simulations = pytest.importorskip("libero_env.sim.mjwarp.simulations")
-wp.config.optimization_level = 0  # kernels compile in a third of the time
 
 EVERYTHING = os.environ.get("LIBERO_WARP") == "all"  # twenty minutes more on a processor
 TASK = "libero_10/3"  # a bowl into a drawer that is then closed: fixtures, joints, contacts
@@ -35,6 +34,14 @@ TEN_TASKS = ["libero_spatial/0", "libero_object/3", "libero_object/7", "libero_g
 TEN_TASKS += ["libero_10/3", "libero_10/9", "libero_90/1", "libero_90/20", "libero_90/60"]
 
 pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module", autouse=True)
+def graphs():
+    """Warp captures and replays graphs on the processor too, which is how what GPUs run is tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(warp_simulations, "can_capture", lambda device: True)
+        yield
 
 
 def make_pair(backends=("mujoco", WARP), **options):
@@ -127,7 +134,6 @@ def test_what_a_simulation_does_depends_on_itself_alone(pair):
 
 @pytest.mark.parametrize("outdated", [False, True])
 def test_a_graph_does_what_its_kernels_do(pair, outdated):
-    """Warp captures and replays graphs on the processor too, which is how what GPUs run is tested."""
     env, action, found = pair[1], smooth_actions(1)[0], []
     for uses_graphs in (False, True):
         env.simulations.uses_graphs = uses_graphs
@@ -135,7 +141,6 @@ def test_a_graph_does_what_its_kernels_do(pair, outdated):
         env.simulations.step([0, 2], action)
         found.append(env.simulations.fields["qpos"].copy())
         found.append(env.simulations.fields["qvel"].copy())
-    env.simulations.uses_graphs = False
     assert (found[0] == found[2]).all() and (found[1] == found[3]).all()
 
 
@@ -242,6 +247,7 @@ def test_too_many_contacts_are_an_error_of_that_simulation_that_says_what_to_set
     flags = np.array(
         [0, int(warp_simulations.mjw.OverflowType.NEFC), int(warp_simulations.mjw.OverflowType.ITERATIONS)]
     )
+    monkeypatch.setattr(env.simulations, "uses_graphs", False)
     substep = env.simulations._substep
     monkeypatch.setattr(
         env.simulations,
@@ -333,6 +339,7 @@ def test_appearances_need_the_other_back_end(pair):
     ("warp,contacts=many", InvalidInputError, "whole number"),
     ("warp,device=", InvalidInputError, "cuda:0"),
     ("mujoco,device=cpu", InvalidInputError, "no settings"),
+    ("warp,contacts=64,contacts=256", InvalidInputError, "contacts is given twice"),
     (7, InvalidInputError, "expected a text"),
 ])  # fmt: skip
 def test_a_back_end_that_is_not_valid_is_said(text, error, told):

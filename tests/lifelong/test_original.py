@@ -32,14 +32,16 @@ def given() -> dict:
     return {"first": first, "second": second, "episode": original.smooth_batch(QUICK, 2, steps=6)}
 
 
-@pytest.fixture
-def elsewhere(monkeypatch):
+@pytest.fixture(scope="module")
+def elsewhere():
     """Call a function in a process whose matrix products round alike on every processor.
 
     Where a unit is at the kink of a ReLU, rounding decides about its share of the gradient.
     """
-    monkeypatch.setenv("MKL_CBWR", "COMPATIBLE")
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setenv("MKL_CBWR", "COMPATIBLE")
+            pool.submit(int).result()  # it is started here
         yield lambda function, *values: pool.submit(function, *values).result()
 
 

@@ -104,9 +104,11 @@ class Benchmark:
         if self.name in suite_names():
             self.tasks = [_entry(task) for task in get_suite(self.name).order(self.task_order_index)]
         else:
-            orders = read_yaml("tasks/data/task_orders.yaml")
-            order = orders[self.task_order_index] if len(tasks) == 10 else range(len(tasks))
-            self.tasks = [tasks[i] for i in order]
+            orders = (
+                read_yaml("tasks/data/task_orders.yaml") if len(tasks) == 10 else [list(range(len(tasks)))]
+            )
+            require_known(f"task order of {self.name}", self.task_order_index, range(len(orders)))
+            self.tasks = [tasks[i] for i in orders[self.task_order_index]]
         self.n_tasks = len(self.tasks)
 
     def _entries(self) -> list[Task]:

@@ -127,18 +127,11 @@ def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
 
 
 def _check_atoms(report: Report, problem: Problem) -> None:
-    """Check that predicates exist, and that fixtures stand in regions of the workspace."""
+    """Check that predicates exist."""
     for atom, line in (*report.init(problem), *report.goal(problem)):
         if atom.predicate not in PREDICATES:
             what = f"the predicate of {atom} does not exist"
             report.add("error", line, "unknown-predicate", what, report.suggest(atom.predicate, PREDICATES))
-    for atom, line in report.init(problem):
-        region = problem.region(atom.args[-1])
-        placed = atom.args[0] in problem.fixtures and atom.predicate in ("On", "In")
-        if placed and (region is None or not region.ranges):
-            what = f"{atom} does not place it: a fixture stands in a region of the workspace"
-            remedy = "name a region with :ranges whose target is the workspace"
-            report.add("error", line, "kind", what, remedy)
 
 
 def _check_regions(report: Report, problem: Problem) -> None:

@@ -78,6 +78,10 @@ def add_object(
         raise LiberoError(
             f"{directory} exists already; choose another name (--name), or replace it (--replace)"
         )
+    if directory.exists() and not (directory / folder.PROPERTIES).is_file():
+        raise InvalidInputError(
+            f"{directory} is not the folder of an object, which --replace would replace; choose another name (--name)"
+        )
     try:
         directory.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
