@@ -1,14 +1,18 @@
 """A sweep under other launchers than Hydra's basic one: the same numbers, errors that are told, and going on."""
 
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
+
+from lifelong.launch import main
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -53,10 +57,13 @@ def plain(tmp_path_factory, demos) -> tuple[Path, Path]:
     """A sweep of Hydra's basic launcher: one job cannot be run. Return the home and its runs."""
     home = tmp_path_factory.mktemp("home")
     (home / "demos").symlink_to(demos)
-    runs = home / "plain"
-    process = start(home, runs, "seed=1,2,-1")
-    output, _ = process.communicate(timeout=600)
-    assert process.returncode == 2 and "2 runs compared" in output, output
+    runs, said = home / "plain", io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
+        patch.setattr(sys, "argv", ["train.py"])
+        patch.setenv("LIBERO_DEMOS", str(home / "demos"))
+        patch.chdir(home)
+        assert main(["-m", *TINY.split(), "seed=1,2,-1", f"runs_dir={runs}"]) == 2
+    assert "2 runs compared" in said.getvalue()
     return home, runs
 
 

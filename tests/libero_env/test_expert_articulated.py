@@ -22,7 +22,7 @@ from libero_env.tasks.problem import Atom
 
 pytestmark = pytest.mark.sim
 
-SEEDS = 10
+SEEDS = 5
 STEPS = 300
 # [rad] yaw of a fixture whose front faces the middle of the table from the right, and from the left
 BACK, FRONT = 3.14159, 0.0
@@ -85,11 +85,11 @@ def test_a_joint_is_moved_and_stays(closing, case):
         env.simulations.step(np.arange(SEEDS), rest)
     held = sum(evaluate(atom, view) for view in env.views)
     # its bars are 2 cm long and taper, and its door is closed only while it is pressed against its stop
-    least = 0.8 if case[0].startswith("short") else 0.9
-    assert reached.sum() >= least * SEEDS
+    least = SEEDS - 1 if case[0].startswith("short") else SEEDS
+    assert reached.sum() >= least
     if case[0] == "short_fridge" and case[2] == "close":
         return
-    assert held >= least * SEEDS, [(skill.phase, skill.failure_reason) for skill in skills]
+    assert held >= least, [(skill.phase, skill.failure_reason) for skill in skills]
 
 
 def test_the_same_motion_style_gives_the_same_actions():

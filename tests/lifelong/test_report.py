@@ -21,6 +21,7 @@ from libero_env.sim.causes import Failure
 from libero_env.tasks import get_suite
 from libero_env.text import json_safe
 from lifelong.errors import LifelongError
+from lifelong.report import page as page_module
 from lifelong.report.comparison import Plan, compare
 from lifelong.report.export import export_runs, load_runs
 from lifelong.report.figures import (
@@ -215,6 +216,15 @@ class Page(HTMLParser):
         return " ".join(" ".join(self.words).split())
 
 
+@pytest.fixture
+def no_papers(monkeypatch):
+    """Write no figures beside a page, which a test does not look at."""
+    monkeypatch.setattr(page_module, "save", lambda figure, stem: None)
+
+
+undrawn = pytest.mark.usefixtures("no_papers")
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = make_run(tmp_path_factory.mktemp("er"), tasks=4)
@@ -307,6 +317,7 @@ def test_an_unfinished_run_is_reported(tmp_path: Path, done: int):
     assert ("None yet" in page.text) == (done == 0)
 
 
+@undrawn
 def test_invalid_lines_and_a_missing_config_are_noted_on_the_page(tmp_path: Path):
     folder = make_run(tmp_path / "run", tasks=2)
     lines = (folder / "results.jsonl").read_text().splitlines()
@@ -316,6 +327,7 @@ def test_invalid_lines_and_a_missing_config_are_noted_on_the_page(tmp_path: Path
     assert "results.jsonl:5: not JSON" in Page(raw).text and "config.yaml is missing" in Page(raw).text
 
 
+@undrawn
 def test_text_of_a_run_is_never_markup(tmp_path: Path):
     folder = make_run(tmp_path / "run", tasks=2)
     (folder / "config.yaml").write_text("algo: {note: '<script>alert(1)</script>'}\n")
@@ -339,6 +351,7 @@ def test_several_runs_side_by_side(tmp_path: Path):
     }
 
 
+@undrawn
 def test_the_page_of_several_runs_has_a_folder_that_git_ignores(tmp_path: Path, monkeypatch):
     runs = [make_run(tmp_path / "runs" / a, a, tasks=2) for a in ("er", "ewc")]
     monkeypatch.chdir(tmp_path)
@@ -347,6 +360,7 @@ def test_the_page_of_several_runs_has_a_folder_that_git_ignores(tmp_path: Path, 
     assert (tmp_path / "comparison" / ".gitignore").read_text() == "*\n"
 
 
+@undrawn
 def test_two_runs_of_one_seed_count_once(tmp_path: Path):
     first, again = (make_run(tmp_path / name, "er", 1, tasks=2) for name in ("first", "again"))
     partial = make_run(tmp_path / "partial", "er", 1, tasks=2, done=1)
@@ -358,6 +372,7 @@ def test_two_runs_of_one_seed_count_once(tmp_path: Path):
     assert "../partial: a further run of seed 1 of er; it is not counted" in page.text
 
 
+@undrawn
 def test_runs_that_differ_in_any_section_are_methods_of_their_own(tmp_path: Path):
     """Each top-level section of a configuration that decides results is compared."""
     sections = {str(key) for key, value in composed().items() if isinstance(value, DictConfig)} - {"tracker"}
@@ -370,6 +385,7 @@ def test_runs_that_differ_in_any_section_are_methods_of_their_own(tmp_path: Path
         assert len(group_runs([load_run(run) for run in runs])) == 2, name
 
 
+@undrawn
 def test_intervals_stay_where_the_metric_can_be(tmp_path: Path, monkeypatch):
     """Two episodes that both failed, with two seeds: the interval starts at 0 and has a width."""
     monkeypatch.setitem(CHARACTERS, "er", (0.0, 1.0))
@@ -430,6 +446,7 @@ def test_no_two_of_twenty_lines_look_the_same():
     assert len(looks) == 20
 
 
+@undrawn
 def test_all_pairs_are_a_triangle_and_oracles_and_memory_have_columns(tmp_path: Path):
     runs = [
         make_run(tmp_path / f"{a}{s}", a, s, tasks=3) for a in ("ewc", "er", "packnet") for s in (1, 2, 3)
@@ -450,6 +467,7 @@ def test_all_pairs_are_a_triangle_and_oracles_and_memory_have_columns(tmp_path: 
     assert triangle(found | {"differences": found["differences"][:2]}, "auc") == []  # not all pairs
 
 
+@undrawn
 def test_orders_and_demonstrations_are_factors_apart_from_the_seed(tmp_path: Path):
     runs = [
         make_run(tmp_path / f"{seed}{data}{order}", "er", seed, tasks=3, data_seed=data, order=order)
@@ -473,6 +491,7 @@ def test_orders_and_demonstrations_are_factors_apart_from_the_seed(tmp_path: Pat
     assert {(run.seed, run.data_seed, run.tasks) for run in again} == set(auc)
 
 
+@undrawn
 def test_conventions_of_other_papers_are_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(CHARACTERS, "single_task", (0.8, 1.0))
     runs = [make_run(tmp_path / f"{a}{s}", a, s, tasks=3) for a in ("er", "single_task") for s in (1, 2, 3)]
@@ -529,6 +548,7 @@ def together(
     return folder
 
 
+@undrawn
 def test_tasks_that_are_learned_together_share_their_costs_and_have_an_intransigence(tmp_path: Path):
     pairs = {(1, 0): 1.0, (1, 1): 0.0} | {(3, task): 1.0 for task in range(4)}
     runs = [
@@ -627,6 +647,7 @@ def test_costs_are_in_both_kinds_of_page(compared: tuple[Path, dict], finished: 
             assert message in text, message
 
 
+@undrawn
 def test_subgoals_are_on_the_page_unless_records_are_old(finished: Path, tmp_path: Path):
     text = Page((finished / "report.html").read_text()).text
     assert "Subgoals" in text and "In thing_0 basket_1_contain_region" in text
@@ -641,6 +662,7 @@ def test_subgoals_are_on_the_page_unless_records_are_old(finished: Path, tmp_pat
     assert "Subgoals" not in text and "Costs" not in text and "FWT" in text
 
 
+@undrawn
 def test_saliency_is_on_the_page(tmp_path: Path):
     folder = make_run(tmp_path / "run", tasks=2)
     assert "<h2>Saliency</h2>" not in write_report([folder]).read_text()
@@ -651,6 +673,7 @@ def test_saliency_is_on_the_page(tmp_path: Path):
     assert "Saliency" in text and "at the cheese" in text
 
 
+@undrawn
 def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Path):
     runs = [
         make_run(tmp_path / "a", "ewc", 1, tasks=2, strength=10),
@@ -673,6 +696,7 @@ def test_keys_that_change_no_result_make_no_method(key: str, tmp_path: Path):
     assert len(group_runs([load_run(run) for run in runs])) == 1
 
 
+@undrawn
 def test_runs_of_one_seed_from_two_starts_are_two_in_the_table_of_episodes(tmp_path: Path):
     runs = [make_run(tmp_path / str(n), "er", 1, tasks=1, epochs=(0, 1)) for n in (1, 2)]
     for number, run in enumerate(runs):
@@ -711,6 +735,7 @@ def test_no_two_methods_have_one_label(tmp_path: Path):
     assert len(set(labels)) == 32, labels
 
 
+@undrawn
 def test_runs_that_learned_from_other_demonstrations_are_told(tmp_path: Path):
     kinds = {
         "old": ("aa", "bb"),
@@ -752,6 +777,7 @@ def test_runs_of_different_progress_and_length_compare(tmp_path: Path):
     assert "1 of 3" in page.text and "0 of 3" in page.text
 
 
+@undrawn
 def test_a_run_behind_the_others_of_its_method_is_not_counted(tmp_path: Path):
     runs = [make_run(tmp_path / f"{a}{s}", a, s, tasks=2) for a, s in (("er", 1), ("ewc", 1), ("ewc", 2))]
     runs.append(make_run(tmp_path / "er2", "er", 2, tasks=2, done=1))
@@ -836,6 +862,7 @@ def test_a_folder_that_cannot_be_written_is_named(finished: Path, tmp_path: Path
         write_report([finished], tmp_path / "sub" / "report.html")
 
 
+@undrawn
 def test_media_above_the_limit_are_omitted_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = make_run(tmp_path / "run", tasks=2)
     for name in ("a", "b"):
@@ -970,6 +997,7 @@ def test_runs_that_differ_in_any_setting_are_two_methods(key: str, tmp_path: Pat
     assert len(group_runs([load_run(run.path) for run in runs])) == 1, "0.0 and 0 are one value"
 
 
+@undrawn
 def test_the_ring_is_the_kept_epoch_and_a_sent_page_names_no_folder_of_the_machine(tmp_path: Path):
     curve = Curve(np.array([4, 8]), np.array([0.8, 0.2]), np.array([5, 5]))
     axes = learning_figure({0: curve}, {}, ["a"], {0: 8}).axes[0]
@@ -981,6 +1009,7 @@ def test_the_ring_is_the_kept_epoch_and_a_sent_page_names_no_folder_of_the_machi
         assert str(tmp_path) not in (page.parent / file).read_text()
 
 
+@undrawn
 def test_what_differs_besides_the_method_is_said_and_other_worlds_are_refused(tmp_path: Path):
     runs = [
         make_run(tmp_path / f"{algo}{seed}", algo, seed, tasks=2) for algo in ("ewc", "er") for seed in (1, 2)
@@ -1015,6 +1044,7 @@ def test_what_differs_besides_the_method_is_said_and_other_worlds_are_refused(tm
     assert "Runs differ in mujoco (3.3.2: er seed 1, er seed 2, ewc seed 1; 4.0.0: ewc seed 2)." in text
 
 
+@undrawn
 def test_a_page_says_what_forward_transfer_is_the_mean_of_and_which_weights_were_never_trained(
     tmp_path: Path,
 ):
