@@ -101,7 +101,9 @@ def pytest_collection() -> Iterator[None]:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark as `unit` every test that is not marked as `sim`."""
-    assert not parallel.user_entries(), "a test module registers as it is imported; every worker would import it"
+    assert not parallel.user_entries(), (
+        "a test module registers as it is imported; every worker would import it"
+    )
     for item in items:
         if item.get_closest_marker("sim") is None:
             item.add_marker("unit")

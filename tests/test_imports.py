@@ -118,7 +118,12 @@ def import_in_fresh_process(home: Path, *groups: list[str]) -> list[dict]:
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory) -> dict[str, dict]:
-    groups = {"libero_env": ENV_SIDE, "libero": FACADE, "libero_eval": JUDGING_SIDE, "lifelong": LEARNING_SIDE}
+    groups = {
+        "libero_env": ENV_SIDE,
+        "libero": FACADE,
+        "libero_eval": JUDGING_SIDE,
+        "lifelong": LEARNING_SIDE,
+    }
     found = import_in_fresh_process(tmp_path_factory.mktemp("home"), *groups.values())
     return dict(zip(groups, found, strict=True))
 

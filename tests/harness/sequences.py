@@ -1,6 +1,7 @@
 """A sequence of three tasks with a tiny policy and a fake environment; simulated kills of runs."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict
 
 import numpy as np
@@ -21,6 +22,7 @@ from lifelong.seeding import generator, seeded
 from lifelong.sequence import TaskSequence
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
+from lifelong.training import costs
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 from tests.harness.policies import small_transformer
@@ -136,6 +138,18 @@ def assert_same(a, b):
         assert torch.equal(a, b)
     else:
         assert a == b or (a != a and b != b)
+
+
+class Uncounted(nullcontext):
+    """In place of the counter of operations, which makes steps several times as slow."""
+
+    def get_total_flops(self) -> int:
+        return 0
+
+
+def count_nothing(monkeypatch) -> None:
+    """Make the steps whose operations are counted, without counting."""
+    monkeypatch.setattr(costs, "count_flops", lambda: Uncounted(Uncounted()))
 
 
 class Killed(BaseException):

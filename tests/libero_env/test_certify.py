@@ -133,8 +133,9 @@ def test_what_cannot_be_tried_fails_with_the_reason():
 
 @pytest.mark.sim
 @pytest.mark.slow
-def test_a_task_file_is_certified_in_two_processes(tmp_path):
+def test_a_task_file_is_certified_in_two_processes(tmp_path, monkeypatch):
+    monkeypatch.setattr("libero_env.design.certify.BATCH", 2)
     file = tmp_path / "mine.bddl"
     file.write_text(get_task("libero_object/2").bddl_text)
-    (found,) = certify([read_task(file)], 17, jobs=2, progress=False)
-    assert [o.state for o in found.outcomes] == list(range(17)) and found.rate > 0.8
+    (found,) = certify([read_task(file)], 3, jobs=2, progress=False)
+    assert [o.state for o in found.outcomes] == [0, 1, 2] and found.rate > 0.6

@@ -108,10 +108,14 @@ def test_random_states_of_tasks(key, drawing):
     states = [random_qpos(model, rng) for _ in range(4)]
     cameras = ["agentview", "robot0_eye_in_hand"]
     assert_equal(render_both(model, cameras, states, drawing == FAITHFUL))
-    for _ in range(6):  # the agent's camera anywhere above and below the table, and close to it
-        model.cam_pos[model.camera("agentview").id] = rng.uniform([-0.8, -0.8, 0.3], [0.8, 0.8, 1.6])
-        model.cam_quat[model.camera("agentview").id] = rng.normal(size=4)
-        assert_equal(render_both(model, ["agentview"], states[:1], drawing == FAITHFUL))
+
+    def moving():  # the agent's camera anywhere above and below the table, and close to it
+        for _ in range(6):
+            model.cam_pos[model.camera("agentview").id] = rng.uniform([-0.8, -0.8, 0.3], [0.8, 0.8, 1.6])
+            model.cam_quat[model.camera("agentview").id] = rng.normal(size=4)
+            yield states[0]
+
+    assert_equal(render_both(model, ["agentview"], moving(), drawing == FAITHFUL))
 
 
 def left_out_of(model, camera, change=lambda data: None):

@@ -123,6 +123,7 @@ def test_a_policy_acts_in_frames_that_stay(stage):
 
 def test_controls_choose_frames_sources_and_perturbations(viewer, recording):
     view = viewer(recording)
+    view.camera.value = "agentview"  # of seven
     view.frame.value = 4
     view.update()
     assert view.shown == 4 and "frame 4" in view.text.content

@@ -372,7 +372,6 @@ def test_two_runs_of_one_seed_count_once(tmp_path: Path):
     assert "../partial: a further run of seed 1 of er; it is not counted" in page.text
 
 
-@undrawn
 def test_runs_that_differ_in_any_section_are_methods_of_their_own(tmp_path: Path):
     """Each top-level section of a configuration that decides results is compared."""
     sections = {str(key) for key, value in composed().items() if isinstance(value, DictConfig)} - {"tracker"}
@@ -673,7 +672,6 @@ def test_saliency_is_on_the_page(tmp_path: Path):
     assert "Saliency" in text and "at the cheese" in text
 
 
-@undrawn
 def test_runs_that_differ_in_more_than_their_seed_are_not_averaged(tmp_path: Path):
     runs = [
         make_run(tmp_path / "a", "ewc", 1, tasks=2, strength=10),

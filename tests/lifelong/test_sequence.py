@@ -1,6 +1,5 @@
 """The task sequence with every algorithm: killed anywhere and resumed, it comes to the same records and weights."""
 
-import contextlib
 import copy
 import math
 
@@ -12,7 +11,6 @@ from lifelong.data.memory import PhaseMemory, ReplayMemory
 from lifelong.report.tables import COST_COLUMNS
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.settings import build
-from lifelong.training import costs
 from lifelong.training.fit import fit
 from tests.harness.algorithms import (
     SMALL,
@@ -23,7 +21,15 @@ from tests.harness.algorithms import (
 )
 from tests.harness.configs import CONFIGS, composed
 from tests.harness.gpu_learning import POLICIES, learn
-from tests.harness.sequences import ALGORITHMS, TASKS, assert_same, dataset, run_context, sequence
+from tests.harness.sequences import (
+    ALGORITHMS,
+    TASKS,
+    assert_same,
+    count_nothing,
+    dataset,
+    run_context,
+    sequence,
+)
 
 EVERY = ALGORITHMS | {
     "agem": lambda: algos.AGEM(memory=ReplayMemory(25)),
@@ -63,16 +69,9 @@ def test_every_algorithm_is_here():
     assert {file.stem for file in CONFIGS.glob("algo/*.yaml")} == set(EVERY)
 
 
-class Uncounted(contextlib.nullcontext):
-    """Lets the steps be made whose operations are counted, without counting; test_resume counts."""
-
-    def get_total_flops(self):
-        return 0
-
-
 @pytest.mark.parametrize(("first", "make"), list(enumerate((EVERY | COMPAT).values())), ids=EVERY | COMPAT)
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, first, make, monkeypatch):
-    monkeypatch.setattr(costs, "count_flops", lambda: Uncounted(Uncounted()))
+    count_nothing(monkeypatch)  # test_resume counts
     assert_resumed_equals_uninterrupted(tmp_path, make, monkeypatch, first=1 + first % 6)
 
 
