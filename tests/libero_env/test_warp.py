@@ -36,14 +36,6 @@ TEN_TASKS += ["libero_10/3", "libero_10/9", "libero_90/1", "libero_90/20", "libe
 pytestmark = pytest.mark.sim
 
 
-@pytest.fixture(scope="module", autouse=True)
-def graphs():
-    """Warp captures and replays graphs on the processor too, which is how what GPUs run is tested."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(warp_simulations, "can_capture", lambda device: True)
-        yield
-
-
 def make_pair(backends=("mujoco", WARP), **options):
     """The same environment on both back ends, `mujoco` first."""
     options = {"cameras": (), "observations": ("proprioception", "objects"), **options}

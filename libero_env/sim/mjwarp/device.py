@@ -40,9 +40,9 @@ def choose_device(name: str | None) -> Any:
 
 
 def can_capture(device: Any) -> bool:
-    """Return whether a control step can be one CUDA graph: that needs memory pools, and CUDA 12.4 for its loop."""
+    """Return whether a control step can be one graph: on a GPU that needs memory pools, and CUDA 12.4 for its loop."""
     if not device.is_cuda:
-        return False
+        return True
     if not wp.is_mempool_enabled(device):
         lack = "memory pools"
     elif not wp.is_conditional_graph_supported():

@@ -33,7 +33,7 @@ _FULL = (
 class WarpSimulations(Simulations):
     """Simulations that are stepped together by MuJoCo Warp, all of them at the cost of all.
 
-    A control step on a GPU is one CUDA graph. Simulations that are not to be stepped are stepped and held, so that
+    A control step is one graph. Simulations that are not to be stepped are stepped and held, so that
     they do not move. Numbers are of single precision.
 
     Args:
@@ -47,8 +47,8 @@ class WarpSimulations(Simulations):
         device_model: The model on the device, with the poses of fixtures of each simulation.
         device_data: The state of all simulations on the device.
         limits_reached: How often a simulation reached a limit of the solver without an error, by the limit's name.
-        uses_graphs: Whether the kernels of a control step are launched as one graph: on GPUs. On the processor that is
-            possible, and slower.
+        uses_graphs: Whether the kernels of a control step are launched as one graph. Without, a step of one simulation
+            on the processor takes twenty times as long.
 
     Raises:
         LiberoError: There is no such device, or MuJoCo Warp has not a feature that the model uses.
