@@ -29,7 +29,7 @@ def test_streams_from_the_command_line(tmp_path, demos, monkeypatch, capsys):
     monkeypatch.setenv("LIBERO_DEMOS", str(demos))
     stream = (
         "algo=er", "benchmark.tasks=2", "benchmark.group_size=2", "pretrain.suite=libero_object",
-        "pretrain.tasks=[1]", "stream.demos_later=1"
+        "pretrain.tasks=[1]"
     )  # fmt: skip
     assert train(tmp_path, *stream, "data.memory=disk") == 0
     output = capsys.readouterr().out
