@@ -79,7 +79,7 @@ train: setup
 test: setup $(PEERS_STAMP) $(BROWSER_STAMP)
 	@$(MAKE) --no-print-directory -j2 lint pytest
 
-pytest:
+pytest: $(STAMP)
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist=worksteal $(ARGS)
 
 lint: $(STAMP)

@@ -208,7 +208,13 @@ def together(studies: tuple[str, str]) -> Iterator[tuple[str, list[str]]]:
         rows = []
         for label in (label for label in found[1] if label != REFERENCES[0] and label in found[0]):
             effects = [
-                np.array([values[label][s] - values[REFERENCES[0]][s] for s in sorted(values[label])])
+                np.array(
+                    [
+                        v - values[REFERENCES[0]][s]
+                        for s, v in values[label].items()
+                        if s in values[REFERENCES[0]]
+                    ]
+                )
                 for values in found
             ]
             mean = welch_difference(effects[0] / 2, -effects[1] / 2).estimate

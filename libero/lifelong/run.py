@@ -10,7 +10,7 @@ config.json              the configuration
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -37,6 +37,7 @@ from libero.lifelong.utils import (
 )
 from libero_env.demos.generate import ensure_demos
 from libero_env.storage import atomic_path, read_json
+from libero_env.text import flatten
 from lifelong import checkpoints
 from lifelong.algorithms.base import load_algorithm
 from lifelong.errors import ConfigError
@@ -157,18 +158,9 @@ def _open_folder(cfg: Any) -> int:
     return done
 
 
-def _values(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield the keys of a configuration with points between, and their values."""
-    for key, value in node.items():
-        if isinstance(value, dict):
-            yield from _values(value, f"{path}{key}.")
-        else:
-            yield f"{path}{key}", value
-
-
 def _require_same(stored: Mapping[str, Any], present: Mapping[str, Any], folder: Path) -> None:
     """Raise a ConfigError where a run would go on with what its finished tasks were not learned with."""
-    began, now = dict(_values(stored)), dict(_values(present))
+    began, now = flatten(stored), flatten(present)
     for key in sorted({*began, *now} - {*MAY_CHANGE, *NO_EFFECT}):
         if began.get(key) != now.get(key):
             raise ConfigError(

@@ -161,15 +161,14 @@ def lint(
         level: Lowest level that is printed, or in the JSON.
         starts: Initial states to check; 0 simulates nothing.
     """
-    found, shown, number = list["Finding"](), list[dict[str, Any]](), 0
+    counts, shown, number = Counter[str](), list[dict[str, Any]](), 0
     for findings in _lint(tasks, assets, starts):
         number += 1
-        found += findings
         for finding in findings:
+            counts[finding.level] += 1
             if LEVELS.index(finding.level) <= LEVELS.index(level):
                 shown.append(asdict(finding))
                 print(finding, flush=True)
-    counts = Counter(finding.level for finding in found)
     text = f"{number} tasks: {counts['error']} errors, {counts['warning']} warnings, {counts['info']} notes"
     return Answer(text, shown, status=int(counts["error"] > 0))
 

@@ -29,7 +29,7 @@ def sinusoidal_positions(length: int, dim: int, factor: float = 10.0) -> Tensor:
     codes = torch.zeros(length, dim, **cpu)
     codes[:, 0::2] = torch.sin(position * rate)
     codes[:, 1::2] = torch.cos(position * rate)[:, : dim // 2]
-    return codes
+    return codes.to(torch.get_default_device())
 
 
 def block_causal_mask(length: int, tokens: int, device: torch.device | None = None) -> Tensor:

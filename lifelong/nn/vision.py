@@ -133,7 +133,8 @@ class SpatialSoftmax(nn.Module):
         self.heat = nn.Linear(channels, keypoints)
         rows, cols = (torch.linspace(-1.0, 1.0, n, device="cpu") for n in size)  # see sinusoidal_positions
         grid = torch.stack(torch.meshgrid(cols, rows, indexing="xy"), dim=-1)  # (H, W, 2): x, y
-        self.register_buffer("grid", grid.reshape(-1, 2).T.contiguous(), persistent=False)
+        grid = grid.reshape(-1, 2).T.contiguous().to(torch.get_default_device())
+        self.register_buffer("grid", grid, persistent=False)
 
     def forward(self, h: Tensor) -> Tensor:
         """Return positions x, y in [-1, 1], (N, C, H, W) -> (N, 2 K), x rightwards and y downwards."""

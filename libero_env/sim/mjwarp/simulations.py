@@ -48,7 +48,7 @@ class WarpSimulations(Simulations):
         device_data: The state of all simulations on the device.
         limits_reached: How often a simulation reached a limit of the solver without an error, by the limit's name.
         uses_graphs: Whether the kernels of a control step are launched as one graph. Without, a step of one simulation
-            on the processor takes twenty times as long.
+            on the processor takes fifteen times as long.
 
     Raises:
         LiberoError: There is no such device, or MuJoCo Warp has not a feature that the model uses.
