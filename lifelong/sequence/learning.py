@@ -204,7 +204,7 @@ class TaskSequence:
         with algorithm.policy_for(task, policy) as acting:
             spent |= costs.action_costs(acting) | costs.peak_costs(self.context.device)
         self.log.append(CostRecord(task=task, costs=spent))
-        self.checkpoints.save_task(task, policy.state_dict(), algorithm.state_dict())
+        self.checkpoints.save_task(task, policy.state_dict(), self.recovery.algorithm_state())
         policy.save_beside(self.context.directory.path)
 
     def _evaluate_seen_tasks(self, stage: Sequence[int]) -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lifelong import checkpoints
-from lifelong.algorithms.base import load_algorithm
+from lifelong.algorithms.base import Algorithm, load_algorithm
 from lifelong.context import RunContext
 from lifelong.errors import CheckpointError, DamagedCheckpointError
 from lifelong.sequence.stages import TrainingPhase, training_phases
@@ -34,6 +34,7 @@ class Recovery:
         self.context, self.data = context, data
         self.log, self.checkpoints = context.directory.log, context.directory.checkpoints
         self._saved = time.monotonic()
+        self._attributes, self._named = _attributes(context.algorithm), set[str]()
 
     def load_stage(self, stage: Sequence[int]) -> bool:
         """Load what was saved after a stage; return whether there was an intact checkpoint."""
@@ -85,11 +86,27 @@ class Recovery:
 
     def save_progress(self, task: int, phase: int, fit_state: dict[str, Any] | None = None) -> None:
         """Save the progress on a task: inside a phase, or before it."""
-        algorithm = self.context.algorithm.state_dict()
-        state = {"task": task, "phase": phase, "fit": fit_state, "algorithm": algorithm}
+        state = {"task": task, "phase": phase, "fit": fit_state, "algorithm": self.algorithm_state()}
         state["policy"] = None if fit_state is not None else self.context.policy.state_dict()
         self.checkpoints.save_progress(state)
         self._saved = time.monotonic()
+
+    def algorithm_state(self) -> State:
+        """Return the state of the algorithm, and say, once, which attributes have changed that it does not hold.
+
+        A class with a `state_dict` of its own may hold them under other names, so there only an empty one tells.
+        """
+        algorithm, state = self.context.algorithm, self.context.algorithm.state_dict()
+        is_known = type(algorithm).state_dict is Algorithm.state_dict or not state
+        lost = _attributes(algorithm).items() - self._attributes.items() if is_known else set()
+        if lost := {name for name, _ in lost} - set(state) - self._named:
+            say(
+                self.context,
+                f"warning: {type(algorithm).__name__} changes {', '.join(sorted(lost))}, which no checkpoint holds: a "
+                "killed run goes on without; name them in state_form, or return them from state_dict",
+            )
+            self._named |= lost
+        return state
 
     def is_due(self) -> bool:
         """Return whether the last save of progress is so long ago that another one is due."""
@@ -153,6 +170,15 @@ class Recovery:
         """Return the parameters that are trained besides those of the policy."""
         of_policy = {id(p) for p in self.context.policy.parameters()}
         return [p for p in self.context.algorithm.trained(self.context.policy) if id(p) not in of_policy]
+
+
+def _attributes(algorithm: Algorithm) -> dict[str, tuple[int, int]]:
+    """Return by name which object each public attribute is, and how much a collection holds."""
+    return {
+        name: (id(value), len(value) if isinstance(value, dict | list | set) else 0)
+        for name, value in vars(algorithm).items()
+        if name != "augment" and not name.startswith("_")
+    }
 
 
 def say(context: RunContext, text: str) -> None:

@@ -3,10 +3,12 @@
 import shutil
 from functools import cache
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
 
-from lifelong import checkpoints
+from lifelong import Algorithm, checkpoints
+from lifelong.checkpoints import Weights
 from lifelong.errors import CheckpointError
 from lifelong.results.provenance import config_digest
 from lifelong.results.records import EvalRecord, LossRecord, from_line
@@ -228,3 +230,36 @@ def test_the_optimiser_of_another_policy_is_named(tmp_path, monkeypatch):
         with pytest.raises(CheckpointError, match="optimi"):
             sequence(run_context(tmp_path, "sequential")).run()
     assert sequences.TASKS == 3
+
+
+class Forgetful(Algorithm):
+    """Keeps what no checkpoint holds."""
+
+    def __init__(self):
+        self.anchor, self.seen, self._derived = None, [], None
+
+    def end_task(self, task_index, dataset, policy, generator):
+        self.anchor, self._derived = policy.state_dict(), object()
+        self.seen.append(task_index)
+
+
+class Anchored(Forgetful):
+    state_form: ClassVar = {"anchor": Weights()}
+
+
+class Careful(Forgetful):
+    def state_dict(self):
+        return {"weights": self.anchor or {}, "seen": self.seen}
+
+    def load_state_dict(self, state, datasets):
+        self.anchor, self.seen = state["weights"], state["seen"]
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "lost"), [(Forgetful, "anchor, seen"), (Anchored, "seen"), (Careful, None)]
+)
+def test_what_no_checkpoint_holds_is_said_once(algorithm, lost, tmp_path, capsys):
+    sequence(run_context(tmp_path, algorithm, tasks=2)).run()
+    printed = capsys.readouterr().out
+    assert printed.count("which no checkpoint holds") == (lost is not None)
+    assert lost is None or f"warning: {algorithm.__name__} changes {lost}, which" in printed
