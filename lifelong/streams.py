@@ -16,7 +16,7 @@ from libero_env.perturbations import Perturbation, reword_task
 from libero_env.tasks import Task
 from libero_env.validation import checked
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.settings import PerturbSetting, read_perturbations
+from lifelong.data.settings import PerturbSetting, read_perturbations, require_switched_on
 from lifelong.data.windows import StageWindows, TaskWindows, WindowSubset
 from lifelong.errors import ConfigError
 from lifelong.seeding import BLUR, generator
@@ -61,6 +61,7 @@ class StreamSettings:
     perturb_seed: Natural = 0
 
     def __post_init__(self) -> None:
+        require_switched_on(self, "stream", perturb=["perturb_seed"], blur=["blur_reach"])
         self._largest_perturbations()
 
     def perturbations(self, sizes: Sequence[int]) -> tuple[tuple[Perturbation, ...], ...]:
@@ -189,9 +190,14 @@ def plan_tasks(config: Configuration) -> TaskPlan:
             "stream.perturb changes instructions, and this language encoder knows tasks by their position; choose "
             "another, such as language=minilm"
         )
-    if stream.blur and len(config.build("algo").stages(len(groups))) == 1:
+    stages, base = len(config.build("algo").stages(len(groups))), config.values["algo"].get("base_tasks")
+    if stream.blur and stages == 1:
         raise ConfigError(
             "stream.blur has no effect on one stage, which has no neighbours; use stream.blur=0"
+        )
+    if isinstance(base, int) and base >= max(stages, 2):
+        raise ConfigError(
+            f"algo.base_tasks is {base}; of {stages} stages none would be left to learn in the algorithm's own way"
         )
     return plan
 

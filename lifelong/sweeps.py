@@ -162,11 +162,11 @@ def read_sweep(folder: Path) -> Sweep:
     """Read a sweep.
 
     Raises:
-        ResultsError: It is no folder of a sweep, or a file is broken.
+        ResultsError: It is not the folder of a sweep, or a file is broken.
     """
     file = folder / SWEEP_FILE
     if not file.is_file():
-        raise ResultsError(f"{folder} is no folder of a sweep: it has no {SWEEP_FILE}")
+        raise ResultsError(f"{folder} is not the folder of a sweep: it has no {SWEEP_FILE}")
     content = _read_json(file)
     words, planned = content.get("words", []), content.get("planned")
     jobs = [job for path in (folder / "jobs").glob(f"*/{JOB_FILE}") if (job := read_job(path))]

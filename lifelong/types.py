@@ -16,7 +16,7 @@ from torch import Tensor
 def _check_path(text: str) -> str:
     if not text or "\0" in text or len(text) > 4000 or max(map(len, text.split("/"))) > 255:
         shown = text if len(text) <= 80 else f"{text[:77]}..."
-        raise ValueError(f"{shown!r} is no path")
+        raise ValueError(f"{shown!r} is not a path")
     return text
 
 

@@ -1,7 +1,8 @@
 """Settings of the demonstrations that a policy learns from."""
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Literal
+from dataclasses import fields
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -56,7 +57,7 @@ class DataSettings:
     demos: Annotated[int, Field(ge=1, le=100_000)]
     image_size: Width
     seq_len: Annotated[int, Field(ge=1, le=100_000)]
-    views: Sequence[Annotated[str, OneOf(CAMERAS)]]
+    views: Annotated[Sequence[Annotated[str, OneOf(CAMERAS)]], Field(min_length=1)]
     proprio: Sequence[Annotated[str, OneOf(LOW_DIM_KEYS)]]
     pairing: Literal["aligned", "stored"] = "aligned"
     labels: Literal["expert", "executed"] = "expert"
@@ -72,6 +73,7 @@ class DataSettings:
     statistics: Statistics | None = None
 
     def __post_init__(self) -> None:
+        require_switched_on(self, "data", perturb=("perturb_copies", "perturb_seed"))
         for key in ("views", "proprio"):
             names = list(getattr(self, key))
             if len(set(names)) < len(names):
@@ -108,6 +110,26 @@ class DataSettings:
             seq_len=self.seq_len,
             measured=self.statistics not in (None, "constants"),
         )
+
+
+def require_switched_on(settings: Any, group: str, **parts: Sequence[str]) -> None:
+    """Check that details of a feature are not chosen where the feature is off.
+
+    Args:
+        settings: Settings of a group, a dataclass.
+        group: Name of the group, for error messages.
+        parts: The key that switches a feature on -> the keys that have no effect where it has its default.
+
+    Raises:
+        ConfigError: Such a key has another value than its default.
+    """
+    defaults = {field.name: field.default for field in fields(settings)}
+    for switch, keys in parts.items():
+        for key in keys if getattr(settings, switch) == defaults[switch] else ():
+            if getattr(settings, key) != defaults[key]:
+                raise ConfigError(
+                    f"{group}.{key} has no effect without {group}.{switch}; leave it out, or set both"
+                )
 
 
 def read_perturbations(

@@ -84,6 +84,10 @@ class EvalSettings:
             self.back_end.require_installed()
         except LiberoError as error:
             raise ConfigError(f"eval.backend: {error}") from error
+        if self.cells != "sampled" and self.cells_share != type(self).cells_share:
+            raise ConfigError(
+                "eval.cells_share has no effect without eval.cells=sampled; leave it out, or set both"
+            )
         self.shift_perturbations()
         needed = self.episodes + (self.curve_episodes if self.selection == "apart" else 0)
         if max(needed, self.curve_episodes) > NUM_INIT_STATES:

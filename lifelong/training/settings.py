@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field
 
 from libero_env.validation import checked
+from lifelong.errors import ConfigError
 from lifelong.types import Count, Natural, NonNegative
 
 
@@ -62,3 +63,9 @@ class FitSettings:
     precision: Literal["auto", "bf16", "fp32", "fp32_strict"] = "auto"
     accumulate: Count = 1
     compile: Annotated[Literal["off", "default", "reduce-overhead"], BeforeValidator(_read_off)] = "off"
+
+    def __post_init__(self) -> None:
+        if self.lr_min > self.lr:
+            raise ConfigError(
+                f"train.lr_min is {self.lr_min:g}, above train.lr, {self.lr:g}: the rate would rise; lower both"
+            )

@@ -51,6 +51,23 @@ def leaves(node, *path):
             yield (*path, key)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("data.views", [], "data.views is []; expected at least 1 entry"),
+        ("data.perturb_copies", 2, "data.perturb_copies has no effect without data.perturb"),
+        ("data.perturb_seed", 2, "data.perturb_seed has no effect without data.perturb"),
+        ("stream.perturb_seed", 2, "stream.perturb_seed has no effect without stream.perturb"),
+        ("stream.blur_reach", 2, "stream.blur_reach has no effect without stream.blur"),
+        ("eval.cells_share", 0.5, "eval.cells_share has no effect without eval.cells=sampled"),
+        ("train.lr", 1e-5, "train.lr_min is 0.0001, above train.lr, 1e-05"),
+    ],
+)
+def test_what_would_have_no_effect_is_refused(key, value, told, whole):
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        checked(changed(whole, **{key.replace(".", "__"): value}))
+
+
 @pytest.mark.parametrize("wrong", [{"a": {"b": 1}}, [[[1]]], float("inf"), 10**400])
 def test_a_value_that_no_key_takes_is_told_with_its_key(wrong, whole):
     for path in leaves(whole):

@@ -166,6 +166,7 @@ def test_invalid_blur_is_refused(change) -> None:
 @pytest.mark.parametrize(("words", "told"), [
     (["benchmark.tasks=1", "stream=shift"], "stream.perturb has no effect on one group"),
     (["algo=multitask", "stream.blur=0.9"], "stream.blur has no effect on one stage"),
+    (["algo=lora", "algo.base_tasks=2"], "algo.base_tasks is 2; of 2 stages none would be left"),
     (["language=onehot", "stream=shift_instruction"], "stream.perturb changes instructions"),
     (["language.numbered=true", "stream=shift_instruction"], "stream.perturb changes instructions"),
 ])  # fmt: skip
