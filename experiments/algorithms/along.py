@@ -47,20 +47,20 @@ def forgotten(pairs: list[tuple[float, float]]) -> float:
 
 def binned(
     values: list[tuple[float, tuple[float, float]]], ends: tuple[float, ...], name: Callable
-) -> Iterator[tuple[str, float]]:
-    """Yield what is forgotten in the cells between two ends."""
+) -> Iterator[tuple[str, list[tuple[float, float]]]]:
+    """Yield the cells between two ends."""
     for low, high in zip(ends[:-1], ends[1:], strict=True):
-        yield name(low, high), forgotten([pair for at, pair in values if low <= at < high])
+        yield name(low, high), [pair for at, pair in values if low <= at < high]
 
 
-def by_distance(results: Results) -> Iterator[tuple[str, float]]:
-    """Yield what was lost by the number of tasks learned since."""
+def by_distance(results: Results) -> Iterator[tuple[str, list[tuple[float, float]]]]:
+    """Yield the measured cells by the number of tasks learned since."""
     values = [(float(i - k), pair) for i, k, pair in cells(results)]
     yield from binned(values, DISTANCES, lambda low, high: f"{low} to {high - 1} tasks since")
 
 
-def by_similarity(results: Results) -> Iterator[tuple[str, float]]:
-    """Yield what was lost by the likeness of the tasks learned since: of instructions, and the same scene."""
+def by_similarity(results: Results) -> Iterator[tuple[str, list[tuple[float, float]]]]:
+    """Yield the measured cells by the likeness of the tasks learned since: of instructions, and the same scene."""
     run = results.run
     texts = embed(run.instructions).numpy()
     texts /= np.linalg.norm(texts, axis=1, keepdims=True)
@@ -72,7 +72,7 @@ def by_similarity(results: Results) -> Iterator[tuple[str, float]]:
     scenes = [scene.group() if (scene := re.match(r"[A-Z_]+_SCENE\d+", name)) else None for name in run.tasks]
     again = [(scenes[k] in scenes[k + 1 : i + 1], pair) for i, k, pair in found if scenes[k] is not None]
     for same, title in ((True, "its scene was seen again"), (False, "its scene was not seen again")):
-        yield title, forgotten([pair for is_same, pair in again if is_same == same])
+        yield title, [pair for is_same, pair in again if is_same == same]
 
 
 def costs(results: Results) -> Iterator[tuple[str, str]]:
@@ -98,17 +98,15 @@ def main() -> None:
         results = ResultLog(Path(folder) / "results.jsonl").read()
         if not np.isnan(results.success_matrix()[0][0, 0]):  # all tasks at once are no stream
             runs.setdefault(run.method, []).append(results)
-    for title, measure in (
-        ("just learned", plasticity),
-        ("forgotten", by_distance),
-        ("forgotten", by_similarity),
-    ):
-        columns = {method: [dict(measure(results)) for results in found] for method, found in runs.items()}
-        names = list(next(iter(columns.values()))[0])
-        means = [[np.array([seed[name] for seed in seeds]) for seeds in columns.values()] for name in names]
-        rows = [[name, *map(_mean, row)] for name, row in zip(names, means, strict=True)]
-        rows = [row for row in rows if set(row[1:]) != {"–"}]  # more tasks apart than the stream has
-        print("\n".join(table([title, *columns], rows)), end="\n\n")
+    show("just learned", {method: [dict(plasticity(r)) for r in found] for method, found in runs.items()})
+    for measure in (by_distance, by_similarity):
+        cut = {method: [dict(measure(results)) for results in found] for method, found in runs.items()}
+        lost = {
+            method: [{name: forgotten(pairs) for name, pairs in seed.items()} for seed in seeds]
+            for method, seeds in cut.items()
+        }
+        first = next(iter(cut.values()))  # all methods are measured in the same cells
+        show("forgotten", lost, {name: sum(len(seed[name]) for seed in first) for name in first[0]})
     spent = {method: dict(costs(found[0])) for method, found in runs.items()}
     names = list(next(iter(spent.values())))
     print(
@@ -116,6 +114,17 @@ def main() -> None:
             table(["cost", *spent], [[name, *(spent[m].get(name, "–") for m in spent)] for name in names])
         )
     )
+
+
+def show(title: str, columns: dict[str, list[dict[str, float]]], sizes: dict[str, int] | None = None) -> None:
+    """Print a table of the means over the seeds of each method, and of the number of cells behind a row."""
+    names = list(next(iter(columns.values()))[0])
+    rows = [[n, *(_mean(np.array([seed[n] for seed in seeds])) for seeds in columns.values())] for n in names]
+    rows = [row for row in rows if set(row[1:]) != {"–"}]  # more tasks apart than the stream has
+    heads = [title, *columns]
+    if sizes:
+        heads, rows = [*heads, "cells"], [[*row, str(sizes[row[0]])] for row in rows]
+    print("\n".join(table(heads, rows)), end="\n\n")
 
 
 def _mean(values: np.ndarray) -> str:
