@@ -239,13 +239,13 @@ class EvaluationResult:
     @property
     def success(self) -> Estimate:
         """Mean success over tasks; see `overall`. Where it could be stopped, the interval is an always-valid one."""
+        return self._success(self.tasks)
+
+    def _success(self, tasks: Sequence[TaskResult]) -> Estimate:
         if self.stopped is None:
-            return overall(self.tasks)
-        wins, count = (
-            sum(sum(task.successes) for task in self.tasks),
-            sum(len(t.successes) for t in self.tasks),
-        )
-        return replace(anytime_interval(wins, count), value=overall(self.tasks).value)
+            return overall(tasks)
+        wins, count = (sum(sum(task.successes) for task in tasks), sum(len(t.successes) for t in tasks))
+        return replace(anytime_interval(wins, count), value=overall(tasks).value)
 
     @property
     def stop_note(self) -> str:
@@ -259,9 +259,9 @@ class EvaluationResult:
 
     @property
     def suites(self) -> dict[str, Estimate]:
-        """Mean success over the tasks of each suite."""
+        """Mean success over the tasks of each suite, with intervals as of `success`."""
         names = dict.fromkeys(task.suite for task in self.tasks)
-        return {name: overall([task for task in self.tasks if task.suite == name]) for name in names}
+        return {name: self._success([task for task in self.tasks if task.suite == name]) for name in names}
 
     @property
     def backend(self) -> str:

@@ -3,6 +3,7 @@
 import io
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import replace
@@ -167,7 +168,9 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
     identity = {**policy.identity, "seed": request.seed}
     versions = {**installed_versions(request.assets), "source": source_digest()}
     if earlier is None:
-        init_states = choose_init_states(request.starts, _episodes(request, tasks), policy.selection)
+        init_states = choose_init_states(
+            request.starts, _episodes(request, tasks, protocol), policy.selection
+        )
     else:
         init_states = earlier.init_states
         tasks_here = {f"task {task.id}": task.digest for task in tasks}
@@ -262,15 +265,24 @@ def choose_init_states(
     return chosen[:count]
 
 
-def _episodes(request: EvalRequest, tasks: Sequence[Task]) -> int | None:
-    """Return the number of episodes of each task; None for all: LIBERO-Plus has one, from the first initial state.
+def _episodes(request: EvalRequest, tasks: Sequence[Task], protocol: EvalProtocol) -> int | None:
+    """Return the number of episodes of each task, by default the protocol's; None for all.
+
+    LIBERO-Plus has one, from the first initial state.
 
     Raises:
-        ConfigError: A task has fewer initial states.
+        ConfigError: A task has fewer initial states, or a suite another number of tasks than the protocol counts.
     """
+    suites = Counter(task.suite for task in tasks)
+    if other := [name for name, n in suites.items() if n != (protocol.counting.tasks or n)]:
+        raise ConfigError(
+            f"protocol {protocol.name} counts {protocol.counting.tasks} tasks of a suite (counting.tasks); these are "
+            f"{suites[other[0]]} of {other[0]}"
+        )
     scarce = [task for task in tasks if task.num_starts == 1]
     from_plus = all(task.suite.startswith("libero_plus_") for task in tasks)
-    count = request.episodes or (1 if from_plus else None)
+    trials = protocol.counting.trials if request.starts == "all" else None
+    count = request.episodes or (1 if from_plus else trials)
     if scarce and (count != 1 or request.starts == "selection"):
         raise ConfigError(
             f"{scarce[0].id} has one initial state, number 0: --episodes 1, without --starts selection"

@@ -51,7 +51,7 @@ class Request:
         suite: Suites or tasks (default: the run's).
         after: Of a run: the policy after this task, from 0 (default: the last).
         starts: Initial states: all 50, or those by which a policy was not, or may have been, chosen.
-        episodes: Number of these starts, from the first on (default: all of them).
+        episodes: Number of these starts, from the first on (default: the protocol's, of `--starts all`; otherwise all).
         protocol: libero, openpi, ..., see `libero protocols list`; or a file of your own, my.yaml.
         perturb_seed: Seed of what perturbations draw.
         clock: Let inference take time: latency=120ms, and what is executed meanwhile, wait=rest,merge=replace,every=8

@@ -66,7 +66,7 @@ class LeRobotPolicy(Policy):
         settings: Fields of LeRobot's configuration of that type.
         act_steps: Number of actions of a chunk that are executed before the next is planned; None for all.
         language: Whether policies without text read the instruction's embedding, as `observation.environment_state`.
-        pretrained: Folder, or name on the Hugging Face Hub, of a policy to begin with; its own settings hold.
+        pretrained: Folder, or name on the Hugging Face Hub, of a policy to begin with; it has its own settings.
 
     Raises:
         MissingPackageError: LeRobot is not installed.
@@ -89,6 +89,13 @@ class LeRobotPolicy(Policy):
         super().__init__(spec)
         self.type = type
         self.language = language and type in WITH_EMBEDDING
+        given = {"policy.act_steps": act_steps, "policy.settings": settings or None}
+        if pretrained is not None and (own := [name for name, value in given.items() if value is not None]):
+            raise ConfigError(
+                f"policy.pretrained={pretrained} has its own settings: leave out {', '.join(own)}"
+            )
+        if act_steps is not None and "n_action_steps" in settings:
+            raise ConfigError("policy.act_steps is policy.settings.n_action_steps: leave out one of them")
         try:
             self.inner = self._build(settings, act_steps, pretrained)
         except (ValueError, NotImplementedError, TypeError) as error:

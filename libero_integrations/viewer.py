@@ -18,7 +18,7 @@ import numpy as np
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.observe import fixture_poses, recorded_frequency, recorded_robot, recorded_task
 from libero_env.demos.read import Episode, read_episodes
-from libero_env.errors import InvalidInputError, LiberoError, require_package
+from libero_env.errors import InvalidInputError, LiberoError, require_known, require_package
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations import KINDS, Perturbation, format_perturbations, parse_perturbations
 from libero_env.sim.observations import image_name
@@ -342,7 +342,15 @@ class Viewer:
             self.update()
 
     def update(self) -> None:
-        """Look at the controls once, and do what they say."""
+        """Look at the controls once, and do what they say; clients may have set values that are not offered."""
+        try:
+            self._update()
+        except LiberoError as error:
+            self._tell(error)
+            self._is_stale = True
+            time.sleep(_REST)
+
+    def _update(self) -> None:
         choice = self.choice()
         if self._is_restarted:
             self.open(choice)
@@ -354,7 +362,13 @@ class Viewer:
             self._scrub()
 
     def choice(self) -> Choice:
-        """Return what the controls ask for."""
+        """Return what the controls ask for.
+
+        Raises:
+            LiberoError: Nothing of the kind is offered.
+        """
+        require_known("task", self.task.value, self._tasks)
+        require_known("recording", self.source.value, self.stage.sources)
         seeds = {one.kind: one.seed for one in self.stage.initial.perturbations}
         perturbations = [
             Perturbation(kind, slider.value, seeds.get(kind, self.stage.request.perturb_seed))
@@ -506,6 +520,7 @@ class Viewer:
 
     def _pictures(self) -> np.ndarray:
         """Return the chosen picture, or those of all cameras in two columns."""
+        require_known("picture", self.camera.value, self.camera.options)
         if self.camera.value != "all":
             return self.stage.picture(self.camera.value)
         pictures = [self.stage.picture(name) for name in self._frustums]

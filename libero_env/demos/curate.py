@@ -160,12 +160,16 @@ def find_demo_files(paths: Sequence[Path]) -> list[Path]:
         raise DemoError(f"{missing[0]} does not exist; give demonstration files, or folders that hold some")
     paths = paths or [demos_dir()]
     groups = [[path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")) for path in paths]
-    files = [  # without parts of unfinished recordings, and links
+    found = (  # without parts of unfinished recordings, and links
         file
         for group in groups
         for file in group
         if file in paths or not (file.is_symlink() or file.parent.suffix == ".parts")
-    ]
+    )
+    known: dict[Path, Path] = {}
+    for file in found:
+        known.setdefault(file.resolve(), file)  # each once
+    files = list(known.values())
     if not files:
         where = ", ".join(map(str, paths))
         raise DemoError(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from libero_env.cli.options import Answer, FilePath
 from libero_env.storage import read_json
+from libero_eval.cli.compare import named
 from libero_eval.requests import EvalRequest, RobustnessRequest
 from lifelong.errors import ConfigError
 
@@ -110,7 +111,7 @@ def robustness(options: RobustnessOptions) -> Answer:
         if useless := [name for name in given if name not in ("report", "out")]:
             names = ", ".join(n if n == "policy" else f"--{n.replace('_', '-')}" for n in useless)
             raise ConfigError(f"--report only writes the page of what is there; leave out {names}")
-        folder = options.out or Path(options.report[0].rpartition("=")[2])
+        folder = options.out or Path(named(options.report[0])[1])
         return _finish([_read(word) for word in options.report], folder)
     beside = [_read(word) for word in options.beside]  # before hours of work
     _check_labels([options.name or options.policy_name, *(policy.label for policy in beside)])
@@ -132,8 +133,8 @@ def _read(word: str) -> "Robustness":
     """Return the outcomes in a folder of this command, NAME=DIR or DIR."""
     from libero_eval.robustness.study import read_study
 
-    name, _, folder = word.rpartition("=")
-    return read_study(Path(folder), name)
+    name, folder = named(word)
+    return read_study(Path(folder), name or "")
 
 
 def _check_labels(labels: "Sequence[str]") -> None:

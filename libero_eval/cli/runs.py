@@ -46,7 +46,8 @@ def serve(
     server = PolicyServer(served.metadata, served.session, host=host, port=port)
 
     def ready(port: int) -> None:
-        print(f"serving {run} after task {served.run.learned} at ws://{host}:{port}", flush=True)
+        at = f"[{host}]" if ":" in host else host
+        print(f"serving {run} after task {served.run.learned} at ws://{at}:{port}", flush=True)
 
     with contextlib.suppress(asyncio.CancelledError):
         asyncio.run(server.run(ready))

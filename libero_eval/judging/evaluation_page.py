@@ -29,9 +29,9 @@ def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
         title=f"{name_of(result)} on {', '.join(suites)}",
         facts=facts(result),
         notes=[f"{task.task}: {task.error_note}" for task in result.tasks if task.error_note]
-        + ([f"{result.stop_note}. The interval of the mean is always valid."] if result.stopped else []),
+        + ([f"{result.stop_note}. The intervals of the means are always valid."] if result.stopped else []),
         means=[
-            _row(name, tasks) | ({"success": result.success} if tasks is result.tasks else {})
+            _row(name, tasks) | {"success": result.suites.get(name, result.success)}
             for name, tasks in means.items()
         ],
         tasks=[_row(task.task, [task], task.instruction) for task in result.tasks],

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from libero_env.geometry import quat_multiply
 from libero_env.sim.observations import image_name
 from libero_env.tasks import Task
 from libero_eval.protocols.preprocessing import preprocess
@@ -13,6 +14,7 @@ from libero_eval.protocols.protocol import EvalProtocol
 from lifelong.evaluation.environments import Obs
 
 ACTION_DIM = 7
+_HAND_TO_GRIP = np.array([[np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)]])  # wxyz
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,8 @@ class PolicyInput:
             the protocol's turning, resizing and cropping.
         state: Proprioception in the protocol's order, rotation convention and dtype, (8,) in most protocols.
         prompt: Instruction, after the protocol's template.
-        extra: Further vectors that a protocol sends by name, such as vla-eval's `controller_states`.
+        extra: Further vectors by name: `controller_states`, as vla-eval reads them from the controller, the state with
+            the rotation of the grip site, which is turned by -90 degrees about the hand's z axis, (8,) float32.
     """
 
     images: Mapping[str, np.ndarray]
@@ -57,7 +60,9 @@ class ProtocolAdapter:
         """
         rows = range(len(next(iter(obs.values())))) if rows is None else rows
         prompt = self.protocol.prompt(self.task)
-        return [PolicyInput(self._images(obs, i), self._state(obs, i), prompt) for i in rows]
+        return [
+            PolicyInput(self._images(obs, i), self._state(obs, i), prompt, self._extra(obs, i)) for i in rows
+        ]
 
     def actions(self, predicted: np.ndarray) -> np.ndarray:
         """Return the simulations' actions, (..., 7) float64; the gripper opens at -1 and closes at +1.
@@ -93,6 +98,14 @@ class ProtocolAdapter:
             "gripper_qpos": np.asarray(obs["gripper_states"][i], np.float64),
         }
         return np.concatenate([parts[name] for name in rules.order or ()]).astype(rules.dtype or "float64")
+
+    def _extra(self, obs: Obs, i: int) -> dict[str, np.ndarray]:
+        if self.protocol.proprioception.source != "observation":
+            return {}
+        hand = np.asarray(obs["ee_quat"][i], np.float64)
+        rotation = axis_angle_positive(np.roll(quat_multiply(hand[None], _HAND_TO_GRIP)[0], -1))
+        parts = (obs["ee_pos"][i], rotation, obs["gripper_states"][i])
+        return {"controller_states": np.concatenate(parts).astype(np.float32)}
 
 
 def view_of(camera: str) -> str:

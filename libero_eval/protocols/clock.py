@@ -17,6 +17,7 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from libero_env.errors import UnknownNameError
+from libero_env.geometry import rotation_between
 from libero_env.text import shown
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate
@@ -332,7 +333,8 @@ class ClockedActor:
         clock: The clock; None for none, which is one without latency.
         seeds: Words of each episode, on which its latencies depend; see `Latency.draws`.
         hz: Control steps per second.
-        still: Action of a robot that waits and has not acted; by default zeros.
+        still: Action of a robot that waits and has not acted; by default zeros. Of absolute actions its gripper, with
+            the pose at the start, where the simulations are watched.
         relative: Whether actions are relative to the present pose.
     """
 
@@ -353,6 +355,7 @@ class ClockedActor:
         self._hz, self._relative = hz, relative
         self._still = np.zeros(self.action_dim) if still is None else np.asarray(still, float)
         self._episodes: list[_Episode] = []
+        self._env: Any = None
         self._running: list[int] = []
 
     @property
@@ -373,6 +376,7 @@ class ClockedActor:
 
     def watch(self, env: Any) -> None:
         """Hand on the simulations; see `lifelong.evaluation.actors.WatchesWorld`."""
+        self._env = env
         if isinstance(self._planner, WatchesWorld):
             self._planner.watch(env)
 
@@ -408,6 +412,10 @@ class ClockedActor:
                 self._episodes[i].answer(chunk)
         actions = np.zeros((len(self._episodes), self.action_dim))
         for i in self._running:
+            if not (self._relative or self._episodes[i].now or self._env is None):  # the pose is held
+                arm = self._env.views[i]
+                pose = (arm.eef_pos, rotation_between(np.eye(3), arm.eef_mat))
+                self._episodes[i].still = np.concatenate([*pose, self._still[-1:]])
             actions[i] = self._episodes[i].step()
         return actions
 

@@ -10,6 +10,7 @@ from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.envs.batch import BatchEnv
 from libero_env.init_states.original_resets import OriginalResets, drawn_fixtures
 from libero_env.init_states.store import load_original_states
+from libero_env.sim.controller import get_controller
 from libero_env.sim.scene import Scene, default_drawing
 from libero_env.tasks import Task
 from libero_eval.protocols.protocol import EvalProtocol
@@ -49,7 +50,7 @@ class ProtocolEnv(BatchEnv):
         drawing: str | None = "protocol",
         backend: str | None = None,
     ):
-        self.protocol, world = protocol, protocol.world
+        self.protocol, world, self._waits = protocol, protocol.world, 0
         assert protocol.pixels.render_size is not None, "the protocol has been checked by require()"
         super().__init__(
             task,
@@ -85,7 +86,22 @@ class ProtocolEnv(BatchEnv):
                 options["start"] = initial_states(
                     self.base_task, self.base_scene, self.protocol, indices, self._stored()
                 )
+        self._waits = self.protocol.settle_steps
         return super().reset(seed=seed, options=options)
+
+    def advance(self, actions: np.ndarray) -> Any:
+        """Step; see `BatchEnv`. While the robot waits, actions are relative, as in vla-eval and LeRobot.
+
+        `episode.settle_action` would otherwise be a goal beside the robot's base.
+        """
+        if self.protocol.world.delta or not self._waits:
+            return super().advance(actions)
+        self._waits, state = self._waits - 1, self.simulations.controller_state
+        own, state.controller = state.controller, get_controller(self.protocol.world.controller)
+        try:
+            return super().advance(actions)
+        finally:
+            state.controller = own
 
     def _stored(self) -> np.ndarray:
         """Return the initial states of the task that the protocol names, rows that begin with [time, qpos, qvel]."""

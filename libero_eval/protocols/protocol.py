@@ -9,7 +9,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
 
@@ -26,9 +26,12 @@ SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero
 # upper bounds are what no protocol means, and no machine does in a life
 _AtLeastOne = Annotated[int, Field(ge=1)]
 _Steps = Annotated[int, Field(ge=1, le=1_000_000)]
-_EnvSeed = Annotated[int, Field(ge=0, le=2**32 - 1)]
+_MAX_SEED = 2**32 - 1
+_EnvSeed = Annotated[int, Field(ge=0, le=_MAX_SEED)]
 _RenderSide = Annotated[int, Field(ge=1, le=16384)]  # pixels
 _Side = Annotated[int, Field(ge=1, le=4096)]
+_Call = Literal["seed", "reset", "set_init_state", "settle"]
+_CALLS = get_args(_Call)  # in the order in which they are made
 _Action = Annotated[tuple[float, ...], Field(min_length=7, max_length=7)]
 
 
@@ -53,7 +56,7 @@ class Simulation:
         loads: Number of times the original had loaded the task before the first counted reset.
         control_freq: Control steps per second, [Hz]; it divides 500. Steps and horizons are counted, not timed.
         controller: Name of the controller, see `libero_env.sim.controller`.
-        delta: Whether actions are relative to the present pose.
+        delta: Whether actions are relative to the present pose. Those of the waiting steps always are.
         predicates: Semantics of the goals, see `libero_env.sim.predicates`.
         perturb: Perturbations, such as `camera=0.3,light=0.5`, see `libero_env.perturbations`; empty for none.
         backend: Backend of the physics and the pictures, see `libero_env.sim.backend`.
@@ -70,7 +73,7 @@ class Simulation:
     seeding: Literal["once", "every_reset"] | None
     seed_per_start: int | None
     seed_per_task: int | None
-    loads: Annotated[int, Field(le=10_000)] | None
+    loads: Annotated[int, Field(ge=1, le=10_000)] | None
     control_freq: ControlFreq
     controller: Literal["osc_pose"]
     delta: bool
@@ -82,9 +85,16 @@ class Simulation:
         """Yield which values contradict each other."""
         if self.perturb:
             yield from _perturbation_problems(self.perturb)
+        if self.fixture_poses == "stored" and self.init_states == "original":
+            yield "world.fixture_poses are stored, but world.init_states are original, with which none are stored"
         if self.fixture_poses == "stored" and self.env_seed is not None:
             yield f"world.env_seed is {self.env_seed}, but world.fixture_poses are stored: nothing is drawn"
         if self.seeding == "once":
+            if self.environments == "rebuilt":
+                yield (
+                    "world.environments are rebuilt, but world.seeding is once, for a task: write every_reset, "
+                    "and what of the seed changes in seed_per_start"
+                )
             for name in ("seed_per_start", "seed_per_task"):
                 if value := getattr(self, name):
                     yield f"world.{name} is {value}, but world.seeding is once"
@@ -107,7 +117,7 @@ class Episodes:
             control step; `after`, after it.
     """
 
-    reset_order: tuple[Literal["seed", "reset", "set_init_state", "settle"], ...]
+    reset_order: tuple[_Call, ...]
     settle_steps: Annotated[int, Field(ge=0, le=10_000)] | None
     settle_action: _Action | None
     settle_counted: bool
@@ -130,11 +140,14 @@ class Episodes:
         single = self.horizon if isinstance(self.horizon, int) else least
         if (lowest := min([*by_suite.values(), single])) < least:
             yield f"episode.horizon is {lowest}; it must be at least {least}"
-        order = self.reset_order
-        if "set_init_state" not in order or len(set(order)) != len(order):
-            yield f"episode.reset_order is {list(order)}; it must have set_init_state, and each call once"
-        elif "reset" in order and order.index("reset") > order.index("set_init_state"):
-            yield "episode.reset_order has reset after set_init_state, which would undo it"
+        order = list(self.reset_order)
+        if "set_init_state" not in order or order != [call for call in _CALLS if call in order]:
+            yield (
+                f"episode.reset_order is {order}; it must have set_init_state, and calls are made once, in the order "
+                f"of {', '.join(_CALLS)}"
+            )
+        elif self.settle_steps and "settle" not in order:
+            yield f"episode.settle_steps is {self.settle_steps}, but episode.reset_order has no settle"
 
 
 @dataclass(frozen=True)
@@ -412,15 +425,22 @@ class EvalProtocol:
         return self.language.template.replace("{instruction}", text)
 
     def env_seed(self, task: Task, init_state: int) -> int | None:
-        """Return the seed that the environment gets for an initial state; None where the poses are stored."""
+        """Return the seed that the environment gets for an initial state; None where the poses are stored.
+
+        Raises:
+            ProtocolError: It is none that NumPy's generator takes.
+        """
         world = self.world
         if world.fixture_poses == "stored" or world.env_seed is None or world.seeding == "once":
             return None if world.fixture_poses == "stored" else world.env_seed
-        return (
-            world.env_seed
-            + (world.seed_per_start or 0) * init_state
-            + (world.seed_per_task or 0) * task.index
-        )
+        per_start, per_task = world.seed_per_start or 0, world.seed_per_task or 0
+        seed = world.env_seed + per_start * init_state + per_task * task.index
+        if not 0 <= seed <= _MAX_SEED:
+            raise ProtocolError(
+                f"protocol {self.name}: world.env_seed {world.env_seed}, seed_per_start {per_start} and seed_per_task "
+                f"{per_task} give {task.id} in initial state {init_state} the seed {seed}; valid: 0 to {_MAX_SEED}"
+            )
+        return seed
 
     def require(self) -> None:
         """Check that the protocol states all that a run needs.

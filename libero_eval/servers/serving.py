@@ -29,7 +29,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import TypedDict
 
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, require_known
 from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.tasks import Task, get_suite, suite_names
 from libero_env.text import printable, shorten, shown
@@ -52,6 +52,7 @@ _OPENPI_IMAGES = {"agentview_rgb": "image", "eye_in_hand_rgb": "wrist_image"}
 _OPENPI_STATE = {"ee_pos": slice(0, 3), "gripper_states": slice(6, 8)}
 MAX_ROWS = 100  # of a request; a task has fifty initial states
 MAX_WORDS = 1000  # characters of an instruction
+_KEYS = ("prompt", "task", "instruction", "reset", "seed", "plan")  # of a request, beside the observation
 
 
 class _Array(TypedDict):
@@ -203,9 +204,13 @@ class ServedPolicy:
 
         Raises:
             PolicyError: A key is missing, or a value has the wrong type, dtype or shape.
+            UnknownNameError: A key is not known.
         """
         if not isinstance(message, Mapping):
             raise PolicyError(f"a request is a map of names and values, not a {type(message).__name__}")
+        for key in message:
+            if not str(key).startswith(PREFIX):  # of an observation, what the policy does not see may be sent
+                require_known("key of a request", str(key), _KEYS)
         if PREFIX + "image" in message and PREFIX + self.run.policy.spec.views[0] not in message:
             message = self._from_openpi(message)
         spec = self.run.policy.spec
@@ -302,7 +307,7 @@ class Session:
         """Return the answer to a request: `actions` (1, 7) float64, or (B, 1, 7) for B rows; with `plan`, their chunks.
 
         Raises:
-            PolicyError: The request is not valid.
+            PolicyError: The request is not valid, or its actions are not finite.
         """
         request = self._served.read(message, self._task)
         rows = len(next(iter(request.obs.values())))
@@ -314,9 +319,12 @@ class Session:
             )
         assert self._actor is not None
         if request.plan is not None:
-            return {"actions": self._actor.plan(request.obs, request.plan)}
-        actions = self._actor.act(request.obs)[:, None]
-        return {"actions": actions if request.rows else actions[0]}
+            actions = self._actor.plan(request.obs, request.plan)
+        else:
+            actions = self._actor.act(request.obs)[:, None]
+        if not np.isfinite(actions).all():
+            raise PolicyError("the policy answers this observation with actions that are not finite")
+        return {"actions": actions if request.rows or request.plan is not None else actions[0]}
 
     def close(self) -> None:
         """Forget the client."""
@@ -419,7 +427,7 @@ class PolicyServer:
             on_ready: Function called with the port, once connections are accepted.
 
         Raises:
-            OSError: The port is taken.
+            ServerError: The address cannot be listened on.
         """
         serve = need("websockets.asyncio.server").serve
         row = sum(8 * math.prod(one["shape"]) for one in self._metadata["observation"].values())
@@ -427,9 +435,16 @@ class PolicyServer:
         options = {"compression": None, "max_size": most, "max_queue": 1}
         loop = asyncio.get_running_loop()
         loop.set_default_executor(ThreadPoolExecutor(1, thread_name_prefix="policy"))  # one request at a time
-        async with serve(
-            self._handle, self._host, self._port, process_request=self._respond, **options
-        ) as server:
+        try:
+            server = await serve(
+                self._handle, self._host, self._port, process_request=self._respond, **options
+            )
+        except OSError as error:
+            raise ServerError(
+                f"--host {self._host} --port {self._port} cannot be listened on: {error.strerror}; --port 0 takes a "
+                "free port"
+            ) from error
+        async with server:
             on_ready(server.sockets[0].getsockname()[1])
             await server.serve_forever()
 

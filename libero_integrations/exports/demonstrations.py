@@ -11,15 +11,22 @@ mirrored images, as the clients of openpi, OpenVLA-OFT, GR00T and LeRobot do.
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from libero_env.demos.actions import KINDS, ActionConverter
+from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import json_attribute, read_header
 from libero_env.demos.hdf5 import BrokenDemoError
-from libero_env.demos.observe import recorded_robot, recorded_task, require_default_frequency
+from libero_env.demos.observe import (
+    StateRenderer,
+    recorded_rendering,
+    recorded_robot,
+    recorded_task,
+    require_default_frequency,
+)
 from libero_env.demos.read import Episode, Labels, read_episodes
 from libero_env.demos.write import require_absent
 from libero_env.errors import DemoError, InvalidInputError, UnknownNameError, require_known
@@ -101,7 +108,7 @@ def export_demos(
 
     Raises:
         UnknownNameError: No such form or kind of actions is known.
-        DemoError: A file is broken or has other images than the first, or the folder exists.
+        DemoError: A file is broken, has other images than the first or does not fit the task, or the folder exists.
         LiberoError: PyArrow or PyAV is not installed.
     """
     if form not in RECORDED:
@@ -110,14 +117,25 @@ def export_demos(
     with _data_set(root, layout, video_mb) as (folder, dataset):
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
             require_default_frequency(file, f"the layout {form}")
-            language = _language(file, task)
-            with closing(ActionConverter(file, actions, task)) as converter:
+            language = recorded_language(file, task)
+            with ExitStack() as stack:
+                converter = stack.enter_context(closing(ActionConverter(file, actions, task)))
+                scene = None if task is None else StateRenderer.of_file(file, RenderConfig(()), task=task)
+                if scene is not None:
+                    stack.callback(scene.close)
                 for episode in read_episodes(file):
                     where = f"{file}: {episode.name}"
+                    if scene is not None:  # a file of another task would get this one's instruction
+                        scene.prepare(episode, where)
                     dataset.add(converter.convert(_exported(episode, where, labels)), language, where)
         controller, relative = KINDS[actions]
         control = {"actions": actions, "controller": controller, "control_delta": relative}
-        how = {"labels": labels, **control, "models": _recorded_models(files)}
+        how = {"labels": labels, **control, "models": _recorded_models(files), "robot": _robots(files)}
+        stated = {
+            "drawing": [recorded_rendering(file).drawing or "not stated" for file in files],
+            "perturb": [str(read_header(file).get("perturb", "none")) for file in files],
+        }
+        how |= {key: "; ".join(sorted(set(values))) for key, values in stated.items()}
         return _finish(folder, dataset, how)
 
 
@@ -146,7 +164,7 @@ def export_published(
 
     Raises:
         UnknownNameError: No such set is known.
-        DemoError: A file is broken, no demonstration reaches its goal, or the folder exists.
+        DemoError: A file is broken or perturbed, no demonstration reaches its goal, or the folder exists.
         LiberoError: PyArrow or PyAV is not installed.
     """
     require_known("published data set", name, PUBLISHED)
@@ -154,6 +172,11 @@ def export_published(
     with _data_set(root, PUBLISHED[name]) as (folder, dataset):
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
             require_default_frequency(file, f"the layout {name}")
+            if perturb := read_header(file).get("perturb"):
+                raise DemoError(
+                    f"{file} was rendered under {perturb}, and the layout {name} has images that are drawn anew, "
+                    f"without it: use --as {', '.join(RECORDED)}, or files without perturbations"
+                )
             recorded = task or recorded_task(file)
             for episode in regenerate(file, config, recorded):
                 where = f"{file}: {episode.name}"
@@ -164,8 +187,7 @@ def export_published(
                     failed.append(where)
         if failed and not exported:
             raise DemoError(f"{failed[0]}: neither this demonstration nor any other reaches its goal again")
-        robots = ", ".join(sorted(set(map(recorded_robot, files))))
-        how = {"robot": robots, "as": name, "left_out": len(failed)}
+        how = {"robot": _robots(files), "as": name, "left_out": len(failed)}
         return *_finish(folder, dataset, config.record() | how), failed
 
 
@@ -205,7 +227,12 @@ def _finish(folder: Path, dataset: Writer, how: dict[str, Any]) -> tuple[int, in
     return size
 
 
-def _language(file: Path, task: Task | None) -> str:
+def recorded_language(file: Path, task: Task | None = None) -> str:
+    """Return the instruction of a file's demonstrations, in the words of the perturbations that it was rendered under.
+
+    Args:
+        task: Task that was recorded; None for the one that the file states.
+    """
     if task is not None:
         return task.language
     stated = json_attribute(read_header(file), "problem_info", file).get("language_instruction")
@@ -223,6 +250,10 @@ def _exported(episode: Episode, where: str, labels: Labels) -> Episode:
     if not len(aligned):
         raise BrokenDemoError(f"{where} has one step; expected a second one to pair it with")
     return replace(aligned, actions=aligned.labels if labels == "expert" else aligned.actions)
+
+
+def _robots(files: Sequence[Path]) -> str:
+    return ", ".join(sorted(set(map(recorded_robot, files))))
 
 
 def _recorded_models(files: Sequence[Path]) -> list[Any]:

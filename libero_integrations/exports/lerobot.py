@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from PIL import Image
@@ -65,7 +65,12 @@ class DatasetWriter:
     Args:
         root: Folder to write into.
         layout: Names and numbers of the data set.
+
+    Attributes:
+        numbers: Names of features that images cannot have.
     """
+
+    numbers: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, root: Path, layout: Layout):
         self.root, self.layout = root, layout
@@ -73,11 +78,22 @@ class DatasetWriter:
 
     def _images(self, episode: Episode, where: str) -> dict[str, np.ndarray]:
         """Return the colour images of an episode by feature; DemoError where they are not those of the first."""
-        images = {
-            self.layout.image_feature(key): frames
-            for key, frames in episode.obs.items()
-            if key.endswith("_rgb")
-        }
+        images: dict[str, np.ndarray] = {}
+        for key, frames in episode.obs.items():
+            if not key.endswith("_rgb"):
+                continue
+            feature = self.layout.image_feature(key)
+            if feature in images or feature in self.numbers:
+                raise DemoError(
+                    f"{where} has a camera {key.removesuffix('_rgb')!r}, whose feature would be {feature}, which this "
+                    "form has already; libero demos rerender draws it under another name"
+                )
+            if self.layout.codec is not None and any(side % 2 for side in frames.shape[1:3]):
+                raise DemoError(
+                    f"{where} has images of {frames.shape[1]}x{frames.shape[2]} pixels; videos need an even height and "
+                    "width: libero demos rerender --size"
+                )
+            images[feature] = frames
         lacking = [camera for camera, key in self.layout.cameras.items() if key not in images]
         if lacking and self.layout.version != "v3.0":
             raise DemoError(
@@ -323,7 +339,7 @@ class VideoDatasetWriter(_LeRobotWriter):
         write_json(meta / "stats.json", summaries)
         info = self._info(
             data_files_size_in_mb=self.layout.data_mb,
-            video_files_size_in_mb=self.layout.video_mb,
+            video_files_size_in_mb=self._video_mb,
             data_path=DATA_PATH,
             video_path=VIDEO_PATH if self._shapes else None,
         )

@@ -21,6 +21,7 @@ from libero_env.errors import LiberoError, need
 from libero_env.parallel import progress_bar
 from libero_env.storage import atomic_path
 from libero_env.tasks import Task
+from libero_integrations.exports.demonstrations import recorded_language
 from libero_integrations.exports.layouts import RECORDED
 
 _QUALITY = 95  # of JPEG
@@ -54,7 +55,8 @@ def write_rerun(
     memory, written = stream.memory_recording(), 0
     with closing(StateRenderer.of_file(file, RenderConfig(()), task=task)) as renderer:
         for episode in progress_bar(renderer.episodes(file, demos), desc="show", unit="demo"):
-            _Branch(rerun, stream, episode.aligned(), hz).write(renderer, _mask_names(file))
+            branch = _Branch(rerun, stream, episode.aligned(), hz)
+            branch.write(renderer, recorded_language(file, task), _mask_names(file))
             written += 1
     with atomic_path(target) as temporary:
         temporary.write_bytes(memory.drain_as_bytes())
@@ -80,10 +82,10 @@ class _Branch:
     def __init__(self, rerun: ModuleType, stream: Any, episode: Episode, hz: int):
         self._rerun, self._stream, self._episode, self._hz = rerun, stream, episode, hz
 
-    def write(self, renderer: StateRenderer, mask_names: dict[int, str]) -> None:
+    def write(self, renderer: StateRenderer, language: str, mask_names: dict[int, str]) -> None:
         """Write everything; the goal is checked in the simulation of a renderer."""
         rerun, episode = self._rerun, self._episode
-        self._fixed("task", rerun.TextDocument(renderer.task.language))
+        self._fixed("task", rerun.TextDocument(language))
         for key, values in episode.obs.items():
             if is_image(key):
                 self._frames(f"cameras/{key}", values, mask_names)

@@ -10,6 +10,7 @@ CRC-32C, the message, its masked CRC-32C.
 
 import io
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from PIL import Image
 
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.read import Episode
-from libero_env.errors import DemoError
+from libero_env.errors import DemoError, InvalidInputError
 from libero_env.parallel import compiled
 from libero_integrations.exports.layouts import STATE, Layout
 from libero_integrations.exports.lerobot import DatasetWriter, write_json
@@ -36,10 +37,20 @@ class RldsWriter(DatasetWriter):
         root: Folder to write into, in which the folder of the version is made.
         layout: Names and numbers of the data set.
         name: Name of the data set.
+
+    Raises:
+        InvalidInputError: The name is not one of TensorFlow Datasets.
     """
+
+    numbers = ("state", "joint_state")
 
     def __init__(self, root: Path, layout: Layout, name: str):
         super().__init__(root, layout)
+        if not re.fullmatch(r"[a-zA-Z]\w*", name):
+            raise InvalidInputError(
+                f"--out {name}: the folder is the name of the data set, which TensorFlow Datasets takes from letters, "
+                "digits and _ only, a letter first"
+            )
         self._folder, self._name = root / VERSION, name
         self._folder.mkdir()
         self._lengths: list[int] = []  # of each shard, in episodes
@@ -119,7 +130,7 @@ class RldsWriter(DatasetWriter):
             key: _feature("image_feature.Image", image={**_array("uint8", *shape), "encodingFormat": "jpeg"})
             for key, shape in self._shapes.items()
         }
-        numbers = {"state": 8, "joint_state": 7}
+        numbers = dict(zip(self.numbers, (8, 7), strict=True))
         steps = {
             "observation": _dict(images | {key: _tensor("float32", size) for key, size in numbers.items()}),
             "action": _tensor("float32", self.layout.action_dim),

@@ -97,9 +97,13 @@ class GrootClient(PolicyClient):
 
     @staticmethod
     def stated(announced: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the number of actions of a chunk."""
+        """Return the order of the state, by which its parts are sent, and the number of actions of a chunk."""
         steps = announced["action"].get("delta_indices")
-        return {"action.chunk": len(steps)} if steps else {}
+        state = {
+            "proprioception.source": "observation",
+            "proprioception.order": ["ee_pos", "ee_rotation", "gripper_qpos"],
+        }
+        return state | ({"action.chunk": len(steps)} if steps else {})
 
     def open(self, episodes: Sequence[EpisodeStart]) -> None:
         """Reset the policy; see `PolicyClient`. The server knows no single episodes."""
@@ -167,6 +171,11 @@ class GrootClient(PolicyClient):
             for key in keys["video"]
         }
         states = np.stack([given.state for given in inputs]).astype(np.float32)[:, None]
+        if states.shape[-1] != STATE["gripper"].stop:
+            raise ServerError(
+                f"{self.address} takes a rotation vector, and the state has {states.shape[-1]} numbers; "
+                "proprioception.rotation: axis_angle in the protocol"
+            )
         observation |= {f"state.{key}": states[..., STATE[key]] for key in keys["state"]}
         return observation | {key: [given.prompt for given in inputs] for key in keys["language"]}
 

@@ -153,7 +153,11 @@ class VlaEvalClient(WebSocketClient):
         if wanted.get("send_wrist_image"):
             images["wrist"] = self.image(given, "robot0_eye_in_hand")
         observation: dict[str, Any] = {"images": images, "task_description": given.prompt}
-        if wanted.get("send_state") and given.state.size:
+        if wanted.get("send_state"):
+            if not given.state.size:
+                raise ServerError(
+                    f"{self.address} needs the state; the protocol has none (proprioception.source)"
+                )
             observation |= {"states": given.state, **given.extra}
         self._send(connection, "observation", observation)
 

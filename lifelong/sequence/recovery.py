@@ -98,8 +98,8 @@ class Recovery:
         """
         algorithm, state = self.context.algorithm, self.context.algorithm.state_dict()
         is_known = type(algorithm).state_dict is Algorithm.state_dict or not state
-        lost = _attributes(algorithm).items() - self._attributes.items() if is_known else set()
-        if lost := {name for name, _ in lost} - set(state) - self._named:
+        changed = _attributes(algorithm).items() - self._attributes.items() if is_known else ()
+        if lost := {name for name, _ in changed} - set(state) - self._named:
             say(
                 self.context,
                 f"warning: {type(algorithm).__name__} changes {', '.join(sorted(lost))}, which no checkpoint holds: a "

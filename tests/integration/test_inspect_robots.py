@@ -24,9 +24,9 @@ STATE = {
 }
 
 
-def evaluate(policy, folder, settle_steps=5, **task) -> tuple[dict, dict]:
+def evaluate(policy, folder, settle_steps=5, perturb=None, **task) -> tuple[dict, dict]:
     """What Inspect Robots says of an evaluation, and what its policy saw and answered."""
-    embodiment = {"camera_size": 32, "assets": "builtin", "settle_steps": settle_steps}
+    embodiment = {"camera_size": 32, "assets": "builtin", "settle_steps": settle_steps, "perturb": perturb}
     arguments = (json.dumps(task), json.dumps(embodiment), policy, folder / "seen.npz")
     found = inspect_robots().run("inspect_robots_run.py", *arguments, cwd=folder, LIBERO_ASSETS="builtin")
     if not (folder / "seen.npz").exists():
@@ -72,17 +72,22 @@ def test_its_episodes_are_those_of_our_environment(tmp_path):
     assert found["metrics"] == {"success_at_end": np.mean(successes)}
 
 
-def test_a_run_acts_as_in_process(tmp_path):
+@pytest.mark.parametrize("perturb", [None, "instruction=0.8"])
+def test_a_run_acts_as_in_process(tmp_path, perturb):
     make_run(tmp_path / "run", "algo=packnet", "policy/head=gmm_small", "policy.stochastic=true")
     out = tmp_path / "local"
     options = ["--episodes", "2", "--unit-starts", "1", "--horizon", "8", "--threads", "1"]
+    options += ["--perturb", perturb] if perturb else []
     assert cli.main(["eval", str(tmp_path / "run"), "--out", str(out), *options]) == 0
     local = json.loads((out / "eval.json").read_text())["tasks"][0]
     suite, _, index = local["task"].partition("/")
     task = {"suite": suite, "task_ids": int(index), "num_starts": 2, "max_steps": 8}
     refused, _ = evaluate(tmp_path / "run", tmp_path, **task)  # the run's smoke settings do not wait
     assert all("-E settle_steps=0" in error for error in refused["errors"]) and len(refused["errors"]) == 2
-    found, seen = evaluate(tmp_path / "run", tmp_path, settle_steps=0, **task)
+    other_goal = "goal=1@step2"  # told by the embodiment
+    refused, _ = evaluate(tmp_path / "run", tmp_path, settle_steps=0, perturb=other_goal, **task)
+    assert refused["errors"] and all("an event has changed the goal" in error for error in refused["errors"])
+    found, seen = evaluate(tmp_path / "run", tmp_path, settle_steps=0, perturb=perturb, **task)
     assert not found["errors"]
     assert "libero_run" in found["registered"]["policy"]
     assert len(seen["t"]) == sum(local["lengths"])

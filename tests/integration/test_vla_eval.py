@@ -58,16 +58,27 @@ def test_both_benchmarks_give_the_same_episodes(recorded, tmp_path):
     assert {"models_digest", "mujoco", "protocol_digest"} <= set(told)
 
 
-def test_a_run_acts_as_in_process(tmp_path, capsys):
+@pytest.mark.parametrize(("data", "perturb"), [
+    ((), ""),
+    (("data.robot=robosuite-1.4.1", "data.drawing=faithful"), "instruction=0.8"),
+])  # fmt: skip
+def test_a_run_acts_as_in_process(tmp_path, capsys, data, perturb):
     """The third way of a checkpoint, after `libero eval RUN` and `libero eval ws://...`: actions to the bit."""
-    make_run(tmp_path / "run", "algo=packnet", "policy/head=gmm_small", "policy.stochastic=true")
+    make_run(tmp_path / "run", "algo=packnet", "policy/head=gmm_small", "policy.stochastic=true", *data)
     out = tmp_path / "local"
     options = ["--episodes", "2", "--unit-starts", "1", "--horizon", "8", "--threads", "1"]
+    card = tmp_path / "libero.yaml"
+    card.write_text(f"extends: libero\nworld: {{perturb: '{perturb}'}}\n")
+    options += ["--protocol", str(card)]
     assert cli.main(["eval", str(tmp_path / "run"), "--out", str(out), *options]) == 0
     tasks = json.loads((out / "eval.json").read_text())["tasks"][:1]
     entry = {
         "benchmark": OURS,
-        "params": {"suite": "libero_object", "task_ids": [int(tasks[0]["task"].partition("/")[2])]},
+        "params": {
+            "suite": "libero_object",
+            "card": str(card),
+            "task_ids": [int(tasks[0]["task"].partition("/")[2])],
+        },
         "episodes_per_task": 2,
         "max_steps": 8,
     }
@@ -75,10 +86,20 @@ def test_a_run_acts_as_in_process(tmp_path, capsys):
     assert found["errors"] == [0]
     assert found["steps"] == tasks[0]["lengths"] and found["success"] == tasks[0]["successes"]
     assert found["actions"] == tasks[0]["actions"]
+    card.write_text("extends: libero\nworld: {perturb: 'goal=1@step2'}\n")
+    found = vla_eval().run("vla_eval_served_run.py", tmp_path / "run", json.dumps([entry]), cwd=tmp_path)
+    assert found["errors"] == [2], "the benchmark tells the other goal, and a run cannot be told it"
 
 
-def test_a_server_for_another_protocol_is_refused(recorded, tmp_path):
-    entry = {"benchmark": OURS, "params": {"suite": "libero_object", "card": "openpi", "env_seed": 0}}
+@pytest.mark.parametrize(("params", "message"), [
+    ({"card": "openpi", "env_seed": 0}, "world.env_seed: protocol openpi has 7, the policy 0"),
+    ({"card": "starvla"}, "proprioception.source: protocol starvla has 'none', the policy 'observation'"),
+    ({"card": "simplevla-rl", "send_state": False}, "the policy needs robot0_eye_in_hand"),
+    ({"camera_size": [64, 64]}, "camera_size: protocol vla-eval has its own"),
+    ({"observations": ["agentview_rgb"], "absolute_action": True}, "absolute_action cannot be used with observations"),
+])  # fmt: skip
+def test_a_server_for_another_protocol_is_refused(recorded, tmp_path, params, message):
+    entry = {"benchmark": OURS, "params": {"suite": "libero_object", **params}}
     with pytest.raises(AssertionError) as refused:
         evaluate(recorded, tmp_path, entry)
-    assert "world.env_seed: protocol openpi has 7, the policy 0" in str(refused.value)
+    assert message in str(refused.value)

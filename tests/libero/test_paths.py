@@ -98,7 +98,8 @@ def test_recordings_are_linked_where_the_original_has_them(tmp_path, monkeypatch
     (newer / Path(name).name).write_text("newer")
     get_libero_path("datasets")
     assert found.read_text() == "newer"
-    assert sorted(find_demo_files([tmp_path])) == sorted(f / Path(name).name for f in (*folders, newer))
+    files = sorted(f / Path(name).name for f in (*folders, newer))
+    assert sorted(find_demo_files([tmp_path])) == sorted(find_demo_files([files[0], tmp_path])) == files
     found.unlink()
     found.write_text("a file of the user's")
     get_libero_path("datasets")

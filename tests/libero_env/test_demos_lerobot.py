@@ -7,7 +7,7 @@ import pytest
 
 from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, LiberoError
-from libero_integrations.exports.demonstrations import export_demos
+from libero_integrations.exports.demonstrations import ORIGIN, export_demos, export_published
 from tests.harness.demos import episode, write
 
 av = pytest.importorskip("av")
@@ -106,6 +106,7 @@ def test_frames_are_where_the_episode_table_says(root, info, episodes, files):
 
 def test_a_full_video_is_continued_in_the_next_file(files, tmp_path):
     export_demos(files, tmp_path / "set", video_mb=0.0, progress=False)
+    assert json.loads((tmp_path / "set/meta/info.json").read_text())["video_files_size_in_mb"] == 0.0
     videos = sorted(p.name for p in (tmp_path / "set/videos/observation.images.image/chunk-000").iterdir())
     rows = parquet.read_table(tmp_path / "set/meta/episodes/chunk-000/file-000.parquet").to_pylist()
     indices = [row["videos/observation.images.image/file_index"] for row in rows]
@@ -190,8 +191,38 @@ def test_files_that_do_not_fit_leave_no_data_set(files, tmp_path):
         export_demos([files[0], other], tmp_path / "set", progress=False)
     assert not (tmp_path / "set").exists()
     odd = write(tmp_path / "odd.hdf5", [smooth(0, 5, 15)])
-    with pytest.raises(LiberoError, match="15x15"):
+    with pytest.raises(LiberoError, match=r"odd.hdf5: demo_0 has images of 15x15 .*rerender --size"):
         export_demos([odd], tmp_path / "set", progress=False)
     (tmp_path / "set").mkdir()
     with pytest.raises(DemoError, match="exists"):
         export_demos(files, tmp_path / "set", progress=False)
+
+
+@pytest.mark.parametrize(
+    ("form", "camera"),
+    [
+        ("lerobot", "image2"),
+        ("gr00t", "wrist_image"),
+        ("rlds", "image"),
+        ("rlds", "state"),
+        ("rlds", "joint_state"),
+    ],
+)
+def test_a_camera_with_the_name_of_another_feature_is_refused(form, camera, tmp_path):
+    one = episode(0, 5)
+    one.obs[f"{camera}_rgb"] = one.obs["agentview_rgb"]
+    file = write(tmp_path / "more.hdf5", [one])
+    with pytest.raises(DemoError, match=rf"more.hdf5: demo_0 has a camera '{camera}'.*another name"):
+        export_demos([file], tmp_path / "set", form, progress=False)
+
+
+def test_robots_drawings_and_perturbations_are_stated(files, tmp_path):
+    other = write(
+        tmp_path / "b.hdf5", [smooth(2, 5)], generator="x", robot="robosuite-1.4.1", perturb="light=0.5"
+    )
+    export_demos([files[0], other], tmp_path / "set", progress=False)
+    origin = json.loads((tmp_path / "set" / ORIGIN).read_text())
+    assert origin["robot"] == "libero, robosuite-1.4.1" and origin["perturb"] == "light=0.5; none"
+    assert origin["drawing"] == "fast; not stated"
+    with pytest.raises(DemoError, match=r"b.hdf5 was rendered under light=0.5"):
+        export_published([other], tmp_path / "none", "lerobot/libero", progress=False)

@@ -18,6 +18,7 @@ from libero_env.demos.observe import StateRenderer, recorded_task
 from libero_env.demos.read import read_episodes
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, UnknownNameError
+from libero_env.tasks import get_task
 from libero_integrations.exports.demonstrations import ORIGIN, export_demos, export_published
 from libero_integrations.exports.regeneration import Regeneration, published_noop_steps, regenerate
 from tests.harness.demos import generate
@@ -244,6 +245,11 @@ def test_a_recording_that_ends_too_early_is_continued(file, episode, tmp_path):
     human.write(0, next(read_episodes(short)))
     (left,) = regenerate(human.finish(), small)
     assert not left.success and len(left.actions) == expected_frames - 3
+
+
+def test_a_task_that_the_states_do_not_fit_is_refused(file, tmp_path):
+    with pytest.raises(DemoError, match=r"demo_0/states is .*expected \(T, \d+\) for"):
+        export_demos([file], tmp_path / "set", task=get_task("libero_goal/3"), progress=False)
 
 
 def test_an_unknown_set_is_named(file, tmp_path):

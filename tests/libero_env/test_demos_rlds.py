@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from libero_env.demos.read import read_demos
-from libero_env.errors import DemoError, UnknownNameError
+from libero_env.errors import DemoError, InvalidInputError, UnknownNameError
 from libero_integrations.exports.demonstrations import ORIGIN, export_demos
 from libero_integrations.exports.layouts import RECORDED
 from libero_integrations.exports.rlds import _crc32c
@@ -145,6 +145,13 @@ def test_a_recording_without_a_camera_is_refused_and_leaves_nothing(form, tmp_pa
     with pytest.raises(DemoError, match=r"blind.hdf5: demo_0 has no images of eye_in_hand.*rerender"):
         export_demos([file], tmp_path / "set", form, progress=False)
     assert [path.name for path in tmp_path.iterdir()] == ["blind.hdf5"]
+
+
+@pytest.mark.parametrize("name", ["my-set", "2sets", "a.b"])
+def test_a_name_that_tensorflow_datasets_does_not_take_is_refused(file, name, tmp_path):
+    with pytest.raises(InvalidInputError, match=f"--out {name}: .*letters, digits and _"):
+        export_demos([file], tmp_path / name, "rlds", progress=False)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_full_disk_leaves_nothing(file, tmp_path, monkeypatch):

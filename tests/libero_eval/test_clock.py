@@ -3,6 +3,7 @@
 import json
 import math
 from itertools import islice
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -192,6 +193,10 @@ def test_absolute_actions_stay_where_nothing_moves():
     found = [actor.act({"t": t})[0] for t in range(4)]
     np.testing.assert_array_equal(found[3], found[2]), "the last pose is the goal"
     assert found[2][1] == 1
+    turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    actor.watch(SimpleNamespace(views=[SimpleNamespace(eef_pos=np.array([1.0, 2.0, 3.0]), eef_mat=turned)]))
+    actor.reset(1)
+    np.testing.assert_allclose(actor.act({"t": 0})[0], [1, 2, 3, 0, 0, np.pi / 2, -1])
 
 
 def test_ensembling_averages_all_chunks_that_are_there():

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from typing import Any
 
 import msgpack
@@ -606,6 +607,33 @@ def test_groot_answers_that_are_not_valid_are_named(get_action, message):
         pytest.raises(ServerError, match=message),
     ):
         actor.act(observations(1, 0))
+
+
+def test_groot_and_vla_eval_take_no_other_state():
+    """A protocol of one's own may have another; its numbers would be taken for those of LIBERO's."""
+    given = PolicyInput(
+        dict.fromkeys(("agentview", "robot0_eye_in_hand"), np.zeros((4, 4, 3), np.uint8)), np.ones(9), ""
+    )
+    own = load_protocol("groot").changed({"proprioception.order": ["gripper_qpos", "ee_pos", "ee_rotation"]})
+    with (
+        policy_servers.groot(policy_servers.groot_endpoints(None)) as address,
+        closing(GrootClient(address, SHORT)) as client,
+    ):
+        load_protocol("groot").check(client.stated(client.announced))
+        with pytest.raises(
+            ProtocolMismatchError, match=r"proprioception\.order: protocol groot has \('gripper"
+        ):
+            own.check(client.stated(client.announced))
+        with pytest.raises(ServerError, match=r"the state has 9 numbers; proprioception\.rotation"):
+            client.ask({0: given})
+    hello = {"observation_params": {"send_state": True}}
+    with (
+        policy_servers.vla_eval(None, hello, []) as address,
+        closing(VlaEvalClient(address, SHORT)) as client,
+    ):
+        client.open([EpisodeStart(TASK, 0)])
+        with pytest.raises(ServerError, match=r"needs the state; .*proprioception\.source"):
+            client.ask({0: replace(given, state=np.zeros(0))})
 
 
 def test_groot_servers_of_other_embodiments_and_none_at_all():

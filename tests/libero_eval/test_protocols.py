@@ -2,6 +2,7 @@
 
 import json
 import math
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from libero_env.cli import main as cli
 from libero_env.tasks import get_task
 from libero_eval.protocols.adapter import ProtocolAdapter, axis_angle, axis_angle_float32, axis_angle_positive
 from libero_eval.protocols.clock import ClockedActor
+from libero_eval.protocols.environment import ProtocolEnv
 from libero_eval.protocols.files import load_protocol, protocol_names
 from libero_eval.protocols.protocol import SUITES, EvalProtocol
 from libero_eval.user_policy import CallableActor, ProtocolActor
@@ -93,7 +95,15 @@ BAD = {
     "replan": ("extends: openpi\naction: {chunk: 4}", r"action\.replan is 5, but action\.chunk is 4"),
     "stored and seeded": ("extends: libero\nworld: {env_seed: 7}", r"world\.env_seed is 7, but .* stored"),
     "order": ("extends: openpi\nepisode: {reset_order: [set_init_state, reset]}",
-     "reset_order has reset after set_init_state"),
+     r"reset_order is \['set_init_state', 'reset'\]; .* in the order of seed, reset, set_init_state, settle"),
+    "settled too early": ("extends: openpi\nepisode: {reset_order: [reset, settle, set_init_state]}",
+     "in the order of seed, reset"),
+    "not settled": ("extends: openpi\nepisode: {reset_order: [reset, set_init_state]}",
+     r"settle_steps is 10, but episode\.reset_order has no settle"),
+    "no fixtures": ("extends: openpi\nworld: {fixture_poses: stored, env_seed: null}",
+     r"fixture_poses are stored, but world\.init_states are original"),
+    "seeded once": ("extends: openpi\nworld: {environments: rebuilt}", r"world\.environments are rebuilt, but"),
+    "loads": ("extends: openpi\nworld: {loads: 0}", r"world\.loads"),
     "template": ("extends: openpi\nlanguage: {template: do}", r"language\.template is 'do'; it must have {instr"),
     "state without source": ("extends: openpi\nproprioception: {source: none}", r"proprioception\.order is "),
     "source of nothing": ("extends: openpi\nsources: {worlds: x}", r"sources\.worlds is not a key"),
@@ -148,6 +158,24 @@ def test_seeds_of_the_environment(name, starts):
     protocol = load_protocol(name)
     assert [protocol.env_seed(TASK, 0), protocol.env_seed(TASK, 3)] == starts
     assert load_protocol("libero").env_seed(TASK, 3) is None
+    with pytest.raises(ProtocolError, match="in initial state 1001 the seed -1; valid: 0 to"):
+        load_protocol("lerobot").changed({"world.seed_per_start": -1}).env_seed(TASK, 1001)
+
+
+@pytest.mark.sim
+def test_the_robot_waits_where_it_is_under_absolute_actions():
+    """As in vla-eval, which changes to absolute actions after the waiting steps: the action of these is no pose."""
+    wait, ends = np.array([load_protocol("openpi").episode.settle_action]), []
+    for delta in (True, False):
+        protocol = load_protocol("libero").changed(
+            {"world.delta": delta, "episode.settle_action": wait[0], "pixels.render_size": (16, 16)}
+        )
+        with closing(ProtocolEnv(protocol, TASK, 1, cameras=(), assets="builtin")) as env:
+            env.reset(options={"init_state": np.zeros(1, int)})
+            obs = [env.step(wait)[0]["ee_pos"][0] for _ in range(protocol.settle_steps + 1)]
+        ends.append(obs)
+    np.testing.assert_array_equal(ends[0][:-1], ends[1][:-1])
+    assert np.linalg.norm(ends[1][-1] - ends[1][-2]) > 0.01, "then actions are absolute"
 
 
 def observations() -> dict[str, np.ndarray]:
@@ -183,6 +211,18 @@ def test_the_state_has_the_order_and_the_type_of_the_protocol():
     np.testing.assert_array_equal(state[6:], obs["gripper_states"][1])
     assert ProtocolAdapter(load_protocol("lerobot"), TASK).inputs(obs)[0].state.dtype == np.float32
     assert ProtocolAdapter(load_protocol("starvla"), TASK).inputs(obs)[0].state.size == 0
+
+
+def test_the_controllers_state_turns_the_hand_to_the_grip_site():
+    (given, _) = ProtocolAdapter(load_protocol("vla-eval"), TASK).inputs(
+        observations() | {"ee_quat": np.array([[np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)], [1.0, 0.0, 0.0, 0.0]])}
+    )
+    sent = given.extra["controller_states"]
+    assert sent.dtype == np.float32 and sent.shape == (8,)
+    np.testing.assert_allclose(sent[3:6], 0, atol=1e-6)  # a quarter turn and back
+    np.testing.assert_allclose(sent[[0, 1, 2, 6, 7]], given.state[[0, 1, 2, 6, 7]], rtol=1e-6)
+    none = load_protocol("vla-eval").changed({"proprioception.source": "none", "proprioception.order": None})
+    assert not ProtocolAdapter(none, TASK).inputs(observations())[0].extra
 
 
 def test_a_quaternion_and_its_negative_are_one_rotation_or_two():

@@ -1,7 +1,9 @@
 """Serving of a run's policy: the same actions as in process, episodes of clients, requests that are refused."""
 
+import asyncio
 import json
 import re
+import socket
 import urllib.error
 import urllib.request
 from contextlib import closing
@@ -12,11 +14,12 @@ import pytest
 from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import connect
 
+from libero_env.errors import LiberoError
 from libero_env.tasks import get_suite, get_task
 from libero_eval.protocols.clock import Clock, ClockedActor
 from libero_eval.servers.actors import ServedActor
 from libero_eval.servers.openpi import OPENPI, OpenpiClient
-from libero_eval.servers.serving import PREFIX, ServedPolicy, announced_run
+from libero_eval.servers.serving import PREFIX, PolicyServer, ServedPolicy, announced_run
 from libero_eval.servers.transport import EpisodeStart, Limits
 from lifelong.errors import PolicyError, ServerError
 from lifelong.evaluation.actors import PolicyActor
@@ -175,18 +178,31 @@ def test_requests_that_are_refused(folder):
         ),
         "task": (good | {"task": "../../secrets.bddl"}, "no task with prompt"),
         "other": (good | {"task": served.run.tasks[1].id}, "no task with prompt"),
+        "unknown": (good | {"rest": True}, "unknown key of a request 'rest'. Did you mean 'reset'"),
+        "far": (good | {"observation/joint_states": np.full(7, 1e30)}, "actions that are not finite"),
         "seed": (good | {"seed": ["a"]}, r"seed is \['a'\]; valid: integers"),
         "openpi": ({"observation/image": obs["agentview_rgb"][0], "prompt": task.language},
          "needs joint_states, which observation/image.*do not hold"),
     }  # fmt: skip
     for name, (message, error) in bad.items():
-        with pytest.raises(PolicyError, match=error):
+        with pytest.raises(LiberoError, match=error):
             served.session().infer(message)
             raise AssertionError(name)
     session = served.session()
     session.infer(good)
     with pytest.raises(PolicyError, match="2 rows in an episode that began with 1"):
         session.infer({f"observation/{k}": v for k, v in both.items()} | {"prompt": task.language})
+
+
+@pytest.mark.parametrize("host", ["nowhere.invalid", "127.0.0.1"])
+def test_an_address_that_cannot_be_listened_on_is_named(folder, host):
+    served = run_of(folder, "algo=er")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        server = PolicyServer(served.metadata, served.session, host=host, port=taken.getsockname()[1])
+        with pytest.raises(
+            ServerError, match=rf"--host {host} --port \d+ cannot be listened on: .*; --port 0"
+        ):
+            asyncio.run(server.run())
 
 
 def test_metadata_of_other_kinds_are_refused_in_one_line(folder):

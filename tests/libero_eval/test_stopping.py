@@ -51,6 +51,7 @@ def test_it_stops_after_the_round_that_makes_the_interval_narrow(tmp_path):
     assert result.init_states == STARTS[:need] and {len(task.successes) for task in result.tasks} == {need}
     assert len(list((tmp_path / "it" / "units").iterdir())) == 2 * need, "what follows was not run"
     assert result.success == anytime_interval(2 * need, 2 * need)
+    assert set(result.suites.values()) == {result.success}
     assert result.stop_note == f"stopped after {2 * need} of 60; width=0.2: known"
     assert total_rows(result)[0].endswith(f"({result.stop_note})")
     assert EvaluationResult.read(tmp_path / "it") == result
@@ -99,7 +100,7 @@ def test_it_stops_when_it_is_decided_against_a_result(tmp_path):
         Group("a", (replace(result, evaluated={"policy": "a"}),)),
         Group("b", (EvaluationResult.read(tmp_path / "all"),)),
     ]
-    assert any("only the sequential one allows for that" in note for note in compare_groups(groups).notes)
+    assert any("only the sequential test allows for that" in note for note in compare_groups(groups).notes)
 
 
 @pytest.mark.parametrize(

@@ -151,6 +151,16 @@ def test_what_an_evaluation_is_asked_for_is_part_of_it(learned, policy, change, 
     join(episodes=4, suite=(*suite, "libero_object/2"))
 
 
+def test_a_protocol_says_how_many_episodes_and_tasks_it_counts(tmp_path):
+    own, words = tmp_path / "own.yaml", {"policy": "expert", "suite": ("libero_goal/0",), "out": tmp_path}
+    own.write_text("extends: libero\ncounting:\n  trials: 2\n  tasks: 1\n")
+    count = lambda **more: len(plan_evaluation(EvalRequest(**words, protocol=str(own), **more)).init_states)  # noqa: E731
+    assert (count(), count(episodes=3), count(starts="selection")) == (2, 3, 20)
+    with pytest.raises(ConfigError, match=r"own counts 1 tasks of a suite .*; these are 10 of libero_goal"):
+        words["suite"] = ("libero_goal",)
+        count()
+
+
 OPTIONS = {
     "names": "original", "size": 64, "timeout": 3.0, "in_flight": 2, "device": "cuda:9", "after": 0, "allow": ("foo",),
     "perturb_seed": 3, "seed": 4

@@ -150,6 +150,20 @@ def test_controls_choose_frames_sources_and_perturbations(viewer, recording):
     until(view, lambda: len(view.stage.frames) == 1)
 
 
+def test_values_that_are_not_offered_do_not_end_it(viewer):
+    """Only the page keeps to what is offered; whoever reaches the socket need not."""
+    view = viewer(TASK)
+    dropdowns = [(control, "nothing") for control in (view.task, view.source, view.camera)]
+    for control, value in [*dropdowns, (view.severities["camera"], 5.0)]:
+        offered, control._impl.value = control.value, value  # as viser does with a message
+        view._is_stale = True
+        view.update()
+        assert "not possible" in view.text.content
+        control._impl.value = offered
+        view.update()
+        assert "not possible" not in view.text.content
+
+
 def test_the_page_and_its_socket_are_served_and_a_client_may_come_back(viewer, capsys):
     view = viewer(TASK)
     with urllib.request.urlopen(f"http://127.0.0.1:{view.port}/") as page:

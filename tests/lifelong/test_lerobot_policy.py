@@ -217,6 +217,8 @@ def test_chunks_do_not_depend_on_what_else_is_simulated() -> None:
      "policy.settings.dim_modle is not a setting of LeRobot's act; valid: .*dim_model"),
     ({"settings": {"vision_backbone": "vgg"}}, "LeRobot refuses its settings: .*vgg"),
     ({"settings": {"chunk_size": 4, "n_action_steps": 4}}, "set data.seq_len=4"),
+    ({"settings": {"n_action_steps": 4}, "act_steps": 2}, "policy.act_steps is policy.settings.n_action_steps"),
+    ({"pretrained": "x", "act_steps": 2}, "leave out policy.act_steps, policy.settings"),
 ])  # fmt: skip
 def test_settings_that_are_not_valid_are_named(changes, words) -> None:
     with pytest.raises(ConfigError, match=words):

@@ -93,6 +93,7 @@ class LiberoEmbodiment(EmbodimentBase):
             perturb=perturb or (),
         )
         self._env: LiberoEnv | None = None
+        self._words: dict[str, str] = {}  # of the task -> of the scene
         self._images = [image_name(camera, "rgb") for camera in self.config.cameras]
         height, width = self.config.camera_size
         self.info = EmbodimentInfo(
@@ -133,7 +134,7 @@ class LiberoEmbodiment(EmbodimentBase):
         obs, _ = self._env.reset(seed=seed, options=None if start is None else {"init_state": start})
         for _ in range(self.settle_steps):
             obs, *_ = self._env.step([0.0] * 7)
-        self._instruction = scene.instruction
+        self._words = {task.language: scene.instruction}
         return self._observation(obs)
 
     def step(self, action: Action) -> StepResult:
@@ -160,10 +161,12 @@ class LiberoEmbodiment(EmbodimentBase):
             self._env = None
 
     def _observation(self, obs: dict[str, Any]) -> Observation:
+        assert self._env is not None
+        words = self._env.batch.task_of(0).language  # as perturbations change it
         return Observation(
             images={name: obs[name] for name in self._images},
             state={key: obs[name] for key, name in STATE.items()},
-            instruction=self._instruction,
+            instruction=self._words.get(words, words),
             extra={
                 "settle_steps": self.settle_steps,
                 "drawing": self.config.drawing,

@@ -53,6 +53,7 @@ class RunPolicy(PolicyBase):
             "robot": loaded.data.robot,
         }
         self._begin: dict[str, Any] = {}
+        self._told: str | None = None
         self.info = PolicyInfo(
             name="libero_run",
             action_space=ACTION,
@@ -76,13 +77,22 @@ class RunPolicy(PolicyBase):
 
         Raises:
             PolicyError: The embodiment `libero` has other options than the run, images have another size than the
-                policy's, or there is no task with this instruction.
+                policy's, there is no task with this instruction, or it changes during the episode.
         """
         for key, value in self._world.items():
             if (other := observation.extra.get(key, value)) != value:
                 raise PolicyError(f"{key} of the embodiment is {other}, of the run {value}: -E {key}={value}")
         images = {PREFIX + name: observation.images[name] for name in self._images}
         state = {PREFIX + name: observation.state[key] for key, name in self._state.items()}
+        words = observation.instruction
+        if self._begin and words not in (None, self._begin["prompt"]):  # perturbed
+            self._begin["instruction"] = words
+        if not self._begin and words != self._told:
+            raise PolicyError(
+                "an event has changed the goal, and a run cannot be told so during an episode here: leave out goal@ "
+                "of -E perturb, or use libero eval"
+            )
+        self._told = words
         answer = self._session.infer({**images, **state, **self._begin})
         self._begin = {}
         return ActionChunk([Action(data) for data in answer["actions"]])

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from vla_eval.benchmarks.base import StepBenchmark, StepResult
 
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.envs.checks import checked_numbers
 from libero_env.errors import LiberoError, SimulationError
 from libero_env.tasks import Task, get_suite
@@ -19,7 +20,7 @@ from libero_eval.protocols.adapter import ProtocolAdapter, view_of
 from libero_eval.protocols.environment import ProtocolEnv, resolve_world, run_protocol
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
-from lifelong.errors import PolicyError, ProtocolError
+from lifelong.errors import PolicyError, ProtocolError, ProtocolMismatchError
 from lifelong.evaluation.environments import Obs
 from lifelong.results.provenance import installed_versions
 
@@ -53,6 +54,8 @@ class LiberoBenchmark(StepBenchmark):
         quat_no_antipodal: Whether rotation vectors keep the quaternion's sign.
         observations: Names of our own observations to send, such as `agentview_rgb` and `joint_states`.
         camera_size: Height and width of the images of `observations`, [pixels].
+        drawing: How these images are drawn; None for the models' default.
+        robot: Model of the arm of `observations` under `libero`; None for the default.
         assets: Models: `builtin`, a folder, or None for the user's choice.
 
     Raises:
@@ -88,6 +91,8 @@ class LiberoBenchmark(StepBenchmark):
         absolute_action: bool = False,
         observations: Sequence[str] | None = None,
         camera_size: Sequence[int] | None = None,
+        drawing: str | None = None,
+        robot: str | None = None,
         assets: str | None = None,
     ):
         super().__init__()
@@ -100,15 +105,35 @@ class LiberoBenchmark(StepBenchmark):
             "episode.settle_steps": num_steps_wait,
             "episode.horizon": max_steps,
             "proprioception.rotation": ROTATIONS[quat_no_antipodal],
+            "proprioception.source": "observation" if send_state else None,
         }
         self.tasks = _tasks(suite, task_ids)
         chosen = load_protocol(card)
         if self.observations is None:
+            own = {"camera_size": camera_size, "drawing": drawing, "robot": robot}
+            if given := [name for name, value in own.items() if value is not None]:
+                raise ProtocolError(
+                    f"{', '.join(given)}: protocol {chosen.name} has its own; only with observations, our own arrays"
+                )
             chosen = _agreed(chosen, {k: v for k, v in asked.items() if v is not None})
+            cameras = chosen.pixels.cameras
+            if lacking := [c for c in IMAGES if c not in cameras and (c == "agentview" or send_wrist_image)]:
+                raise ProtocolMismatchError(
+                    f"pixels.cameras: protocol {chosen.name} has {', '.join(cameras)}, and the policy needs "
+                    f"{', '.join(lacking)}"
+                )
         else:
             height, width = camera_size or chosen.pixels.render_size or (128, 128)
             settling = chosen.settle_steps if num_steps_wait is None else num_steps_wait
-            chosen = run_protocol(chosen, (height, width), max_steps or 600, settling)
+            if absolute_action:
+                raise ProtocolError(
+                    "absolute_action cannot be used with observations: runs move relative to the pose"
+                )
+            steps = 600 if max_steps is None else max_steps
+            arm = robot or DEFAULT_ROBOT
+            chosen = run_protocol(
+                chosen, (height, width), steps, settling, arm, drawing=drawing, assets=assets
+            )
         self.protocol, notes = resolve_world(chosen, self.tasks, assets)
         self.protocol.require()
         if self.protocol.action.clock:
@@ -183,21 +208,19 @@ class LiberoBenchmark(StepBenchmark):
 
     def make_obs(self, raw_obs: Obs, task: dict[str, Any]) -> dict[str, Any]:
         """Return what the server receives for an observation of the simulation."""
-        assert self._adapter is not None and self._task is not None, "reset was called"
+        assert self._adapter is not None and self._env is not None, "reset was called"
+        acted = self._env.task_of(0)  # as an event may have changed it
         if self.observations is not None:
             arrays = {PREFIX + name: raw_obs[name][0] for name in self.observations}
-            acted = self._task if self._env is None else self._env.task
             return {"task_description": acted.language, "task": acted.id, **arrays}
         (given,) = self._adapter.inputs(raw_obs)
         cameras = [c for c in given.images if c == "agentview" or self.send_wrist_image]
         observation: dict[str, Any] = {
             "images": {IMAGES[camera]: given.images[camera] for camera in cameras},
-            "task_description": given.prompt,
+            "task_description": self.protocol.prompt(acted),
         }
         if self.send_state:
             observation |= {"states": given.state, **given.extra}
-            if self.protocol.name == "vla-eval":
-                observation["controller_states"] = self._controller_state(raw_obs)
         return observation
 
     def get_step_result(self, step_result: StepResult) -> dict[str, Any]:
@@ -260,25 +283,10 @@ class LiberoBenchmark(StepBenchmark):
             if names := self.observations:
                 options["cameras"] = tuple(camera for camera in IMAGES if view_of(camera) in names)
                 options["observations"] = ("rgb", *(name for name in names if not name.endswith("_rgb")))
-                options["drawing"] = None
             self._task, self._env = task, ProtocolEnv(self.protocol, task, 1, **options)
             # the task as the protocol's perturbations change it
             self._adapter = ProtocolAdapter(self.protocol, self._env.task)
         return self._env
-
-    def _controller_state(self, obs: Obs) -> np.ndarray:
-        """Return what vla-eval's benchmark reads from the controller: the grip site's pose and the fingers, (8,)."""
-        from vla_eval.rotation import matrix_to_quat, quat_to_axisangle
-
-        assert self._env is not None
-        view = self._env.views[0]
-        rotation = quat_to_axisangle(matrix_to_quat(np.asarray(view.eef_mat, np.float32)))
-        parts = [
-            np.asarray(view.eef_pos, np.float32),
-            rotation,
-            np.asarray(obs["gripper_states"][0], np.float32),
-        ]
-        return np.concatenate(parts)
 
     def _frame(self, obs: Obs) -> np.ndarray | None:
         """Return the agent's image of a recorded video, as policies see it in most protocols."""

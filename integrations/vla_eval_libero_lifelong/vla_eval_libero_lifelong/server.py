@@ -45,6 +45,7 @@ class RunServer(PredictModelServer):
         self.served = ServedPolicy(restore(Path(run), after=after, device=device, allow=allow), seed=seed)
         self._sessions: dict[str, Session] = {}
         self._begins: dict[str, dict[str, Any]] = {}
+        self._words: dict[str, str | None] = {}  # that each session was told
 
     def get_observation_params(self) -> dict[str, Any]:
         """Return what the benchmark must send, as its constructor's arguments."""
@@ -53,6 +54,8 @@ class RunServer(PredictModelServer):
             "card": "libero",
             "observations": [*spec.views, *spec.proprio],
             "camera_size": list(spec.image_size),
+            "drawing": self.served.run.data.drawing,
+            "robot": self.served.run.data.robot,
             "num_steps_wait": settings.settle_steps,
             "max_steps": settings.horizon,
         }
@@ -90,7 +93,7 @@ class RunServer(PredictModelServer):
         """Return the action of one step, (7,).
 
         Raises:
-            PolicyError: The observation lacks something that the policy needs.
+            PolicyError: The observation lacks something that the policy needs, or the instruction has changed.
         """
         session = self._sessions.get(ctx.session_id)
         if session is None:
@@ -101,7 +104,16 @@ class RunServer(PredictModelServer):
                 "the observations have no names of ours; the benchmark is "
                 "vla_eval_libero_lifelong.benchmark:LiberoBenchmark"
             )
-        answer = session.infer({**arrays, **self._begins.pop(ctx.session_id, {})})
+        begin, words = self._begins.pop(ctx.session_id, {}), obs.get("task_description")
+        if begin and words not in (None, begin["prompt"]):  # perturbed
+            begin["instruction"] = words
+        if not begin and words != self._words[ctx.session_id]:
+            raise PolicyError(
+                "an event has changed the goal, and a run cannot be told so during an episode here: leave out goal@ "
+                "of world.perturb, or use libero eval"
+            )
+        self._words[ctx.session_id] = words
+        answer = session.infer({**arrays, **begin})
         return {"actions": answer["actions"][0]}
 
 
