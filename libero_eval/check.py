@@ -167,7 +167,8 @@ def _missing_records(results: Results) -> Iterator[str]:
     """Yield what the records of learned tasks lack, compared with each other."""
     ended = sorted({record.task for record in results.of(TaskEndRecord)})
     for task in ended:
-        row = measured_tasks(results.run.cells, results.run.group(task), len(results.run.tasks))
+        run = results.run
+        row = measured_tasks(run.cells, run.group(task), len(run.tasks), run.cells_share)
         if absent := [seen for seen in row if results.evaluation("matrix", task, seen) is None]:
             yield f"evaluations after task {task} of tasks {_listed(absent)}"
     curves = {task: set(curve.epochs.tolist()) for task, curve in results.curves().items()}

@@ -30,6 +30,9 @@ from lifelong.stats.sequential import anytime_interval
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
+# What the outcome of an episode depends on by design. Other entries of the environment (renderer, processor) and
+# versions change little; a difference in them is told, and the comparison goes on.
+WORLD = ("models", "robot", "drawing")
 UNMEASURED = (
     "digest",
     "actions",
@@ -264,6 +267,11 @@ class EvaluationResult:
         return {name: self._success([task for task in self.tasks if task.suite == name]) for name in names}
 
     @property
+    def world(self) -> dict[str, Any]:
+        """What the outcome of an episode depends on by design, of the environment."""
+        return world_of(self.environment)
+
+    @property
     def backend(self) -> str:
         """Backend that simulated it; results that name none are of `mujoco`."""
         world = self.protocol.get("world")
@@ -352,6 +360,11 @@ def by_start(tasks: Sequence[TaskResult]) -> dict[tuple[str, int], bool]:
         for task in tasks
         for start, won in zip(task.init_states, task.successes, strict=True)
     }
+
+
+def world_of(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of an environment that outcomes depend on by design, see `WORLD`."""
+    return {k: v for k, v in environment.items() if k.partition("_")[0] in WORLD and v is not None}
 
 
 def overall(results: Sequence[TaskResult]) -> Estimate:

@@ -182,7 +182,7 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
         raise ConfigError(
             f"{' and '.join(twice)}: task files are evaluated one by one; name one with --suite"
         )
-    until = StoppingRule.read(request.until, protocol, ids, init_states) if request.until else None
+    until = StoppingRule.read(request.until, protocol, tasks, init_states) if request.until else None
     return Evaluation(
         identity=identity,
         tasks=tasks,

@@ -106,7 +106,7 @@ def power(options: PowerOptions) -> None:
         )
     question = _question(options)
     if options.episodes:
-        print(power_text.shown(question, options.episodes))
+        print(power_text.shown(question, options.episodes, options.correlation))
     elif options.difference is None and not options.results:
         print(power_text.table(question))
     else:
@@ -139,7 +139,7 @@ def board(
 
 def _results_in(word: str) -> list[str]:
     """Return the results that a word names: all files eval.json in a folder."""
-    name, path = _named(word)
+    name, path = named(word)
     if not Path(path).is_dir():
         return [word]
     files = sorted(Path(path).rglob("eval.json"))
@@ -206,7 +206,7 @@ def _question(options: PowerOptions) -> "Question":
             f"--base {base:g} and --difference {gap:g} give a success of {base + gap:g}, above 1"
         )
     if options.correlation is not None:
-        discordance = discordance_of(base, gap, options.correlation)
+        discordance = None if options.episodes else discordance_of(base, gap, options.correlation)
     return Question(base, gap, discordance, options.power, options.alpha, options.tests)
 
 
@@ -237,7 +237,7 @@ def _single_groups(words: Sequence[str], *, by_name: bool = False) -> "list[Grou
     from libero_eval.evaluation_file import EvaluationResult
     from libero_eval.judging.comparability import Group
 
-    split = [_named(w) for w in words]
+    split = [named(w) for w in words]
     labels = _labels([path for _, path in split])
     groups = []
     for (name, path), label in zip(split, labels, strict=True):
@@ -256,7 +256,8 @@ def _group(words: Sequence[str]) -> "Group":
     return Group(words[0], tuple(EvaluationResult.read(w) for w in words[1:]), tuple(words[1:]))
 
 
-def _named(word: str) -> tuple[str | None, str]:
+def named(word: str) -> tuple[str | None, str]:
+    """Return the name, if one is given, and the path of a word NAME=PATH or PATH; paths may hold "=", too."""
     name, sign, path = word.partition("=")
     return (name, path) if sign and name and not Path(word).exists() else (None, word)
 

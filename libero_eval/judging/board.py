@@ -198,7 +198,11 @@ def render_board(board: Board) -> str:
         cells = [percent(row.suites[suite].value) if suite in row.suites else "–" for suite in several]
         success = [percent(row.success.value), interval_text(row.success)]
         rows.append([str(row.tier), row.label, *success, *cells, str(row.episodes)])
-    return "\n".join([text_table(rows, left=2), *(f"note: {note}" for note in board.notes)])
+    notes = list(board.notes)
+    if any(row.episodes != board.shared for row in board.rows):
+        of_suites = ", those of suites of all of its own" if several else ""
+        notes.append(f"success is that in the {board.shared} episodes that all ran{of_suites}")
+    return "\n".join([text_table(rows, left=2), *(f"note: {note}" for note in notes)])
 
 
 def write_board(board: Board, entries: Sequence[Group], path: Path) -> Path:

@@ -7,15 +7,12 @@ from typing import Any
 import numpy as np
 
 from libero_env.text import flatten, plain, shorten
-from libero_eval.evaluation_file import EvaluationResult, by_start
+from libero_eval.evaluation_file import WORLD, EvaluationResult, by_start
 from lifelong.errors import ComparisonError
 from lifelong.report.comparison import check_same_back_end
 from lifelong.stats.episodes import Pairs
 
-# What the outcome of an episode depends on by design. Other entries of the environment (renderer, processor) and
-# versions change little; a difference in them is told, and the comparison goes on.
-WORLD = ("models", "robot", "drawing")
-PASSING = ("instruction_set", "policy_threads")  # what every machine differs in
+PASSING = ("instruction_set", "policy_threads")  # entries in which every machine differs
 UNKNOWN = "not recorded"
 
 
@@ -100,7 +97,7 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
         )
     remarks = [f"{label}, {t.task}: {t.error_note}" for label, r in rows for t in r.tasks if t.error_note]
     remarks += [
-        f"{label}: {result.stop_note}; of all tests only the sequential one allows for that"
+        f"{label}: {result.stop_note}; of all tests and intervals here only the sequential test allows for that"
         for label, result in rows
         if result.stopped
     ]
@@ -109,13 +106,12 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
 
 def settings(result: EvaluationResult) -> dict[str, Any]:
     """Return everything that must be equal, flat, by dotted name: protocol, environment, instructions of the tasks."""
-    world = {k: v for k, v in result.environment.items() if k.partition("_")[0] in WORLD and v is not None}
     tasks = {
         r.task: {"name": r.name, "instruction": r.instruction} | ({"digest": r.digest} if r.digest else {})
         for r in result.tasks
     }
     protocol = {k: v for k, v in result.protocol.items() if k != "digest"}  # it follows from the others
-    return flatten(plain({"protocol": protocol, "environment": world, "tasks": tasks}))
+    return flatten(plain({"protocol": protocol, "environment": result.world, "tasks": tasks}))
 
 
 def match(first: Group, second: Group) -> Matched:

@@ -12,6 +12,7 @@ import numpy as np
 from libero_env.sim.backend import MUJOCO
 from libero_env.storage import write_json
 from libero_env.text import json_safe
+from libero_eval.evaluation_file import by_start
 from libero_eval.judging.comparability import (
     Group,
     check_comparable,
@@ -58,8 +59,8 @@ class Contrast:
         suites: That on each suite, if there are several.
         tasks: That on each task.
         sequential: Test that may be stopped early; None if a policy has several runs.
-        shown: Difference that so many pairs would have shown in four of five cases, as often as these two differ; NaN
-            if unknown.
+        shown: Difference that so many pairs would have shown in four of five cases, as often as these two differ, at
+            the first step of Holm's procedure; NaN if unknown.
         dropped: Number of episodes of each without a partner; they are not counted.
     """
 
@@ -140,7 +141,7 @@ class Comparison:
         rates: The policies.
         comparisons: Each pair of them.
         controls: The same policy twice, if there is such a pair: what arises by chance alone.
-        groups: Aggregates over runs; None unless each policy has at least two.
+        groups: Aggregates over runs; None unless each policy has at least two, and all have starts in common.
         notes: Remarks for the reader.
         backend: Backend that simulated all of it.
         alpha: Probability of a false difference in a family.
@@ -197,7 +198,7 @@ def compare_groups(
     for a, b in combinations(groups, 2):
         (controls if _is_control(a, b) else rivals).append((a, b))
     notes += [note for a, b in controls for note in _control_notes(a, b)]
-    comparisons = _adjusted([_compare(a, b, alpha) for a, b in rivals])
+    comparisons = _adjusted([_compare(a, b, alpha, len(rivals)) for a, b in rivals])
     notes += [
         f"{c.first} and {c.second}: {c.total.difference.pairs} pairs; without a partner and not counted: "
         f"{c.dropped[0]} episodes of {c.first}, {c.dropped[1]} of {c.second}"
@@ -209,6 +210,9 @@ def compare_groups(
             "no control arm: evaluate one of the policies again with another --seed and name both results "
             "with --control, to see which differences arise by chance alone"
         )
+    scores = _group_scores(groups)
+    if scores is None and groups and all(len(s.results) > 1 for s in groups):
+        notes.append("no start is common to all runs of all policies: there are no aggregates over runs")
     backend = (groups or control)[0].results[0].backend  # type: ignore[index]  # there is one of them
     if backend != MUJOCO:
         notes.append(f"simulated by backend={backend}; not to be compared with results of others")
@@ -216,7 +220,7 @@ def compare_groups(
         rates=tuple(_rate(s) for s in groups),
         comparisons=tuple(comparisons),
         controls=tuple(_compare(a, b, alpha) for a, b in controls),
-        groups=_group_scores(groups),
+        groups=scores,
         notes=tuple(notes),
         alpha=alpha,
         backend=backend,
@@ -234,7 +238,7 @@ def write_comparison(comparison: Comparison, path: Path, gate: Gate | None = Non
     return path
 
 
-def _compare(a: Group, b: Group, alpha: float) -> Contrast:
+def _compare(a: Group, b: Group, alpha: float, tests: int = 1) -> Contrast:
     matched = match(a, b)
     pairs, names = matched.pairs, matched.tasks
     suites = list(dict.fromkeys(name.partition("/")[0] for name in names))
@@ -256,7 +260,7 @@ def _compare(a: Group, b: Group, alpha: float) -> Contrast:
         suites=tuple(by_suite) if len(suites) > 1 else (),
         tasks=tuple(by_task),
         sequential=sequential_test(pairs, alpha) if pairs.single else None,
-        shown=_shown(total, alpha),
+        shown=_shown(total, alpha, tests),
         dropped=matched.dropped,
     )
 
@@ -281,14 +285,16 @@ def _adjusted(comparisons: Sequence[Contrast]) -> list[Contrast]:
     ]
 
 
-def _shown(total: Difference, alpha: float) -> float:
+def _shown(total: Difference, alpha: float, tests: int) -> float:
     """Return the difference that as many pairs show in four of five cases; NaN where it cannot be computed."""
     if total.counts is None:
         return math.nan
     base = max(total.first, total.second)
     if not 0 < base < 1 or not total.counts.discordant:
         return math.nan
-    question = Question(base, -base / 1000, alpha=alpha)  # downwards: near 100 % there is no room above
+    question = Question(
+        base, -base / 1000, alpha=alpha, tests=tests
+    )  # downwards: near 100 % is no room above
     share = min(total.counts.discordant / total.counts.pairs, question.discordance_range[1])
     return shown_difference(replace(question, discordance=max(share, base / 1000)), total.pairs)
 
@@ -310,16 +316,19 @@ def _rate(group: Group) -> Rate:
 
 
 def _group_scores(groups: Sequence[Group]) -> GroupScores | None:
-    """Return aggregates over runs, on the tasks that all runs have; None unless each has two runs."""
+    """Return aggregates over runs, of the starts that all runs have; None without any, or unless each has two runs."""
     if not groups or any(len(s.results) < 2 for s in groups):
         return None
-    rates = {
-        s.label: [{t.task: float(np.mean(t.successes)) for t in r.tasks} for r in s.results] for s in groups
-    }
-    shared = set.intersection(*(set(row) for rows in rates.values() for row in rows))
-    names = sorted(shared)
+    won = {s.label: [by_start(r.tasks) for r in s.results] for s in groups}
+    shared = sorted(set.intersection(*(set(table) for tables in won.values() for table in tables)))
+    starts = [[key for key in shared if key[0] == task] for task in dict.fromkeys(task for task, _ in shared)]
+    if not starts:
+        return None
     return group_scores(
-        {k: np.array([[row[name] for name in names] for row in rows]) for k, rows in rates.items()}
+        {
+            label: np.array([[np.mean([table[key] for key in keys]) for keys in starts] for table in tables])
+            for label, tables in won.items()
+        }
     )
 
 

@@ -44,7 +44,7 @@ def verdict(c: Contrast, alpha: float) -> str:
     """Return one sentence on what a comparison shows."""
     d, p = c.total.difference, c.total.adjusted
     assert p is not None
-    tested = f"{p_equation(p)}, {d.test}"
+    tested = f"{p_equation(p)}{' after Holm' if p != d.p_value else ''}, {d.test}"
     if p <= alpha:
         better, worse = (c.first, c.second) if d.value > 0 else (c.second, c.first)
         return f"{better} is better than {worse} in these starts: {points(d.interval)} points ({tested})."
@@ -188,7 +188,7 @@ def _groups(comparison: Comparison) -> str:
         rows.append([name, str(runs), *cells[0], *cells[1]])
     return "\n".join(
         [
-            "over runs (rliable; intervals draw runs anew, and are too narrow for fewer than five)",
+            "over runs, of the starts that all have (rliable; intervals draw runs anew, too narrow for less than 5)",
             text_table(rows),
             *(
                 f"a run of {a} beats one of {b} on a task with probability {e.value:.2f} [{e.low:.2f}, {e.high:.2f}]"
@@ -244,12 +244,12 @@ def _contrast_content(c: Contrast, comparison: Comparison) -> dict[str, Any]:
         "rows": (c.total, *c.suites),
         "verdict": verdict(c, comparison.alpha),
         "sequential": sequential_text(c) if c.sequential else None,
-        "forest": as_svg(forest_figure(c, comparison.controls[0] if comparison.controls else None)),
+        "forest": as_svg(forest_figure(c, comparison.alpha, *comparison.controls[:1])),
     }
 
 
 @matplotlib.rc_context(STYLE)
-def forest_figure(c: Contrast, control: Contrast | None = None) -> Figure:
+def forest_figure(c: Contrast, alpha: float, control: Contrast | None = None) -> Figure:
     """Draw the difference of every task with its interval; above them all tasks, suites and the control arm.
 
     Tasks whose difference is significant after Holm are filled. Of more than sixty tasks, those that differ most are
@@ -257,6 +257,7 @@ def forest_figure(c: Contrast, control: Contrast | None = None) -> Figure:
 
     Args:
         c: The comparison.
+        alpha: Level of significance.
         control: One policy twice, drawn above in grey, with a band of what chance alone makes.
     """
     tasks = sorted(c.tasks, key=lambda p: -abs(p.difference.value))[:MOST_ROWS]
@@ -271,7 +272,7 @@ def forest_figure(c: Contrast, control: Contrast | None = None) -> Figure:
     axes = figure.subplots()
     for place, (row, _, colour) in enumerate(rows):
         e = row.difference.interval
-        strong = row.adjusted is not None and row.adjusted <= 0.05
+        strong = row.adjusted is not None and row.adjusted <= alpha
         axes.plot([100 * e.low, 100 * e.high], [place, place], color=colour, lw=1.6 if place == 0 else 1.1)
         face = colour if strong else "white"
         axes.plot(100 * e.value, place, "s" if place == 0 else "o", ms=4.2, mec=colour, mfc=face, mew=1.0)

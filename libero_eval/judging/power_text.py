@@ -39,12 +39,14 @@ def answer(question: Question) -> str:
     return "\n".join(lines)
 
 
-def shown(question: Question, episodes: int) -> str:
+def shown(question: Question, episodes: int, correlation: float | None = None) -> str:
     """Say which difference a number of episodes of each policy in the same starts shows."""
-    downwards = replace(question, difference=-question.base / 1000, discordance=question.discordance)
-    sizes = {"worse": shown_difference(downwards, episodes)}
-    if question.base < 1:
-        sizes["better"] = shown_difference(replace(question, difference=(1 - question.base) / 1000), episodes)
+    downwards = replace(question, difference=-question.base / 1000)
+    upwards = replace(question, difference=(1 - question.base) / 1000)
+    sizes = {
+        name: shown_difference(one, episodes, correlation)
+        for name, one in (("worse", downwards), ("better", upwards))
+    }
     lines = [
         f"{episodes} pairs, success {100 * question.base:.1f} %, power {100 * question.power:.0f} %, alpha "
         f"{question.alpha:g}{_tests(question)}: shown are"
@@ -66,7 +68,7 @@ def table(question: Question) -> str:
             cells.append(_episodes(question, gap, share))
         rows.append([*cells, str(unpaired_episodes(replace(question, difference=gap, discordance=None)))])
     return (
-        f"episodes of each policy, success {100 * question.base:.0f} %, power {100 * question.power:.0f} %, "
+        f"episodes of each policy, success {100 * question.base:g} %, power {100 * question.power:.0f} %, "
         f"alpha {question.alpha:g}{_tests(question)}\n"
         "in the same starts, by the share of starts in which exactly one of the two succeeds; in other starts\n\n"
         f"{text_table(rows, left=0)}\n\n"

@@ -27,7 +27,7 @@ from lifelong.report.figures import (
     legend_below,
     shorten,
 )
-from lifelong.report.tables import save_page
+from lifelong.report.tables import percent, save_page
 from lifelong.stats.intervals import Estimate
 
 ALPHA = 0.05  # of the kinds together
@@ -85,8 +85,8 @@ def render(policy: Robustness) -> str:
         *([f"starts: {len(policy.outcomes.starts)}{lost}"] if (lost := _lost_text(policy.outcomes)) else []),
         *(["", EVENTS_TEXT, text_table(events)] if len(events) > 1 else []),
         *(
-            f"{name_of(pair.condition)}: {100 * pair.success.value:.0f}, expected {100 * pair.expected:.0f}, "
-            f"excess {100 * pair.excess.value:+.0f} {interval_text(pair.excess)}".replace("+-", "-")
+            f"{name_of(pair.condition)}: {percent(pair.success.value, 0)}, expected {percent(pair.expected, 0)}, "
+            f"excess {percent(pair.excess.value, 0)} {interval_text(pair.excess)}".rstrip()
             for pair in policy.interactions
         ),
     ]
@@ -207,7 +207,10 @@ def _content(policy: Robustness) -> dict[str, Any]:
             {**asdict(pair), "condition": name_of(pair.condition)} for pair in policy.interactions
         ],
         "redrawn": dict(policy.redrawn),
-        "events": [asdict(row) for row in policy.event_rows],
+        "events": [
+            {**asdict(row), "difference": asdict(row.difference), "p_value": row.p_value}
+            for row in policy.event_rows
+        ],
         "outcomes": {
             name_of(condition): rows.astype(int).tolist()
             for condition, rows in zip(outcomes.conditions, outcomes.successes, strict=True)

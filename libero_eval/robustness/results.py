@@ -60,7 +60,7 @@ class Interaction:
     Attributes:
         condition: Both perturbations.
         success: Success with both.
-        expected: Success if each left the share that it leaves alone: p_a · p_b / p_base.
+        expected: Success if each left the share that it leaves alone: p_a · p_b / p_base; NaN where that is 0 / 0.
         excess: Success with both minus that: below 0 they hurt each other.
     """
 
@@ -198,14 +198,11 @@ class Outcomes:
     def _interaction(self, condition: Condition) -> Interaction:
         columns = [self.conditions.index(c) for c in (condition, *((one,) for one in condition), ())]
 
-        def expected(rates: Floats) -> Floats:
-            return _shares(rates[..., 1] * rates[..., 2], rates[..., 3])
-
         rates, draws = self.rates[columns], self.draws[:, columns]
-        excess = _estimate(
-            float(rates[0] - expected(rates)), draws[:, 0] - expected(draws), self._least, -np.inf, np.inf
-        )
-        return Interaction(condition, self.success(condition), float(expected(rates)), excess)
+        expected = _share(float(rates[1] * rates[2]), float(rates[3]))
+        drawn = draws[:, 0] - _shares(draws[:, 1] * draws[:, 2], draws[:, 3])
+        excess = _estimate(float(rates[0]) - expected, drawn, self._least, -np.inf, np.inf)
+        return Interaction(condition, self.success(condition), expected, excess)
 
 
 @dataclass(frozen=True)
@@ -410,6 +407,8 @@ def _shares(parts: Floats, wholes: Floats) -> Floats:
 
 def _estimate(value: float, draws: Floats, least: float, low: float, high: float) -> Estimate:
     """Return a value with the quantiles of its draws, to whose distances the variance `least` is added."""
+    if np.isnan(value):
+        return UNKNOWN
     ends = np.quantile(draws, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     down, up = np.hypot(np.maximum([value - ends[0], ends[1] - value], 0), 1.96 * np.sqrt(least))
     return Estimate(value, max(low, float(value - down)), min(high, float(value + up)))

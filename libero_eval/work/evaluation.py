@@ -20,7 +20,7 @@ from libero_env.perturbations import parse_perturbations
 from libero_env.perturbations.events import NEVER
 from libero_env.tasks import Task
 from libero_env.text import json_safe
-from libero_eval.evaluation_file import EvaluationResult, Stopped, TaskResult
+from libero_eval.evaluation_file import EvaluationResult, Stopped, TaskResult, world_of
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.work.claims import LEASE
 from libero_eval.work.progress import busy_seconds
@@ -202,6 +202,8 @@ class Evaluation:
         rounds = list(takewhile(lambda units: all(unit.name in done for unit in units), self._rounds))
         known = tuple(start for units in rounds for start in units[0].init_states)
         if self.until is not None and known:
+            for unit in rounds[0]:
+                self.until.check_world(world_of(done[unit.name].environment))
             tasks = [
                 TaskResult.joined([done[unit.name].result for unit in units])
                 for units in zip(*rounds, strict=True)

@@ -3,10 +3,12 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from libero_env.text import flatten, json_safe, shown
+from libero_env.tasks import Task
+from libero_env.text import flatten, json_safe, shorten, shown
 from libero_eval.evaluation_file import EvaluationResult, TaskResult, by_start
 from libero_eval.protocols.protocol import EvalProtocol
 from lifelong.errors import ConfigError
@@ -27,16 +29,18 @@ class StoppingRule:
         width: Width of the always-valid interval of the mean success; None for a comparison.
         margin: Loss of success that is accepted: whether this policy is better or worse than the other by that.
         other: Whether the other policy succeeded, by task and start.
+        world: What the outcomes depend on by design, where they are those of the other policy: models, robot, drawing.
     """
 
     text: str
     width: float | None = None
     margin: float = 0.0
     other: Mapping[tuple[str, int], bool] = field(default_factory=dict)
+    world: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
     def read(
-        cls, text: str, protocol: EvalProtocol, tasks: Sequence[str], starts: Sequence[int]
+        cls, text: str, protocol: EvalProtocol, tasks: Sequence[Task], starts: Sequence[int]
     ) -> "StoppingRule":
         """Return the rule of a text for an evaluation.
 
@@ -64,12 +68,29 @@ class StoppingRule:
             here, there = flatten(json_safe(protocol.resolved())), flatten(dict(result.protocol))
             differ = sorted(k for k in here.keys() | there.keys() if here.get(k) != there.get(k))
             raise ConfigError(f"--until {text}: the protocol there differs in {', '.join(differ)}")
+        here = {task.id: (task.language, task.digest) for task in tasks}
+        for one in result.tasks:
+            language, digest = here.get(one.task, (one.instruction, one.digest))
+            if one.instruction != language or one.digest not in (None, digest):
+                raise ConfigError(f"--until {text}: {one.task} there is another task, or has other objects")
         known = {(task.task, start) for task in result.tasks for start in task.starts}
-        if lacking := [(task, start) for start in starts for task in tasks if (task, start) not in known]:
+        if lacking := [(task, start) for start in starts for task in here if (task, start) not in known]:
             raise ConfigError(
                 f"--until {text}: no episode of {lacking[0][0]}, start {lacking[0][1]} is there"
             )
-        return cls(text, None, numbers.get("margin", 0.0), by_start(result.tasks))
+        return cls(text, None, numbers.get("margin", 0.0), by_start(result.tasks), result.world)
+
+    def check_world(self, world: Mapping[str, Any]) -> None:
+        """Check that episodes were run as those of the other policy were.
+
+        Raises:
+            ConfigError: Models, robot or drawing are others.
+        """
+        both = sorted(self.world.keys() & world.keys())
+        if differ := [key for key in both if self.world[key] != world[key]]:
+            values = {key: [shorten(str(one[key]), 60) for one in (self.world, world)] for key in differ}
+            texts = (f"{key} is {there} there and {here} here" for key, (there, here) in values.items())
+            raise ConfigError(f"--until {self.text}: {', '.join(texts)}")
 
     def starts_needed(self, tasks: Sequence[TaskResult], starts: Sequence[int]) -> int | None:
         """Return from how many of the starts each task has to be run; None for more than these.

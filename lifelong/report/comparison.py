@@ -221,13 +221,19 @@ def _published(runs: Sequence[Run]) -> dict[str, float]:
 
 
 def _forgetting(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
-    """Return NBT_k of every task by its name, over the runs in which another task followed it."""
+    """Return NBT_k of every task by its name, over the runs in which another task followed it.
+
+    Of a task that a run learns several times, the mean is the run's.
+    """
     found: dict[str, list[float]] = {}
     for run in runs:
         assert run.metrics is not None
+        own: dict[str, list[float]] = {}
         followed = run.record.group(run.learned - 1).start
         for name, value in zip(run.record.tasks[:followed], run.metrics.nbt_by_task, strict=False):
-            found.setdefault(name, []).append(float(value))
+            own.setdefault(name, []).append(float(value))
+        for name, values in own.items():
+            found.setdefault(name, []).append(float(np.mean(values)))
     return {name: _mean(values) for name, values in found.items()}
 
 

@@ -26,9 +26,9 @@ def load_runs(*patterns: str | Path) -> "pd.DataFrame":
 
     Columns: `path`, `method` (the label of the reports), `algo`, `benchmark`, `policy`, `preset`, `seed`, `counted`
     (whether reports count it: not a further run of a seed, nor one behind others of its method), `finished`, `tasks`,
-    `tasks_learned`; the metrics `fwt`, `nbt`, `auc`, `final_success`, `just_learned`, each with `_low` and
-    `_high` of its interval, and those of other conventions; `cost.NAME`, the costs of the reports (bytes, seconds,
-    parameters, FLOPs); `config.KEY` for every key of the configuration.
+    `tasks_learned`, `transfer` (how forward transfer is estimated); the metrics `fwt`, `nbt`, `auc`, `final_success`,
+    `just_learned`, each with `_low` and `_high` of its interval, and those of other conventions; `cost.NAME`, the
+    costs of the reports (bytes, seconds, parameters, FLOPs); `config.KEY` for every key of the configuration.
 
     Args:
         patterns: Run directories, folders that hold some at any depth, or patterns such as `runs/*/er/*`.
@@ -100,6 +100,7 @@ def _row(run: Run, group: Group) -> dict[str, object]:
         "finished": run.results.finished,
         "tasks": len(record.tasks),
         "tasks_learned": run.learned,
+        "transfer": run.results.transfer,
     }
     if run.metrics is not None:
         for name in METRIC_NAMES:

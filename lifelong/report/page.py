@@ -4,6 +4,7 @@ import base64
 import json
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,8 @@ from lifelong.results.results import Results
 from lifelong.results.shifts import shift_scores
 from lifelong.results.summary import write_episodes
 from lifelong.stats.intervals import Estimate
-from lifelong.stats.metrics import METRIC_NAMES, Metrics, metric_values
+from lifelong.stats.methods import compared_transfer
+from lifelong.stats.metrics import METRIC_NAMES, Metrics, Transfer, lifelong_metrics, metric_values
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -182,7 +184,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
 
 def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]:
     """Return the template's variables for several runs, and write figures and numbers beside the page."""
-    groups = sorted(group_runs(runs), key=_rank)
+    groups = sorted(_comparable(group_runs(runs)), key=_rank)
     found = compare(groups, plan)
     later = found["after_base_stage"]
     for group in found["groups"].values():  # a page that is sent says nothing of this machine
@@ -236,7 +238,7 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
             for label, group in found["groups"].items()
             if np.isfinite(group["published"]["fwt"])
         ],
-        "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[r.results.transfer] for r in counted)),
+        "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[_compared_transfer(r, counted)] for r in counted)),
         "forgotten_tasks": _forgotten(found, "forgetting_by_task", texts),
         "forgotten_subgoals": _forgotten(found, "subgoals"),
         "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),
@@ -246,6 +248,21 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         "triangles": {name: rows for name in METRIC_TEXTS if (rows := triangle(found, name))},
         "runs": [_run_row(run, group.label, folder) for group in groups for run in group.runs],
     }
+
+
+def _comparable(groups: Sequence[Group]) -> list[Group]:
+    """Return the groups with the metrics by which their runs are compared."""
+    counted = [run for group in groups for run in group.runs]
+
+    def compared(run: Run) -> Run:
+        scores = run.results.scores(transfer=_compared_transfer(run, counted)) if run.metrics else None
+        return replace(run, metrics=lifelong_metrics(scores)) if scores else run
+
+    return [replace(group, runs=tuple(map(compared, group.runs))) for group in groups]
+
+
+def _compared_transfer(run: Run, runs: Sequence[Run]) -> Transfer:
+    return compared_transfer(run.results.transfer, {r.results.transfer for r in runs if r.metrics})
 
 
 def _success_of(group: Group) -> tuple[Panel, dict[str, Any], Line]:

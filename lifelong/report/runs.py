@@ -256,8 +256,9 @@ def _progress(run: Run) -> str:
 
 
 def _unlike_draws(groups: Sequence[Group]) -> list[str]:
-    """Return a sentence where methods were run with other orders of tasks, or other seeds of demonstrations."""
+    """Return a sentence where methods were run with other seeds, orders of tasks, or seeds of demonstrations."""
     draws: dict[str, Callable[[RunRecord], Any]] = {
+        "seeds": lambda record: record.seed,
         "tasks or their orders": lambda record: record.tasks,
         "seeds of the demonstrations (data.seed)": lambda record: record.data_seed,
     }
@@ -357,6 +358,8 @@ def settings_of(run: Run) -> dict[str, Any]:
         settings[key] = value if isinstance(value, str | int | float | bool | None) else str(value)
     if "eval.backend" in settings:  # device and memory aside
         settings["eval.backend"] = record.backend
+    if not run.config:
+        settings["tasks"] = len(record.tasks)
     if init_from := run.config.get("init_from"):  # each seed may start from a run of the same seed
         settings["init_from"] = re.sub(r"seed\d+", "seed", str(init_from))
     return {n: getattr(record, n) for n in _BASICS} | dict(sorted(settings.items()))

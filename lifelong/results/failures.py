@@ -85,7 +85,9 @@ def _text(counts: Mapping[str, int]) -> str:
 
 
 def _matrix(results: Results) -> dict[tuple[int, int], EvalRecord]:
-    return {(r.learned, r.task): r for r in results.evaluations() if r.phase == "matrix"}
+    """Return the evaluations of the tasks learned so far; the row of a task that is being learned is not complete."""
+    learned, found = results.learned_tasks(), results.evaluations()
+    return {(r.learned, r.task): r for r in found if r.phase == "matrix" and r.learned < learned}
 
 
 def _tally(

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 from libero_env.text import text_table
@@ -22,6 +23,7 @@ class Savings:
         again: Number of steps from the end of the run until it was back; None if it was given up.
         first: Number of steps from the run's initial weights; None if it was given up, or not measured.
         tried: Number of steps after which the longer of the two was given up.
+        paired: Whether the first was measured.
     """
 
     task: int
@@ -30,6 +32,7 @@ class Savings:
     again: int | None
     first: int | None
     tried: int
+    paired: bool
 
     @property
     def share(self) -> float | None:
@@ -81,11 +84,13 @@ def savings(records: Sequence[RelearnRecord]) -> list[Savings]:
             r
             for r in records
             if (r.task, r.start) == (task, "initial") and r.learned_error == last.learned_error
+            if len({b - a for one in (r, last) for a, b in pairwise(one.steps)}) < 2  # measured as often
         ]
         first = rivals[-1] if rivals else None
         tried = max(last.steps[-1], first.steps[-1] if first else 0)
         needed = first.needed if first else None
-        found.append(Savings(task, last.learned_error, last.errors[0], last.needed, needed, tried))
+        errors = last.learned_error, last.errors[0]
+        found.append(Savings(task, *errors, last.needed, needed, tried, first is not None))
     return found
 
 
@@ -103,10 +108,9 @@ def savings_heads(records: Sequence[RelearnRecord]) -> tuple[str, ...]:
 def savings_rows(records: Sequence[RelearnRecord]) -> list[tuple[str, ...]]:
     """Return the savings of one part of `by_measure` as text, a row for each task, counted from 1."""
     shown = _percent if records[0].episodes else "{:.3f}".format
-    started = {r.task for r in records if r.start == "initial"}
     rows: list[tuple[str, ...]] = []
     for row in savings(records):
-        first = _steps(row.first, row.tried) if row.task in started else "–"
+        first = _steps(row.first, row.tried) if row.paired else "–"
         again = _steps(row.again, row.tried)
         share = "–" if row.share is None else f"{100 * row.share:.0f} %".replace("-", "−")
         measured = shown(row.learned_error), shown(row.final_error)

@@ -289,7 +289,7 @@ class Results:
 
     def subgoals(self) -> Subgoals:
         """Return how often parts of the goals of the tasks learned so far were reached, and forgotten."""
-        return subgoals(self.of(EvalRecord), self.learned_tasks())
+        return subgoals(self.of(EvalRecord), [*map(self.last_of_group, range(self.learned_tasks()))])
 
     def seconds_by_phase(self) -> dict[str, float]:
         """Return the wall time of the recorded phases (such as demos), of training and of evaluation, [s]."""

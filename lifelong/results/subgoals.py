@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong.results.records import EvalRecord
-from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
+from lifelong.stats.intervals import UNKNOWN, Estimate, combine_intervals, wilson_interval
 
 
 @dataclass(frozen=True)
 class AtomRates:
-    """How often one atom of a task's goal held, as shares of the episodes.
+    """How often one atom of a task's goal held, as shares of the episodes; NaN where that was not measured.
 
     Attributes:
         task: Position in the sequence.
@@ -46,6 +46,8 @@ class AtomRates:
 class PredicateRates:
     """How often atoms with a predicate were reached at any time: means over the tasks whose goals contain it.
 
+    They are NaN unless that was measured of all these tasks.
+
     Attributes:
         predicate: Name of the predicate, such as In.
         learned: Rate right after learning each of the tasks.
@@ -73,13 +75,14 @@ def predicate_of(atom: str) -> str:
     return atom.strip("() ").split(" ", 1)[0]
 
 
-def subgoals(evaluations: Iterable[EvalRecord], tasks: int) -> Subgoals:
+def subgoals(evaluations: Iterable[EvalRecord], ends: Sequence[int]) -> Subgoals:
     """Return how often the atoms of the learned tasks were reached.
 
     Args:
         evaluations: Records of a run; those of learning curves are ignored. Of equal keys the last one counts.
-        tasks: Number of tasks learned.
+        ends: Of each learned task, the last one that was learned together with it.
     """
+    tasks = len(ends)
     cells = {
         (r.learned, r.task): r for r in evaluations if r.phase == "matrix" and r.atoms and r.learned < tasks
     }
@@ -88,22 +91,29 @@ def subgoals(evaluations: Iterable[EvalRecord], tasks: int) -> Subgoals:
         rows = [learned for learned, other in cells if other == task]
         if rows:
             pairs.append((cells[min(rows), task], cells[max(rows), task]))
-    return Subgoals(tuple(a for pair in pairs for a in _atoms(*pair)), tuple(_predicates(pairs)))
+    atoms = tuple(a for pair in pairs for a in _atoms(*pair, ends))
+    return Subgoals(atoms, tuple(_predicates(pairs, ends)))
 
 
-def _atoms(learned: EvalRecord, final: EvalRecord) -> list[AtomRates]:
+def _atoms(learned: EvalRecord, final: EvalRecord, ends: Sequence[int]) -> list[AtomRates]:
+    just, last = (1.0 if known else np.nan for known in _measured(learned, final, ends))
     held = (
-        learned.atoms_at_start,
-        learned.atoms_ever,
-        learned.atoms_at_end,
-        final.atoms_ever,
-        final.atoms_at_end,
+        (1.0, learned.atoms_at_start),
+        (just, learned.atoms_ever),
+        (just, learned.atoms_at_end),
+        (last, final.atoms_ever),
+        (last, final.atoms_at_end),
     )
-    columns = [np.asarray(rows, float).mean(0) for rows in held]
+    columns = [known * np.asarray(rows, float).mean(0) for known, rows in held]
     return [AtomRates(learned.task, a, *(float(c[i]) for c in columns)) for i, a in enumerate(learned.atoms)]
 
 
-def _predicates(pairs: Sequence[tuple[EvalRecord, EvalRecord]]) -> list[PredicateRates]:
+def _measured(learned: EvalRecord, final: EvalRecord, ends: Sequence[int]) -> tuple[bool, bool]:
+    """Return whether a task's first and last evaluations are those just after learning it, and at the end."""
+    return learned.learned == ends[learned.task], final.learned == ends[-1]
+
+
+def _predicates(pairs: Sequence[tuple[EvalRecord, EvalRecord]], ends: Sequence[int]) -> list[PredicateRates]:
     found: list[PredicateRates] = []
     names = dict.fromkeys(predicate_of(a) for learned, _ in pairs for a in learned.atoms)
     for name in names:
@@ -119,13 +129,14 @@ def _predicates(pairs: Sequence[tuple[EvalRecord, EvalRecord]]) -> list[Predicat
         # A task that is not followed by another has one evaluation only, so no difference.
         drops = [s for learned, final, s in counted if learned.learned != final.learned]
         forgotten = _mean([s[0] for s in drops], [s[1] for s in drops], over=len(counted))
+        just, end = map(all, zip(*(_measured(a, b, ends) for a, b, _ in counted), strict=True))
         found.append(
             PredicateRates(
                 name,
                 tuple(learned.task for learned, *_ in counted),
-                _mean(first),
-                _mean(last),
-                Estimate(np.nan, np.nan, np.nan) if same else forgotten,
+                _mean(first) if just else UNKNOWN,
+                _mean(last) if end else UNKNOWN,
+                forgotten if just and end and not same else UNKNOWN,
             )
         )
     return found

@@ -6,7 +6,8 @@ episodes.csv.gz  one row an episode: the method's label, the run's number among 
                  (numbers of tasks learned together), which `cells` of the matrix were measured and their share, the
                  evaluation (`phase` curve or matrix, `row`: position of the task learned last, `epoch` trained on it),
                  the task (`position` in the sequence, and its name), `start` (initial state), `success` (0 or 1),
-                 `length` [control steps]; episodes that a simulation error ended are left out
+                 `length` [control steps]; the last two are empty where a simulation error ended the episode. Of a run
+                 that is not finished, the episodes of the tasks that it has learned
 """
 
 import csv
@@ -169,11 +170,13 @@ def _rows(method: str, number: int, order: int, results: Results) -> Iterator[tu
     run = results.run
     together = " ".join(str(len(group)) for group in run.groups)
     seeds, kind = (run.seed, run.data_seed), (results.transfer, together, run.cells, run.cells_share)
-    for record in results.evaluations():
-        task = run.tasks[record.task] if record.task < len(run.tasks) else ""
-        key = (method, number, *seeds, order, *kind, record.phase, record.learned)
+    learned = results.learned_tasks()
+    for record in (r for r in results.evaluations() if r.learned < learned):
+        place = (record.learned, record.epoch, record.task, run.tasks[record.task])
+        key = (method, number, *seeds, order, *kind, record.phase, *place)
         for start, won, length in zip(record.init_states, record.successes, record.lengths, strict=True):
-            yield (*key, record.epoch, record.task, task, start, int(won), length)
+            yield (*key, start, int(won), length)
+        yield from ((*key, start, "", "") for start, _ in record.simulation_errors)
 
 
 def read_episodes(path: Path) -> list[tuple[str, Results]]:
@@ -189,17 +192,19 @@ def read_episodes(path: Path) -> list[tuple[str, Results]]:
         if tuple(reader.fieldnames or ()) != COLUMNS:
             raise ResultsError(f"{path} is no table of episodes; expected the columns {', '.join(COLUMNS)}")
         runs: dict[tuple[str, ...], list[dict[str, str]]] = {}
+        orders: dict[str, dict[int, str]] = {}
         for row in reader:
             runs.setdefault((row["method"], row["run"]), []).append(row)
-        return [(key[0], _results(rows)) for key, rows in runs.items()]
+            orders.setdefault(row["order"], {})[int(row["position"])] = row["task"]
+        return [(key[0], _results(rows, orders[rows[0]["order"]])) for key, rows in runs.items()]
     except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
         raise ResultsError(f"{path}: the episodes cannot be read ({error})") from error
 
 
-def _results(rows: list[dict[str, str]]) -> Results:
-    names = {int(row["position"]): row["task"] for row in rows}
-    tasks = [names[place] for place in range(max(names) + 1)]
+def _results(rows: list[dict[str, str]], names: Mapping[int, str]) -> Results:
     first = rows[0]
+    count = sum(map(int, first["together"].split()))
+    tasks = [names.get(place, f"not learned by any run of order {first['order']}") for place in range(count)]
     records: list[Record] = [_run(first, tasks)]
     cells: dict[tuple[str, ...], list[dict[str, str]]] = {}
     for row in rows:
@@ -208,7 +213,7 @@ def _results(rows: list[dict[str, str]]) -> Results:
     for episodes in cells.values():
         record = _evaluation(episodes)
         records.append(record)
-        if record.phase == "matrix":
+        if record.phase == "matrix" or record.learned not in kept:
             kept[record.learned] = record.epoch
     records += [TaskEndRecord(task=task, best_epoch=epoch, seconds=0.0) for task, epoch in kept.items()]
     return Results(tuple(records))
@@ -234,6 +239,8 @@ def _run(row: Mapping[str, str], tasks: list[str]) -> RunRecord:
 
 
 def _evaluation(rows: list[dict[str, str]]) -> EvalRecord:
+    lost = [(int(row["start"]), "") for row in rows if not row["success"]]
+    rows = [row for row in rows if row["success"]]
     values: dict[str, Any] = {
         "phase": rows[0]["phase"],
         "learned": int(rows[0]["row"]),
@@ -242,6 +249,7 @@ def _evaluation(rows: list[dict[str, str]]) -> EvalRecord:
         "successes": [bool(int(row["success"])) for row in rows],
         "lengths": [int(row["length"]) for row in rows],
         "init_states": [int(row["start"]) for row in rows],
+        "simulation_errors": lost,
         "seconds": 0.0,
     }
     return validate(EvalRecord, values)

@@ -8,7 +8,7 @@ With n seeds no rank or sign test has a p-value below 2 / 2ⁿ (0.0625 with five
 on their normal distribution. Error rates by simulation: experiments/comparisons.
 """
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from itertools import combinations
@@ -26,7 +26,14 @@ from lifelong.stats.intervals import (
     mean_and_standard_error,
     wilson_interval,
 )
-from lifelong.stats.metrics import METRIC_NAMES, METRIC_RANGES, Scores, lifelong_metrics, metric_values
+from lifelong.stats.metrics import (
+    METRIC_NAMES,
+    METRIC_RANGES,
+    Scores,
+    Transfer,
+    lifelong_metrics,
+    metric_values,
+)
 
 ALPHA = 0.05
 CONFIDENCE = 0.95
@@ -251,15 +258,17 @@ def spreads(runs: Sequence[MethodRun]) -> dict[str, dict[str, float]]:
     return found
 
 
+def compared_transfer(own: Transfer, kinds: Collection[Transfer]) -> Transfer:
+    """Return the estimate by which a run is compared: eq. 3 as published only if all runs use it."""
+    return "cross_fitted" if own == "published" and {*kinds} != {"published"} else own
+
+
 def _comparable(methods: Mapping[str, Sequence[MethodRun]]) -> dict[str, list[MethodRun]]:
-    """Return the runs with one kind of estimate of forward transfer: eq. 3 as published only if all of them use it."""
-    if {m.scores.transfer for runs in methods.values() for m in runs} == {"published"}:
-        return {label: list(runs) for label, runs in methods.items()}
+    """Return the runs with the estimates of forward transfer by which they are compared."""
+    kinds = {m.scores.transfer for runs in methods.values() for m in runs}
     return {
         label: [
-            replace(m, scores=replace(m.scores, transfer="cross_fitted"))
-            if m.scores.transfer == "published"
-            else m
+            replace(m, scores=replace(m.scores, transfer=compared_transfer(m.scores.transfer, kinds)))
             for m in runs
         ]
         for label, runs in methods.items()

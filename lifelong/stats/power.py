@@ -35,7 +35,11 @@ class Question:
 
     def __post_init__(self) -> None:
         other = self.base + self.difference
-        if not 0 < self.base < 1 or not 0 <= other <= 1:
+        if not 0 < self.base < 1:
+            raise ConfigError(
+                f"--base, the success of the first policy, is {self.base:g}; it has to be above 0 and below 1"
+            )
+        if not 0 <= other <= 1:
             raise ConfigError(
                 f"success rates are between 0 and 1; these are {self.base:g} and {other:g} (base + difference)"
             )
@@ -133,18 +137,22 @@ def unpaired_episodes(question: Question) -> int:
     return math.ceil(((pooled + apart) / question.difference) ** 2)
 
 
-def shown_difference(question: Question, pairs: int) -> float:
+def shown_difference(question: Question, pairs: int, correlation: float | None = None) -> float:
     """Return the smallest difference, in steps of 0.001, that so many pairs show with the power; NaN if none.
 
-    The discordance is that of independent outcomes, or the given one as far as the rates of each difference allow it.
+    The discordance is that of independent outcomes, or the given one, or that of the outcomes' correlation, as far as
+    the rates of each difference allow it.
     """
     sign = math.copysign(1.0, question.difference)
     room = (1 - question.base) if sign > 0 else question.base
     for step in range(1, math.floor(1000 * room + 1e-9) + 1):
         moved = replace(question, difference=sign * step / 1000, discordance=None)
-        if question.discordance is not None:
+        share = question.discordance
+        if correlation is not None:
+            share = discordance_of(moved.base, moved.difference, correlation)
+        if share is not None:
             low, high = moved.discordance_range
-            moved = replace(moved, discordance=min(max(question.discordance, low), high))
+            moved = replace(moved, discordance=min(max(share, low), high))
         if paired_power(moved, pairs) >= question.power:
             return step / 1000
     return math.nan

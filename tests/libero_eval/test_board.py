@@ -8,7 +8,7 @@ import pytest
 
 from libero_env.cli.main import main
 from libero_eval.evaluation_file import Stopped
-from libero_eval.judging.board import make_board, write_board
+from libero_eval.judging.board import make_board, render_board, write_board
 from libero_eval.judging.comparability import Group, check_comparable
 from libero_eval.judging.evaluation_page import write_evaluation_page
 from lifelong.errors import ComparisonError
@@ -105,6 +105,8 @@ def test_other_episodes_are_refused_by_name():
         make_board([a, fewer])
     board = make_board([a, fewer], ["starts"])
     assert board.shared == 50 and board.rows[0].success.value == 1.0 and "; allowed" in board.notes[0]
+    assert "success is that in the 50 episodes that all ran" in render_board(board)
+    assert "episodes that all ran" not in render_board(make_board([a]))
     with pytest.raises(ComparisonError, match="no episode is common to a, b"):
         make_board([a, won("b", first(9), "libero_goal/1")], ["starts"])
 

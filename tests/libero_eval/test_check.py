@@ -8,10 +8,18 @@ import yaml
 
 from libero_env.cli.main import main
 from libero_eval.check import examine
-from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, from_line
+from lifelong.results.log import ResultLog
+from lifelong.results.records import (
+    EvalRecord,
+    LossRecord,
+    RunEndRecord,
+    TaskEndRecord,
+    from_line,
+    measured_tasks,
+)
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
-from tests.harness.records import run_start
+from tests.harness.records import evaluation, run_start
 from tests.harness.sequences import run_context, sequence
 
 
@@ -133,3 +141,13 @@ def test_a_folder_without_runs_is_named(tmp_path, capsys):
     assert "no run directory" in capsys.readouterr().err
     (tmp_path / "results.jsonl").touch()
     assert faults(tmp_path)
+
+
+def test_cells_that_a_sample_leaves_out_are_not_missed(tmp_path):
+    log = ResultLog(tmp_path / "results.jsonl")
+    log.append(run_start("abcd", cells="sampled", cells_share=0.4))
+    for row in range(4):
+        for task in measured_tasks("sampled", [row], 4, 0.4):
+            log.append(evaluation("matrix", row, 0, task, 2))
+        log.append(TaskEndRecord(task=row, best_epoch=0, seconds=1.0))
+    assert not [text for text in faults(tmp_path) if "lacks evaluations" in text]

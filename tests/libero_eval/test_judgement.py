@@ -14,7 +14,7 @@ from libero_eval.evaluation_file import Stopped  # noqa: E402
 from libero_eval.judging.comparability import Group, check_comparable, match, settings  # noqa: E402
 from libero_eval.judging.comparison import Comparison, compare_groups, gate, write_comparison  # noqa: E402
 from libero_eval.judging.group_scores import group_scores  # noqa: E402
-from libero_eval.judging.page import gate_text, render  # noqa: E402
+from libero_eval.judging.page import forest_figure, gate_text, render  # noqa: E402
 from libero_integrations.exports.results import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
 from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
 from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
@@ -82,6 +82,14 @@ def test_holm_is_over_comparisons_suites_and_tasks(found):
     assert smallest.adjusted == pytest.approx(min(1, 20 * smallest.difference.p_value))
 
 
+def test_differences_that_are_significant_at_the_level_that_was_asked_for_are_filled(found):
+    for alpha in (0.05, 1e-9):
+        (axes,) = forest_figure(found.comparisons[0], alpha).axes
+        rows = (found.comparisons[0].total, *found.comparisons[0].suites, *found.comparisons[0].tasks)
+        filled = [line for line in axes.lines if line.get_marker() in "so" and line.get_mfc() != "white"]
+        assert len(filled) == sum(row.adjusted <= alpha for row in rows) and (alpha < 0.05 or filled)
+
+
 def test_the_order_of_the_policies_turns_the_sign_only():
     sides = [side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.8, 2, policy="b:b"))]
     one, other = (compare_groups(order).comparisons[0].total.difference for order in (sides, sides[::-1]))
@@ -101,6 +109,12 @@ def test_texts_name_what_is_shown_and_what_is_not(found):
     text = render(equal)
     assert "No difference is shown: a − b" in text and "in four of five cases" in text
     assert "not decided after 500 pairs" in text and "note: no control arm" in text
+    three = [
+        side(name, drawn_result(rate, 1, policy=name)) for name, rate in (("a", 0.9), ("b", 0.8), ("c", 0.7))
+    ]
+    pair, *_ = compare_groups(three).comparisons
+    assert pair.shown > compare_groups(three[:2]).comparisons[0].shown, "of three tests"
+    assert "after Holm" not in text and "after Holm, McNemar, exact)" in render(compare_groups(three))
 
 
 @pytest.mark.parametrize(("changes", "field", "values"), [
@@ -241,6 +255,23 @@ def test_runs_of_methods_are_aggregated_by_rliable():
     )  # whatever was drawn before
 
 
+def test_aggregates_over_runs_are_of_the_starts_that_all_have():
+    pytest.importorskip("rliable")
+
+    def runs(name, numbers, counts):
+        rows = [
+            [task_result(f"libero_goal/{n}", [1] * 10 + [0] * (count - 10)) for n in numbers]
+            for count in counts
+        ]
+        return side(name, *(result_of(*tasks, policy=f"{name}{i}:m") for i, tasks in enumerate(rows)))
+
+    groups = [runs("a", (0, 1), (10, 10)), runs("b", (1, 2), (10, 40)), runs("c", (0, 2), (10, 10))]
+    assert compare_groups(groups[:2]).groups.mean["b"].value == 1.0, "the thirty failures have no partner"
+    judged = compare_groups(groups)
+    assert judged.groups is None and "there are no aggregates over runs" in judged.notes[-1]
+    assert "nan" not in render(judged)
+
+
 def test_the_file_holds_everything(found, tmp_path):
     values = json.loads(write_comparison(found, tmp_path / "c.json").read_text())
     assert values["format"] == "libero-comparison/1" and len(values["comparisons"][0]["tasks"]) == 20
@@ -326,6 +357,11 @@ def test_exports_to_model_cards_are_entries_as_the_hub_documents_them(tmp_path):
         "perturbed by gain=0.5, clock latency=100ms, stopped after 7 of 20; width=0.9: known"
         in entry["notes"]
     )
+    interval = replace(changed, tasks=changed.tasks[:1]).success  # wider, as that of a stopped evaluation is
+    assert (
+        f"95 % interval {100 * interval.low:.1f} to {100 * interval.high:.1f}" in entry["notes"]
+        and interval.low < 0.2
+    )
     bare = export_eval_results(replace(result, times={}), tmp_path, "org/libero")
     assert not {"date", "source"} & yaml.safe_load(bare[1].read_text())[0].keys()
 
@@ -347,6 +383,10 @@ def test_commands(tmp_path, monkeypatch, capsys):
     assert main(["power", "a", "b"]) == 0 and "observed in 500 pairs" in capsys.readouterr().out
     assert main(["power", "--difference", "0.03", "--correlation", "0.3", "--tests", "4"]) == 0
     assert "over 4 comparisons" in capsys.readouterr().out
+    assert main(["power", "--base", "0.9", "--episodes", "114", "--correlation", "0.5"]) == 0
+    assert "worse by 10.0 points" in capsys.readouterr().out, (
+        "as --difference=-0.1 --correlation 0.5 asks for 114"
+    )
     assert main(["power", "--episodes", "500"]) == 0 and "worse by" in capsys.readouterr().out
     assert main(["power", "--base", "0.99"]) == main(["power", "--base", "0.99", "--episodes", "100"]) == 0
     assert "--difference 0.03" not in capsys.readouterr().err

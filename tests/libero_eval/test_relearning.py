@@ -160,6 +160,9 @@ def test_savings_pair_the_starts_of_each_task() -> None:
     assert savings_rows(records)[2][3:] == ("0", "–", "–"), "the first was not measured"
     assert savings_rows(records)[3][3:] == ("> 10", "10", "–")
     assert savings_tables(records).count("\n") == 4
+    for odd in ({"learned_error": 0.2}, {"steps": (0, 50)}):  # of other demonstrations, measured less often
+        last = replace(record(0, "final", (0.3, 0.1)), **odd)
+        assert savings_rows([*records, last])[0][4:] == ("–", "–")
 
 
 def test_settings_and_initial_weights_do_not_share_a_table() -> None:

@@ -242,3 +242,8 @@ def test_a_policy_that_never_succeeds_has_nothing_to_lose(tmp_path) -> None:
     policy = Robustness("none", outcomes({(): 0, A: 0, B: 0}))
     assert "nothing to lose" in verdict(policy)
     assert write_robustness([policy], tmp_path).exists() and "none" in render(policy)
+    better = Robustness(
+        "none", outcomes({(): 0, B: 5, C: 5, BOTH: 5})
+    )  # what is left of nothing is not known
+    assert "camera=1,light=1: 50, expected –, excess –" in render(better).splitlines()
+    assert write_robustness([better], tmp_path) and "nan" not in (tmp_path / "robustness.html").read_text()

@@ -71,6 +71,13 @@ def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> N
     assert labels == ["first", "second"]
     assert main(["robustness", "--report", "found", "found", "--out", "both"]) == 2
     assert "two policies are named found" in capsys.readouterr().err
+    (still / "found").rename(still / "a=b")
+    assert (
+        main(["robustness", "--report", "a=b", "c=a=b"]) == 0 and (still / "a=b" / "robustness.html").exists()
+    )
+    text = (still / "a=b" / "robustness.json").read_text()
+    assert [policy["label"] for policy in json.loads(text)["policies"]] == ["a=b", "c"]
+    (still / "a=b").rename(still / "found")
 
     others = ["--kinds", "noise", "--severities", "1", "--pairs", "--perturb-seed", "3", "--out", "found"]
     assert main(["robustness", *WORDS, *others]) == 0
@@ -114,6 +121,9 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
     record = json.loads((still / "found" / "robustness.json").read_text())["policies"][0]
     rows = {row["name"]: (row["episodes"], row["began"], row["solved"]) for row in record["events"]}
     assert rows == {"camera=1@step1": (2, 2, 0), "light=1@touched": (2, 0, 0)}
+    assert {row["p_value"] for row in record["events"]} == {1.0} and not record["events"][0]["difference"][
+        "value"
+    ]
     assert "<h2>Events</h2>" in (still / "found" / "robustness.html").read_text()
     conditions = conditions_of(RobustnessRequest(events=True))
     assert len(conditions) == 19 and {"object=0.6@step20", "camera=1@lifted"} <= {*conditions}

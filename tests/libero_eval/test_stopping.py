@@ -14,6 +14,7 @@ from libero_eval.judging.evaluation_page import write_evaluation_page
 from libero_eval.work.progress import total_rows
 from libero_eval.work.stopping import StoppingRule
 from libero_eval.work.worker import Worker
+from lifelong.errors import ConfigError
 from lifelong.stats.sequential import anytime_interval, log_evidence
 from tests.harness.evaluations import QUICK, TASKS, Countdown, evaluate, evaluation
 
@@ -37,7 +38,7 @@ class Always(Countdown):
 
 
 def rule(text, starts=STARTS):
-    return StoppingRule.read(text, QUICK, IDS, starts)
+    return StoppingRule.read(text, QUICK, TASKS, starts)
 
 
 def stopping(out, text, **changes):
@@ -101,6 +102,21 @@ def test_it_stops_when_it_is_decided_against_a_result(tmp_path):
         Group("b", (EvaluationResult.read(tmp_path / "all"),)),
     ]
     assert any("only the sequential test allows for that" in note for note in compare_groups(groups).notes)
+
+
+def test_it_is_compared_with_the_same_tasks_in_the_same_world_only(tmp_path):
+    other = evaluate(tmp_path / "ref", init_states=STARTS)
+    text = f"against={tmp_path / 'ref'}"
+    changed = [replace(other.tasks[0], instruction="another"), *other.tasks[1:]]
+    replace(other, tasks=tuple(changed)).write(tmp_path / "ref" / "eval.json")
+    with pytest.raises(ConfigError, match=f"{IDS[0]} there is another task"):
+        rule(text)
+    replace(other, environment={**other.environment, "robot": "another"}).write(
+        tmp_path / "ref" / "eval.json"
+    )
+    rule(text).check_world({"robot": "another"})
+    with pytest.raises(ConfigError, match="robot is another there and libero here"):
+        rule(text).check_world({"robot": "libero"})
 
 
 @pytest.mark.parametrize(

@@ -175,6 +175,11 @@ def test_episodes_in_other_starts_are_as_in_textbooks():
 def test_correlated_outcomes_differ_less():
     assert discordance_of(0.9, 0.03, 0) == pytest.approx(0.9 * 0.07 + 0.93 * 0.1)
     assert discordance_of(0.9, 0.03, 0.5) < discordance_of(0.9, 0.03, 0.1)
+    count = paired_episodes(Question(0.9, -0.1, discordance_of(0.9, -0.1, 0.5)))
+    assert shown_difference(Question(0.9, -0.1), count, 0.5) == pytest.approx(0.1, abs=0.002)
+    assert f"worse by {100 * shown_difference(Question(0.9, -0.1), 50, 0.5):.1f} p" in shown(
+        Question(0.9, -0.1), 50, 0.5
+    )
 
 
 def test_the_sequential_test_stops_earlier_for_larger_differences():
@@ -185,6 +190,7 @@ def test_the_sequential_test_stops_earlier_for_larger_differences():
 
 @pytest.mark.parametrize(("values", "message"), [
     ((0.9, 0.2), "between 0 and 1"),
+    ((1.0, -0.1), "--base, .* is 1; it has to be"),
     ((0.9, 0.0), "cannot be shown"),
     ((0.9, 0.05, 0.01), "a discordance of 0.01 is impossible"),
     ((0.9, 0.05, None, 0.01), "alpha < power"),
@@ -200,7 +206,7 @@ def test_a_difference_that_needs_millions_is_refused():
 
 
 def test_tables_of_power_name_what_is_impossible():
-    assert "–" in table(Question(0.9, 0.03))
+    assert "–" in table(Question(0.9, 0.03)) and "success 99.5 %" in table(Question(0.995, 0.003))
     assert "worse by" in shown(Question(0.9, 0.03), 500)
     assert "no difference that is possible" in shown(Question(0.99, 0.005), 20)
 

@@ -24,6 +24,7 @@ def test_a_row_has_what_the_summary_of_the_run_has():
         run = load_run(Path(row["path"]))
         summary = json_safe(summarize(run.results))
         assert (row["seed"], row["finished"]) == (summary["run"]["seed"], summary["finished"])
+        assert row["transfer"] == summary["statistics"]["transfer"]
         for name in ("fwt", "nbt", "auc"):
             assert row[name] == pytest.approx(summary["metrics"][name]["value"])
         assert row["config.train.lr"] == run.config["train"]["lr"]

@@ -57,6 +57,8 @@ def test_causes_and_interference_of_a_run():
     assert table["tables"][0][1][0] == (0, "bowl", [0, 1, 1])
     assert table["served"] == [(0, "bowl", [0, 1, 1]), (1, "cheese", [1, 0, 0]), (2, "drawer", [0, 0, 0])]
     assert causes_text(ROWS) == "dropped 2, wrong object 2, never reached 1"
+    half = failure_score(Results((run_start(["a", "b", "c"]), *ROWS[:3], ROWS[5])))  # its last row has begun
+    assert half.by_task == {0: {"wrong object": 1}, 1: {}} and max(half.after) == 1
 
 
 def test_records_keep_failures_and_runs_without_them_have_no_score():

@@ -638,6 +638,15 @@ def test_forgetting_by_task_and_by_subgoal(compared: tuple[Path, dict]):
     assert ", ".join(f"{100 * d:.1f}" for d in by_seed).replace("-", "−") in text
 
 
+def test_a_task_that_is_learned_twice_is_one_value_of_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(globals(), "GROCERIES", ["milk", "butter", "milk", "soup"])
+    run = load_run(make_run(tmp_path, tasks=4))
+    milk, *_ = compare(group_runs([run]))["groups"]["er"]["forgetting_by_task"].values()
+    assert milk["mean"] == pytest.approx(run.metrics.nbt_by_task[[0, 2]].mean()) and np.isnan(
+        milk["half_width"]
+    )
+
+
 def test_costs_are_in_both_kinds_of_page(compared: tuple[Path, dict], finished: Path):
     page, found = compared
     assert found["groups"]["er"]["costs"]["stored_bytes"] == 6e6  # after the last of three tasks
@@ -773,6 +782,10 @@ def test_runs_of_different_progress_and_length_compare(tmp_path: Path):
     runs.append(make_run(tmp_path / "c", "ewc", 1, tasks=3, done=0))
     page = Page(write_report(runs, tmp_path / "out.html").read_text())
     assert "1 of 3" in page.text and "0 of 3" in page.text
+    runs = [make_run(tmp_path / "3", tasks=3), make_run(tmp_path / "4", seed=2, tasks=4, done=3)]
+    for run in runs:  # nothing else tells that they are no runs of one method
+        (run / "config.yaml").unlink()
+    assert [group.label for group in group_runs([*map(load_run, runs)])] == ["er (tasks 3)", "er (tasks 4)"]
 
 
 @undrawn
@@ -797,6 +810,7 @@ def test_a_run_behind_the_others_of_its_method_is_not_counted(tmp_path: Path):
 @pytest.mark.parametrize(
     "key, value, told",
     [
+        ("seed", 3, "The seeds differ between methods: er against ewc."),
         ("benchmark__order", 1, "The tasks or their orders differ between methods: er against ewc."),
         (
             "data__seed",
@@ -814,9 +828,11 @@ def test_what_differs_between_all_runs_of_two_methods_is_told(
 ):
     facts = {key.split("__")[1]: value} if key == "benchmark__order" else {}
     facts |= {"data_seed": value} if key == "data__seed" else {}
+    other = value if key == "seed" else 2
     runs = [make_run(tmp_path / f"er{s}", "er", s, tasks=2) for s in (1, 2)]
     runs += [
-        configure(make_run(tmp_path / f"ewc{s}", "ewc", s, tasks=2, **facts), **{key: value}) for s in (1, 2)
+        configure(make_run(tmp_path / f"ewc{s}", "ewc", s, tasks=2, **facts), **{key: value})
+        for s in (1, other)
     ]
     groups = group_runs([load_run(configure(run, data__memory=str(n))) for n, run in enumerate(runs)])
     lines = [line for line in unlike(groups) if not line.startswith("No record tells")]
@@ -1057,3 +1073,21 @@ def test_a_page_says_what_forward_transfer_is_the_mean_of_and_which_weights_were
     assert any("nothing was trained" in note and "task 2" in note for note in notes)
     with pytest.raises(LifelongError, match=f"it holds 1, in {re.escape(str(tmp_path))}/\\*;"):
         load_run(tmp_path)
+
+
+@undrawn
+def test_a_page_has_one_estimate_of_forward_transfer(tmp_path: Path):
+    runs = [make_run(tmp_path / algo, algo, tasks=2) for algo in ("er", "ewc")]
+    first, *others = (runs[0] / "results.jsonl").read_bytes().splitlines(keepends=True)
+    values = {k: v for k, v in json.loads(first).items() if k != "crc32"}
+    (runs[0] / "results.jsonl").write_bytes(
+        b"".join([signed_line(values | {"transfer": "published"}), *others])
+    )
+    page = write_report(runs, tmp_path / "out")
+    fwt = json.loads((page.parent / "comparison.json").read_text())["groups"]["er"]["metrics"]["fwt"]["mean"]
+    text = Page(page.read_text()).text
+    assert (
+        f"er 1 {100 * fwt:.1f} " in text
+        and f"{100 * fwt:.1f}" != f"{100 * load_run(runs[0]).metrics.fwt.value:.1f}"
+    )
+    assert "as measured" not in text and "chosen without the start that measures it" in text

@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,9 @@ from lifelong.results.records import (
     to_line,
 )
 from lifelong.results.results import Results
-from lifelong.results.summary import summarize, write_summary
+from lifelong.results.summary import read_episodes, summarize, write_episodes, write_summary
+from lifelong.stats.metrics import metric_values
+from tests.harness.records import run_start
 
 START = start_record(
     algo="er",
@@ -277,6 +280,34 @@ def test_an_unfinished_run_is_measured_over_the_tasks_it_learned():
     assert summary["tasks_learned"] == 1
     assert summary["metrics"]["final_success"]["value"] == 0.5
     assert summarize(Results((START,)))["metrics"] is None
+
+
+@pytest.mark.parametrize("cells", ["all", "last_row"])
+def test_the_episodes_of_an_unfinished_run_give_its_numbers_whatever_was_lost(cells, tmp_path: Path):
+    """The third of four tasks is being learned; simulation errors ended an episode of two points of one curve."""
+    won = {
+        "successes": (True, False, True, True),
+        "init_states": (0, 2, 3, 4),
+        "simulation_errors": ((1, "boom"),),
+    }
+    lost = [replace(evaluation("curve", 0, epoch, 0, 2, 4), **won) for epoch in (1, 2)]
+    lost[1] = replace(lost[1], init_states=(0, 1, 3, 4), simulation_errors=((2, "boom"),))
+    cases = [
+        evaluation("curve", 0, 0, 0, 1, 5),
+        *lost,
+        *(evaluation("curve", 1, e, 1, e, 5) for e in range(3)),
+    ]
+    cases += [evaluation("matrix", *key, 3) for key in ((0, 2, 0), (1, 2, 0), (1, 2, 1))] * (cells == "all")
+    cases += [TaskEndRecord(task=task, best_epoch=2, seconds=1.0) for task in range(2)]
+    cases += [evaluation("curve", 2, 0, 2, 1)]
+    other = Results((run_start("abcd", seed=2), *(evaluation("matrix", 3, 0, task, 3) for task in range(4))))
+    run = Results((run_start("abcd", cells=cells), *cases))
+    file = write_episodes(tmp_path / "episodes.csv", [("er", run), ("er", other)])
+    found = read_episodes(file)[0][1]
+    assert found.run.tasks == run.run.tasks, "as the other run's rows name them"
+    assert found.learned_tasks() == run.learned_tasks() == 2
+    for name, value in metric_values(run.scores()).items():
+        assert metric_values(found.scores())[name] == pytest.approx(value, nan_ok=True)
 
 
 def test_the_summary_is_strict_json_and_complete(log: ResultLog, tmp_path: Path):

@@ -31,7 +31,7 @@ RUN = [
 
 
 def test_every_atom_of_every_task():
-    found = subgoals(RUN, 3)
+    found = subgoals(RUN, range(3))
     assert [a.atom for a in found.atoms] == [*POT, *TWO, *POT]
     turn, on = found.atoms[:2]
     assert (turn.learned_ever, turn.final_ever, turn.forgotten) == (1.0, 1.0, 0.0)
@@ -41,7 +41,7 @@ def test_every_atom_of_every_task():
 
 
 def test_predicates_are_averaged_over_tasks_and_the_last_has_forgotten_nothing():
-    found = {p.predicate: p for p in subgoals(RUN, 3).predicates}
+    found = {p.predicate: p for p in subgoals(RUN, range(3)).predicates}
     assert set(found) == {"Turnon", "On", "In"}, "the drawer was closed already"
     assert found["On"].tasks == (0, 2)
     assert found["On"].learned.value == pytest.approx((0.8 + 1.0) / 2)
@@ -54,22 +54,36 @@ def test_predicates_are_averaged_over_tasks_and_the_last_has_forgotten_nothing()
 
 def test_what_held_from_the_start_does_not_count():
     half = record(0, 0, POT, [10, 10], [5, 0])  # turned on already in five episodes, reached in the others
-    one = {p.predicate: p for p in subgoals([half], 1).predicates}
+    one = {p.predicate: p for p in subgoals([half], [0]).predicates}
     assert one["Turnon"].learned.value == 1.0 and np.isnan(one["Turnon"].forgotten.value)
     missed = record(0, 0, POT, [5, 10], [5, 0])  # never turned on where it was off
-    assert {p.predicate: p.learned.value for p in subgoals([missed], 1).predicates}["Turnon"] == 0.0
+    assert {p.predicate: p.learned.value for p in subgoals([missed], [0]).predicates}["Turnon"] == 0.0
 
 
 def test_the_last_of_equal_records_counts_and_tasks_that_are_not_done_do_not():
     again = record(2, 0, POT, [10, 9])
-    assert subgoals([*RUN, again], 3).atoms[1].final_ever == pytest.approx(0.9)
-    assert [a.task for a in subgoals(RUN, 1).atoms] == [0, 0]
+    assert subgoals([*RUN, again], range(3)).atoms[1].final_ever == pytest.approx(0.9)
+    assert [a.task for a in subgoals(RUN, [0]).atoms] == [0, 0]
+
+
+@pytest.mark.parametrize(("rows", "ends", "unknown"), [
+    ([(0, 0), (1, 1), (2, 2)], [0, 1, 2], "final"),  # eval.cells=diagonal
+    ([(2, 0), (2, 1), (2, 2)], [0, 1, 2], "learned"),  # last_row
+    ([(2, 0), (2, 1), (2, 2)], [2, 2, 2], ""),  # all learned together
+])  # fmt: skip
+def test_what_was_not_measured_is_not_taken_from_elsewhere(rows, ends, unknown):
+    found = subgoals([r for r in RUN if (r.learned, r.task) in rows], ends)
+    for name in ("learned", "final"):
+        assert np.isnan(getattr(found.atoms[1], f"{name}_ever")) == (name == unknown)
+        assert all(np.isnan(getattr(p, name).value) == (name == unknown) for p in found.predicates)
+    assert all(np.isnan(p.forgotten.value) for p in found.predicates)
+    assert np.isnan(found.atoms[1].forgotten) == bool(unknown)
 
 
 def test_records_without_atoms_have_no_subgoals():
     names = ("atoms", "atoms_at_start", "atoms_ever", "atoms_at_end")
     old = [replace(r, **dict.fromkeys(names, ())) for r in RUN]
-    assert subgoals(old, 3) == subgoals([], 0)
+    assert subgoals(old, range(3)) == subgoals([], ())
 
 
 def test_rows_are_as_long_as_there_are_atoms():
