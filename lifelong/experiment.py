@@ -92,10 +92,13 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
                 if ranks.first:
                     _note_single_frames(context.policy, names["policy"])
                     context.tracker.start(_run_name(names, settings), str(directory.path), plain)
-                    _record_start(context, names, plain)
-                _run_sequence(context, pretraining, plain)
-                if ranks.first:
-                    context.tracker.finish()
+                try:
+                    if ranks.first:
+                        _record_start(context, names, plain)
+                    _run_sequence(context, pretraining, plain)
+                finally:  # else the next job of a sweep would log into this run
+                    if ranks.first:
+                        context.tracker.finish()
             elif ranks.first:
                 print(
                     f"{directory.path} is finished; its report is written again (resume=false repeats the run)"

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -83,8 +84,8 @@ class WandB(Tracker):
         self._run.log(dict(values), step=step)
 
     def finish(self) -> None:
-        """End the run."""
-        self._run.finish()
+        """End the run; after an error as one that failed."""
+        self._run.finish(exit_code=int(sys.exc_info()[0] is not None))
 
 
 class Trackio(Tracker):
