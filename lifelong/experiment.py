@@ -3,8 +3,8 @@
 import os
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from libero_env.errors import is_quiet
 from libero_env.memory import memory_limit
 from libero_env.perturbations import format_perturbations
 from libero_env.sim.scene import default_drawing
+from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
@@ -82,9 +83,9 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
     settings = configuration.settings()
     directory = RunDirectory(Path(settings.runs_dir) / _run_name(names, settings))
     _check_writable(directory.path)
-    _set_threads(settings, directory.path)
     keep_freed_memory()
-    with deterministic(settings.deterministic):
+    with deterministic(settings.deterministic), _restored_threads():
+        _set_threads(settings, directory.path)
         # before anything is written: an invalid configuration leaves no trace
         context, pretraining = _build_contexts(configuration, settings, directory, ranks)
         with _held(context, plain, settings.resume):
@@ -148,6 +149,16 @@ def _check_writable(directory: Path) -> None:
         raise ConfigError(f"runs_dir: {nearest} is a file; expected a folder, in which {directory} is made")
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise ConfigError(f"runs_dir: nothing can be written into {nearest}, in which {directory} is made")
+
+
+@contextmanager
+def _restored_threads() -> Iterator[None]:
+    """Give PyTorch its number of threads back afterwards: the next job of a sweep may ask for the default."""
+    before = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _set_threads(settings: RunSettings, directory: Path) -> None:
@@ -232,9 +243,9 @@ def _build_contexts(
     if not first:
         return context, None
     pretrain = config.build("pretrain")
-    digest = config_digest(
-        {key: config.values[key] for key in PRETRAIN_KEYS}
-    )  # equal ones are shared by runs
+    # equal ones are shared by runs; the size of one-hot embeddings depends on the run's tasks, too
+    keys = {key: config.values[key] for key in PRETRAIN_KEYS} | {"language_dim": languages.shape[1]}
+    digest = config_digest(keys)
     folder = Path(settings.runs_dir) / "pretrain" / str(pretrain.suite) / digest
     return context, pretraining_context(
         context, plan.before, languages[:first], pretrain, RunDirectory(folder)
@@ -330,7 +341,7 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
 def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Mapping[str, Any]) -> None:
     """Make sure of the demonstrations, pretrain, and learn the task sequence."""
     began = time.perf_counter()
-    datasets = _open_datasets(context)
+    datasets = _open_datasets(context, pretraining.tasks if pretraining else ())
     with context.envs:
         TaskSequence(context, datasets, prepare=lambda: _pretrain(pretraining, context, plain)).run()
     if context.ranks.first:
@@ -338,17 +349,23 @@ def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Ma
         context.directory.log.append(RunEndRecord(seconds=seconds, finished=utc_now()))
 
 
-def _open_datasets(context: RunContext) -> DemoDatasets:
-    """Find the tasks' demonstrations, record those that are missing, and return their windows."""
-    paths, copies = context.ranks.broadcast(_find_demos, context)
+def _open_datasets(context: RunContext, others: Sequence[Task]) -> DemoDatasets:
+    """Find the tasks' demonstrations, record those that are missing, and return their windows.
+
+    Args:
+        others: Tasks that the run learns besides, of which `data.files` may have files, too.
+    """
+    paths, copies = context.ranks.broadcast(_find_demos, context, others)
     spec = context.policy.spec
     return DemoDatasets(paths, context.demos, spec, context.languages, context.data, context.device, copies)
 
 
-def _find_demos(context: RunContext) -> tuple[list[Path], list[tuple[Path, ...]]]:
+def _find_demos(
+    context: RunContext, others: Sequence[Task]
+) -> tuple[list[Path], list[tuple[Path, ...]]]:
     """Return the demonstration file of each task, and those of further copies."""
     began = time.perf_counter()
-    recorded = find_demos(context.tasks, context.demos, context.data, context.progress)
+    recorded = find_demos(context.tasks, context.demos, context.data, context.progress, others)
     own = (context.tasks, context.demos, context.perturbed, context.data, context.progress)
     paths, copies = perturb_demos(recorded, *own), demo_copies(recorded, *own)
     _record_demonstrations(context, recorded)
@@ -386,7 +403,7 @@ def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mappin
             print(f"Before the sequence: {count} tasks of {suite} in {directory.path}", flush=True)
             names = {"algo": "multitask", "benchmark": suite, "policy": "pretrained"}
             _record_start(pretraining, names, config)
-        TaskSequence(pretraining, _open_datasets(pretraining)).run(evaluate=False)
+        TaskSequence(pretraining, _open_datasets(pretraining, context.tasks)).run(evaluate=False)
         if not done and ranks.first:
             seconds = time.perf_counter() - began
             directory.log.append(RunEndRecord(seconds=seconds, finished=utc_now()))

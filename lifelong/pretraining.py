@@ -7,6 +7,7 @@ from pathlib import Path
 from torch import Tensor
 
 from libero_env.tasks import Task
+from libero_env.text import flatten
 from lifelong import checkpoints
 from lifelong.algorithms.multitask import Multitask
 from lifelong.context import RunContext
@@ -14,12 +15,15 @@ from lifelong.errors import CheckpointError, ConfigError
 from lifelong.evaluation.restore import read_config, restore
 from lifelong.policies.base import Policy
 from lifelong.results.log import ResultLog
-from lifelong.results.run_directory import RunDirectory
+from lifelong.results.run_directory import RunDirectory, read_saved_config
 from lifelong.seeding import INIT, seeded
 from lifelong.settings import Configuration, PretrainSettings
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
 from lifelong.types import PolicySpec
+
+# keys that decide what a policy reads, of which weights with the same shapes may differ
+INPUTS = ("language.model", "language.numbered", "language.pad_to", "data.views", "data.proprio")
 
 
 def load_initial_weights(path: Path) -> tuple[dict[str, Tensor], Path]:
@@ -78,8 +82,26 @@ def policy_at_start(config: Configuration, spec: PolicySpec, seed: int, weights:
         policy: Policy = config.build("policy", spec=spec)
     if weights is not None:
         found, file = load_initial_weights(Path(weights).expanduser())
+        _check_inputs(config, file)
         checkpoints.load_weights(policy, found, file)
     return policy
+
+
+def _check_inputs(config: Configuration, file: Path) -> None:
+    """Check that a policy reads what the weights of a checkpoint were learned with, where its run's folder tells it.
+
+    Raises:
+        CheckpointError: It reads something else, which has the same shapes.
+    """
+    saved = file.parent.parent / "config.yaml"
+    if not saved.is_file():
+        return
+    was, now = (flatten(values) for values in (read_saved_config(saved), config.values))
+    for key in INPUTS:
+        if key in was and was[key] != now.get(key):
+            raise CheckpointError(
+                f"{file} does not fit this run: it was learned with {key}={was[key]}, and this run has {now.get(key)}"
+            )
 
 
 def _last_checkpoint(run: Path) -> Path:

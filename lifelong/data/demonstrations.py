@@ -30,7 +30,11 @@ from lifelong.types import PolicySpec
 
 
 def find_demos(
-    tasks: Sequence[Task], counts: Sequence[int], data: DataSettings, progress: bool | None
+    tasks: Sequence[Task],
+    counts: Sequence[int],
+    data: DataSettings,
+    progress: bool | None,
+    others: Sequence[Task] = (),
 ) -> list[Path]:
     """Return the demonstration file of each task; missing demonstrations are recorded.
 
@@ -42,6 +46,7 @@ def find_demos(
         counts: Number of demonstrations required of each task.
         data: Image size, robot, and the files or their folder.
         progress: Whether to show a progress bar; None shows one in a terminal, and lines otherwise.
+        others: Further tasks of which `data.files` may have files, such as those of a pretraining.
 
     Raises:
         DataError: A named file or folder does not exist, or demonstrations that are there cannot be used.
@@ -51,7 +56,7 @@ def find_demos(
     for task, count in zip(tasks, counts, strict=True):  # a task may occur again, with fewer of them
         required[task.id] = max(count, required.get(task.id, 0))
     by_id = {task.id: task for task in tasks}
-    files = _named_files(tasks, required, data)
+    files = _named_files(tasks, required, data, others)
     if folder is not None:
         files = _files_in(folder, [t for t in by_id.values() if t.id not in files], required, data) | files
     for count in sorted(set(counts), reverse=True):
@@ -72,7 +77,9 @@ def find_demos(
     return [files[task.id] for task in tasks]
 
 
-def _named_files(tasks: Sequence[Task], required: Mapping[str, int], data: DataSettings) -> dict[str, Path]:
+def _named_files(
+    tasks: Sequence[Task], required: Mapping[str, int], data: DataSettings, others: Sequence[Task]
+) -> dict[str, Path]:
     """Return the files of `data.files`, by the id of the task that each states.
 
     Raises:
@@ -82,6 +89,8 @@ def _named_files(tasks: Sequence[Task], required: Mapping[str, int], data: DataS
     for path in (Path(name).expanduser() for name in data.files):
         stated = recorded_task(path)
         task = next((one for one in tasks if same_meaning(one.problem, stated.problem)), None)
+        if task is None and any(same_meaning(one.problem, stated.problem) for one in others):
+            continue
         if task is None:
             names = ", ".join(one.name for one in tasks[:5]) + (", ..." if len(tasks) > 5 else "")
             raise DataError(f"data.files: {path} is of {stated.name!r}, not of a task of this run: {names}")
