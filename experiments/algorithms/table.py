@@ -18,7 +18,6 @@ from study import REFERENCES, Planned, planned
 from libero_env.text import duration, quantity
 from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
-from lifelong.results.shifts import shift_scores
 from lifelong.stats.intervals import Estimate
 from lifelong.stats.methods import paired_difference, welch_difference
 from lifelong.stats.metrics import metric_values
@@ -63,7 +62,7 @@ def tables(study: str, found: dict) -> Iterator[tuple[str, list[str]]]:
     rows = [[label, training[label], *costs(groups[label]["costs"])] for label in order]
     heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
     yield "costs", table(heads, rows)
-    yield from shifts(study, order, {label: group["told_task"] for label, group in groups.items()})
+    yield from shifts(groups, order)
 
 
 def by_auc(measured: dict[str, dict]) -> list[str]:
@@ -141,29 +140,22 @@ def training_seconds(study: str) -> dict[str, str]:
     }
 
 
-def shifts(study: str, order: list[str], told: dict[str, bool]) -> Iterator[tuple[str, list[str]]]:
+def shifts(groups: dict[str, dict], order: list[str]) -> Iterator[tuple[str, list[str]]]:
     """Final success under each held-out shift, and what the shift costs, alone and beside the first reference."""
-    found: dict[str, dict[str, dict[int, tuple[float, float]]]] = {}  # by shift, algorithm and seed
-    for run, folder in finished(study):
-        for score in shift_scores(ResultLog(folder / "results.jsonl").read()):
-            both = (score.success("final").value, score.success("final_shifted").value)
-            found.setdefault(score.shift, {}).setdefault(run.method, {})[run.seed] = both
-    for shift, methods in found.items():
-        lost = {m: {seed: a - b for seed, (a, b) in seeds.items()} for m, seeds in methods.items()}
+    for shift in dict.fromkeys(shift for group in groups.values() for shift in group["shifts"]):
         rows = []
-        for label in (label for label in order if label in methods):
-            own, other = lost[label], lost[REFERENCES[0]]
-            seeds = sorted(own.keys() & other.keys())
-            less = "–" if label == REFERENCES[0] else _plain_difference([own[s] - other[s] for s in seeds])
-            means = [statistics.mean(values) for values in zip(*methods[label].values(), strict=True)]
+        for label in (label for label in order if shift in groups[label]["shifts"]):
+            found = groups[label]["shifts"][shift]
+            less = found["lost_less"].get(REFERENCES[0])
             rows.append(
                 [
                     label,
-                    str(len(own)),
-                    "yes" if told[label] else "no",
-                    *(f"{mean:.2f}" for mean in means),
-                    _plain_difference(list(own.values())),
-                    less,
+                    str(len(found["seeds"])),
+                    "yes" if groups[label]["told_task"] else "no",
+                    f"{found['final']:.2f}",
+                    f"{found['final_shifted']:.2f}",
+                    _estimate(Estimate(**found["lost"])),
+                    _estimate(Estimate(**less)) if less else "–",
                 ]
             )
         heads = ["algorithm", "seeds", "told the task", "final", f"under `{shift}`", "lost"]

@@ -4,7 +4,7 @@ Intervals and tests are those of `lifelong.stats.methods`.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ import numpy as np
 from lifelong.errors import ComparisonError
 from lifelong.report.runs import Group, Run, algorithm_of, check_same_world, settings_of, stage_of, unlike
 from lifelong.results.provenance import few_of
+from lifelong.results.shifts import shift_scores
 from lifelong.stats.intervals import mean_and_half_width
-from lifelong.stats.methods import MARGIN, MethodRun, spreads, statistics
+from lifelong.stats.methods import MARGIN, MethodRun, paired_difference, spreads, statistics
 from lifelong.stats.metrics import METRIC_NAMES, intransigence, metric_values
 
 MUJOCO = "mujoco"  # back end of results that name none
@@ -47,7 +48,8 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
         `groups`: by label, with `runs`, `seeds`, `orders`, `told_task`, `spreads` (between runs that differ in one
         thing alone), `metrics` (mean, standard_error, low, high, the value of each seed or order), `other_conventions`
         (of other papers), `published` (FWT and AUC of eq. 3 as written), `forgetting_by_task` (NBT by task name),
-        `subgoals` and `costs`.
+        `subgoals`, `costs` and `shifts` (by held-out shift: `final` success without and under it, `lost` with Student's
+        interval, and by reference `lost_less`, paired by seed).
         `differences` and `statistics`: see `lifelong.stats.methods.statistics`.
         `after_base_stage`: `metrics` by label and `differences` over the later tasks alone, as if the sequence began
         with them, of the methods whose runs all learned a task after a base stage; None if there are none. `backend`:
@@ -70,12 +72,17 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
         if runs and all(r.results.has_later_tasks() for r in runs)
     }
     plan_later = replace(plan, references=tuple(r for r in plan.references if r in later))
+    compared = {
+        g.label: _group(g, measured[g.label], found["metrics"].get(g.label), _reference(measured))
+        for g in groups
+    }
+    shifted = {label: _shifted(runs) for label, runs in measured.items()}
+    for label, group in compared.items():
+        others = {other: shifted[other] for other in plan.references if other != label}
+        group["shifts"] = _shifts(shifted[label], others)
     return {
         "backend": next((r.record.backend for runs in measured.values() for r in runs), MUJOCO),
-        "groups": {
-            g.label: _group(g, measured[g.label], found["metrics"].get(g.label), _reference(measured))
-            for g in groups
-        },
+        "groups": compared,
         "differences": found["differences"],
         "statistics": found["statistics"],
         "after_base_stage": _statistics(later, plan_later) if later else None,
@@ -247,6 +254,41 @@ def _subgoals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, float]]]:
         }
         for name in dict.fromkeys(p.predicate for p in rows)
     }
+
+
+_Shifted = dict[str, dict[int, tuple[float, float]]]  # shift -> seed -> final success without and under it
+
+
+def _shifted(runs: Sequence[Run]) -> _Shifted:
+    found: _Shifted = {}
+    for run in runs:
+        for score in shift_scores(run.results):
+            both = score.success("final").value, score.success("final_shifted").value
+            if np.isfinite(both).all():
+                found.setdefault(score.shift, {})[run.record.seed] = both
+    return found
+
+
+def _shifts(own: _Shifted, references: Mapping[str, _Shifted]) -> dict[str, dict[str, Any]]:
+    """Return what a method's final success loses under each held-out shift, alone and beside references."""
+    lost = {shift: {seed: a - b for seed, (a, b) in seeds.items()} for shift, seeds in own.items()}
+    found: dict[str, dict[str, Any]] = {}
+    for shift, seeds in own.items():
+        final, under = np.mean(list(seeds.values()), axis=0)
+        less: dict[str, Any] = {}
+        for name, others in references.items():
+            common = sorted(seeds.keys() & others.get(shift, {}).keys())
+            gaps = [lost[shift][seed] - (others[shift][seed][0] - others[shift][seed][1]) for seed in common]
+            if gaps:
+                less[name] = asdict(paired_difference(np.array(gaps)).estimate)
+        found[shift] = {
+            "seeds": sorted(seeds),
+            "final": float(final),
+            "final_shifted": float(under),
+            "lost": asdict(paired_difference(np.array(list(lost[shift].values()))).estimate),
+            "lost_less": less,
+        }
+    return found
 
 
 def costs_of(runs: Sequence[Run]) -> dict[str, float]:

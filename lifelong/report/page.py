@@ -241,6 +241,8 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[_compared_transfer(r, counted)] for r in counted)),
         "forgotten_tasks": _forgotten(found, "forgetting_by_task", texts),
         "forgotten_subgoals": _forgotten(found, "subgoals"),
+        "shifted": _shifted(found, plan.references),
+        "references": plan.references,
         "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),
         "heatmaps": heatmaps,
         "forgetting": as_svg(forgetting_figure(lines)),
@@ -248,6 +250,16 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         "triangles": {name: rows for name in METRIC_TEXTS if (rows := triangle(found, name))},
         "runs": [_run_row(run, group.label, folder) for group in groups for run in group.runs],
     }
+
+
+def _shifted(found: Mapping[str, Any], references: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
+    """Return by held-out shift a row for each method that was evaluated under it."""
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for label, group in found["groups"].items():
+        for shift, values in group["shifts"].items():
+            lost = [values["lost"], *map(values["lost_less"].get, references)]
+            rows.setdefault(shift, []).append({"label": label, **values, "lost": lost})
+    return rows
 
 
 def _comparable(groups: Sequence[Group]) -> list[Group]:

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 import yaml
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from omegaconf import DictConfig
@@ -1091,3 +1092,32 @@ def test_a_page_has_one_estimate_of_forward_transfer(tmp_path: Path):
         and f"{100 * fwt:.1f}" != f"{100 * load_run(runs[0]).metrics.fwt.value:.1f}"
     )
     assert "as measured" not in text and "chosen without the start that measures it" in text
+
+
+def test_what_methods_lose_under_a_held_out_shift_is_compared(tmp_path: Path) -> None:
+    """Student's interval of what is lost, and of what is lost less the reference's, over the seeds of both."""
+    runs, lost = [], {"er": {}, "ewc": {}}
+    for algo, under in (("er", (0.6, 0.5, 0.1)), ("ewc", (0.2, 0.3))):
+        for seed, rate in enumerate(under, 1):
+            run = make_run(tmp_path / f"{algo}{seed}", algo, seed, tasks=2)
+            log, rng = ResultLog(run / "results.jsonl"), np.random.default_rng(seed)
+            shifted = [
+                replace(_evaluation(rng, "matrix", 1, 10, task, rate), phase="shift", shift="light=0.5")
+                for task in (0, 1)
+            ]
+            for record in shifted:
+                log.append(record)
+            final = [log.read().evaluation("matrix", 1, task).rate for task in (0, 1)]
+            lost[algo][seed] = np.mean(final) - np.mean([record.rate for record in shifted])
+            runs.append(run)
+    page = write_report(runs, tmp_path / "page" / "report.html", Plan(("er",)))
+    found = json.loads((page.parent / "comparison.json").read_text())["groups"]
+    own, other = (next(g["shifts"]["light=0.5"] for k, g in found.items() if k.startswith(a)) for a in lost)
+    values, gaps = list(lost["er"].values()), [lost["ewc"][s] - lost["er"][s] for s in (1, 2)]
+    assert (own["seeds"], own["lost_less"], other["seeds"]) == ([1, 2, 3], {}, [1, 2])
+    for estimate, sample in ((own["lost"], values), (other["lost_less"]["er"], gaps)):
+        ends = scipy.stats.t.interval(0.95, len(sample) - 1, np.mean(sample), scipy.stats.sem(sample))
+        assert [estimate["value"], estimate["low"], estimate["high"]] == pytest.approx(
+            [np.mean(sample), *ends]
+        )
+    assert "<h2>Under light=0.5</h2>" in page.read_text() and "less er's" in page.read_text()
