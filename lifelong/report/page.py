@@ -242,7 +242,6 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         "forgotten_tasks": _forgotten(found, "forgetting_by_task", texts),
         "forgotten_subgoals": _forgotten(found, "subgoals"),
         "shifted": _shifted(found, plan.references),
-        "references": plan.references,
         "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),
         "heatmaps": heatmaps,
         "forgetting": as_svg(forgetting_figure(lines)),
@@ -252,14 +251,19 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
     }
 
 
-def _shifted(found: Mapping[str, Any], references: Sequence[str]) -> dict[str, list[dict[str, Any]]]:
-    """Return by held-out shift a row for each method that was evaluated under it."""
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for label, group in found["groups"].items():
-        for shift, values in group["shifts"].items():
-            lost = [values["lost"], *map(values["lost_less"].get, references)]
-            rows.setdefault(shift, []).append({"label": label, **values, "lost": lost})
-    return rows
+def _shifted(found: Mapping[str, Any], references: Sequence[str]) -> dict[str, tuple[list[str], list[Any]]]:
+    """Return by held-out shift the references, and a row for each method, that were evaluated under it."""
+    groups: Mapping[str, Any] = found["groups"]
+    tables: dict[str, tuple[list[str], list[Any]]] = {}
+    for shift in dict.fromkeys(shift for group in groups.values() for shift in group["shifts"]):
+        own = {label: group["shifts"][shift] for label, group in groups.items() if shift in group["shifts"]}
+        names = [name for name in references if name in own]
+        rows = [
+            {"label": label, **values, "lost": [values["lost"], *map(values["lost_less"].get, names)]}
+            for label, values in own.items()
+        ]
+        tables[shift] = names, rows
+    return tables
 
 
 def _comparable(groups: Sequence[Group]) -> list[Group]:
