@@ -26,7 +26,7 @@ from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
 from lifelong.data.demonstrations import DemoDatasets, check_folder, demo_copies, find_demos, perturb_demos
 from lifelong.data.settings import DataSettings
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, DataError
 from lifelong.evaluation.environments import (
     EnvPool,
     held_out_shift,
@@ -349,32 +349,33 @@ def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Ma
         context.directory.log.append(RunEndRecord(seconds=seconds, finished=utc_now()))
 
 
-def _open_datasets(context: RunContext, others: Sequence[Task]) -> DemoDatasets:
+def _open_datasets(context: RunContext, others: Sequence[Task], learned: bool = False) -> DemoDatasets:
     """Find the tasks' demonstrations, record those that are missing, and return their windows.
 
     Args:
         others: Tasks that the run learns besides, of which `data.files` may have files, too.
+        learned: Whether they are learned already, by a pretraining that runs with the same demonstrations share.
     """
-    paths, copies = context.ranks.broadcast(_find_demos, context, others)
+    paths, copies = context.ranks.broadcast(_find_demos, context, others, learned)
     spec = context.policy.spec
     return DemoDatasets(paths, context.demos, spec, context.languages, context.data, context.device, copies)
 
 
 def _find_demos(
-    context: RunContext, others: Sequence[Task]
+    context: RunContext, others: Sequence[Task], learned: bool
 ) -> tuple[list[Path], list[tuple[Path, ...]]]:
     """Return the demonstration file of each task, and those of further copies."""
     began = time.perf_counter()
     recorded = find_demos(context.tasks, context.demos, context.data, context.progress, others)
     own = (context.tasks, context.demos, context.perturbed, context.data, context.progress)
     paths, copies = perturb_demos(recorded, *own), demo_copies(recorded, *own)
-    _record_demonstrations(context, recorded)
+    _record_demonstrations(context, recorded, learned)
     seconds = time.perf_counter() - began
     context.directory.log.append(PhaseRecord(phase="demos", seconds=seconds))
     return paths, copies
 
 
-def _record_demonstrations(context: RunContext, paths: Sequence[Path]) -> None:
+def _record_demonstrations(context: RunContext, paths: Sequence[Path], learned: bool) -> None:
     """Record what the tasks' demonstrations are; say where a resume learns from others than the run did before."""
     origins = [demo_origin(path, count) for path, count in zip(paths, context.demos, strict=True)]
     record = DemonstrationsRecord(
@@ -384,9 +385,16 @@ def _record_demonstrations(context: RunContext, paths: Sequence[Path]) -> None:
     )
     log = context.directory.log
     before = log.read().of(DemonstrationsRecord)
+    names = [t.name for t in context.tasks]
+    changes = changed_demonstrations(before[-1], record, names) if before else ""
+    if changes and learned:
+        raise DataError(
+            f"the pretraining in {context.directory.path} cannot be shared by a run {changes.partition(':')[0]}; "
+            "use another runs_dir, or move that folder away"
+        )
     if not before or before[-1] != record:
         log.append(record)
-    if before and (changes := changed_demonstrations(before[-1], record, [t.name for t in context.tasks])):
+    if changes:
         print(f"resumed {changes}", file=sys.stderr)
 
 
@@ -403,7 +411,7 @@ def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mappin
             print(f"Before the sequence: {count} tasks of {suite} in {directory.path}", flush=True)
             names = {"algo": "multitask", "benchmark": suite, "policy": "pretrained"}
             _record_start(pretraining, names, config)
-        TaskSequence(pretraining, _open_datasets(pretraining, context.tasks)).run(evaluate=False)
+        TaskSequence(pretraining, _open_datasets(pretraining, context.tasks, done)).run(evaluate=False)
         if not done and ranks.first:
             seconds = time.perf_counter() - began
             directory.log.append(RunEndRecord(seconds=seconds, finished=utc_now()))

@@ -193,7 +193,8 @@ class Job:
                     raise SystemExit(self.status) from error
                 return None
         file = Path(hydra_config.runtime.output_dir) / JOB_FILE
-        key = config_digest(plain_data(config))
+        # a run of another name is another one
+        key = config_digest({**plain_data(config), "run": [config.runs_dir, config.run_id]})
         record = JobRecord(int(hydra_config.job.num), key, tuple(hydra_config.overrides.task), "running")
         # a finished run returns at once, or is evaluated under another shift
         again = ranks.size > 1 or not config.resume or config.eval.shift is not None

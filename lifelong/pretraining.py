@@ -22,6 +22,7 @@ from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
 from lifelong.types import PolicySpec
 
+_ROUTED = ("clare", "dmpel", "iscil")
 # keys that decide what a policy reads, of which weights with the same shapes may differ
 INPUTS = ("language.model", "language.numbered", "language.pad_to", "data.views", "data.proprio")
 
@@ -44,6 +45,14 @@ def load_initial_weights(path: Path) -> tuple[dict[str, Tensor], Path]:
     if not isinstance(state.get("policy"), dict):
         raise CheckpointError(
             f"{file} holds no policy's weights; name a run's directory or a task_<k>.safetensors"
+        )
+    algorithm = state.get("algorithm") or {}
+    if (
+        algorithm.get("library") and "base" not in algorithm
+    ):  # LoRA, which keeps its base, has adapters in the weights
+        raise CheckpointError(
+            f"{file}: its policy acts with experts beside these weights, as of {', '.join(_ROUTED)}, which another run "
+            "cannot begin with; name the checkpoint after its base stage, or a run of another algorithm"
         )
     return state["policy"], file
 

@@ -99,15 +99,21 @@ def tune(request: TuneRequest) -> None:
     lists = swept(request.overrides)
     words = [word for word in request.overrides if word.partition("=")[0] not in lists]
     for key in (word.lstrip("+~").partition("=")[0] for word in words):
-        if key.partition(".")[0] in ("seed", "benchmark", "eval"):  # a preset may set them for the runs
+        # a preset may set them for the runs
+        if key.partition(".")[0] in ("seed", "benchmark", "eval") or key == "train.steps_per_epoch":
             raise ConfigError(
-                f"{key} has no effect in libero tune; leave it out: see --seeds, --suite and --stream"
+                f"{key} has no effect in libero tune; leave it out: see --seeds, --suite, --stream and --steps"
             )
     config, choices = compose_run(words, request.config_dir)
     plain = plain_data(config)
     check_obeyed(plain, lists)
     checked = Configuration(plain)
     lists = lists or _suggested(checked)
+    if request.write and (others := [key for key in lists if not key.startswith("algo.")]):
+        raise ConfigError(
+            f"--write keeps settings of the algorithm, and {others[0]} is none; leave out --write, and set {others[0]} "
+            "in a preset of your own"
+        )
     values = [dict(zip(lists, chosen, strict=True)) for chosen in itertools.product(*lists.values())]
     candidates = [
         _candidate(
@@ -138,7 +144,8 @@ def tune(request: TuneRequest) -> None:
     if frontier.at_edge():
         print("the chosen value is the first or the last one: try values beyond it", file=sys.stderr)
     about = _about(request, proxy.streams, choices, plain)
-    stem = request.out / f"{algo}-{head}-{'-'.join(key.rpartition('.')[2] for key in best.settings)}"
+    names = "-".join(key.rpartition(".")[2].replace("/", "-") for key in best.settings)
+    stem = request.out / f"{algo}-{head}-{names}"
     write_frontier(frontier, stem.with_suffix(".json"), about)
     draw_frontier(frontier, f"{algo}: {keys}", stem)
     print(f"picture: {stem}.png")
@@ -171,9 +178,11 @@ def _candidate(
     from lifelong.tuning.proxy import Candidate
 
     config = plain_data(compose_run(words, config_dir)[0])
-    for group in ("algo", "data", "train"):  # before anything is recorded or learned
+    for group in ("algo", "data", "train", "stream", "pretrain"):  # before anything is recorded or learned
         Configuration(config).build(group)
-    return Candidate(label, {key: _value_at(config, key.lstrip("+")) for key in values}, config)
+    # of a group, the name of its file
+    settings = {k: _value_at(config, k.lstrip("+")) if "." in k else name for k, name in values.items()}
+    return Candidate(label, settings, config)
 
 
 def _label(values: Iterable[str]) -> str:
@@ -201,9 +210,11 @@ def _streams(request: TuneRequest) -> "tuple[tuple[Task, ...], ...]":
     Raises:
         UnknownNameError: A suite or task does not exist.
     """
+    from libero_env.tasks import get_suite
     from lifelong.settings import BenchmarkSettings
     from lifelong.tuning.proxy import STREAMS
 
+    get_suite(request.suite)  # not `own`, whose files no option names
     chosen = [text.split(",") for text in request.stream] if request.stream else STREAMS
     return tuple(
         BenchmarkSettings(request.suite, tasks=[int(t) if str(t).isdigit() else t for t in tasks]).sequence()

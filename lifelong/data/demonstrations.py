@@ -119,7 +119,7 @@ def _files_in(
             files[task.id] = file
     if not (left := [task for task in tasks if task.id not in files]):
         return files
-    stated = _stated_tasks(folder)
+    stated = _stated_tasks(folder, list(files.values()))
     for task in left:
         size = (data.image_size, data.image_size)
         own = demo_path(
@@ -148,16 +148,26 @@ def _files_in(
     return files
 
 
-def _stated_tasks(folder: Path) -> list[tuple[Path, Task]]:
-    """Return the files in a folder, each with the task that it states; say which state none."""
-    stated = []
-    for path in sorted(folder.rglob("*.hdf5")):
-        if path.is_symlink() or path.parent.suffix == ".parts":
+def _stated_tasks(folder: Path, used: Sequence[Path]) -> list[tuple[Path, Task]]:
+    """Return the files in a folder, each with the task that it states; say which state none or are behind a link.
+
+    Args:
+        used: Files in it that are used already.
+    """
+    stated, links = [], []
+    for path in sorted(folder.rglob("*")):
+        if path.parent.suffix == ".parts" or not (path.suffix == ".hdf5" or path.is_dir()):
+            continue
+        if path.is_symlink():
+            links += [] if any(path in (file, *file.parents) for file in used) else [str(path)]
+        if path.is_symlink() or path.is_dir():
             continue
         try:
             stated.append((path, recorded_task(path)))
         except DemoError as error:
             print(f"not used: {error}", file=sys.stderr)
+    if links:
+        print(f"not used: links, which are not followed: {', '.join(links)}; see data.files", file=sys.stderr)
     return stated
 
 

@@ -144,5 +144,12 @@ class PretrainSettings:
 
         Raises:
             UnknownNameError: The suite or a task does not exist.
+            ConfigError: The suite has fewer tasks than are asked for.
         """
-        return () if self.suite is None else BenchmarkSettings(self.suite, tasks=self.tasks).sequence()
+        if self.suite is None:
+            return ()
+        get_suite(self.suite)  # not `own`, whose files are those of the benchmark
+        try:
+            return BenchmarkSettings(self.suite, tasks=self.tasks).sequence()
+        except ConfigError as error:
+            raise ConfigError(str(error).replace("benchmark.tasks", "pretrain.tasks")) from None

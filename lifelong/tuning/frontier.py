@@ -15,7 +15,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 from numpy.typing import NDArray
 
 from libero_env.storage import atomic_write_text, write_json
-from lifelong.errors import ConfigError
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, hide_spines, save
 
 Errors = list[list[float]]  # of one trial: after each stage, the error on each task so far
@@ -265,15 +264,10 @@ def write_tuned(outcome: Outcome, path: Path, about: str) -> None:
     Args:
         outcome: The chosen value.
         about: Where it comes from; a comment at the top.
-
-    Raises:
-        ConfigError: A setting is none of the algorithm.
     """
     node: dict[str, Any] = {}
     for key, value in outcome.settings.items():
-        group, *names = key.split(".")
-        if group != "algo" or not names:
-            raise ConfigError(f"{key} is no setting of the algorithm: set it in a preset of your own instead")
+        _, *names = key.split(".")  # of algo
         place = node
         for name in names[:-1]:
             place = place.setdefault(name, {})

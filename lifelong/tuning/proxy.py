@@ -301,7 +301,7 @@ def measure_frontier(
     everyone = (fine_tuning, *others, *candidates)
     for one in everyone:
         check_obeyed(one.config, one.settings)
-    errors: dict[str, list[Errors]] = {one.label: [] for one in everyone}
+    errors: list[list[Errors]] = [[] for _ in everyone]
     places = [(stream, seed) for stream in proxy.streams for seed in proxy.seeds]
     total, done = len(places) * len(everyone), 0
     for stream, seed in places:
@@ -309,23 +309,23 @@ def measure_frontier(
             raise ConfigError(
                 "a stream has one task; expected two or more, of which the first can be forgotten"
             )
-        for one in everyone:
+        for one, own in zip(everyone, errors, strict=True):
             began = time.perf_counter()
             trial = Trial(one.config, stream, seed, proxy.steps, proxy.held_out)
             found = measure(trial, partial(_opened, trial), folder)
-            errors[one.label].append(found)
+            own.append(found)
             done += 1
             shown = ", ".join(f"{error:.3f}" for error in found[-1])
             print(
                 f"{done}/{total} {one.label}, {stream[0].name} and {len(stream) - 1} more, seed {seed}: "
                 f"errors at the end {shown} ({time.perf_counter() - began:.0f} s)"
             )
-    base = tuple(errors[fine_tuning.label])
-
-    def outcome(one: Candidate) -> Outcome:
-        return Outcome(one.label, one.settings, tuple(errors[one.label]), base)
-
-    return Frontier(tuple(map(outcome, candidates)), tuple(map(outcome, (fine_tuning, *others))))
+    outcomes = [
+        Outcome(one.label, one.settings, tuple(own), tuple(errors[0]))
+        for one, own in zip(everyone, errors, strict=True)
+    ]
+    compared = 1 + len(others)
+    return Frontier(tuple(outcomes[compared:]), tuple(outcomes[:compared]))
 
 
 def check_obeyed(config: Mapping[str, Any], keys: Iterable[str]) -> None:

@@ -121,6 +121,26 @@ def test_files_of_no_task_of_the_run_or_of_the_same_task_are_refused(tmp_path, r
         demonstrations.find_demos(TASKS, [2, 2, 2], settings(str(tmp_path)), False)
 
 
+def test_links_in_a_folder_are_not_followed_and_told(tmp_path, recorded, capsys):
+    elsewhere, folder = tmp_path / "elsewhere", tmp_path / "folder"
+    elsewhere.mkdir()
+    in_layout = write_demos(elsewhere, TASKS[0], 2)
+    folder.mkdir()
+    (folder / TASKS[0].suite).symlink_to(in_layout.parent)  # is used
+    (folder / "a.hdf5").symlink_to(own(elsewhere / "a.hdf5"))
+    (folder / "more").symlink_to(elsewhere)
+    demonstrations.find_demos(TASKS[:2], [2, 2], settings(str(folder)), False)
+    assert recorded == [TASKS[1].name]
+    links = f"{folder / 'a.hdf5'}, {folder / 'more'}"
+    assert f"not used: links, which are not followed: {links}; see data.files" in capsys.readouterr().err
+
+
+def test_files_may_be_of_tasks_that_are_learned_before_or_after(tmp_path, recorded):
+    data = replace(settings(None), files=[str(path := own(tmp_path / "a.hdf5"))])
+    assert path not in demonstrations.find_demos(TASKS[:1], [2], data, False, TASKS[1:])
+    assert path in demonstrations.find_demos(TASKS[1:], [2, 2], data, False, TASKS[:1])
+
+
 def test_without_a_folder_recorded_files_are_used(tmp_path, recorded, monkeypatch):
     write_demos(tmp_path, TASKS[1], 2)
     monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path))

@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
 from omegaconf import OmegaConf
 
 import libero_env.parallel as parallel
@@ -204,6 +205,19 @@ def test_a_sweep_runs_again_what_is_asked_for_again(word, again, here, monkeypat
     assert seen == [again] * 2
 
 
+def test_jobs_of_one_folder_with_other_names_of_their_runs_are_others(here, monkeypatch):
+    keys = []
+
+    def run(file, record, learn, report, *, again):
+        keys.append(record.key)
+        return replace(record, status="failed", exit_status=2)
+
+    monkeypatch.setattr("lifelong.launch.run_job", run)
+    for word in ("run_id=a", "run_id=b", "runs_dir=other"):
+        main(["train", "-m", "seed=1,2", "hydra.sweep.dir=sweep", word])
+    assert len(set(keys)) == 6
+
+
 @pytest.mark.parametrize(("words", "noted"), [
     ("policy=bc_rnn_small", True), ("policy=bc_vilt_small", True),
     ("policy=bc_transformer_small policy.readout=instruction", True), ("policy=bc_transformer_small", False),
@@ -281,3 +295,19 @@ def test_short_work_prints_no_lines(monkeypatch):
     monkeypatch.setattr(sys, "stderr", stream)
     assert list(parallel.progress_bar(range(5), file=stream)) == [0, 1, 2, 3, 4]
     assert stream.getvalue() == ""
+
+
+def test_a_run_that_fails_ends_its_tracker_and_gives_the_threads_back(here, monkeypatch):
+    """In a sweep, else the next job logs into the same run of W&B, with the same number of threads."""
+    begun, ended = [], []
+
+    def learn(*args):
+        begun.append(torch.get_num_threads())
+        raise ConfigError("the first task begins")
+
+    monkeypatch.setattr(experiment, "_run_sequence", learn)
+    monkeypatch.setattr("lifelong.tracking.Tracker.finish", lambda tracker: ended.append(tracker))
+    tiny = ("preset=smoke", "language=onehot", "device=cpu", "data.image_size=32")
+    default = torch.get_num_threads()
+    assert main(["train", "-m", *tiny, f"threads={default + 1},0"]) == 2
+    assert len(ended) == 2 and begun == [default + 1, default]

@@ -2,6 +2,7 @@
 
 import errno
 import os
+from types import SimpleNamespace
 
 import pytest
 from filelock import FileLock
@@ -134,3 +135,15 @@ def test_wandb_keeps_the_steps_in_the_directory_of_the_run(tmp_path, monkeypatch
     assert tracker._run.step == 3 and tracker._run.id.startswith("libero_object-er-")
     tracker.finish()
     assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))
+
+
+def test_wandb_ends_a_run_with_an_error_as_failed():
+    codes, tracker = [], WandB(mode="offline")
+    tracker._run = SimpleNamespace(finish=lambda exit_code: codes.append(exit_code))
+    tracker.finish()
+    with pytest.raises(LifelongError):
+        try:
+            raise LifelongError
+        finally:
+            tracker.finish()
+    assert codes == [0, 1]

@@ -3,31 +3,35 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from libero_env.tasks import get_suite
-from lifelong import checkpoints
+from lifelong import checkpoints, experiment
 from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
 from lifelong.context import RunContext
 from lifelong.data.memory import ReplayMemory
-from lifelong.errors import CheckpointError, ConfigError, LiberoError
-from lifelong.pretraining import load_initial_weights, pretraining_context
+from lifelong.errors import CheckpointError, ConfigError, DataError, LiberoError
+from lifelong.pretraining import load_initial_weights, policy_at_start, pretraining_context
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import utc_now
-from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, TaskEndRecord
+from lifelong.results.records import DemonstrationsRecord, EvalRecord, LossRecord, RunEndRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.sequence import TaskSequence
 from lifelong.settings import BenchmarkSettings, Configuration, PretrainSettings, plain_data
 from lifelong.stats.metrics import lifelong_metrics
 from lifelong.streams import StageData, StageWindows, StreamSettings, learning_stages, plan_tasks
+from lifelong.training.distributed import Ranks
 from tests.harness.algorithms import assert_resumed_equals_uninterrupted
 from tests.harness.configs import composed
 from tests.harness.fakes import Windows
 from tests.harness.records import evaluation, run_start
+from tests.harness.runs import TINY
 from tests.harness.sequences import Killed, Killer, assert_same, dataset, run_context, sequence
 
 ROOT = Path(__file__).parents[2]
@@ -192,6 +196,10 @@ def test_pretraining_takes_a_suite_or_nothing() -> None:
     assert [t.suite for t in PretrainSettings("libero_90", tasks=2).sequence()] == ["libero_90"] * 2
     with pytest.raises(LookupError, match="libero_90"):
         PretrainSettings("libero_9").sequence()
+    with pytest.raises(LookupError, match="unknown suite 'own'"):
+        PretrainSettings("own").sequence()
+    with pytest.raises(ConfigError, match="pretrain.tasks is 99; libero_goal has 10 tasks"):
+        PretrainSettings("libero_goal", tasks=99).sequence()
     with pytest.raises(LiberoError, match="epochs is 0"):
         PretrainSettings(epochs=0)
     for key in ("tasks", "demos", "epochs"):
@@ -328,6 +336,13 @@ def test_paths_without_weights_are_refused(tmp_path) -> None:
     checkpoints.save(progress, {"task": 0, "policy": None, "fit": {}})
     with pytest.raises(CheckpointError, match="holds no policy's weights"):
         load_initial_weights(progress)
+    routed = RunDirectory(tmp_path).checkpoints.task_path(0)
+    for library in ({}, {1: {"layer": {}}}):  # of the base stage, and with experts after it
+        checkpoints.save(routed, {"task": 0, "policy": {}, "algorithm": {"library": library}})
+        if not library:
+            load_initial_weights(routed)
+    with pytest.raises(CheckpointError, match="acts with experts beside these weights"):
+        load_initial_weights(routed)
 
 
 def test_single_task_starts_each_task_from_the_pretrained_weights(tmp_path) -> None:
@@ -351,3 +366,53 @@ def test_orders_by_seed_hold_the_same_tasks():
         BenchmarkSettings("libero_10", order=3, order_seed=1).sequence()
     with pytest.raises(ConfigError, match="benchmark.order is 3 and benchmark.tasks a list"):
         BenchmarkSettings("libero_10", order=3, tasks=(0, 1)).sequence()
+
+
+@pytest.mark.parametrize("word", [
+    "language.numbered=true", "language.model=bert", "data.views=[eye_in_hand_rgb,agentview_rgb]",
+    "data.proprio=[ee_pos,gripper_states,joint_states]"
+])  # fmt: skip
+def test_weights_that_were_learned_with_other_inputs_of_the_same_shapes_are_refused(tmp_path, word) -> None:
+    run = RunDirectory(tmp_path / "run")
+    config = Configuration(plain_data(composed(*TINY)))
+    spec = config.build("data").spec(4)
+    policy = policy_at_start(config, spec, 1, None)
+    checkpoints.save(
+        run.checkpoints.task_path(0), {"task": 0, "policy": policy.state_dict(), "algorithm": {}}
+    )
+    (run.path / "config.yaml").write_text(yaml.safe_dump(dict(config.values)))
+    policy_at_start(config, spec, 2, run.checkpoints.task_path(0))
+    other = Configuration(plain_data(composed(*TINY, word)))
+    with pytest.raises(CheckpointError, match=f"learned with {word.partition('=')[0]}="):
+        policy_at_start(other, spec, 1, run.checkpoints.task_path(0))
+
+
+@pytest.mark.parametrize(("language", "shared"), [("onehot", False), ("minilm", True)])
+def test_runs_share_a_pretraining_with_embeddings_of_the_same_size(tmp_path, language, shared) -> None:
+    folders = set()
+    for tasks in (1, 2):
+        words = (
+            f"language={language}",
+            f"benchmark.tasks={tasks}",
+            "pretrain.suite=libero_object",
+            "pretrain.tasks=1",
+        )
+        config = Configuration(plain_data(composed(*TINY, *words, f"runs_dir={tmp_path}")))
+        _, before = experiment._build_contexts(config, config.settings(), RunDirectory(tmp_path), Ranks())
+        folders.add(before.directory.path)
+    assert (len(folders) == 1) == shared
+
+
+def test_a_pretraining_is_not_shared_by_runs_with_other_demonstrations(tmp_path, monkeypatch) -> None:
+    context = run_context(tmp_path, "sequential")
+    monkeypatch.setattr(
+        experiment,
+        "demo_origin",
+        lambda path, count: SimpleNamespace(count=count, generator="", digest=path.name),
+    )
+    first, other = ([Path(name)] * len(context.tasks) for name in "ab")
+    for _ in range(2):
+        experiment._record_demonstrations(context, first, True)
+    with pytest.raises(DataError, match="cannot be shared by a run with other demonstrations than before of"):
+        experiment._record_demonstrations(context, other, True)
+    assert len(context.directory.log.read().of(DemonstrationsRecord)) == 1

@@ -1,6 +1,7 @@
 """Tuning chooses by what is kept and learned, goes on where it was stopped, and writes what a run then reads."""
 
 import json
+import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,12 +14,11 @@ import yaml
 from libero_env.cli.main import main
 from lifelong import algorithms
 from lifelong.composition import compose_run, swept
-from lifelong.errors import LiberoError
 from lifelong.policies.base import Policy
 from lifelong.settings import BenchmarkSettings, Configuration, plain_data
 from lifelong.training.settings import FitSettings
 from lifelong.tuning import proxy
-from lifelong.tuning.frontier import Frontier, Outcome, render, write_tuned
+from lifelong.tuning.frontier import Frontier, Outcome, render
 from lifelong.tuning.proxy import StreamData, Trial, measure, scaled
 from tests.harness.configs import CONFIGS, composed
 from tests.harness.runs import TINY, make_windows
@@ -159,6 +159,11 @@ def test_a_sweep_is_measured_once_and_its_choice_is_what_a_run_reads(tmp_path, f
     choice = capsys.readouterr().out.split()[-1]
     assert choice == "tuned@algo=deterministic_small/mas_own"
     assert compose_run(["algo=mas", choice], own)[0].algo.strength in (10, 1000)
+    mixture = own / "tuned" / "gmm_small" / "ewc.yaml"  # beside the package's, of the estimator
+    mixture.parent.mkdir()
+    mixture.write_text("estimator: {strength: 99}\n")
+    chosen, _ = compose_run(["algo=ewc", "tuned@algo=gmm_small/ewc"], own)
+    assert chosen.algo.estimator.strength == 99
 
 
 def test_a_sweep_that_is_stopped_goes_on_to_the_same_result(tmp_path, fake_streams, monkeypatch) -> None:
@@ -261,6 +266,7 @@ def test_lists_of_values_are_found_and_others_are_left() -> None:
     (["algo=ewc", "algo.strength=-1,2"], "algo.strength"),
     (["algo=ewc", "--stream", "61"], "one task"),
     (["algo=ewc", "--stream", "61,990"], "unknown task"),
+    (["algo=ewc", "--suite", "own", "--stream", "0,1"], "unknown suite 'own'"),
     (["algo=multitask", "train.lr=1e-3,2e-3"], "several tasks together"),
     (["algo=ewc", "algo.strength=[1"], "["),
 ])  # fmt: skip
@@ -285,6 +291,7 @@ def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> 
     (["seed=1,2"], "seed"),
     (["seed=3"], "seed"),
     (["train.steps_per_epoch=10,400"], "train.steps_per_epoch"),
+    (["train.steps_per_epoch=10"], "train.steps_per_epoch"),
     (["benchmark=libero_goal"], "benchmark"),
     (["eval.episodes=3"], "eval.episodes"),
 ])  # fmt: skip
@@ -295,10 +302,27 @@ def test_what_no_trial_obeys_is_refused_by_name(words, key, capsys, tmp_path, fa
     assert len(error.strip().splitlines()) == 1 and not fake_streams
 
 
-def test_a_key_outside_of_the_algorithm_is_measured_but_not_written(tmp_path) -> None:
-    one = Outcome("0.1", {"train.lr": 0.1}, (), ())
-    with pytest.raises(LiberoError, match=r"train.lr is no setting of the algorithm"):
-        write_tuned(one, tmp_path / "x.yaml", "")
+@pytest.mark.parametrize("word", ["stream.blur_reach=2", "stream.perturb_seed=2", "pretrain.epochs=3"])
+def test_what_a_run_refuses_is_refused(word, capsys, tmp_path, fake_streams) -> None:
+    assert tune(*WORDS, word, *FAST, "--out", str(tmp_path)) == 2
+    assert f"{word.partition('=')[0]} has no effect without" in capsys.readouterr().err and not fake_streams
+
+
+def test_a_key_outside_of_the_algorithm_is_not_written_and_says_so_before_it_is_measured(
+    capsys, tmp_path, fake_streams
+) -> None:
+    words = ("train.lr=1e-3,2e-3", *FAST, "--out", str(tmp_path), "--write", str(tmp_path))
+    assert tune(*WORDS, *words) == 2
+    assert "--write keeps settings of the algorithm, and train.lr is none" in capsys.readouterr().err
+    assert not fake_streams
+
+
+def test_algorithms_are_compared_with_themselves(capsys, tmp_path, fake_streams) -> None:
+    """Values of the same label: `algo=er` beside er, 1 and 1.0."""
+    words = [word for word in WORDS if not word.startswith("algo")]
+    assert tune(*words, "algo=er,lwf", *FAST, "er", "--out", str(tmp_path)) == 0
+    said = capsys.readouterr().out
+    assert said.count("\n| er ") == 2 and re.search("chosen: algo=(er|lwf)\n", said)
 
 
 # --- what is shipped
