@@ -47,9 +47,8 @@ def load_initial_weights(path: Path) -> tuple[dict[str, Tensor], Path]:
             f"{file} holds no policy's weights; name a run's directory or a task_<k>.safetensors"
         )
     algorithm = state.get("algorithm") or {}
-    if (
-        algorithm.get("library") and "base" not in algorithm
-    ):  # LoRA, which keeps its base, has adapters in the weights
+    # LoRA, which keeps its base, has adapters in the weights
+    if algorithm.get("library") and "base" not in algorithm:
         raise CheckpointError(
             f"{file}: its policy acts with experts beside these weights, as of {', '.join(_ROUTED)}, which another run "
             "cannot begin with; name the checkpoint after its base stage, or a run of another algorithm"

@@ -292,9 +292,8 @@ def _shown(total: Difference, alpha: float, tests: int) -> float:
     base = max(total.first, total.second)
     if not 0 < base < 1 or not total.counts.discordant:
         return math.nan
-    question = Question(
-        base, -base / 1000, alpha=alpha, tests=tests
-    )  # downwards: near 100 % is no room above
+    # downwards: near 100 % there is no room above
+    question = Question(base, -base / 1000, alpha=alpha, tests=tests)
     share = min(total.counts.discordant / total.counts.pairs, question.discordance_range[1])
     return shown_difference(replace(question, discordance=max(share, base / 1000)), total.pairs)
 

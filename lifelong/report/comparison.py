@@ -72,9 +72,9 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
         if runs and all(r.results.has_later_tasks() for r in runs)
     }
     plan_later = replace(plan, references=tuple(r for r in plan.references if r in later))
+    reference = _reference(measured)
     compared = {
-        g.label: _group(g, measured[g.label], found["metrics"].get(g.label), _reference(measured))
-        for g in groups
+        g.label: _group(g, measured[g.label], found["metrics"].get(g.label), reference) for g in groups
     }
     shifted = {label: _shifted(runs) for label, runs in measured.items()}
     for label, group in compared.items():
@@ -256,7 +256,8 @@ def _subgoals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, float]]]:
     }
 
 
-_Shifted = dict[str, dict[int, tuple[float, float]]]  # shift -> seed -> final success without and under it
+# shift -> (seed, data_seed) -> final success without and under it
+_Shifted = dict[str, dict[tuple[int, int | None], tuple[float, float]]]
 
 
 def _shifted(runs: Sequence[Run]) -> _Shifted:
@@ -265,7 +266,7 @@ def _shifted(runs: Sequence[Run]) -> _Shifted:
         for score in shift_scores(run.results):
             both = score.success("final").value, score.success("final_shifted").value
             if np.isfinite(both).all():
-                found.setdefault(score.shift, {})[run.record.seed] = both
+                found.setdefault(score.shift, {})[run.record.seed, run.record.data_seed] = both
     return found
 
 
@@ -277,12 +278,12 @@ def _shifts(own: _Shifted, references: Mapping[str, _Shifted]) -> dict[str, dict
         final, under = np.mean(list(seeds.values()), axis=0)
         less: dict[str, Any] = {}
         for name, others in references.items():
-            common = sorted(seeds.keys() & others.get(shift, {}).keys())
-            gaps = [lost[shift][seed] - (others[shift][seed][0] - others[shift][seed][1]) for seed in common]
+            theirs = {seed: a - b for seed, (a, b) in others.get(shift, {}).items()}
+            gaps = [value - theirs[seed] for seed, value in lost[shift].items() if seed in theirs]
             if gaps:
                 less[name] = asdict(paired_difference(np.array(gaps)).estimate)
         found[shift] = {
-            "seeds": sorted(seeds),
+            "seeds": sorted(seed for seed, _ in seeds),
             "final": float(final),
             "final_shifted": float(under),
             "lost": asdict(paired_difference(np.array(list(lost[shift].values()))).estimate),
