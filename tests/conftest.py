@@ -52,6 +52,17 @@ def copied(table: dict) -> dict:
     return {key: value.copy() if isinstance(value, dict | list) else value for key, value in table.items()}
 
 
+@pytest.fixture(scope="module")
+def uncounted() -> Iterator[None]:
+    """Count no operations, which makes the steps several times as slow that are counted."""
+    from lifelong.training import costs
+    from tests.harness.sequences import Uncounted
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(costs, "count_flops", lambda: Uncounted(Uncounted()))
+        yield
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder with the original's task files, measurements and recordings; absent on most machines."""

@@ -31,8 +31,8 @@ def step_costs(
 ) -> dict[str, float]:
     """Count the parameters, and the floating-point operations of one training step.
 
-    Real steps are made, on copies and in float32, with replay and penalties; the optimiser and clipping have no
-    matrix products and do not count. Policy and algorithm are unchanged afterwards. The number of operations is
+    Real steps are made, on copies and in float32, with replay and penalties; clipping, the optimiser and what follows
+    it do not count. Policy and algorithm are unchanged afterwards. The number of operations is
     linear in the batch size, so two small batches determine that of any.
 
     Args:
@@ -66,21 +66,21 @@ def _step_flops(policy: Policy, algorithm: Algorithm, windows: WindowDataset, si
 
 
 def action_costs(policy: Policy) -> dict[str, float]:
-    """Count the operations of one action in one simulation: the mean over `seq_len` actions with a full history.
+    """Count the operations of one action in one simulation with a full history: the mean over those of one plan.
 
     Args:
         policy: Policy to measure. Its history is reset; its mode and weights stay.
     """
-    draws, steps = generator(0), policy.spec.seq_len
+    draws = generator(0)
     policy.reset(1)
     observation = fake_batch(policy.spec, 1, draws, steps=1).to(device_of(policy)).observation
     with in_mode(policy, training=False):
-        for _ in range(steps):
+        for _ in range(policy.spec.seq_len):
             policy.act(observation, [draws])
         with count_flops() as counter:
-            for _ in range(steps):
+            for _ in range(policy.execute):
                 policy.act(observation, [draws])
-    return {"flops_per_action": counter.get_total_flops() / steps}
+    return {"flops_per_action": counter.get_total_flops() / policy.execute}
 
 
 @contextmanager

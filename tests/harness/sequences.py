@@ -8,11 +8,12 @@ import numpy as np
 import torch
 
 from libero_env.tasks import get_suite
+from lifelong import algorithms as algos
 from lifelong import checkpoints
-from lifelong.algorithms import ER, EWC, Algorithm, PackNet, Sequential
+from lifelong.algorithms import Algorithm
 from lifelong.context import RunContext
 from lifelong.data import SequenceVLDataset
-from lifelong.data.memory import ReplayMemory
+from lifelong.data.memory import PhaseMemory, ReplayMemory
 from lifelong.data.settings import DataSettings
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
@@ -22,7 +23,6 @@ from lifelong.seeding import generator, seeded
 from lifelong.sequence import TaskSequence
 from lifelong.streams import StreamSettings
 from lifelong.tracking import Tracker
-from lifelong.training import costs
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 from tests.harness.policies import small_transformer
@@ -33,9 +33,34 @@ SPEC = PolicySpec(views=("agentview_rgb",), image_size=(16, 16), proprio={"x": 2
 TASKS = 3
 
 
-ALGORITHMS = {
-    "sequential": Sequential, "er": lambda: ER(memory=ReplayMemory(12)), "ewc": EWC, "packnet": PackNet
-}  # fmt: skip
+ALGORITHMS: dict[str, Callable[[], Algorithm]] = {
+    "sequential": algos.Sequential,
+    "er": lambda: algos.ER(memory=ReplayMemory(12)),
+    "ewc": algos.EWC,
+    "packnet": algos.PackNet,
+}
+EVERY = ALGORITHMS | {
+    "agem": lambda: algos.AGEM(memory=ReplayMemory(25)),
+    "averaging": algos.Averaging,
+    "clare": lambda: algos.CLARE(rank=2, hidden=2, discriminator_steps=3, threshold=1.5, windows=5),
+    "compressed_er": lambda: algos.CompressedER(budget=9_000),
+    "derpp": lambda: algos.DERpp(budget=25, alpha=0.5),
+    "dmpel": lambda: algos.DMPEL(rank=2, alpha=4.0, pool=2, recall_steps=20),
+    "iscil": lambda: algos.IsCiL(rank=2, alpha=4.0, bases=3, states=10),
+    "lora": lambda: algos.LoRA(rank=2, alpha=4.0),
+    "lwf": algos.LwF,
+    "m2distill": lambda: algos.M2Distill(budget=12),
+    "mas": algos.MAS,
+    "mir": lambda: algos.MIR(memory=ReplayMemory(25), candidates=2),
+    "mlr": lambda: algos.MLR(budget=30, adjustment=0.3),
+    "multitask": algos.Multitask,
+    "omla": lambda: algos.OMLA(rank=2, alpha=4.0),
+    "phase_er": lambda: algos.ER(memory=PhaseMemory(25)),
+    "self_distillation": lambda: algos.LwF(instruction="own"),
+    "si": algos.SI,
+    "single_task": algos.SingleTask,
+    "slca": algos.SLCA,
+}
 
 
 class FakeEnv:
@@ -141,15 +166,10 @@ def assert_same(a, b):
 
 
 class Uncounted(nullcontext):
-    """In place of the counter of operations, which makes steps several times as slow."""
+    """In place of the counter of operations."""
 
     def get_total_flops(self) -> int:
         return 0
-
-
-def count_nothing(monkeypatch) -> None:
-    """Make the steps whose operations are counted, without counting."""
-    monkeypatch.setattr(costs, "count_flops", lambda: Uncounted(Uncounted()))
 
 
 class Killed(BaseException):

@@ -24,6 +24,7 @@ from tests.harness.algorithms import assert_resumed_equals_uninterrupted
 from tests.harness.configs import FILES, chosen
 from tests.harness.records import evaluation, run_start
 
+pytestmark = pytest.mark.usefixtures("uncounted")
 STREAM = StreamSettings(base_tasks=2)
 ALGORITHMS = sorted(f.stem for f in FILES if str(f.parent) == "algo")
 

@@ -24,14 +24,10 @@ from lifelong.sequence.measuring import digest
 from lifelong.stats.metrics import lifelong_metrics
 from tests.harness.policies import small_transformer
 from tests.harness.records import run_start
-from tests.harness.sequences import SPEC, TASKS, FakeEnv, count_nothing, run_context, sequence
+from tests.harness.sequences import SPEC, TASKS, FakeEnv, run_context, sequence
 
+pytestmark = pytest.mark.usefixtures("uncounted")
 FROZEN = {"packnet": PackNet, "lora": lambda: LoRA(rank=2), "single_task": SingleTask}
-
-
-@pytest.fixture(autouse=True)
-def uncounted(monkeypatch):
-    count_nothing(monkeypatch)
 
 
 class Camera(FakeEnv):

@@ -12,6 +12,7 @@ from lifelong.policies.base import Policy
 from tests.harness.policies import small_mlp, small_transformer
 from tests.harness.sequences import SPEC, dataset, run_context, sequence
 
+pytestmark = pytest.mark.usefixtures("uncounted")
 COUNTED = {"first": [0], "latest": [2], "seen": [0, 1, 2], "stream": [0, 1, 2]}
 EVAL = EvalSettings(episodes=1, curve="none", select="last", cells="diagonal", horizon=2, precision="fp32")
 

@@ -7,7 +7,6 @@ import pytest
 import torch
 
 from lifelong import algorithms as algos
-from lifelong.data.memory import PhaseMemory, ReplayMemory
 from lifelong.report.tables import COST_COLUMNS
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.settings import build
@@ -22,37 +21,15 @@ from tests.harness.algorithms import (
 from tests.harness.configs import CONFIGS, composed
 from tests.harness.gpu_learning import POLICIES, learn
 from tests.harness.sequences import (
-    ALGORITHMS,
+    EVERY,
     TASKS,
     assert_same,
-    count_nothing,
     dataset,
     run_context,
     sequence,
 )
 
-EVERY = ALGORITHMS | {
-    "agem": lambda: algos.AGEM(memory=ReplayMemory(25)),
-    "averaging": algos.Averaging,
-    "clare": lambda: algos.CLARE(rank=2, hidden=2, discriminator_steps=3, threshold=1.5, windows=5),
-    "compressed_er": lambda: algos.CompressedER(budget=9_000),
-    "derpp": lambda: algos.DERpp(budget=25, alpha=0.5),
-    "dmpel": lambda: algos.DMPEL(rank=2, alpha=4.0, pool=2, recall_steps=20),
-    "iscil": lambda: algos.IsCiL(rank=2, alpha=4.0, bases=3, states=10),
-    "lora": lambda: algos.LoRA(rank=2, alpha=4.0),
-    "lwf": algos.LwF,
-    "m2distill": lambda: algos.M2Distill(budget=12),
-    "mas": algos.MAS,
-    "mir": lambda: algos.MIR(memory=ReplayMemory(25), candidates=2),
-    "mlr": lambda: algos.MLR(budget=30, adjustment=0.3),
-    "multitask": algos.Multitask,
-    "omla": lambda: algos.OMLA(rank=2, alpha=4.0),
-    "phase_er": lambda: algos.ER(memory=PhaseMemory(25)),
-    "self_distillation": lambda: algos.LwF(instruction="own"),
-    "si": algos.SI,
-    "single_task": algos.SingleTask,
-    "slca": algos.SLCA,
-}
+pytestmark = pytest.mark.usefixtures("uncounted")  # test_costs counts
 COMPAT = {
     f"{name} of the original": lambda words=words: build(composed(*words, "compat=libero").algo)
     for name, words in (
@@ -71,7 +48,6 @@ def test_every_algorithm_is_here():
 
 @pytest.mark.parametrize(("first", "make"), list(enumerate((EVERY | COMPAT).values())), ids=EVERY | COMPAT)
 def test_killed_and_resumed_equals_uninterrupted(tmp_path, first, make, monkeypatch):
-    count_nothing(monkeypatch)  # test_resume counts
     assert_resumed_equals_uninterrupted(tmp_path, make, monkeypatch, first=1 + first % 6)
 
 

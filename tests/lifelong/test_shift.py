@@ -39,6 +39,7 @@ from tests.harness.demos import record_wander
 from tests.harness.records import evaluation, run_start
 from tests.harness.runs import make_run
 
+pytestmark = pytest.mark.usefixtures("uncounted")
 TASKS = get_suite("libero_object").tasks[:2]
 NAMES = {"policy": "tiny", "benchmark": "libero_object", "algo": "sequential", "preset": "smoke"}
 TINY = (

@@ -34,6 +34,7 @@ from tests.harness.records import evaluation, run_start
 from tests.harness.runs import TINY
 from tests.harness.sequences import Killed, Killer, assert_same, dataset, run_context, sequence
 
+pytestmark = pytest.mark.usefixtures("uncounted")
 ROOT = Path(__file__).parents[2]
 
 

@@ -24,6 +24,7 @@ from tests.harness.algorithms import learn_frames, make_policy
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
 from tests.harness.policies import small_rnn, small_transformer, small_vilt
 
+pytestmark = pytest.mark.usefixtures("uncounted")
 SETTINGS = FitSettings(epochs=5, batch_size=8, lr=1e-2, warmup_steps=3, precision="fp32")
 
 
