@@ -5,7 +5,7 @@
     python -m tests.harness.gpu_learning DEVICE late                              # memories that differ from the CPU's
     python -m tests.harness.gpu_learning pretended faults                         # what planted faults lead to
 
-DEVICE is `cpu`, `cuda` or `pretended`, POLICY one of `POLICIES`.
+DEVICE is `cpu`, `cuda` or `pretended`, POLICY one of `POLICIES`. Another command may follow after `--`.
 """
 
 import sys
@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -37,7 +38,7 @@ from lifelong.results.records import LossRecord
 from lifelong.seeding import generator, seeded
 from lifelong.sequence.recovery import Recovery
 from lifelong.settings import build
-from lifelong.training import fit
+from lifelong.training import costs, fit
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 from lifelong.types import Batch, PolicySpec
@@ -61,7 +62,7 @@ SHORT = {  # what algorithms compute between tasks
     "iscil": ["algo.bases=3"],
 }
 TASKS = 2
-_FIT = FitSettings(epochs=2, steps_per_epoch=3, batch_size=2, lr=1e-3, precision="fp32")
+_FIT = FitSettings(epochs=2, steps_per_epoch=2, batch_size=2, lr=1e-3, precision="fp32")
 
 
 @dataclass
@@ -168,7 +169,8 @@ def learn(algorithm: str, policy: str, device: torch.device) -> Learned:
 def _save_and_die(
     self: Recovery, task: int, phase: int, fit: Any = None, save: Callable = Recovery.save_progress
 ) -> None:
-    save(self, task, phase, fit)
+    if task == TASKS - 1:
+        save(self, task, phase, fit)
     if task == TASKS - 1 and fit is not None and fit["epoch"] == 1:
         raise Killed
 
@@ -194,18 +196,21 @@ def _sequence(folder: Path, algorithm: str, policy: str, device: torch.device) -
 
 
 def _count(found: Learned, watch: Watch, stack: ExitStack) -> None:
-    """Count launches and waits of the second step of each epoch, those within optimisers and losses, and of actions."""
-    step, act, loss, starts = Step.__call__, PolicyActor.act, Policy.loss, []
+    """Count launches and waits from the end of an epoch's first step to that of its second, those within optimisers and
+    losses, and of actions.
+    """
+    step, act, loss, ends = Step.__call__, PolicyActor.act, Policy.loss, []
 
     def counted_step(self: Step, *args: Any) -> Any:
-        starts.append((watch.launches, len(watch.waits)))
-        return step(self, *args)
+        losses = step(self, *args)
+        ends.append((watch.launches, len(watch.waits)))
+        return losses
 
     def counted_epoch(*args: Any) -> Any:
-        starts.clear()
+        ends.clear()
         losses = take_steps(*args)
-        found.launches = starts[2][0] - starts[1][0] or None
-        found.waits.append(watch.waits[starts[1][1] : starts[2][1]])
+        found.launches = ends[1][0] - ends[0][0] or None
+        found.waits.append(watch.waits[ends[0][1] : ends[1][1]])
         return losses
 
     def counted_loss(self: Policy, batch: Batch) -> torch.Tensor:
@@ -308,20 +313,31 @@ def _waits_of_counters_on_the_gpu() -> list[str]:
         return watch.waits[before:]
 
 
-def main(device: str, command: str, *words: str) -> None:
+def main(device: str, *words: str) -> None:
     if device == "pretended":
         pretended_gpu.pretend()
-    chosen, repeats = torch.device("cuda" if device == "pretended" else device), 20 if device == "cuda" else 1
+    chosen = torch.device("cuda" if device == "pretended" else device)
+    for is_end, command in groupby(words, "--".__eq__):
+        if is_end:
+            print("--")
+        else:
+            answer(chosen, *command, repeats=20 if device == "cuda" else 1)
+
+
+def answer(device: torch.device, command: str, *words: str, repeats: int) -> None:
     if command == "learn":
         for word in words:
             policy, _, algorithms = word.partition(":")
-            for algorithm in algorithms.split(",") if algorithms else ALGORITHMS:
-                print(json.dumps(asdict(learn(algorithm, policy, chosen))), flush=True)
+            first, *others = algorithms.split(",") if algorithms else ALGORITHMS
+            print(json.dumps(asdict(learn(first, policy, device))), flush=True)
+            with patch.object(costs, "count_flops", lambda: sequences.Uncounted(sequences.Uncounted())):
+                for algorithm in others:
+                    print(json.dumps(asdict(learn(algorithm, policy, device))), flush=True)
     elif command == "step":
         for word in words:
-            print(json.dumps(asdict(published_step(word.split(","), chosen))))
+            print(json.dumps(asdict(published_step(word.split(","), device))))
     else:
-        print(json.dumps(planted_faults() if command == "faults" else differing_memories(chosen, repeats)))
+        print(json.dumps(planted_faults() if command == "faults" else differing_memories(device, repeats)))
 
 
 if __name__ == "__main__":

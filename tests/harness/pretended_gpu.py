@@ -156,14 +156,10 @@ class GpuTensor(torch.Tensor):
     def __repr__(self, **_: Any) -> str:
         return f"cuda({self.host!r})"
 
-    @classmethod
-    def __torch_function__(cls, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
-        if func is torch.Tensor.tolist:
-            return args[0].cpu().tolist()
-        if func is torch._VF.lstm:  # without cuDNN, step by step
-            return torch._decomp.decompositions.lstm_impl(*args)
-        with torch._C.DisableTorchFunctionSubclass():
-            return func(*args, **(kwargs or {}))
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    def tolist(self) -> Any:
+        return self.cpu().tolist()
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
@@ -172,6 +168,10 @@ class GpuTensor(torch.Tensor):
 
 class _PretendedMode(TorchDispatchMode):
     """Sees what has no argument on the GPU: new tensors, and copies from the CPU."""
+
+    @classmethod
+    def _should_skip_dynamo(cls) -> bool:  # nothing is compiled, and each operation would cost more
+        return False
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         return _execute(func, args, kwargs or {})
@@ -266,6 +266,10 @@ def pretend() -> None:
     """Make `cuda` a device, for the rest of the process."""
     for name, value in _PATCHED.items():
         setattr(torch.cuda, name, lambda *_, value=value, **__: value)
+    lstm = torch._VF.lstm  # is cuDNN's; without it, step by step
+    torch._VF.lstm = lambda x, *args: (
+        torch._decomp.decompositions.lstm_impl if isinstance(x, GpuTensor) else lstm
+    )(x, *args)
     torch.cuda.synchronize = lambda *_: SEEN.wait("synchronize")
     for module in (torch.utils._foreach_utils, sys.modules["torch.optim.optimizer"]):
         module._foreach_supported_types.append(GpuTensor)

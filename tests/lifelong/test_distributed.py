@@ -14,28 +14,27 @@ from lifelong.errors import ConfigError
 from lifelong.training.distributed import Ranks, process_group
 from tests.harness import ranks_worker as worker
 
+pytestmark = pytest.mark.usefixtures("uncounted")
 ROOT = Path(__file__).parents[2]
 
 
-def torchrun(processes: int, *arguments: str, cwd: Path = ROOT) -> subprocess.CompletedProcess:
-    command = [
-        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes)
-    ]  # fmt: skip
+@pytest.fixture(scope="module")
+def two(tmp_path_factory) -> tuple[Path, subprocess.CompletedProcess]:
+    """Let two processes learn, of which the second is killed afterwards."""
+    folder = tmp_path_factory.mktemp("two")
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command += [worker.__file__, folder]
     env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    return subprocess.run(
-        [*command, *arguments], cwd=cwd, env=env, capture_output=True, text=True, timeout=600, check=False
+    done = subprocess.run(
+        command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=600, check=False
     )
-
-
-def run_worker(mode: str, folder: Path) -> subprocess.CompletedProcess:
-    return torchrun(2, str(ROOT / "tests" / "harness" / "ranks_worker.py"), mode, str(folder))
+    return folder, done
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("two")
-    done = run_worker("learn", folder)
-    assert done.returncode == 0, done.stderr
+def learned(two) -> Path:
+    folder, done = two
+    assert {p.name for p in folder.glob("learned_*")} == {"learned_0", "learned_1"}, done.stderr
     return folder
 
 
@@ -65,11 +64,12 @@ def test_communication_between_processes(learned):
     assert {p.name for p in learned.glob("talked_*")} == {"talked_0", "talked_1"}
 
 
-def test_a_killed_process_ends_all(tmp_path):
-    done = run_worker("die", tmp_path)
+@pytest.mark.slow
+def test_a_killed_process_ends_all(two, learned):
+    _, done = two
     assert done.returncode != 0
     assert "another process of this run has ended" in done.stderr or "SIGKILL" in done.stderr
-    assert not list(tmp_path.iterdir())
+    assert not (learned / "went_on").exists()
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 8])

@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,8 @@ LEARNED = (
     "bc_transformer_flow:er,lwf,dmpel",
     "bc_vilt:m2distill,lora",
 )
+# launches of a step, and of its augmentation
+MOST = {"preset=paper": (1090, 95), "preset=paper,compat=libero": (835, 320)}
 WAITS_OF_A_STEP = {"dmpel": 1}  # which experts count; of all others none
 WAITS_OF_AN_ACTION = 4  # the action, and a mixture's three parameters
 CHOICES_OF_AN_ACTION = {
@@ -35,8 +38,9 @@ CHOICES_OF_AN_ACTION = {
 }  # of experts: once, and once for each layer that has a choice
 
 
-def asked(device: str, *words: str) -> list[dict]:
-    """Run `tests.harness.gpu_learning` in a process of its own, and return what it prints."""
+@cache
+def asked(device: str, *words: str) -> list[list]:
+    """Run `tests.harness.gpu_learning` in a process of its own, and return what it prints of each command."""
     if device == "cuda" and not torch.cuda.is_available():
         pytest.skip("no GPU")
     if device == "pretended" and torch.version.cuda is not None:
@@ -50,11 +54,19 @@ def asked(device: str, *words: str) -> list[dict]:
     command = [sys.executable, "-m", "tests.harness.gpu_learning", device, *words]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-4000:]
-    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith(("{", "0", "1"))]
+    return [
+        [json.loads(line) for line in part.splitlines() if line.startswith(("{", "0", "1"))]
+        for part in done.stdout.split("--\n")
+    ]
+
+
+def pretended() -> list[list]:
+    """Ask the pretended GPU for all that these tests need, in one process."""
+    return asked("pretended", "learn", *LEARNED, "--", "step", *MOST, "--", "late", "--", "faults")
 
 
 def test_learning_asks_of_a_gpu_what_it_can_do() -> None:
-    found = asked("pretended", "learn", *LEARNED)
+    found = pretended()[0]
     assert {learned["policy"] for learned in found} == {word.partition(":")[0] for word in LEARNED}
     for learned in found:
         name = learned["algorithm"]
@@ -67,17 +79,14 @@ def test_learning_asks_of_a_gpu_what_it_can_do() -> None:
 
 
 def test_a_step_of_the_published_protocol_asks_no_more_of_a_gpu() -> None:
-    most = {"preset=paper": (1090, 95), "preset=paper,compat=libero": (835, 320)}
-    for found, (launches, of_augmentation) in zip(
-        asked("pretended", "step", *most), most.values(), strict=True
-    ):
+    for found, (launches, of_augmentation) in zip(pretended()[1], MOST.values(), strict=True):
         assert found["waits"] == []
         assert 500 < found["launches"] <= launches
         assert 50 < found["launches_of_augmentation"] <= of_augmentation
 
 
 def test_the_pretended_gpu_finds_planted_faults() -> None:
-    (found,) = asked("pretended", "faults")
+    (found,) = pretended()[3]
     assert "same device" in found["mixed"] and "numpy" in found["numpy"] and "generator" in found["generator"]
     assert found["late"] == "1" and int(found["counters"]) > 0
 
@@ -85,7 +94,7 @@ def test_the_pretended_gpu_finds_planted_faults() -> None:
 @pytest.mark.gpu
 @pytest.mark.parametrize("policy", ["bc_mlp_small"])  # has no dropout, which draws on the device
 def test_a_gpu_learns_as_the_cpu(policy: str) -> None:
-    on_gpu, on_cpu = (asked(device, "learn", policy) for device in ("cuda", "cpu"))
+    on_gpu, on_cpu = (asked(device, "learn", policy)[0] for device in ("cuda", "cpu"))
     for ours, theirs in zip(on_gpu, on_cpu, strict=True):
         assert ours["losses"] == pytest.approx(theirs["losses"], rel=1e-2), ours["algorithm"]
         assert ours["waits_in_optimizers"] == [], ours["algorithm"]
@@ -93,4 +102,4 @@ def test_a_gpu_learns_as_the_cpu(policy: str) -> None:
 
 @pytest.mark.parametrize("device", ["pretended", pytest.param("cuda", marks=pytest.mark.gpu)])
 def test_memories_of_windows_on_a_gpu_are_those_of_the_cpu(device: str) -> None:
-    assert asked(device, "late") == [0]
+    assert (pretended()[2] if device == "pretended" else asked(device, "late")[0]) == [0]
