@@ -34,6 +34,9 @@ WORKSPACES = _Workspaces()
 
 def find_workspace(name: str) -> Path | None:
     """Return the folder of a user's workspace; None where there is none of this name."""
-    directory = objects_dir() / name
-    own = name.isidentifier() and name not in BUILTIN_WORKSPACES and os.path.isfile(directory / FILE)
-    return directory if own else None
+    return objects_dir() / name if name not in BUILTIN_WORKSPACES and is_described(name) else None
+
+
+def is_described(name: str) -> bool:
+    """Return whether the user's folder of objects describes a workspace of this name."""
+    return name.isidentifier() and os.path.isfile(objects_dir() / name / FILE)

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from libero_env.cli.options import (
@@ -137,7 +138,7 @@ def certify_tasks(
         lines.append(f"FAIL  {one.task} {one.name}: {100 * one.rate:.0f} %, such as: {reason}")
     for task in found:
         if part := next(over_time(task.problem.goal), None):
-            lines.append(f"note  {task.id}: the original's reader refuses {part}")
+            lines.append(f"note  {task.id} {task.name}: the original's reader refuses {part}")
     good, total = sum(len(c.lengths) for c in certificates), sum(len(c.outcomes) for c in certificates)
     lines.append(
         f"{good}/{total} = {100 * good / total:.1f} %; {len(short)} of {len(certificates)} tasks under {require:.0%}"
@@ -188,8 +189,11 @@ def _lint(names: Sequence[str], assets: str | None, starts: int) -> "Iterator[li
             if task.suite != "file" and task.id in seen:
                 continue
             seen.add(task.id)
-            if task.suite == "file":  # line numbers refer to the text that `libero tasks show` prints
-                yield lint_text(task.bddl_text, name, task, pack, starts=starts)
+            if task.suite == "file":
+                where = (
+                    f"{name} ({task.name}, as BDDL)"  # what `libero tasks show` prints, whose lines are named
+                )
+                yield lint_text(task.bddl_text, where, task, pack, starts=starts)
             else:
                 yield lint_task(task, pack, starts=starts)
 
@@ -236,9 +240,9 @@ def new(
     if bddl:
         print(write_task(task, path.with_suffix(".bddl")))
     for command in (
-        f"libero tasks preview {path} --video",
-        f"libero tasks lint {path}",
-        f"libero demos generate --task {path} --n 10",
+        f"libero tasks preview {quote(str(path))} --video",
+        f"libero tasks lint {quote(str(path))}",
+        f"libero demos generate --task {quote(str(path))} --n 10",
         f"python train.py benchmark=own benchmark.files='[{path}]' language=onehot",
     ):
         print(f"  {command}")

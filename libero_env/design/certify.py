@@ -254,7 +254,7 @@ def _missing(certificate: Certificate, states: int) -> Iterator[list[int]]:
 def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> list[Outcome]:
     """Return the outcomes from some initial states, simulated together; an error is a failure with its message."""
     try:
-        env, shapes = _environment(task, pack)
+        env, shapes = _environment(task, pack, build_scene(task.problem, pack).digest)
         number = np.resize(states, env.num_envs)
         sampled = task.suite == FILE
         env.reset(
@@ -276,7 +276,7 @@ def attempt(task: Task, states: Sequence[int], pack: Pack, disturb: bool) -> lis
 
 
 @lru_cache(maxsize=1)
-def _environment(task: Task, pack: Pack) -> tuple[BatchEnv, Shapes]:
+def _environment(task: Task, pack: Pack, scene: str) -> tuple[BatchEnv, Shapes]:
     env = BatchEnv(task, BATCH, num_threads=1, cameras=(), horizon=NO_HORIZON, assets=pack)
     return env, Shapes(env.scene)
 

@@ -1,6 +1,7 @@
 """Template of a user-defined task: a valid YAML file with comments on what can be changed."""
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from math import hypot
 
@@ -10,6 +11,7 @@ from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.storage import parse_yaml_text
 from libero_env.tasks.builder import EMPTY, load_scene, make_task, model_regions, scene_names
 from libero_env.tasks.task import Task
+from libero_env.workspaces import WORKSPACES
 
 # Places of objects (x, y) [m] in the original's scenes, and of furniture (x, y, yaw).
 _SLOTS = ((-0.05, 0.0), (0.05, 0.2), (-0.2, 0.15), (0.1, -0.02), (-0.18, -0.12), (-0.05, 0.3))
@@ -39,14 +41,16 @@ def task_template(
         LiberoError: A name does not exist, or there are more objects than places.
     """
     objects = list(objects)
-    if scene in EMPTY and len(objects) < 2 and not goal:
+    given = load_scene(scene) if scene in scene_names() else {}
+    if (scene in EMPTY or scene in WORKSPACES) and len(objects) < 2 and not goal:
         objects = [*objects, "plate"] if objects else list(_DEFAULT_OBJECTS)
-    names = _number(objects)
+    names = _number(objects, given.get("objects", ()))
     goal = list(goal) or _default_goal(names)
     language = language or _words(goal, names)
     taken = _occupied(scene)
     places: dict[str, object] = {}
-    for name, (x, y, yaw) in _assign_slots(_number(furniture), _FURNITURE, taken, "furniture"):
+    fixtures = _number(furniture, given.get("fixtures", {}).values())
+    for name, (x, y, yaw) in _assign_slots(fixtures, _FURNITURE, taken, "furniture"):
         places[name] = f"{{at: [{x}, {y}], yaw: {yaw}}}"
     for name, (x, y) in _assign_slots(names, _SLOTS, taken, "objects"):
         places[name] = f"{{at: [{x}, {y}], half: 0.025}}"
@@ -81,10 +85,14 @@ def _words(goal: Iterable[str], names: Mapping[str, str]) -> str:
     return " and ".join(phrases)
 
 
-def _number(categories: Iterable[str]) -> dict[str, str]:
-    named: dict[str, str] = {}
+def _number(categories: Iterable[str], present: Iterable[str | Mapping[str, int]]) -> dict[str, str]:
+    """Return name -> category, numbered after what is present: categories, or numbers of them."""
+    counts, named = Counter[str](), dict[str, str]()
+    for entry in present:
+        counts.update(entry if isinstance(entry, Mapping) else [entry])
     for category in categories:
-        named[f"{category}_{1 + list(named.values()).count(category)}"] = category
+        counts[category] += 1
+        named[f"{category}_{counts[category]}"] = category
     return named
 
 

@@ -32,9 +32,14 @@ def get_object(category: str) -> ObjectModel:
         model = _registered[category]()
         _check(category, model)
         return model
+    directory = folder.find(category)
     if category in builtin.builtin_names():
+        if directory is not None:
+            raise LiberoError(
+                f"{category} is an object of the benchmark and one of yours, in {directory}; rename its folder"
+            )
         return builtin.build(category)
-    if (directory := folder.find(category)) is not None:
+    if directory is not None:
         return folder.load(directory, category)
     raise UnknownNameError("object category", category, object_names())
 
@@ -44,7 +49,7 @@ def version_of(category: str) -> Hashable:
     if category in _registered or category in builtin.builtin_names():
         return _registered.get(category)
     directory = folder.find(category) or find_workspace(category)
-    return directory and tuple((path, path.lstat().st_mtime_ns) for path in sorted(directory.iterdir()))
+    return directory and tuple((path, path.lstat().st_mtime_ns) for path in sorted(directory.rglob("*")))
 
 
 def object_names() -> tuple[str, ...]:

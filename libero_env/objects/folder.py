@@ -191,9 +191,10 @@ def spec_of(file: Mjcf) -> mujoco.MjSpec:
 def digest(directory: Path) -> str:
     """Return a digest of the files that a scene is built from, 16 hexadecimal digits."""
     hashed = hashlib.sha256()
-    for path in sorted(directory.iterdir()):
-        if path.is_file() and path.name not in (PREVIEW, PROPERTIES):
-            hashed.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+    for path in sorted(directory.rglob("*")):
+        if path.is_file() and path.name != PREVIEW:
+            name = path.relative_to(directory).as_posix()
+            hashed.update(name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return hashed.hexdigest()[:16]
 
 

@@ -54,6 +54,7 @@ from string import Template
 from typing import Any
 
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.paths import objects_dir
 from libero_env.storage import read_yaml
 from libero_env.tasks import bddl
 from libero_env.tasks.cameras import Camera
@@ -62,7 +63,7 @@ from libero_env.tasks.schema import Source, Trace, read_definition, scene_file
 from libero_env.tasks.task import FILE, Task, check_name
 from libero_env.text import shown, suggest
 from libero_env.validation import validate
-from libero_env.workspaces import WORKSPACES
+from libero_env.workspaces import BUILTIN_WORKSPACES, WORKSPACES, is_described
 
 EMPTY: Mapping[str, str] = {
     "kitchen": "kitchen_table",
@@ -75,6 +76,8 @@ EMPTY: Mapping[str, str] = {
 _HALF_EXTENT = {"object": 0.025, "fixture": 0.01}  # [m] default, as in the original's scenes
 _PLACING = ("On", "In")  # predicates of init atoms that give an entity its place
 _TABLE = "main_table"  # name of the fixture `table` in the original's task files
+# sites that tell the original's reader where an object ends
+_PLACEMENT_SITES = frozenset({"default_site", "bottom_site", "top_site", "horizontal_radius_site"})
 _NESTED = re.compile(r"\(\s*(and|or|not|forall|then|never|count)\b", re.IGNORECASE)
 # field of a problem, or section of a task file -> key
 _KEYS_OF = {"name": "problem", "domain": "problem", "views": "cameras"}
@@ -190,9 +193,7 @@ def model_regions(category: str) -> tuple[str, ...]:
     from libero_env.assets.pack import select_pack
 
     names = {site.name for site in select_pack().build(category).spec.sites}
-    return tuple(
-        sorted(name for name in names if name and name != "default_site" and not name.endswith("_site"))
-    )
+    return tuple(sorted(names - _PLACEMENT_SITES - {""}))
 
 
 def _build(
@@ -352,7 +353,12 @@ class _Merge:
             raise InvalidInputError(
                 f"{source.at('scene')}: scene is {scene!r:.60}; expected one of {', '.join(valid)}"
             )
-        elif scene in EMPTY or scene in WORKSPACES:
+        elif self._check_models and scene in (*valid, *BUILTIN_WORKSPACES) and is_described(scene):
+            raise InvalidInputError(
+                f"{source.at('scene')}: {scene} is a scene of the benchmark and a workspace of yours, in "
+                f"{objects_dir()}; rename its folder"
+            )
+        elif scene in EMPTY or (scene in WORKSPACES and scene not in valid):
             category = EMPTY.get(scene, scene)
             return _Content(fixtures={_TABLE if category == "table" else category: category})
         elif scene.endswith((".yaml", ".yml")):
@@ -383,7 +389,9 @@ class _Merge:
                 self._check_category("object", category, source, key, i)
                 for _ in range(number):
                     counts[category] += 1
-                    named[f"{category}_{counts[category]}"] = category
+                    while (name := f"{category}_{counts[category]}") in existing:
+                        counts[category] += 1
+                    named[name] = category
         return named
 
     def _place(self, places: Values, content: _Content, source: Source) -> list[str]:
@@ -411,8 +419,8 @@ class _Merge:
         """Return atoms such as `On a b` without brackets, and expressions with them."""
         atoms = []
         for i, text in enumerate(keys.get(key, ())):
-            is_nested = text.startswith("(") and (text.count("(") > 1 or _NESTED.match(text))
-            atoms.append(text if is_nested else text.removeprefix("(").removesuffix(")").strip())
+            text = text if text.startswith("(") else f"({text})"
+            atoms.append(text if text.count("(") > 1 or _NESTED.match(text) else text[1:-1].strip())
             self.trace.note(atoms[-1], source, key, i)
         return atoms
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Required
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 from typing_extensions import TypedDict
 
-from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.errors import BDDLError, InvalidInputError, LiberoError
 from libero_env.storage import read_yaml_file
 from libero_env.tasks.problem import MAX_ENTITIES, MAX_PARTS
 from libero_env.tasks.sexpr import number, parse_tree
@@ -169,10 +169,8 @@ def _atom(text: str) -> str:
     text = text.strip()
     try:
         tree = parse_tree(text if text.startswith("(") else f"({text})", "")
-    except LiberoError as error:
-        raise ValueError(
-            f"{text!r:.60} is not an atom or expression: {str(error).partition(': ')[2]}"
-        ) from None
+    except BDDLError as error:
+        raise ValueError(f"{text!r:.60} is not an atom or expression: {error.what}") from None
     if not tree.items:
         raise ValueError("it is empty; expected an atom such as On plate_1 stove_1")
     return text
@@ -224,7 +222,8 @@ class Rectangle(TypedDict, total=False):
 
 
 def _support(text: str) -> str:
-    if len(text.strip("() ").split()) not in (1, 2):
+    *predicate, _ = text.strip("() ").split() or [""]
+    if [word.capitalize() for word in predicate] not in ([], ["On"], ["In"]):
         raise ValueError(
             f"{text!r:.60} is not a place; expected such as plate_1, or In basket_1_contain_region"
         )

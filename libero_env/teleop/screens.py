@@ -13,7 +13,7 @@ from PIL import Image
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.env import require_display
-from libero_env.errors import LiberoError, RenderError
+from libero_env.errors import LiberoError, RenderError, require_known
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP
 from libero_env.sim.predicates import glowing_sites
@@ -172,7 +172,9 @@ class Window(_Timed):
         self.option.geomgroup[0] = 0  # collision shapes are hidden
         self.view = mujoco.MjvCamera()
         self.view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self.view.fixedcamid = model.camera(self.camera).id
+        cameras = [model.camera(i).name for i in range(model.ncam)]
+        require_known("camera", self.camera, cameras)
+        self.view.fixedcamid = cameras.index(self.camera)
         return mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_150)
 
     def close(self) -> None:

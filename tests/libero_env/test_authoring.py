@@ -108,6 +108,7 @@ def test_empty_scenes_have_their_workspace_alone(scene):
     ("On plate_1 akita_black_bowl_1", [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
     ("(on plate_1 akita_black_bowl_1)", [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
     (("On", "plate_1", "akita_black_bowl_1"), [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
+    ("On plate_1 akita_black_bowl_1 ", [Atom("On", ("plate_1", "akita_black_bowl_1"))]),
     ([("Up", "plate_1"), "Up akita_black_bowl_1"], [Atom("Up", ("plate_1",)), Atom("Up", ("akita_black_bowl_1",))]),
 ])  # fmt: skip
 def test_goals_are_atoms_in_any_notation(goal, expected):
@@ -117,6 +118,7 @@ def test_goals_are_atoms_in_any_notation(goal, expected):
 def test_goals_may_be_expressions_over_undeclared_places():
     goal = make_task(**said(goal="(Or (Open wooden_cabinet_1_top_region) (Not (Up plate_1)))")).problem.goal
     assert goal == Or((Atom("Open", ("wooden_cabinet_1_top_region",)), Not(Atom("Up", ("plate_1",)))))
+    assert make_task(**said(goal="Not (Up plate_1)")).problem.goal == goal.parts[1]
 
 
 def test_objects_are_added_to_a_scene_and_those_of_the_scene_can_be_moved():
@@ -183,6 +185,7 @@ def test_a_scene_may_be_a_file_beside_the_task(tmp_path):
     ({"regions": {"kitchen_table": {"mat": {"half": 0.1}}}}, "it has half, but no at; add such as at: \\[0, 0.2\\]"),
     ({"regions": {"kitchen_table": {"mat": {"at": [0, 0], "half": 0.1, "ranges": [[0, 0, 1, 1]]}}}}, "both at and"),
     ({"place": {**FACTS["place"], "plate_1": {"ranges": [[0, 0, 0.1, 0.1]], "half": 0.3}}}, "it has half, but no at"),
+    ({"place": {**FACTS["place"], "plate": "Under akita_black_bowl_1"}}, "'Under akita_black_bowl_1' is not a place"),
 ])  # fmt: skip
 def test_errors_state_what_is_valid(changes, message):
     with pytest.raises(LiberoError, match=message):
@@ -207,6 +210,15 @@ def test_places_are_the_sites_that_goals_can_name():
     assert {"top_region", "middle_region", "bottom_region", "top_side"} <= set(
         model_regions("wooden_cabinet")
     )
+
+
+def test_what_is_added_gets_a_number_that_is_free():
+    places = {name: place for name, place in FACTS["place"].items() if not name.startswith("wooden")}
+    for given, free in ((2, 3), (1, 2)):
+        at = {f"wooden_cabinet_{given}": [0, 0.4], f"wooden_cabinet_{free}": [0, -0.3]}
+        changes = {"fixtures": {f"wooden_cabinet_{given}": "wooden_cabinet"}, "goal": "Up plate_1"}
+        made = make_task(**said(**changes, place=places | at))
+        assert at.keys() < made.problem.fixtures.keys()
 
 
 def test_the_tasks_of_files_form_a_suite(tmp_path):
@@ -251,6 +263,8 @@ def test_the_settings_of_a_run_take_files(tmp_path):
     {"scene": "floor", "objects": ["milk", "butter", "ketchup", "basket"]},
     {"furniture": ["wooden_cabinet"], "objects": ["butter"], "goal": ["Open wooden_cabinet_1_top_region"]},
     {"scene": "kitchen_scene1", "objects": ["butter"], "goal": ["On butter_1 plate_1"]},
+    {"scene": "kitchen_scene1", "objects": ["plate"], "goal": ["On plate_2 plate_1"]},
+    {"scene": "kitchen_table"},
 ], ids=str)  # fmt: skip
 def test_templates_are_tasks_with_space_between_objects(options):
     text, task = task_template(**options)

@@ -2,7 +2,9 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
+import mujoco
 import pytest
 
 from libero_env.assets.pack import BuiltinPack
@@ -10,7 +12,8 @@ from libero_env.cli import main as cli
 from libero_env.design import certify as module
 from libero_env.design.certify import Certificate, Outcome, certify, markdown_table, results
 from libero_env.errors import LiberoError
-from libero_env.tasks import get_suite, get_task, read_task
+from libero_env.objects import ObjectModel, register_object
+from libero_env.tasks import get_suite, get_task, make_task, read_task
 
 TASKS = get_suite("libero_object").tasks[:2]
 
@@ -121,6 +124,26 @@ def test_an_outcome_depends_on_its_start_alone():
     together = module.attempt(TASKS[0], [0, 1, 2], pack, False)
     assert all(o.success and o.steps > 20 for o in together)
     assert module.attempt(TASKS[0], [2], pack, False) == together[2:]
+
+
+@pytest.mark.sim
+def test_a_changed_object_is_tried_in_the_scene_that_has_it():
+    def block(width: float):
+        spec = mujoco.MjSpec()
+        box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [width, width, 0.02], "mass": 0.05, "group": 0}
+        spec.worldbody.add_body(name="main").add_geom(name="g0", **box)
+        return ObjectModel(
+            "block", spec, bottom_offset=(0, 0, -0.02), top_offset=(0, 0, 0.02), horizontal_radius=width
+        )
+
+    places = {"block_1": (0, 0), "plate_1": (0.05, 0.2)}
+    facts = {"scene": "kitchen", "objects": ["block", "plate"], "place": places, "language": "lift it"}
+    solved = []
+    for width in (0.02, 0.06):  # a hand opens 0.08 m
+        register_object("block", partial(block, width))
+        task = make_task(goal="On block_1 plate_1", **facts)
+        solved.append(module.attempt(task, [0], BuiltinPack(), False)[0].success)
+    assert solved == [True, False]
 
 
 @pytest.mark.sim

@@ -5,6 +5,7 @@ import math
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -209,6 +210,27 @@ def test_the_command_prints_findings_and_its_status_counts_errors(tmp_path, caps
     assert capsys.readouterr().out.startswith("1 tasks: "), "each once, whatever it is called"
     assert cli.main(["tasks", "lint", "libero_objet/1"]) == 2
     assert cli.main(["tasks", "lint", str(tmp_path / "none.bddl")]) == 2
+
+
+@pytest.mark.sim
+def test_zones_and_starts_are_judged_as_what_they_are(tmp_path, capsys):
+    """A zone is used, and an init atom of a region with `goal` in its name is not the goal."""
+    (tmp_path / "a.yaml").write_text("""language: put the bowl on the plate
+scene: kitchen
+objects: [akita_black_bowl, plate, wine_bottle]
+regions: {kitchen_table: {goal_spot: {at: [0, 0], half: 0.02}, mat: {at: [0.1, -0.2], half: 0.05}}}
+place: {plate_1: [0.05, 0.2], akita_black_bowl_1: kitchen_table_goal_spot, wine_bottle_1: [-0.1, -0.2]}
+zones: [kitchen_table_mat]
+goal: On akita_black_bowl_1 plate_1
+""")
+    cli.main(["tasks", "lint", str(tmp_path / "a.yaml"), "--starts", "1", "--json", "--level", "info"])
+    rules = {one["rule"] for one in json.loads(capsys.readouterr().out)}
+    assert not rules & {"unused-region", "goal-at-start"}
+
+
+def test_a_surface_that_no_hand_reaches_has_no_ring():
+    high = replace(load_workspace("kitchen_table"), offset=(0.0, 0.0, 3.0))
+    assert furthest_reach(high) == 0.0
 
 
 def test_linting_texts_needs_no_torch():

@@ -251,6 +251,35 @@ def test_a_file_of_the_originals_kind_is_read(tmp_path):
     assert get_object("brick").spec.compile().ngeom == 2
 
 
+BODY = '<mujoco><worldbody><body name="b"{}>{}</body></worldbody></mujoco>'
+SOLID = '<geom type="box" size=".02 .03 .05" mass=".1" rgba="1 0 0 1"/>'
+STICKER = '<geom type="box" size=".01 .001 .01" pos="0 .031 0" contype="0" conaffinity="0" mass="0"{}/>'
+
+
+@pytest.mark.parametrize(("group", "seen"), [("", 2), (' group="1"', 1)])
+def test_solid_geoms_that_are_seen_beside_visual_ones_stay_seen(tmp_path, group, seen):
+    (tmp_path / "b.xml").write_text(BODY.format("", SOLID + STICKER.format(group)))
+    add_object(tmp_path / "b.xml")
+    model = get_object("b").spec.compile()
+    assert (model.geom_group == 1).sum() == seen
+
+
+@pytest.mark.parametrize(
+    ("turned", "told"), [("", 0), (' quat="0.7071 0.7071 0 0"', 1), (' euler="0 90 0"', 1)]
+)
+def test_a_rotation_that_is_omitted_is_told(tmp_path, turned, told):
+    (tmp_path / "b.xml").write_text(BODY.format(turned, SOLID))
+    notes = add_object(tmp_path / "b.xml").notes
+    assert sum("the rotation of its root body is omitted" in note for note in notes) == told
+
+
+def test_sites_are_places_whatever_their_names_end_in(tmp_path):
+    site = '<site name="drop_site" pos="0 0 .05" size=".02"/>'
+    (tmp_path / "b.xml").write_text(BODY.format("", SOLID + site))
+    add_object(tmp_path / "b.xml")
+    assert model_regions("b") == ("drop_site",)
+
+
 def test_registering_lasts_for_the_process_and_is_made_once(tmp_path):
     path = box(tmp_path / "block.stl")
     assert register_object_file(path, mass=0.2) == "block"
@@ -298,6 +327,17 @@ def test_what_is_kept_of_a_scene_depends_on_the_files(tmp_path):
     text = (place / "object.xml").read_text()
     (place / "object.xml").write_text(text.replace("0.9 0.1 0.1", "0.1 0.9 0.1"))
     assert digest() != first
+    second, properties = digest(), (place / "object.yaml").read_text()
+    (place / "object.yaml").write_text(properties + "articulation: {open: [0.1, 0.2], close: [0, 0.05]}\n")
+    assert digest() != second
+
+
+def test_an_object_with_the_name_of_one_of_the_benchmark_is_refused(tmp_path):
+    (tmp_path / "brick.xml").write_text(ORIGINAL)
+    place = add_object(tmp_path / "brick.xml").folder
+    place.rename(place.with_name("milk"))
+    with pytest.raises(LiberoError, match="milk is an object of the benchmark and one of yours"):
+        get_object("milk")
 
 
 def broken(tmp_path: Path, kind: str) -> Path:

@@ -161,3 +161,11 @@ def test_a_task_without_its_workspace_is_refused(bench, objects_home):
     (folder / "workspace.yaml").unlink()
     with pytest.raises(UnknownNameError, match=r"unknown workspace among the fixtures \['bench'\]"):
         LiberoEnv(made, cameras=())
+
+
+@pytest.mark.parametrize("name", ["kitchen_table", "kitchen", "kitchen_scene1"])
+def test_a_workspace_with_the_name_of_a_scene_of_the_benchmark_is_refused(bench, name):
+    folder = bench(TABLE)
+    folder.rename(folder.with_name(name))
+    with pytest.raises(LiberoError, match=f"{name} is a scene of the benchmark and a workspace of yours"):
+        task(scene=name)

@@ -13,6 +13,7 @@ from libero_env.demos.read import read_demos
 from libero_env.demos.replay import replay
 from libero_env.errors import LiberoError, RenderError
 from libero_env.sim.render import renderer_name
+from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_task
 from libero_env.teleop import screens as teleop_screens
 from libero_env.teleop.screens import MouseReader, as_text, key_name, open_screen, press_typed
@@ -244,3 +245,10 @@ def test_the_numbers_of_a_mouse_need_one(capsys):
 def test_a_status_reads_as_a_line():
     status = Status("close it", {"(Close door_1)": False}, 7, 1, 3)
     assert str(status) == "close it | (Close door_1) no | step 7 | 1 of 3 recorded"
+
+
+def test_a_window_names_the_cameras_that_there_are():
+    window = teleop_screens.Window.__new__(teleop_screens.Window)  # none is opened
+    window.camera = "agentvew"
+    with pytest.raises(LiberoError, match="camera 'agentvew'.*Did you mean 'agentview'"):
+        window._make_context(build_scene(get_task(TASK).problem).model)

@@ -135,7 +135,7 @@ def _check_atoms(report: Report, problem: Problem) -> None:
 
 
 def _check_regions(report: Report, problem: Problem) -> None:
-    used = {name for atom in (*problem.init, *problem.goal.atoms()) for name in atom.args}
+    used = {name for atom in (*problem.init, *problem.goal.atoms()) for name in atom.args} | {*problem.zones}
     goal = {name for atom in problem.goal.atoms() for name in atom.args}
     seen: dict[tuple, str] = {}
     for region in problem.regions:

@@ -50,7 +50,7 @@ def reach(workspace: Workspace) -> tuple[float, float]:
 def furthest_reach(workspace: Workspace) -> float:
     """Return the largest distance from the base's axis at which a hand in any orientation reaches the surface, [m]."""
     drop = workspace.robot_base_pos[2] + _SHOULDER - workspace.surface_height - _GRIP_HEIGHT
-    return sqrt(_ARM_LENGTH**2 - drop**2)
+    return sqrt(max(_ARM_LENGTH**2 - drop**2, 0.0))
 
 
 def check_scene(report: Report, task: Task, pack: Pack, starts: int) -> None:
@@ -201,7 +201,7 @@ def _report_start(report: Report, scene: Scene, rule: str, what: str, count: int
         remedy = "place it where it is flat and wide enough to carry it"
     elif rule == "placement":
         remedy = "see the message"
-    elif "goal" in what:
+    elif not what.startswith("("):  # of the goal, not of an init atom
         level, rule, line = "error", "goal-at-start", report.lines.line(":goal")
         remedy = "change the initial conditions so that the goal does not hold"
     else:

@@ -31,7 +31,8 @@ def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notif
     """Write the MJCF file of an object, with its meshes and textures; return its mass and collision geometry.
 
     The object is the one body of the file's world or, as in the original's files, the body `object` within it.
-    Collision geoms become group 0, visual geoms group 1; without visual geoms, copies of the collision geoms are added.
+    Collision geoms become group 0, visual geoms group 1. Where there are no visual geoms, or some in the same group,
+    copies of the collision geoms are added.
 
     Args:
         path: MJCF file to read.
@@ -125,6 +126,10 @@ def _root(spec: mujoco.MjSpec, file: Mjcf, notify: Notify) -> mujoco.MjsBody:
         exclude.bodyname1, exclude.bodyname2 = (
             ROOT_BODY if name == body.name else name for name in (exclude.bodyname1, exclude.bodyname2)
         )
+    if abs(_compiled(spec.copy(), file.path).body_quat[1, 0]) < 1 - 1e-6:
+        notify(
+            f"{file.path.name}: the rotation of its root body is omitted, to which scenes give a pose; rotate its parts"
+        )
     body.name, body.pos, body.quat = ROOT_BODY, (0, 0, 0), (1, 0, 0, 0)
     omitted = [*spec.worldbody.geoms, *spec.worldbody.sites]
     moving = [joint for joint in body.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE]
@@ -139,13 +144,14 @@ def _root(spec: mujoco.MjSpec, file: Mjcf, notify: Notify) -> mujoco.MjsBody:
 
 
 def _sort_geoms(spec: mujoco.MjSpec) -> None:
-    """Assign the groups of collision (0) and visual (1) geoms; without visuals, add copies of the collision geoms."""
+    """Assign the groups of collision (0) and visual (1) geoms, and add copies of collision geoms that are seen."""
     geoms = list(spec.geoms)
     solid = [geom for geom in geoms if geom.contype or geom.conaffinity]
     visuals = [geom for geom in geoms if not (geom.contype or geom.conaffinity) and geom.group < _HIDDEN]
     named = {geom.name for geom in geoms}
+    seen = {geom.group for geom in visuals}  # solid geoms in the same group are seen as well
     for number, geom in enumerate(solid):
-        if not visuals:
+        if not visuals or geom.group in seen:
             _add_visual(geom)
         free = (f"g{k}" for k in itertools.count(number) if f"g{k}" not in named)
         geom.group, geom.name = 0, geom.name or next(free)
