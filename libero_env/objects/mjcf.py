@@ -84,12 +84,14 @@ class Mjcf:
         root: Its elements, without those that are left out; files are named by absolute paths.
         text: The same as text for MuJoCo.
         omitted: Number of lights, cameras, actuators, sensors and keyframes that are left out.
+        files: Meshes and textures that it names.
     """
 
     path: Path
     root: ET.Element
     text: str
     omitted: int
+    files: tuple[Path, ...]
     _places: tuple[str, ...] = field(repr=False)
 
     def explain(self, error: Exception) -> str:
@@ -118,9 +120,9 @@ def read_mjcf(path: Path) -> Mjcf:
         _check_values(parent)
     _check_counts(root)
     _check_joined(root)
-    files = _resolve_files(root, path.parent)
+    files = tuple(_resolve_files(root, path.parent))
     text, places = write_xml(root)
-    mjcf = Mjcf(path, root, text, omitted, places)
+    mjcf = Mjcf(path, root, text, omitted, files, places)
     if files or root.find("asset/texture") is not None:
         stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
         if error := _compile_error_of(text, stamps, str(path)):

@@ -292,6 +292,22 @@ def test_registering_lasts_for_the_process_and_is_made_once(tmp_path):
     assert "block" in object_names() and folder.names() == ()
 
 
+def test_registering_again_reads_what_the_file_names(tmp_path):
+    defaults = '<mujoco><default><default class="c"><geom type="box" size=".02 .02 %s"/></default></default></mujoco>'
+    body = '<include file="sizes.xml"/><worldbody><body name="b"><geom class="c"/></body></worldbody>'
+    (tmp_path / "block.xml").write_text(f"<mujoco>{body}</mujoco>")
+    for height in (0.04, 0.06):
+        (tmp_path / "sizes.xml").write_text(defaults % height)
+        assert get_object(register_object_file(tmp_path / "block.xml")).top_offset[2] == height
+    mesh, seen = textured_box(tmp_path / "box.obj"), []
+    (picture,) = tmp_path.glob("*.png")
+    for colour in ((250, 0, 0), (0, 0, 250)):
+        Image.new("RGB", (8, 8), colour).save(picture)
+        (texture,) = get_object(register_object_file(mesh)).spec.textures
+        seen.append(Image.open(texture.file).convert("RGB").getpixel((0, 0)))
+    assert seen == [(250, 0, 0), (0, 0, 250)]
+
+
 @pytest.mark.parametrize("how", ["truncated", "missing", "extended"])
 def test_an_object_of_the_cache_that_is_damaged_is_made_again(tmp_path, caplog, how):
     path = box(tmp_path / "block.stl")

@@ -14,19 +14,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from libero_env.design.objects.mesh_file import load_surfaces
 from libero_env.design.objects.mesh_object import Options, store_mesh
 from libero_env.design.objects.mjcf_file import store_mjcf
 from libero_env.design.objects.trial import try_object
 from libero_env.errors import InvalidInputError, LiberoError
-from libero_env.limited import limited_process
+from libero_env.limited import call_limited, limited_process
 from libero_env.objects import catalog, folder
 from libero_env.objects.builtin import builtin_names
+from libero_env.objects.mjcf import read_mjcf
 from libero_env.objects.model import ObjectModel
 from libero_env.paths import cache_dir, objects_dir
 from libero_env.storage import cached_folder
 
 _FORMAT = 1  # version of stored folders; increase it when the same file gives another object
 _LONGEST_NAME = 60  # characters
+MJCF_FORMATS = (".xml", ".mjcf")
 
 
 @dataclass(frozen=True)
@@ -95,7 +100,7 @@ def add_object(
 def register_object_file(path: str | Path, name: str | None = None, **options: Any) -> str:
     """Convert a mesh or MJCF file into an object for this process, as `register_object` does for a function.
 
-    The object is cached: the same content of the file is converted once.
+    The object is cached: the same content of the file, and of those that it names, is converted once.
 
     Args:
         path: File, as for `add_object`.
@@ -114,9 +119,9 @@ def register_object_file(path: str | Path, name: str | None = None, **options: A
     name = name or _name_of(path)
     if not name.isidentifier() or len(name) > _LONGEST_NAME:
         raise LiberoError(f"{name[:80]!r} is not a valid category; use letters, digits and underscores")
-    content = repr((_FORMAT, chosen, hashlib.sha256(path.read_bytes()).hexdigest(), name))
-    directory = cache_dir() / "objects" / hashlib.sha256(content.encode()).hexdigest()[:16] / name
     with limited_process():
+        content = repr((_FORMAT, chosen, _content(path), name))
+        directory = cache_dir() / "objects" / hashlib.sha256(content.encode()).hexdigest()[:16] / name
         cached_folder(directory, lambda: _make(path, name, directory, chosen))
     catalog.register_object(name, lambda: folder.load(directory, name))
     return name
@@ -148,6 +153,24 @@ def check_name(name: str, *, reject_existing: bool = True) -> str:
     return name
 
 
+def _content(path: Path) -> str:
+    """Return a digest of a file and of those that it names."""
+    hashed = hashlib.sha256()
+    if path.suffix.lower() in MJCF_FORMATS:
+        mjcf = read_mjcf(path)
+        hashed.update(mjcf.text.encode())
+        for file in mjcf.files:
+            hashed.update(file.read_bytes())
+    else:
+        hashed.update(path.read_bytes())
+        for surface in call_limited(load_surfaces, path, about=str(path)):
+            image = surface.image.tobytes() if surface.image else b""
+            hashed.update(
+                np.ascontiguousarray(surface.vertices).tobytes() + repr(surface.rgba).encode() + image
+            )
+    return hashed.hexdigest()
+
+
 def _name_of(path: Path) -> str:
     words = "".join(c if c.isascii() and c.isalnum() else "_" for c in path.stem.lower())
     return words if not words[:1].isdigit() else f"object_{words}"
@@ -160,7 +183,7 @@ def _make(path: Path, name: str, directory: Path, options: Options) -> Added:
     notes: list[str] = []
     scratch = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=directory.parent))
     try:
-        if path.suffix.lower() in (".xml", ".mjcf"):
+        if path.suffix.lower() in MJCF_FORMATS:
             if options.mesh_options:
                 raise LiberoError(
                     f"{path}: an MJCF file defines {', '.join(options.mesh_options)} itself; omit it"
