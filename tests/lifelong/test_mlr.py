@@ -172,7 +172,7 @@ def test_latents_take_a_byte_for_each_number():
 
 def test_a_step_costs_less_than_one_of_fine_tuning_with_the_same_windows():
     policy, algorithm = learned(2)
-    plain = step_costs(make_policy(), sequences.Sequential(), sequences.dataset(1), 8)
+    plain = step_costs(make_policy(), sequences.ALGORITHMS["sequential"](), sequences.dataset(1), 8)
     algorithm.begin_task(2, sequences.dataset(2), policy)
     costs = step_costs(policy, algorithm, sequences.dataset(2), 8)
     assert costs["flops_per_step"] < plain["flops_per_step"]
