@@ -99,8 +99,10 @@ def _replay_episode(
     obs = env.set_state(states[0])
     drift, arm_drift, frames, terminated = [], [], [], False
     for t, action in enumerate(episode.actions):
-        if by == "state" and t:
-            obs = env.set_state(states[t])
+        if by == "state" and t:  # the goal's conditions over time remember the states before
+            env.simulations.set_physics_state(0, states[t])
+            env.batch.check_goal(0)
+            obs = {name: rows[0] for name, rows in env.batch.observe(0).items()}
         qpos, recorded_qpos = env.simulations.fields["qpos"][0], states[t, 1 : 1 + nq]
         offsets = qpos[objects] - recorded_qpos[objects]  # (n, 3)
         drift.append(np.linalg.norm(offsets, axis=1).max(initial=0.0))
@@ -141,11 +143,11 @@ def rerun_actions(file: Path, target: Path) -> Path:
         env = renderer.env.batch
         for episode in progress_bar(renderer.episodes(file), desc="replay", unit="demo"):
             renderer.env.set_state(episode.states[0])
-            states = []
+            states, success = [], False
             for action in episode.actions:
                 states.append(env.simulations.physics_state(0))
                 env.simulations.step([0], action[None])
-            success = bool(env.check_goal(0)[0])
+                success, _ = env.check_goal(0)  # conditions over time remember each moment
             writer.write(
                 demo_number(episode.name), replace(episode, states=np.array(states), success=success)
             )

@@ -8,13 +8,17 @@ import pytest
 
 from libero_env import BatchEnv, Expert, LiberoEnv, SubprocEnv, make_task
 from libero_env.cli.main import main
+from libero_env.demos.read import read_episodes
+from libero_env.demos.replay import REPLAY_MODES, replay, rerun_actions
 from libero_env.errors import BDDLError, InvalidInputError, LiberoError, UnknownNameError
+from libero_env.expert.expert import Attempt
 from libero_env.expert.planning.goal_plan import UnsupportedGoalError, plan_goal
 from libero_env.sim.history import History
 from libero_env.sim.predicates import SEMANTICS, register_predicate
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.tasks import Atom, Count, Never, Then, bddl, write_task
 from libero_env.tasks.problem import KINDS, differences
+from tests.harness.demos import generate
 
 A, B, C = (Atom("Open", (name,)) for name in ("a", "b", "c"))
 GOALS = [
@@ -193,6 +197,28 @@ def test_a_state_keeps_what_was_remembered():
         broken[-2] = 0.5
         with pytest.raises(InvalidInputError, match="what the goal remembers"):
             env.set_state(broken)
+
+
+def test_recordings_that_are_run_again_are_judged_by_all_their_moments(tmp_path, monkeypatch):
+    def wave(env, experts, noise, max_steps):
+        actions, states, ended = np.array(moves(1, -1, -1)), [], False
+        physics = lambda: [env.simulations.physics_state(i) for i in range(env.num_envs)]  # noqa: E731
+        while not np.any(ended):
+            states.append(physics())
+            ended = env.step(np.tile(actions[len(states) - 1], (env.num_envs, 1)))[2]
+        states, done = np.array([*states, physics()]), actions[: len(states)]
+        fixtures = env.simulations.fixtures
+        return [
+            Attempt(bool(ended[i]), states[:, i], done, done, 0, "", fixtures[i].copy())
+            for i in range(len(experts))
+        ]
+
+    monkeypatch.setattr("libero_env.demos.record.run_experts", wave)
+    file = generate(STEPS, 1, path=tmp_path / "wave.hdf5", camera_size=(16, 16), workers=1)
+    again = rerun_actions(file, tmp_path / "again.hdf5")
+    for recorded in (file, again):
+        assert [episode.success for episode in read_episodes(recorded)] == [True]
+        assert [one.success for mode in REPLAY_MODES for one in replay(recorded, by=mode)] == [True, True]
 
 
 def test_counting_and_what_must_not_happen():
