@@ -4,6 +4,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
 
+from pydantic import AfterValidator
+
 from libero_env.cli.options import (
     Device,
     Field,
@@ -38,6 +40,15 @@ EVENT_SEVERITIES = (0.3, 0.6, 1.0)
 HELD_OUT = 5  # demonstrations that relearning is measured on
 CLOCK = "clock="  # beginning of a condition that is no perturbation
 PAIRS = ("camera=0.4,light=0.4", "camera=0.4,robot=0.4", "light=0.4,noise=0.4")
+
+
+def _check_run_folder(path: Path) -> Path:
+    if path.is_file():  # a checkpoint is also a policy, but these commands measure a run
+        raise ValueError(f"{path} is a file; give the directory of the run")
+    return path
+
+
+RunFolder = Annotated[FilePath, AfterValidator(_check_run_folder)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,7 +228,7 @@ class RelearnRequest(_Checked):
         ConfigError: A value is of another kind or outside of its range.
     """
 
-    run: Positional[FilePath]
+    run: Positional[RunFolder]
     tasks: tuple[Natural, ...] = ()
     steps: Positive = 400
     every: Positive = 20
@@ -257,7 +268,7 @@ class DiagnoseRequest(_Checked):
         ConfigError: A value is of another kind or outside of its range.
     """
 
-    run: Positional[FilePath]
+    run: Positional[RunFolder]
     held_out: Annotated[int, Field(ge=1, le=1000)] = 5
     episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
     device: Device = "auto"

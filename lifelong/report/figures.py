@@ -287,7 +287,7 @@ def _draw_matrix(axes: Axes, panel: Panel, first: int, font: float) -> matplotli
     size = len(panel.rates)
     image = axes.imshow(100 * panel.rates, cmap=success_colours(), vmin=0, vmax=100)
     axes.set_title(shorten(panel.title))
-    ticks = range(0, size, 1 if size <= LARGEST_WITH_EVERY_TASK else math.ceil(size / 10))
+    ticks = range(0, size, 1 if size <= LARGEST_WITH_EVERY_TASK else math.ceil(size / 6))
     axes.set_yticks([t for t in ticks if t >= first], [str(t + 1) for t in ticks if t >= first])
     axes.set_xticks(ticks, [str(t + 1) for t in ticks])
     axes.tick_params(length=0)

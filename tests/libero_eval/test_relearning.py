@@ -13,7 +13,7 @@ import torch
 from libero_eval import relearning
 from libero_eval.cli import runs
 from libero_eval.relearning import Trial, error_on, failure_share, relearn, steps_until
-from libero_eval.requests import RelearnRequest
+from libero_eval.requests import DiagnoseRequest, RelearnRequest
 from lifelong.algorithms import Sequential
 from lifelong.checkpoints import load
 from lifelong.data.settings import DataSettings
@@ -394,6 +394,10 @@ def test_tasks_that_do_not_exist_and_settings_that_make_no_sense_are_refused(fin
     for change in ({"every": 0}, {"steps": 0}, {"tolerance": -0.1}, {"held_out": 0}, {"episodes": 51}):
         with pytest.raises(ConfigError, match=f"relearn.{next(iter(change))} is"):
             RelearnRequest(run=folder, **change)
+    (folder / "task_2.safetensors").touch()
+    for request in (RelearnRequest, DiagnoseRequest):
+        with pytest.raises(ConfigError, match=r"task_2.safetensors is a file; give the directory of the run"):
+            request(run=folder / "task_2.safetensors")
     with pytest.raises(ConfigError, match="--held-out is of the error, and --episodes measures success"):
         RelearnRequest(run=folder, held_out=10, episodes=5)
     asked = (RelearnRequest(run=folder, episodes=n).demos_held_out for n in (0, 5))
