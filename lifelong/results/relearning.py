@@ -22,8 +22,8 @@ class Savings:
         final_error: The same at the end of the run.
         again: Number of steps from the end of the run until it was back; None if it was given up.
         first: Number of steps from the run's initial weights; None if it was given up, or not measured.
-        tried: Number of steps after which the longer of the two was given up.
-        paired: Whether the first was measured.
+        again_tried: Largest number of steps from the end of the run.
+        first_tried: Largest number of steps from the initial weights; None if it was not measured.
     """
 
     task: int
@@ -31,8 +31,8 @@ class Savings:
     final_error: float
     again: int | None
     first: int | None
-    tried: int
-    paired: bool
+    again_tried: int
+    first_tried: int | None
 
     @property
     def share(self) -> float | None:
@@ -87,10 +87,9 @@ def savings(records: Sequence[RelearnRecord]) -> list[Savings]:
             if len({b - a for one in (r, last) for a, b in pairwise(one.steps)}) < 2  # measured as often
         ]
         first = rivals[-1] if rivals else None
-        tried = max(last.steps[-1], first.steps[-1] if first else 0)
-        needed = first.needed if first else None
+        needed, tried = (first.needed, first.steps[-1]) if first else (None, None)
         errors = last.learned_error, last.errors[0]
-        found.append(Savings(task, *errors, last.needed, needed, tried, first is not None))
+        found.append(Savings(task, *errors, last.needed, needed, last.steps[-1], tried))
     return found
 
 
@@ -110,8 +109,8 @@ def savings_rows(records: Sequence[RelearnRecord]) -> list[tuple[str, ...]]:
     shown = _percent if records[0].episodes else "{:.3f}".format
     rows: list[tuple[str, ...]] = []
     for row in savings(records):
-        first = _steps(row.first, row.tried) if row.paired else "–"
-        again = _steps(row.again, row.tried)
+        first = "–" if row.first_tried is None else _steps(row.first, row.first_tried)
+        again = _steps(row.again, row.again_tried)
         share = "–" if row.share is None else f"{100 * row.share:.0f} %".replace("-", "−")
         measured = shown(row.learned_error), shown(row.final_error)
         rows.append((str(row.task + 1), *measured, again, first, share))

@@ -150,16 +150,20 @@ def test_savings_pair_the_starts_of_each_task() -> None:
         record(3, "final", (0.3, 0.2)),
         record(3, "initial", (0.5, 0.1)),
         record(4, "initial", (0.5, 0.1)),
+        record(5, "initial", (0.5, 0.4, 0.3)),  # tried for longer than the other
+        record(5, "final", (0.3, 0.2)),
     ]
     (records,) = by_measure(records)
     found = savings(records)
     assert [(s.task, s.again, s.first, s.share) for s in found] == [
-        (0, 10, 40, 0.75), (1, 20, 10, -1.0), (2, 0, None, None), (3, None, 10, None)
+        (0, 10, 40, 0.75), (1, 20, 10, -1.0), (2, 0, None, None), (3, None, 10, None),
+        (5, None, None, None),
     ]  # fmt: skip
     assert savings_rows(records)[0] == ("1", "0.100", "0.300", "10", "40", "75 %")
     assert savings_rows(records)[2][3:] == ("0", "–", "–"), "the first was not measured"
     assert savings_rows(records)[3][3:] == ("> 10", "10", "–")
-    assert savings_tables(records).count("\n") == 4
+    assert savings_rows(records)[4][3:] == ("> 10", "> 20", "–")
+    assert savings_tables(records).count("\n") == 5
     for odd in ({"learned_error": 0.2}, {"steps": (0, 50)}):  # of other demonstrations, measured less often
         last = replace(record(0, "final", (0.3, 0.1)), **odd)
         assert savings_rows([*records, last])[0][4:] == ("–", "–")
