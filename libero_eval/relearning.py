@@ -15,23 +15,25 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 import torch
 
+from libero_env.demos.read import demo_origin
 from libero_env.errors import SimulationError
 from libero_eval.requests import RelearnRequest
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.demonstrations import DemoDatasets, find_demos, perturb_demos
+from lifelong.data.demonstrations import DemoDatasets, demo_copies, find_demos, perturb_demos
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows, WindowDataset
-from lifelong.errors import LifelongError
+from lifelong.errors import DataError, LifelongError
 from lifelong.evaluation.environments import VectorEnv
 from lifelong.evaluation.restore import LoadedRun, read_config, restore
 from lifelong.evaluation.rollout import rollout
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.results.log import ResultLog
-from lifelong.results.records import RelearnRecord, back_limit
+from lifelong.results.records import DemonstrationsRecord, RelearnRecord, back_limit
 from lifelong.results.relearning import FILE_NAME
 from lifelong.seeding import RELEARN
 from lifelong.sequence.learning import meet
@@ -80,7 +82,7 @@ def failure_share(policy: Policy, run: LoadedRun, task: int, env: VectorEnv, epi
         policy,
         env,
         range(episodes),
-        language=run.embed(run.learned_task(task)),
+        language=run.embed(task),
         horizon=run.eval.horizon,
         settle_steps=run.eval.settle_steps,
         seed=(run.seed, RELEARN, task),
@@ -134,11 +136,11 @@ def relearn(request: RelearnRequest, initial: Policy) -> list[RelearnRecord]:
         )
         training, held_out = task_windows(run, task, request.demos_held_out, config)
         with measured_on(run, task, held_out, request.episodes) as measure:
-            with before.acting(run.tasks[task]) as then:
+            with before.acting(task) as then:
                 learned = measure(then)
             trial = Trial(task, training, measure, back_limit(learned, request.tolerance, request.episodes))
             for start in starts:
-                acting = run.acting(run.tasks[task]) if start == "final" else None
+                acting = run.acting(task) if start == "final" else None
                 with acting or nullcontext(_met(run, initial, task, config)) as policy:
                     record = _relearned(run, policy, start, trial, learned, request, config)
                     log.append(replace(record, weights=weights if start == "initial" else ""))
@@ -285,7 +287,7 @@ def stage_windows(run: LoadedRun, config: Configuration) -> StageData:
     """
     stream, learned = _learned_from(run, config)
     paths, read = find_demos(run.tasks, learned, run.data, None), replace(run.data, memory="host")
-    languages = torch.stack([run.embed(run.learned_task(task)) for task in range(len(run.tasks))])
+    languages = torch.stack([run.embed(task) for task in range(len(run.tasks))])
     windows = DemoDatasets(paths, learned, run.policy.spec, languages, read, run.device)
     return StageData(windows, run.stages, stream, run.seed)
 
@@ -311,19 +313,31 @@ def task_windows(
     learned_from, needed = learned[task], list(learned)
     needed[task] += held_out
     recorded = find_demos(run.tasks, needed, data, None)[task]  # data.files may name files of every task
-    tasks, counts = [run.tasks[task]], [needed[task]]
-    (path,) = perturb_demos([recorded], tasks, counts, [run.perturbations(task)], data, None)
-    languages, read = run.embed(run.learned_task(task))[None], replace(data, memory="host")
+    _require_learned(run, task, recorded, learned_from)
+    tasks, perturb = [run.tasks[task]], [run.perturbations(task)]
+    (path,) = perturb_demos([recorded], tasks, [needed[task]], perturb, data, None)
+    copies = demo_copies([recorded], tasks, [learned_from], perturb, data, None)
+    languages, read = run.embed(task)[None], replace(data, memory="host")
 
-    def windows(count: int) -> TaskWindows:
-        return DemoDatasets([path], [count], run.policy.spec, languages, read, run.device)[0]
+    def windows(count: int, copies: Sequence[Sequence[Path]] = ()) -> TaskWindows:
+        return DemoDatasets([path], [count], run.policy.spec, languages, read, run.device, copies)[0]
 
-    training = windows(learned_from)
+    training = windows(learned_from, copies)
     if not held_out:
         return training, None
-    everything = windows(sum(counts))
-    rest = torch.arange(len(training), len(everything))  # windows are in the order of the demonstrations
+    everything, own = windows(needed[task]), len(training) // (1 + len(copies[0]))
+    rest = torch.arange(own, len(everything))  # windows are in the order of the demonstrations
     return training, everything.batch(rest[torch.linspace(0, len(rest) - 1, min(MEASURED, len(rest))).long()])
+
+
+def _require_learned(run: LoadedRun, task: int, file: Path, count: int) -> None:
+    """Raise a DataError where a file no longer has the demonstrations that a run learned a task from."""
+    found = ResultLog(run.path / "results.jsonl").read().of(DemonstrationsRecord)
+    if found and demo_origin(file, count).digest != found[-1].digests[task]:
+        raise DataError(
+            f"{file} has other demonstrations than {run.path} learned {run.tasks[task].name!r} from; "
+            "data.files or data.folder of the run's config.yaml say where they are looked for"
+        )
 
 
 @contextmanager

@@ -286,7 +286,7 @@ class SaliencyRequest(_Checked):
         start: Initial state of the rollout.
         moments: Number of images.
         stride: Distance of two places in pixels of a 128-pixel image.
-        horizon: Maximum number of control steps.
+        horizon: Maximum number of control steps (default: the run's).
         device: auto, cpu, cuda, cuda:1.
         allow: Packages of others whose classes the run's configuration may name (default: none; their code is
             executed).
@@ -298,7 +298,7 @@ class SaliencyRequest(_Checked):
     start: Annotated[int, Field(ge=0, lt=NUM_INIT_STATES)] = 0
     moments: Annotated[int, Field(ge=1, le=100)] = 6
     stride: Annotated[float, Field(ge=1, le=128)] = 8.0
-    horizon: Horizon = 200
+    horizon: Horizon | None = None
     device: Device = "auto"
     allow: tuple[str, ...] = ()
 

@@ -27,12 +27,13 @@ from torch.nn import functional
 from libero_env.errors import SimulationError
 from libero_env.storage import atomic_path, atomic_write_text, require_own_folders
 from libero_eval.requests import SaliencyRequest
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, PolicyError
 from lifelong.evaluation.actors import PolicyActor, observe
 from lifelong.evaluation.environments import Obs
 from lifelong.evaluation.restore import LoadedRun, restore
 from lifelong.evaluation.rollout import run_episodes
 from lifelong.policies.base import Policy, in_mode
+from lifelong.policies.bc_rnn import BCRNN
 from lifelong.seeding import generator
 from lifelong.types import Batch, Observation
 
@@ -167,6 +168,20 @@ def window_at(frames: Sequence[Mapping[str, Tensor]], step: int, length: int) ->
     return {name: torch.cat([frame[name] for frame in window], dim=1) for name in window[0]}
 
 
+def frames_used(policy: Policy, step: int) -> int:
+    """Return how many frames, the last ones, a policy's action depends on that it takes at a step of an episode.
+
+    Raises:
+        PolicyError: The policy plans several actions at once, of which most depend on earlier frames.
+    """
+    if policy.chunk > 1:
+        raise PolicyError(
+            f"saliency explains the action of the last frame, and this policy plans {policy.chunk} actions at once"
+        )
+    length, memory = policy.spec.seq_len, policy.memory if isinstance(policy, BCRNN) else "window"
+    return {"window": length, "reset": step % length + 1, "none": 1}[memory]
+
+
 def _places(size: int, stride: float) -> Tensor:
     """Return evenly spaced centres about a stride apart; the outer ones are half a distance from the edge."""
     count = max(1, round(size / stride))
@@ -237,20 +252,21 @@ def draw_saliency(request: SaliencyRequest) -> Path:
 
     Raises:
         ConfigError: The task does not exist, or the folder is a link that leads out of the run.
-        LiberoError: The run cannot be read, or its policy has no `predict`.
+        LiberoError: The run cannot be read, or its policy has no `predict` or plans several actions at once.
     """
     run = restore(request.run, after=request.after, device=request.device, allow=request.allow)
     task, settings = request.task, SaliencySettings(stride=request.stride)
     if task >= len(run.tasks):
         raise ConfigError(f"there is no task {task}; valid: tasks 0 to {len(run.tasks) - 1}")
     require_own_folders(run.path, "saliency", error=ConfigError)
-    frames, success = _run_episode(run, task, request.start, request.horizon)
+    horizon = request.horizon or run.eval.horizon
+    frames, success = _run_episode(run, task, request.start, horizon)
     steps = sorted({round(i) for i in np.linspace(0, len(frames) - 1, request.moments)})
     if len(steps) < request.moments:
         print(f"note: {len(steps)} moments, as the rollout has no more steps", file=sys.stderr)
-    language = run.embed(run.learned_task(task)).to(run.device)
-    with run.acting(run.tasks[task]) as policy:
-        windows = [window_at(frames, step, policy.spec.seq_len) for step in steps]
+    language = run.embed(task).to(run.device)
+    with run.acting(task) as policy:
+        windows = [window_at(frames, step, frames_used(policy, step)) for step in steps]
         batches = [_batch(window, language, policy) for window in windows]
         heats = [saliency(policy, batch, settings).cpu().numpy() for batch in batches]
     pictures = [frames[step]["images"][0, 0].cpu().numpy() for step in steps]
@@ -261,6 +277,8 @@ def draw_saliency(request: SaliencyRequest) -> Path:
     with atomic_path(path) as part:
         Image.fromarray(contact_sheet(pictures, heats, enlarge)).save(part, "PNG")
     outcome = "success" if success else "failure"
+    if horizon != run.eval.horizon:
+        outcome += f" within {horizon} steps, and the run's horizon is {run.eval.horizon}"
     caption = f"{run.learned_task(task).language}: {outcome}, after learning {run.learned + 1} tasks"
     caption += f"; start {request.start}, steps {', '.join(map(str, steps))}"
     atomic_write_text(path.with_suffix(".txt"), f"{caption}\n")
@@ -269,8 +287,8 @@ def draw_saliency(request: SaliencyRequest) -> Path:
 
 def _run_episode(run: LoadedRun, task: int, start: int, horizon: int) -> tuple[list[dict[str, Tensor]], bool]:
     """Return the policy's observations at each step, (1, 1, ...) tensors by name, and the episode's success."""
-    language, draws = run.embed(run.learned_task(task)), [generator(run.seed, start)]
-    with closing(run.environment(task, 1, horizon)) as env, run.acting(run.tasks[task]) as policy:
+    language, draws = run.embed(task), [generator(run.seed, start)]
+    with closing(run.environment(task, 1, horizon)) as env, run.acting(task) as policy:
         actor = RecordingActor(policy, language, run.device, run.eval.precision, draws)
         done = run_episodes(actor, env, [start], horizon=horizon, settle_steps=run.eval.settle_steps)
     if done.failed:

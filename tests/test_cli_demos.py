@@ -53,6 +53,13 @@ def test_images_have_the_size_that_a_run_reads():
     assert config.camera_size == (32, 48)
 
 
+def test_the_seed_is_that_of_a_run_unless_it_is_given():
+    request = cli_demos.RecordingRequest(task="libero_goal/3", training=("preset=laptop", "data.seed=7"))
+    for given, seed in ((None, 7), (0, 0)):
+        (config,) = cli_demos.demo_configs(replace(request, seed=given))
+        assert config.seed == seed
+
+
 @pytest.mark.parametrize(("given", "robot"), [(None, "robosuite-1.4.1"), ("libero", "libero")])
 def test_the_robot_is_that_of_a_run_unless_it_is_given(given, robot):
     training = ("preset=laptop", "data.robot=robosuite-1.4.1")
@@ -162,3 +169,6 @@ def test_images_can_be_left_out_and_rendered_later(tmp_path, monkeypatch):
     assert cli.main(["demos", "rerender", str(file), str(drawn), "--size", "16"]) == 0
     (demo,) = read_demos(drawn, ["agentview_rgb", "joint_states"])
     assert demo.obs["agentview_rgb"].shape[1:] == (16, 16, 3)
+    dark = tmp_path / "dark.hdf5"
+    assert cli.main(["demos", "rerender", str(file), str(dark), "--perturb", "light=0.5"]) == 0
+    assert {"agentview_rgb", "eye_in_hand_rgb"} <= set(h5py.File(dark)["data/demo_0/obs"])

@@ -150,7 +150,7 @@ def shifts(groups: dict[str, dict], order: list[str]) -> Iterator[tuple[str, lis
             rows.append(
                 [
                     label,
-                    str(len(found["seeds"])),
+                    str(found["runs"]),
                     "yes" if groups[label]["told_task"] else "no",
                     f"{found['final']:.2f}",
                     f"{found['final_shifted']:.2f}",

@@ -49,7 +49,8 @@ class RecordingRequest:
         bddl: A user-defined task file.
         n: Demonstrations of each task.
         size: Size of the images, 128 or 120x160 (default: 128, or that of --for).
-        training: Overrides of libero train, such as preset=laptop: size, drawing and robot are those of this run.
+        training: Overrides of libero train, such as preset=laptop: size, drawing, robot and seed are those of this
+            run.
         cameras: Cameras to render: names, or texts such as "top,pos=0.4 0 1.6,lookat=0 0 0.9,fovy=60,body=world",
             each of which adds a camera (default: agentview robot0_eye_in_hand).
         no_images: Record states, proprioception and actions only; `rerender` can add images later.
@@ -58,7 +59,7 @@ class RecordingRequest:
         segmentation: Record a segmentation too.
         robot: Model of the arm, libero or robosuite-1.4.1 (default: libero, or that of --for).
         backend: Physics, mujoco, or warp on a GPU, as in warp,device=cuda:1.
-        seed: Seed of starts, motion styles and action noise.
+        seed: Seed of starts, motion styles and action noise (default: 0, or that of --for).
         reserved: Start from the 50 stored states, which evaluation uses.
         variation: What varies: the motion style, noise on the executed actions, pushes; or none.
         noise: Standard deviation of the noise on actions (default: 0.12).
@@ -80,7 +81,7 @@ class RecordingRequest:
     segmentation: Segmentation | None = None
     robot: str | None = None
     backend: str = "mujoco"
-    seed: Seed = 0
+    seed: Seed | None = None
     reserved: bool = False
     variation: tuple[Literal["style", "noise", "pushes", "none"], ...] = ("style", "noise", "pushes")
     noise: Annotated[float, Field(ge=0, le=10)] | None = None
@@ -130,15 +131,16 @@ def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
         images = {"size": request.size, "depth": request.depth, "segmentation": request.segmentation}
         refuse("with --no-images", cameras=request.cameras, **images)
     size, drawing, robot = request.size or DemoConfig.camera_size, request.drawing, request.robot
+    seed = request.seed
     if request.training:
         data = importlib.import_module("lifelong.cli.runs").data_settings(request.training)
         size, drawing = request.size or (data.image_size, data.image_size), drawing or data.drawing
-        robot = robot or data.robot
+        robot, seed = robot or data.robot, data.seed if seed is None else seed
     return [
         DemoConfig(
             task,
             size,
-            request.seed,
+            seed or 0,
             request.pairing,
             disturb=bool({"noise", "pushes"} & set(request.variation)),
             variation=variation(request),

@@ -25,6 +25,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from libero_env.assets.pack import Pack
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import Episode
@@ -48,16 +49,21 @@ class ActionConverter:
         file: Demonstration file, which states scene and robot.
         kind: One of `KINDS`.
         task: Task that was recorded; None for the one that the file states.
+        assets: Where models come from, as for `LiberoEnv`.
 
     Raises:
         UnknownNameError: No such kind of action is known.
         DemoError: It is not a demonstration file, or names no task.
     """
 
-    def __init__(self, file: Path, kind: str, task: Task | None = None):
+    def __init__(
+        self, file: Path, kind: str, task: Task | None = None, assets: Pack | str | Path | None = None
+    ):
         require_known("kind of actions", kind, KINDS)
         self.kind, self._file = kind, file
-        self._renderer = StateRenderer.of_file(file, RenderConfig(()), task=task) if kind != "delta" else None
+        self._renderer = (
+            StateRenderer.of_file(file, RenderConfig(()), assets, task=task) if kind != "delta" else None
+        )
 
     def convert(self, episode: Episode) -> Episode:
         """Return an episode with its actions converted; each must stand with the state before it.

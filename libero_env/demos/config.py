@@ -201,6 +201,10 @@ class DemoConfig:
         extra = self.render_config.header() | self.render_config.mask_names(scene)
         if variation := changed_options(self.variation):
             extra["variation"] = json.dumps(variation)
+        if scene.workspace.own or any(item.digest for item in scene.entities.values()):
+            extra["own_models"] = (
+                scene.digest
+            )  # the user's also have regions, grasps, ... that no compiled model has
         if self.backend.is_warp:  # files without it are of MuJoCo
             extra["backend"] = self.backend.name
         return make_header(
@@ -253,9 +257,13 @@ def _contents(part: Any) -> Iterator[tuple[str, bytes]]:
 
 def _env_kwargs(render: RenderConfig) -> dict[str, Any]:
     """Return the arguments that the original's environment would be made with."""
+    return {**read_yaml("demos/original_env.yaml"), **camera_kwargs(render)}
+
+
+def camera_kwargs(render: RenderConfig) -> dict[str, Any]:
+    """Return those arguments of the original's environment that say what is rendered."""
     height, width = render.size
     return {
-        **read_yaml("demos/original_env.yaml"),
         "camera_names": sorted(map(camera_name, render.cameras), reverse=True),
         "camera_heights": height,
         "camera_widths": width,

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -324,25 +324,31 @@ def read_values(group: h5py.Group, key: str, where: str, *, check: bool = True) 
     return values
 
 
-def demo_states(file: Path, name: str) -> np.ndarray:
-    """Return the states (T, 1 + nq + nv) of a demonstration; empty where it has none."""
+def demo_motion(file: Path, name: str) -> list[np.ndarray | None]:
+    """Return states and actions, executed and intended, of a demonstration; None for what it does not have."""
+    keys = ("states", "actions", "expert_actions")
     with open_demo_file(file) as handle:
-        states = read_values(handle["data"][name], "states", f"{file}: {name}")
-    return np.zeros(0) if states is None else states
+        return [read_values(handle["data"][name], key, f"{file}: {name}") for key in keys]
+
+
+def same_motion(one: Sequence[np.ndarray | None], other: Sequence[np.ndarray | None]) -> bool:
+    """Return whether two demonstrations have the same states and actions, see `demo_motion`, to the bit."""
+    return all(
+        a is b if a is None or b is None else np.array_equal(a, b) for a, b in zip(one, other, strict=True)
+    )
 
 
 def reached_goal(group: h5py.Group, where: str, ends: Iterable[np.ndarray | None]) -> bool:
-    """Return whether a demonstration reached its goal: what its attribute says, or that its rewards or dones end so.
+    """Return whether a demonstration reached its goal: what its attribute says, else how its rewards or dones end.
 
     Args:
         group: The demonstration.
         where: File and name, for error messages.
-        ends: Rewards and dones, where it has them.
+        ends: Rewards and dones, where it has them; the first decides.
     """
-    last = [values[-1] > 0 for values in ends if values is not None]
     stated = read_attribute(group, "success", where)
-    if stated is None:
-        return any(last) if last else True
+    if stated is None:  # an episode that failed may be done, too
+        return next((bool(values[-1] > 0) for values in ends if values is not None), True)
     if not isinstance(stated, bool | int | np.bool_ | np.integer) or int(stated) not in (0, 1):
         raise BrokenDemoError(f"{where} attribute success is {stated!r}; expected true or false")
     return bool(stated)

@@ -130,8 +130,11 @@ def filter_demos(
     """
     require_absent(target)
     dropped = [key for key, on in (("failures", success_only), ("no-ops", without_noops)) if on]
+    header = task_header(file, task)
     dropped_text = f"without {' and '.join(dropped) or 'nothing'}"
-    writer = DemoWriter(target, task_header(file, task) | {"filter": dropped_text})
+    if "filter" in header:
+        dropped_text = f"{header['filter']}, then {dropped_text}"
+    writer = DemoWriter(target, header | {"filter": dropped_text})
     writer.discard_parts()  # of an interrupted call, perhaps with another file
     count = 0
     for episode in read_episodes(file):

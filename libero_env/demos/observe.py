@@ -125,9 +125,9 @@ def recorded_rendering(file: Path) -> RenderConfig:
     with open_demo_file(file) as handle:
         size = picture_size(handle, file) or default.size
     return RenderConfig(
-        tuple(map(str, header.get("cameras", default.cameras))),
+        tuple(map(str, header.get("cameras", ()))) or default.cameras,
         size,
-        tuple(map(str, header.get("pictures", default.modalities))),
+        tuple(map(str, header.get("pictures", ()))) or default.modalities,
         header.get("drawing", FAST if "generator" in header else None),
     )
 

@@ -10,11 +10,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from libero_env.assets.pack import Pack, select_pack
-from libero_env.demos.config import MASK_NAMES, PERTURBED_HEADER, RenderConfig
-from libero_env.demos.contents import demo_names, demo_number, demo_states, json_attribute
+from libero_env.assets.pack import BUILTIN, Pack, select_pack
+from libero_env.demos.config import MASK_NAMES, PERTURBED_HEADER, RenderConfig, camera_kwargs
+from libero_env.demos.contents import demo_motion, demo_names, demo_number, json_attribute, same_motion
 from libero_env.demos.generate import DemoJob, claim_incomplete, number_of_processes, run_each
 from libero_env.demos.hdf5 import open_demo_file
 from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task, task_header
@@ -46,17 +44,21 @@ class RenderJob(DemoJob):
     path: Path = field(init=False)
 
     def __post_init__(self) -> None:
-        drawing = self.config.drawing or default_drawing(select_pack())
+        pack = select_pack()
+        drawing = self.config.drawing or default_drawing(pack)
         object.__setattr__(self, "config", replace(self.config, drawing=drawing))
         text, (height, width) = format_perturbations(self.config.perturb), self.config.size
         if len(text) > _LONGEST:
             text = f"{text[:40]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
-        folder = self.file.parent / f"under-{text}-{height}x{width}-{drawing}"
+        shown = drawing if pack.name == BUILTIN else f"{drawing}-{pack.name}"
+        folder = self.file.parent / f"under-{text}-{height}x{width}-{shown}"
         object.__setattr__(self, "path", folder / self.file.name if text else self.file)
 
     @cached_property
     def writer(self) -> DemoWriter:
-        return DemoWriter(self.path, rendered_header(self.file, self.config, self.task))
+        return DemoWriter(
+            self.path, rendered_header(self.file, self.config, self.task, select_pack()), ("models",)
+        )
 
     def missing(self, n: int) -> set[int]:
         """Return which of the first `n` recorded demonstrations are not rendered; see `DemoJob`.
@@ -64,13 +66,15 @@ class RenderJob(DemoJob):
         Raises:
             DemoError: What is there is broken, or of other demonstrations.
         """
-        rendered, missing = self.writer.recorded_states(), set()
+        rendered, missing = self.writer.recorded_motion(), set()
         with open_demo_file(self.file) as handle:
-            names = demo_names(handle, self.file)[:n]
-        for name in names:
+            names = demo_names(handle, self.file)
+        if gone := set(rendered) - set(map(demo_number, names)):
+            raise DemoError(f"{self.path} has demo_{min(gone)}, which {self.file} no longer has")
+        for name in names[:n]:
             if (number := demo_number(name)) not in rendered:
                 missing.add(number)
-            elif not np.array_equal(rendered[number], demo_states(self.file, name)):
+            elif not same_motion(rendered[number], demo_motion(self.file, name)):
                 raise DemoError(f"{self.path} has another {name} than {self.file}")
         return missing
 
@@ -156,12 +160,13 @@ def rerender(
     """
     if target.exists() and target.samefile(file):
         raise DemoError(f"{target} is the file to read; choose another name")
-    config = replace(config, drawing=config.drawing or default_drawing(select_pack(assets)))
+    pack = select_pack(assets)
+    config = replace(config, drawing=config.drawing or default_drawing(pack))
     task = task or recorded_task(file)
-    with closing(StateRenderer.of_file(file, config, assets, task=task)) as renderer:
-        header = rendered_header(file, config, task) | config.mask_names(renderer.scene)
-        writer = DemoWriter(target, header)
-        recorded = writer.recorded_states()
+    with closing(StateRenderer.of_file(file, config, pack, task=task)) as renderer:
+        header = rendered_header(file, config, task, pack) | config.mask_names(renderer.scene)
+        writer = DemoWriter(target, header, ("models",))
+        recorded = writer.recorded_motion()
         episodes = islice(read_episodes(file), limit)
         for episode in progress_bar(episodes, desc="render", unit="demo", progress=progress):
             name, number = episode.name, demo_number(episode.name)
@@ -169,22 +174,27 @@ def rerender(
                 poses = fixture_poses(episode, renderer.scene, f"{file}: {name}")
                 obs, robot_states = renderer.render_states(episode.states, poses, name)
                 writer.write(number, replace(episode, obs=obs, robot_states=robot_states))
-            elif not np.array_equal(recorded[number], episode.states):
+            elif not same_motion(recorded[number], (episode.states, episode.actions, episode.expert_actions)):
                 raise DemoError(f"{target} has another {name} than {file}; choose another name or remove it")
     return writer.finish()
 
 
-def rendered_header(file: Path, config: RenderConfig, task: Task) -> dict[str, Any]:
+def rendered_header(file: Path, config: RenderConfig, task: Task, pack: Pack) -> dict[str, Any]:
     """Return the attributes of a file that is rendered again, with the instruction where perturbations reword it.
 
     Args:
         config: What is rendered; its drawing is named.
         task: Task that was recorded.
+        pack: Models that are shown.
     """
     before = task_header(file, task)
     replaced = ("cameras", "pictures", "drawing", MASK_NAMES, *PERTURBED_HEADER)
     header = {k: v for k, v in before.items() if k not in replaced}
-    header |= {**config.header(), "pairing": "aligned"}
+    models = json.dumps({"pack": pack.name, "digest": pack.digest})
+    header |= {**config.header(), "pairing": "aligned", "models": models}
+    made_with = json_attribute(before, "env_args", file)
+    if isinstance(kwargs := made_with.get("env_kwargs"), dict):
+        header["env_args"] = json.dumps({**made_with, "env_kwargs": {**kwargs, **camera_kwargs(config)}})
     if "instruction" in f"{before.get('perturb', '')} {header.get('perturb', '')}":
         instruction = reword_task(task, config.perturb).language
         info = json_attribute(before, "problem_info", file)

@@ -11,7 +11,7 @@ from libero_env.assets.pack import Pack
 from libero_env.demos.actions import KINDS, ActionConverter
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import demo_number, read_header
-from libero_env.demos.observe import StateRenderer
+from libero_env.demos.observe import StateRenderer, recorded_rendering
 from libero_env.demos.read import Episode
 from libero_env.demos.write import DemoWriter, require_absent
 from libero_env.errors import DemoError
@@ -79,11 +79,11 @@ def replay(
         raise DemoError(f"replay by {by!r}; valid: {', '.join(REPLAY_MODES)}")
     if by == "state" and actions != "delta":
         raise DemoError(f"a replay by state executes no {actions} actions; replay by action")
-    config = RenderConfig(tuple(cameras), size, drawing=read_header(file).get("drawing"))
+    config = RenderConfig(tuple(cameras), size, drawing=recorded_rendering(file).drawing)
     keys = [image_name(camera, "rgb") for camera in cameras]
     extra = 0 if actions == "delta" else EXTRA_STEPS
     with (
-        closing(ActionConverter(file, actions, task)) as converter,
+        closing(ActionConverter(file, actions, task, assets)) as converter,
         closing(StateRenderer.of_file(file, config, assets, task=task, control=KINDS[actions])) as renderer,
     ):
         for episode in renderer.episodes(file, demos):

@@ -7,7 +7,7 @@ any other: `read_demos` reads it, or the whole folder.
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
@@ -18,9 +18,9 @@ import numpy as np
 from libero_env.demos.contents import (
     LOW_DIM_KEYS,
     check_demo,
+    demo_motion,
     demo_names,
     demo_number,
-    demo_states,
     file_attributes,
     is_image,
     value_fault,
@@ -35,6 +35,7 @@ FRAMES_PER_CHUNK = 8
 _CONFIG_KEYS = (  # attributes in which all demonstrations of a file agree
     *("bddl_file_name", "bddl_file_content", "seed", "camera_size", "cameras", "pictures", "drawing"),
     *("pairing", "generator", "disturbed", "variation", "model_digest", "filter", "perturb", "perturb_draws"),
+    "own_models",
 )
 REMEDY = "choose another file or remove this one"
 
@@ -54,12 +55,13 @@ class DemoWriter:
 
     Args:
         header: Attributes of the group `data`; `make_header` makes those of the original.
+        agree: Further attributes in which all demonstrations have to agree.
     """
 
-    def __init__(self, path: str | Path, header: Mapping[str, Any]):
+    def __init__(self, path: str | Path, header: Mapping[str, Any], agree: Sequence[str] = ()):
         self.path = Path(path)
         self.parts = self.path.with_name(self.path.name + ".parts")
-        self.header = dict(header)
+        self.header, self._agree = dict(header), (*_CONFIG_KEYS, *agree)
 
     def recorded(self) -> set[int]:
         """Return the numbers of the demonstrations that are complete on disk, in the file or among the parts.
@@ -69,9 +71,9 @@ class DemoWriter:
         """
         return {demo_number(name) for _, name in self._sources()}
 
-    def recorded_states(self) -> dict[int, np.ndarray]:
-        """Return the states (T, 1 + nq + nv) of each recorded demonstration, by its number."""
-        return {demo_number(name): demo_states(file, name) for file, name in list(self._sources())}
+    def recorded_motion(self) -> dict[int, list[np.ndarray | None]]:
+        """Return states and actions of each recorded demonstration, see `demo_motion`, by its number."""
+        return {demo_number(name): demo_motion(file, name) for file, name in list(self._sources())}
 
     def discard_parts(self) -> None:
         """Remove the parts that an interrupted recording left."""
@@ -157,10 +159,10 @@ class DemoWriter:
                 yield file, name
 
     def _check_header(self, file: Path, stated: Mapping[str, Any]) -> None:
-        for key in _CONFIG_KEYS if self.header else ():
+        for key in self._agree if self.header else ():
             here, expected = (_plain(values.get(key)) for values in (stated, self.header))
             if here != expected:
-                if key == "model_digest":
+                if key in ("model_digest", "own_models", "models"):
                     raise OtherRecordingError(f"{file}: was recorded with other models; {REMEDY}")
                 raise OtherRecordingError(
                     f"{file}: was recorded with {key} = {shorten(repr(here), 80)}, not "

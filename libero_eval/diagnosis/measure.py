@@ -4,7 +4,7 @@ The parts of a policy are what `encode`, `over_time` and `head` compute with. Wh
 policy that acts on it, so that weights of a task's own (PackNet, LoRA, single_task) count as what they are.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -157,7 +157,7 @@ def diagnose(request: DiagnoseRequest) -> Diagnosis:
             fishers[task] = estimator.estimate(training, policy, generator(run.seed, task))
         if end == ends[-1]:
             continue
-        with run.acting(run.tasks[task]) as acting:
+        with run.acting(task) as acting:
             now = copy_weights(acting)
         drifts += drift(policy, task, just[end], now, held_out)
         measures = [(held_out, 0, "error")] + [(None, request.episodes, "failures")] * bool(request.episodes)
@@ -165,13 +165,14 @@ def diagnose(request: DiagnoseRequest) -> Diagnosis:
             with measured_on(run, task, batch, episodes) as measure:
                 swaps.append(swap(policy, task, just[end], now, parts, measure, name))
     later = [(a, b) for a in stages for b in stages if stages[a] < stages[b]]
-    steps = list(zip(ends, ends[1:], strict=False)) if plain else []
+    separate = None if plain or _act_alike(run, ends) else algorithm
+    steps = [] if separate else list(zip(ends, ends[1:], strict=False))
     return Diagnosis(
         run=str(run.path),
         algorithm=algorithm,
         instructions=tuple(run.learned_task(task).language for task in stages),
         learned=len(stages),
-        notes=tuple(_notes(run, len(stages), None if plain else algorithm)),
+        notes=tuple(_notes(run, len(stages), separate)),
         updates=tuple(found for a, b in steps for found in updates(b, just[a], just[b], parts)),
         overlaps=tuple(overlap(pair, fishers[pair[0]], fishers[pair[1]], parts) for pair in later),
         drifts=tuple(drifts),
@@ -182,8 +183,17 @@ def diagnose(request: DiagnoseRequest) -> Diagnosis:
 def _just_after(run: LoadedRun, end: int, request: DiagnoseRequest) -> Weights:
     """Return the weights that acted on a stage's tasks just after it."""
     then = restore(run.path, after=end, device=request.device, allow=request.allow)
-    with then.acting(run.tasks[end]) as policy:
+    with then.acting(end) as policy:
         return copy_weights(policy)
+
+
+def _act_alike(run: LoadedRun, ends: Sequence[int]) -> bool:
+    """Return whether the same weights act on the tasks of all stages."""
+    acting = []
+    for end in (ends[0], ends[-1]):
+        with run.acting(end) as policy:
+            acting.append(copy_weights(policy))
+    return all(torch.equal(value, acting[1][name]) for name, value in acting[0].items())
 
 
 def _notes(run: LoadedRun, learned: int, separate: str | None) -> list[str]:
@@ -253,10 +263,10 @@ def overlap(
     """Return the overlap of two tasks' Fisher information, of all weights and within each part."""
 
     def among(names: list[str]) -> float:
-        flat = [
-            torch.cat([fisher[n].flatten() for n in names if n in fisher]).double()
-            for fisher in (first, second)
-        ]
+        known = [n for n in names if n in first]
+        if not known:  # a part that is frozen whole
+            return float("nan")
+        flat = [torch.cat([fisher[n].flatten() for n in known]).double() for fisher in (first, second)]
         return fisher_overlap(flat[0].cpu().numpy(), flat[1].cpu().numpy())
 
     return Overlap(tasks, among(list(first)), {part: among(names) for part, names in parts.items()})

@@ -96,9 +96,10 @@ def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regen
     env = renderer.env.batch
     labels = episode.labels if config.labels == "expert" else episode.actions
     moving = np.flatnonzero(~published_noop_steps(episode.actions))
-    env.simulations.set_physics_state(0, episode.states[0])
+    renderer.env.set_state(episode.states[0])
     for _ in range(config.settle_steps):
         env.simulations.step([0], _WAIT)
+        env.check_goal(0)  # conditions over time remember each moment
     stored: dict[str, list[np.ndarray]] = {
         key: [] for key in (*env.observer.empty_images(0), *STATE, "joint_states")
     }
@@ -116,7 +117,7 @@ def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regen
         states.append(env.simulations.physics_state(0))
         actions.append(label)
         env.simulations.step([0], executed[None])
-        success = i + 1 >= len(recorded) and bool(env.check_goal(0)[0])
+        success = env.check_goal(0)[0] and i + 1 >= len(recorded)
     return Episode(
         np.array(actions).reshape(-1, 7),
         np.array(states),

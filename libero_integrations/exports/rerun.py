@@ -96,8 +96,11 @@ class _Branch:
         if episode.expert_actions is not None:
             self._numbers("expert_action", episode.expert_actions, names)
         held = []
-        for state in episode.states:
-            renderer.env.batch.set_state(0, state)
+        for step, state in enumerate(episode.states):
+            if step == 0:
+                renderer.env.batch.set_state(0, state)
+            else:  # conditions over time remember the states before
+                renderer.env.simulations.set_physics_state(0, state)
             reached, atoms = renderer.env.batch.check_goal(0)
             held.append({"reached": reached, **atoms})
         for atom in held[0]:

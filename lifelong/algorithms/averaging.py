@@ -67,11 +67,10 @@ class Averaging(Algorithm):
         return 1 / (later + 1) if self.share is None else self.share
 
     def begin_task(self, task_index: int, dataset: TaskWindows, policy: Policy) -> None:
-        """Store the weights that the task begins with, if they are needed at its end."""
+        """Store the weights that the task begins with, unless the task's are taken whole."""
         for pattern in self.parts:
             matching(list(policy.state_dict()), [pattern], "weight", "algo.parts")
-        later = self.tasks + 1 > self.base_tasks
-        if later and min(self.share_of(self.tasks + 1), *self.parts.values(), 1) < 1:
+        if self.tasks + 1 > self.base_tasks:
             self.before = copy_weights(policy)
 
     @torch.no_grad()

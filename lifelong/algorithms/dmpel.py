@@ -1,5 +1,6 @@
 """A growing library of low-rank experts and a router that mixes them."""
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
@@ -260,6 +261,9 @@ class _Routed(Policy):
         self._coefficients: Tensor | None = None
         self.training = inner.training
         self.chunk, self.execute, self.inpaints = inner.chunk, inner.execute, inner.inpaints
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "_Routed":
+        return _Routed(copy.deepcopy(self.inner, memo), self._algorithm)  # which the layers' hooks refer to
 
     def window_losses(self, batch: Batch) -> Tensor:
         """Call the inner policy; windows without a query are routed by their own first frame."""

@@ -8,8 +8,9 @@ from weakref import WeakValueDictionary
 
 import torch
 
+from libero_env.assets.pack import select_pack
 from libero_env.demos.config import DemoConfig, RenderConfig
-from libero_env.demos.contents import demo_names, read_header
+from libero_env.demos.contents import demo_names, json_attribute, read_header
 from libero_env.demos.generate import demo_path, ensure_demos
 from libero_env.demos.hdf5 import open_demo_file
 from libero_env.demos.observe import recorded_frequency, recorded_robot, recorded_task
@@ -114,7 +115,7 @@ def _files_in(
     for task in tasks:
         file = folder / task.suite / f"{task.name}_demo.hdf5"
         if file.is_file():
-            if reason := _misfit(file, required[task.id], data):
+            if reason := _other_task(file, task) or _misfit(file, required[task.id], data):
                 raise DataError(f"data.folder: {file} {reason}")
             files[task.id] = file
     if not (left := [task for task in tasks if task.id not in files]):
@@ -126,8 +127,10 @@ def _files_in(
             folder, DemoConfig(task, size, data.seed or 0, drawing=data.drawing, robot=data.robot)
         )
         paths = [path for path, other in stated if same_meaning(task.problem, other.problem)]
-        if own in paths:  # which the recording completes
-            continue
+        if own in paths:
+            paths.remove(own)
+            if all(_recorded_by_expert(path) for path in paths):  # the recording completes its own
+                continue
         reasons = {path: _misfit(path, required[task.id], data) for path in paths}
         fitting = [path for path, reason in reasons.items() if not reason]
         if len(fitting) > 1:
@@ -139,7 +142,7 @@ def _files_in(
             files[task.id] = fitting[0]
             continue
         for path, reason in reasons.items():
-            if not str(read_header(path).get("generator", "")).startswith("scripted-expert"):
+            if not _recorded_by_expert(path):
                 raise DataError(f"data.folder: {path} {reason}")
             print(f"not used: {path} {reason}; others are recorded", file=sys.stderr)
     if stated and not files and not any(same_meaning(t.problem, o.problem) for t in left for _, o in stated):
@@ -171,6 +174,23 @@ def _stated_tasks(folder: Path, used: Sequence[Path]) -> list[tuple[Path, Task]]
     return stated
 
 
+def _recorded_by_expert(file: Path) -> bool:
+    """Return whether a file is the expert's, all of it."""
+    header = read_header(file)
+    return str(header.get("generator", "")).startswith("scripted-expert") and "filter" not in header
+
+
+def _other_task(file: Path, task: Task) -> str:
+    """Return that a file states another task than its name does, to follow its name; "" where it does not."""
+    try:
+        stated = recorded_task(file)
+    except DemoError:  # it states none
+        return ""
+    if stated.name == task.name or same_meaning(stated.problem, task.problem):
+        return ""
+    return f"is of {stated.name!r}, not of {task.name!r}; data.files takes files by the task that they state"
+
+
 def _misfit(file: Path, required: int, data: DataSettings) -> str:
     """Return why a file cannot be learned from with these settings, to follow its name; "" where it can."""
     header, size = read_header(file), data.image_size
@@ -182,6 +202,11 @@ def _misfit(file: Path, required: int, data: DataSettings) -> str:
         return f"was recorded at {hz} Hz; runs act at {CONTROL_HZ} Hz"
     if data.seed is not None and header.get("seed", data.seed) != data.seed:
         return f"was recorded with seed {header['seed']}; data.seed is {data.seed}"
+    models, used = json_attribute(header, "models", file).get("pack"), select_pack().name
+    if models not in (None, used):
+        return f"shows the models {models}; those of this run are {used}, see LIBERO_ASSETS"
+    if json_attribute(header, "variation", file).get("reserved"):
+        return "starts from the stored initial states, from which policies are evaluated"
     if data.drawing and "generator" in header and header.get("drawing", FAST) != data.drawing:
         return f"is drawn {header.get('drawing', FAST)}; data.drawing is {data.drawing}"
     available = len(demo_lengths(file, required))

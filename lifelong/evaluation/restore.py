@@ -74,13 +74,18 @@ class LoadedRun:
         """Return the perturbations under which a task of the run was learned and evaluated."""
         return self.perturb[position] if self.perturb else ()
 
-    def embed(self, task: Task) -> torch.Tensor:
+    def embed(self, task: Task | int) -> torch.Tensor:
         """Return the (L,) embedding of a task's instruction, as in training.
+
+        Args:
+            task: A task, or the position of one of the run's, which may have a task twice.
 
         Raises:
             LanguageError: The instruction cannot be embedded.
             LifelongError: The run's embedding is defined for its own tasks only (one-hot).
         """
+        if isinstance(task, int):
+            return self.language.embed(self.instructions)[task - len(self.tasks)]
         learned = map(self.learned_task, range(len(self.tasks)))
         names = [(t.name, t.language) for t in learned]
         if (own := (task.origin.name, task.language)) in names:
@@ -117,11 +122,17 @@ class LoadedRun:
         )
 
     @contextmanager
-    def acting(self, task: Task) -> Iterator[Policy]:
-        """Yield the policy that acts on a task; for a task that is not the run's, that of the last task learned."""
-        names = [t.name for t in self.tasks]
-        name = task.origin.name
-        position = names.index(name) if name in names else self.learned
+    def acting(self, task: Task | int) -> Iterator[Policy]:
+        """Yield the policy that acts on a task; for a task that is not the run's, that of the last task learned.
+
+        Args:
+            task: As for `embed`.
+        """
+        if isinstance(task, int):
+            position = task
+        else:
+            names, name = [t.name for t in self.tasks], task.origin.name
+            position = names.index(name) if name in names else self.learned
         stage = next(stage for stage in self.stages if position in stage)
         with self.algorithm.policy_for(stage[-1], self.policy) as policy:
             yield policy

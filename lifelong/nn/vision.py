@@ -55,8 +55,22 @@ def make_norm(kind: str, channels: int) -> nn.Module:
             raise PolicyError(
                 f"{channels} channels cannot be normalised in groups of 8; use a multiple of 8, or another norm"
             )
-        return nn.GroupNorm(groups, channels)
+        return _GroupNorm(groups, channels)
     return {"batch": nn.BatchNorm2d, "none": nn.Identity}[kind](channels)
+
+
+class _GroupNorm(nn.GroupNorm):
+    """Group normalisation that can be learned on inputs that need no gradient, such as those of a frozen convolution.
+
+    There PyTorch (2.13, on a CPU, channels last) writes the gradient of the input into no memory and is killed.
+    """
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Normalise (N, C, H, W)."""
+        learned = any(p.requires_grad for p in self.parameters())
+        if learned and torch.is_grad_enabled() and not x.requires_grad:
+            x = x.detach().requires_grad_()
+        return super().forward(x)
 
 
 class FiLM(nn.Module):

@@ -14,7 +14,7 @@ from lifelong.report.runs import Group, Run, algorithm_of, check_same_world, set
 from lifelong.results.provenance import few_of
 from lifelong.results.shifts import shift_scores
 from lifelong.stats.intervals import mean_and_half_width
-from lifelong.stats.methods import MARGIN, MethodRun, paired_difference, spreads, statistics
+from lifelong.stats.methods import MARGIN, MethodRun, paired_difference, spreads, statistics, units
 from lifelong.stats.metrics import METRIC_NAMES, intransigence, metric_values
 
 MUJOCO = "mujoco"  # back end of results that name none
@@ -257,36 +257,40 @@ def _subgoals(runs: Sequence[Run]) -> dict[str, dict[str, dict[str, float]]]:
 
 
 # shift -> (seed, data_seed) -> final success without and under it
-_Shifted = dict[str, dict[tuple[int, int | None], tuple[float, float]]]
+_Shifted = dict[str, dict[Hashable, list[tuple[float, float]]]]
 
 
 def _shifted(runs: Sequence[Run]) -> _Shifted:
+    """Return final success without and under each held-out shift, of the runs of each seed, or order."""
     found: _Shifted = {}
-    for run in runs:
+    for unit, run in zip(units(runs_of(runs)), runs, strict=True):
         for score in shift_scores(run.results):
             both = score.success("final").value, score.success("final_shifted").value
             if np.isfinite(both).all():
-                found.setdefault(score.shift, {})[run.record.seed, run.record.data_seed] = both
+                found.setdefault(score.shift, {}).setdefault(unit, []).append(both)
     return found
+
+
+def _lost(rates: Mapping[Hashable, Sequence[tuple[float, float]]]) -> dict[Hashable, float]:
+    return {unit: float(np.mean([a - b for a, b in pairs])) for unit, pairs in rates.items()}
 
 
 def _shifts(own: _Shifted, references: Mapping[str, _Shifted]) -> dict[str, dict[str, Any]]:
     """Return what a method's final success loses under each held-out shift, alone and beside references."""
-    lost = {shift: {seed: a - b for seed, (a, b) in seeds.items()} for shift, seeds in own.items()}
     found: dict[str, dict[str, Any]] = {}
-    for shift, seeds in own.items():
-        final, under = np.mean(list(seeds.values()), axis=0)
-        less: dict[str, Any] = {}
+    for shift, rates in own.items():
+        final, under = np.mean([np.mean(pairs, axis=0) for pairs in rates.values()], axis=0)
+        lost, less = _lost(rates), dict[str, Any]()
         for name, others in references.items():
-            theirs = {seed: a - b for seed, (a, b) in others.get(shift, {}).items()}
-            gaps = [value - theirs[seed] for seed, value in lost[shift].items() if seed in theirs]
+            theirs = _lost(others.get(shift, {}))
+            gaps = [value - theirs[unit] for unit, value in lost.items() if unit in theirs]
             if gaps:
                 less[name] = asdict(paired_difference(np.array(gaps)).estimate)
         found[shift] = {
-            "seeds": sorted(seed for seed, _ in seeds),
+            "runs": sum(map(len, rates.values())),
             "final": float(final),
             "final_shifted": float(under),
-            "lost": asdict(paired_difference(np.array(list(lost[shift].values()))).estimate),
+            "lost": asdict(paired_difference(np.array(list(lost.values()))).estimate),
             "lost_less": less,
         }
     return found

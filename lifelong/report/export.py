@@ -120,7 +120,7 @@ def _latex(runs: Sequence[Run]) -> str:
     lines = [f"% {' '.join(text.split())}" for text in found["conditions"]]
     lines += [rf"\begin{{tabular}}{{l{'r' * (1 + len(METRIC_NAMES))}}}", r"\toprule"]
     lines.append(
-        " & ".join(["method", "seeds", *(_TITLES.get(name, name.upper()) for name in METRIC_NAMES)]) + r" \\"
+        " & ".join(["method", "runs", *(_TITLES.get(name, name.upper()) for name in METRIC_NAMES)]) + r" \\"
     )
     lines.append(r"\midrule")
     for label, group in found["groups"].items():

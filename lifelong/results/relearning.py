@@ -24,6 +24,7 @@ class Savings:
         first: Number of steps from the run's initial weights; None if it was given up, or not measured.
         again_tried: Largest number of steps from the end of the run.
         first_tried: Largest number of steps from the initial weights; None if it was not measured.
+        every: Number of steps between measurements, 0 if there was only one.
     """
 
     task: int
@@ -33,6 +34,7 @@ class Savings:
     first: int | None
     again_tried: int
     first_tried: int | None
+    every: int
 
     @property
     def share(self) -> float | None:
@@ -89,7 +91,8 @@ def savings(records: Sequence[RelearnRecord]) -> list[Savings]:
         first = rivals[-1] if rivals else None
         needed, tried = (first.needed, first.steps[-1]) if first else (None, None)
         errors = last.learned_error, last.errors[0]
-        found.append(Savings(task, *errors, last.needed, needed, last.steps[-1], tried))
+        every = max(b - a for one in (last, first or last) for a, b in pairwise((*one.steps[:1], *one.steps)))
+        found.append(Savings(task, *errors, last.needed, needed, last.steps[-1], tried, every))
     return found
 
 
@@ -101,7 +104,8 @@ def savings_heads(records: Sequence[RelearnRecord]) -> tuple[str, ...]:
     )
     again = f"steps again (tolerance {one.tolerance:g}, {on})"
     weights = next((f" (weights {r.weights[:8]})" for r in records if r.weights), "")
-    return "task", f"{what} just learned", f"{what} at the end", again, f"steps at first{weights}", "savings"
+    learned = f"{what} just learned", f"{what} at the end"
+    return "task", *learned, again, f"steps at first{weights}", "savings", "measured every"
 
 
 def savings_rows(records: Sequence[RelearnRecord]) -> list[tuple[str, ...]]:
@@ -113,7 +117,8 @@ def savings_rows(records: Sequence[RelearnRecord]) -> list[tuple[str, ...]]:
         again = _steps(row.again, row.again_tried)
         share = "–" if row.share is None else f"{100 * row.share:.0f} %".replace("-", "−")
         measured = shown(row.learned_error), shown(row.final_error)
-        rows.append((str(row.task + 1), *measured, again, first, share))
+        every = f"{row.every} steps" if row.every else "–"
+        rows.append((str(row.task + 1), *measured, again, first, share, every))
     return rows
 
 

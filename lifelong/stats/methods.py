@@ -275,15 +275,19 @@ def _comparable(methods: Mapping[str, Sequence[MethodRun]]) -> dict[str, list[Me
     }
 
 
+def units(runs: Sequence[MethodRun]) -> list[Hashable]:
+    """Return of each run of a method what it is a sample of: its seed, or its order and demonstrations if they vary."""
+    several = len({(m.order, m.demonstrations) for m in runs}) > 1
+    return [(m.order, m.demonstrations) if several else m.seed for m in runs]
+
+
 def _by_seed(runs: Sequence[MethodRun]) -> dict[str, dict[Hashable, float]]:
     """Return each metric by seed; with several orders or sets of demonstrations, means over seeds by these."""
-    several = len({(m.order, m.demonstrations) for m in runs}) > 1
-    units: dict[Hashable, list[dict[str, float]]] = {}
-    for m in runs:
-        unit = (m.order, m.demonstrations) if several else m.seed
-        units.setdefault(unit, []).append(metric_values(m.scores))
+    by_unit: dict[Hashable, list[dict[str, float]]] = {}
+    for unit, m in zip(units(runs), runs, strict=True):
+        by_unit.setdefault(unit, []).append(metric_values(m.scores))
     return {
-        name: {unit: float(np.mean([v[name] for v in rows])) for unit, rows in units.items()}
+        name: {unit: float(np.mean([v[name] for v in rows])) for unit, rows in by_unit.items()}
         for name in METRIC_NAMES
     }
 

@@ -8,6 +8,7 @@ import copy
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from fractions import Fraction
 from typing import Any
 
 import psutil
@@ -23,7 +24,7 @@ from lifelong.data.windows import WindowDataset
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.seeding import generator, seeded
 
-_SMALL_BATCH = 2  # [windows] smaller of the two batches whose operations are counted
+_SMALL_BATCH = 2  # [windows] least size of the smaller of the two batches whose operations are counted
 
 
 def step_costs(
@@ -32,8 +33,8 @@ def step_costs(
     """Count the parameters, and the floating-point operations of one training step.
 
     Real steps are made, on copies and in float32, with replay and penalties; clipping, the optimiser and what follows
-    it do not count. Policy and algorithm are unchanged afterwards. The number of operations is
-    linear in the batch size, so two small batches determine that of any.
+    it do not count. Policy and algorithm are unchanged afterwards. The number of operations is linear in the batch
+    size, so two small batches determine that of any; they are such that replay has its exact share of both.
 
     Args:
         policy: Policy in the middle of training.
@@ -42,11 +43,13 @@ def step_costs(
     """
     trained = algorithm.trained(policy)
     sizes = {id(p): p.numel() for p in (*policy.parameters(), *trained)}
-    few, many = (_step_flops(policy, algorithm, windows, size) for size in (_SMALL_BATCH, 2 * _SMALL_BATCH))
+    small = Fraction(getattr(algorithm, "ratio", 1)).limit_denominator(batch_size).denominator
+    small *= -(-_SMALL_BATCH // small)
+    few, many = (_step_flops(policy, algorithm, windows, size) for size in (small, 2 * small))
     return {
         "parameters": sum(sizes.values()),
         "parameters_trained": algorithm.count_trained(policy),
-        "flops_per_step": few + (many - few) * (batch_size - _SMALL_BATCH) / _SMALL_BATCH,
+        "flops_per_step": few + (many - few) * (batch_size - small) / small,
     }
 
 

@@ -7,8 +7,10 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env.assets.pack import BuiltinPack
 from libero_env.cli.main import main
 from libero_env.demos.config import RenderConfig, rendered_perturbations
+from libero_env.demos.contents import read_header
 from libero_env.demos.curate import describe, examine
 from libero_env.demos.observe import recorded_rendering
 from libero_env.demos.read import read_demos, read_episodes
@@ -61,6 +63,25 @@ def assert_same(file, other):
 @pytest.mark.sim
 def test_severity_0_is_the_file_to_the_bit(path, tmp_path):
     assert_same(path, perturbed(path, tmp_path / "again.hdf5", "camera=0,noise=0,instruction=0"))
+
+
+@pytest.mark.sim
+def test_a_rendered_file_states_its_models_and_cameras_and_has_one_pack(path, tmp_path):
+    class Moon(BuiltinPack):
+        name = "moon"
+
+    out = tmp_path / "out.hdf5"
+    config = RenderConfig(("agentview", "frontview"), (16, 24), ("rgb", "depth"))
+    rerender(path, out, config, assets=Moon(), limit=1, progress=False)
+    stated = read_header(out)
+    assert json.loads(stated["models"])["pack"] == "moon"
+    made_with, before = (json.loads(h["env_args"])["env_kwargs"] for h in (stated, read_header(path)))
+    assert made_with | {k: v for k, v in before.items() if k.startswith("camera_")} == before
+    assert [made_with[f"camera_{k}"] for k in ("names", "heights", "widths", "depths")] == [
+        ["frontview", "agentview"], 16, 24, True
+    ]  # fmt: skip
+    with pytest.raises(DemoError, match="was recorded with other models"):
+        rerender(path, out, config, progress=False)
 
 
 @pytest.mark.sim

@@ -76,6 +76,24 @@ def test_filtering_keeps_the_chosen_steps_unchanged(path, tmp_path):
         assert [handle[f"data/demo_{i}"].attrs["source_demo"] for i in range(2)] == ["demo_0", "demo_2"]
 
 
+def test_filters_of_filtered_files_are_all_stated(path, tmp_path):
+    filter_demos(path, tmp_path / "b.hdf5", without_noops=True)
+    filter_demos(tmp_path / "b.hdf5", tmp_path / "c.hdf5", success_only=True)
+    assert read_header(tmp_path / "c.hdf5")["filter"] == "without no-ops, then without failures"
+
+
+def test_rewards_decide_success_where_it_is_not_stated(tmp_path):
+    file = write(tmp_path / "foreign.hdf5", [replace(episode(1), success=False)])
+    with h5py.File(file, "r+") as handle:
+        demo = handle["data/demo_0"]
+        del demo.attrs["success"]
+        demo["dones"][-1] = 1  # of an episode that ended in failure, too
+    assert examine(file).successes == 0
+    with h5py.File(file, "r+") as handle:
+        del handle["data/demo_0/rewards"]
+    assert examine(file).successes == 1
+
+
 def test_no_ops_of_a_copy_are_those_of_the_given_threshold(path, tmp_path):
     stats = filter_demos(path, tmp_path / "b.hdf5", threshold=1.0)
     assert stats.noops == examine(path, threshold=1.0).noops > examine(path).noops

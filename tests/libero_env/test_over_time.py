@@ -18,6 +18,7 @@ from libero_env.sim.predicates import SEMANTICS, register_predicate
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.tasks import Atom, Count, Never, Then, bddl, write_task
 from libero_env.tasks.problem import KINDS, differences
+from libero_integrations.exports.regeneration import Regeneration, regenerate
 from tests.harness.demos import generate
 
 A, B, C = (Atom("Open", (name,)) for name in ("a", "b", "c"))
@@ -219,6 +220,8 @@ def test_recordings_that_are_run_again_are_judged_by_all_their_moments(tmp_path,
     for recorded in (file, again):
         assert [episode.success for episode in read_episodes(recorded)] == [True]
         assert [one.success for mode in REPLAY_MODES for one in replay(recorded, by=mode)] == [True, True]
+    settings = Regeneration(size=(16, 16), assets="builtin", drawing="fast")
+    assert [one.success for one in regenerate(file, settings)] == [True]
 
 
 def test_counting_and_what_must_not_happen():

@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from libero_eval.diagnosis import measure
-from libero_eval.diagnosis.measure import diagnose, drift, parts_of, swap, updates
+from libero_eval.diagnosis.measure import diagnose, drift, overlap, parts_of, swap, updates
 from libero_eval.diagnosis.page import findings, write_diagnosis
 from libero_eval.relearning import error_on
 from libero_eval.requests import DiagnoseRequest
 from lifelong.algorithms.base import acting_with
+from lifelong.algorithms.lora import LoRA
 from lifelong.algorithms.single_task import SingleTask
 from lifelong.checkpoints import load
 from lifelong.errors import LifelongError
@@ -184,6 +185,16 @@ def test_weights_of_a_tasks_own_are_not_lost(learned, algorithm):
     assert all(d.relative == 0 for d in found.drifts)
     assert not found.updates and "gives each task weights of its own" in found.notes[0]
     assert "nothing is lost" in findings(found)[1]
+
+
+def test_one_adapter_for_all_tasks_has_updates_and_a_frozen_part_no_overlap(learned):
+    found = diagnose(learned(lambda: LoRA(rank=2, alpha=4.0, adapters="shared", adapted=("head.*",))))
+    assert not found.notes and {(u.task, u.part) for u in found.updates} == {(2, "head")}
+    policy, then, _ = policies()
+    parts = parts_of(policy, dataset(0).batch(torch.arange(8)))
+    fisher = {name: then[name].square() for name in parts["head"]}
+    shared = overlap((0, 1), fisher, fisher, parts)
+    assert shared.all == pytest.approx(1) and np.isnan(shared.parts["encoder"])
 
 
 def test_unfinished_runs_say_so_and_missing_checkpoints_are_named(learned):

@@ -159,14 +159,14 @@ def test_savings_pair_the_starts_of_each_task() -> None:
         (0, 10, 40, 0.75), (1, 20, 10, -1.0), (2, 0, None, None), (3, None, 10, None),
         (5, None, None, None),
     ]  # fmt: skip
-    assert savings_rows(records)[0] == ("1", "0.100", "0.300", "10", "40", "75 %")
-    assert savings_rows(records)[2][3:] == ("0", "–", "–"), "the first was not measured"
-    assert savings_rows(records)[3][3:] == ("> 10", "10", "–")
-    assert savings_rows(records)[4][3:] == ("> 10", "> 20", "–")
+    assert savings_rows(records)[0] == ("1", "0.100", "0.300", "10", "40", "75 %", "10 steps")
+    assert savings_rows(records)[2][3:] == ("0", "–", "–", "–"), "the first was not measured"
+    assert savings_rows(records)[3][3:] == ("> 10", "10", "–", "10 steps")
+    assert savings_rows(records)[4][3:] == ("> 10", "> 20", "–", "10 steps")
     assert savings_tables(records).count("\n") == 5
     for odd in ({"learned_error": 0.2}, {"steps": (0, 50)}):  # of other demonstrations, measured less often
         last = replace(record(0, "final", (0.3, 0.1)), **odd)
-        assert savings_rows([*records, last])[0][4:] == ("–", "–")
+        assert savings_rows([*records, last])[0][4:6] == ("–", "–")
 
 
 def test_settings_and_initial_weights_do_not_share_a_table() -> None:
@@ -203,7 +203,7 @@ def test_success_is_back_where_it_falls_short_by_the_tolerance_at_most() -> None
     assert needed(0.1, 1.0, 0.2) is None
     assert needed(0.0, 1.0, 0.05) == 10, "a task without failures is back, too"
     found = [record(0, "final", (0.9, 0.1), episodes=20), record(0, "initial", (1.0, 0.5, 0.1), episodes=20)]
-    assert savings_rows(found) == [("1", "90 %", "10 %", "10", "20", "50 %")]
+    assert savings_rows(found) == [("1", "90 %", "10 %", "10", "20", "50 %", "10 steps")]
     text = savings_tables([record(0, "final", (0.3, 0.1)), *found])
     assert text.index("error just learned") < text.index("success just learned")
     (part,) = by_measure([record(0, "initial", (0.1,)), found[0]])
@@ -236,7 +236,7 @@ def test_rollouts_are_those_of_the_run(monkeypatch) -> None:
 
     protocol = SimpleNamespace(horizon=70, settle_steps=3, precision="fp32")
     run = SimpleNamespace(
-        eval=protocol, learned_task=lambda k: f"task {k}", embed=str.upper, seed=9, device="cpu"
+        eval=protocol, learned_task=lambda k: f"task {k}", embed="TASK {}".format, seed=9, device="cpu"
     )
     monkeypatch.setattr(relearning, "rollout", rollout)
     measured = policy()

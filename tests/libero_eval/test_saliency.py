@@ -1,6 +1,7 @@
 """Saliency maps against a policy whose input is known."""
 
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,12 +11,23 @@ from torch import Tensor
 
 from libero_eval.policies import RunPolicy
 from libero_eval.requests import EvalRequest, SaliencyRequest
-from libero_eval.saliency import SaliencySettings, contact_sheet, draw_saliency, overlay, saliency, window_at
+from libero_eval.saliency import (
+    SaliencySettings,
+    _batch,
+    contact_sheet,
+    draw_saliency,
+    frames_used,
+    overlay,
+    saliency,
+    window_at,
+)
 from lifelong.data import fake_batch
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, PolicyError
 from lifelong.policies.base import Policy
 from lifelong.seeding import generator
 from lifelong.types import Batch, PolicySpec
+from tests.harness.algorithms import frame
+from tests.harness.policies import small_rnn
 
 SPEC = PolicySpec(image_size=(64, 96), proprio={"x": 2}, language_dim=3, seq_len=2)
 PATCH = (slice(20, 28), slice(60, 70))  # of the second camera
@@ -113,6 +125,29 @@ def test_windows_end_at_the_step():
     assert window_at(frames, 1, 4)["x"].flatten().tolist() == [0, 1]
 
 
+@pytest.mark.parametrize("memory", ["reset", "window", "none"])
+def test_the_explained_action_is_that_of_the_frames_that_it_was_taken_from(memory):
+    spec = replace(SPEC, seq_len=3)
+    torch.manual_seed(0)
+    policy = small_rnn(spec, "deterministic", memory=memory).eval()
+    seen = fake_batch(spec, 1, generator(1), steps=7).observation
+    policy.reset(1)
+    each = [frame(seen, step) for step in range(7)]
+    frames = [{"images": one.images, **one.proprio} for one in each]
+    for step, one in enumerate(each):
+        acted = policy.act(one, [generator(0)])
+        used = _batch(window_at(frames, step, frames_used(policy, step)), seen.language[0], policy)
+        with torch.no_grad():
+            explained = policy.predict(used)[:, -1]
+        torch.testing.assert_close(explained.clamp(-1, 1), acted)
+
+
+def test_a_policy_that_plans_several_actions_is_refused_by_name():
+    policy = SimpleNamespace(chunk=5)
+    with pytest.raises(PolicyError, match="this policy plans 5 actions at once"):
+        frames_used(policy, 3)
+
+
 def test_sheets_of_two_starts_stand_beside_each_other_and_name_them(tmp_path, monkeypatch, capsys):
     policy = OnePatch(SPEC).eval()
     run = SimpleNamespace(
@@ -120,6 +155,7 @@ def test_sheets_of_two_starts_stand_beside_each_other_and_name_them(tmp_path, mo
         tasks=["task"],
         learned=1,
         device="cpu",
+        eval=SimpleNamespace(horizon=200),
         learned_task=lambda task: SimpleNamespace(language="do it"),
         embed=lambda task: torch.zeros(3),
         acting=lambda task: nullcontext(policy),

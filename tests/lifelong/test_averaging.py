@@ -109,7 +109,9 @@ def test_nothing_is_kept_from_task_to_task_but_a_number() -> None:
     for task in range(2):
         learn(learner, acting, task)
     assert learner.state_dict() == {"tasks": 2, "before": None}
+    learner.share = 1.0  # the start of a trial is shared with those of other shares
     learner.begin_task(2, Windows(2), acting)
+    assert learner.before is not None
     check(learner.state_dict(), Averaging.state_form, "state", acting)
 
 

@@ -67,6 +67,16 @@ def test_costs_of_two_small_steps_determine_those_of_any(kind: str, make: Callab
     assert said == counted(lambda: step(second.batch(torch.arange(9)), generator(0)))
 
 
+@pytest.mark.parametrize("ratio", [0.125, 0.25, 0.375, 0.75, 1.5])
+def test_replay_counts_by_its_share_of_a_step(ratio):
+    policy, first, second = make_policy(), dataset(0), dataset(1)
+    costs = {}
+    for algorithm in (Sequential(), ER(memory=ReplayMemory(9), ratio=ratio)):
+        algorithm.end_task(0, first, policy, generator(0))
+        costs[type(algorithm)] = step_costs(policy, algorithm, second, 16)["flops_per_step"]
+    assert costs[ER] == (1 + ratio) * costs[Sequential]
+
+
 def test_replay_doubles_a_step_and_its_gradient_costs_twice_the_loss():
     policy, first, second = make_policy(), dataset(0), dataset(1)
     costs = {}

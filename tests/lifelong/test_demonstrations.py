@@ -8,6 +8,8 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env.demos.config import DemoConfig
+from libero_env.demos.generate import demo_path
 from libero_env.tasks import get_suite
 from lifelong.data import demonstrations
 from lifelong.data.settings import DataSettings
@@ -83,6 +85,8 @@ def test_a_repeated_task_has_one_file_with_the_most_demonstrations_that_are_requ
     ({"perturb": "light=0.5"}, "was rendered under light=0.5"),
     ({"seed": 2}, "was recorded with seed 2; data.seed is 1"),
     ({"generator": "teleoperation", "robot": "robosuite-1.4.1"}, "data.robot is libero"),
+    ({"models": '{"pack": "moon"}'}, "shows the models moon; those of this run are"),
+    ({"variation": '{"reserved": true}'}, "stored initial states, from which policies are evaluated"),
 ])  # fmt: skip
 def test_demonstrations_that_do_not_fit_are_refused_by_name(kwargs, words, tmp_path, recorded):
     path = own(tmp_path / "mine.hdf5", **kwargs)
@@ -106,6 +110,28 @@ def test_what_the_expert_recorded_otherwise_is_told_and_recorded_again(tmp_path,
     assert recorded == [TASKS[1].name] and "not used" in capsys.readouterr().err
     demonstrations.find_demos(TASKS[:1], [2], settings(str(tmp_path)), False)
     assert f"other tasks only, such as {TASKS[1].name}" in capsys.readouterr().err
+
+
+def test_a_file_in_the_layout_is_refused_where_it_states_another_task(tmp_path, recorded):
+    (tmp_path / TASKS[1].suite).mkdir()
+    own(tmp_path / TASKS[1].suite / f"{TASKS[1].name}_demo.hdf5", TASKS[0])
+    with pytest.raises(DataError, match=f"is of '{TASKS[0].name}', not of '{TASKS[1].name}'"):
+        demonstrations.find_demos(TASKS, [2, 2, 2], settings(str(tmp_path)), False)
+
+
+def test_a_file_of_the_user_goes_before_what_the_expert_recorded_in_its_folder(tmp_path, recorded):
+    path = demo_path(tmp_path, DemoConfig(TASKS[1], (8, 8)))
+    path.parent.mkdir(parents=True)
+    expert = {"generator": "scripted-expert-15", "robot": "libero"}
+    own(path, **expert)
+    own(tmp_path / "seed5.hdf5", **expert | {"seed": 5})
+    demonstrations.find_demos(TASKS[1:2], [2], settings(str(tmp_path)), False)
+    assert recorded == [TASKS[1].name], "which goes on with its own"
+    (tmp_path / "seed5.hdf5").unlink()
+    for more in ({"generator": "teleoperation"}, {"filter": "without no-ops"}):
+        mine = own(tmp_path / "mine.hdf5", **expert | more)
+        assert demonstrations.find_demos(TASKS[1:2], [2], settings(str(tmp_path)), False) == [mine]
+        mine.unlink()
 
 
 def test_files_of_no_task_of_the_run_or_of_the_same_task_are_refused(tmp_path, recorded):

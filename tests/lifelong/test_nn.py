@@ -29,7 +29,7 @@ from lifelong.nn import (
 from lifelong.nn.augmentation import jitter
 from lifelong.nn.tokens import standardise
 from lifelong.nn.transformer import TransformerLayer, attend, block_causal_mask
-from lifelong.nn.vision import FlatReadout, to_network
+from lifelong.nn.vision import FlatReadout, make_norm, to_network
 from lifelong.training.precision import bf16_runs_on_cpu
 from lifelong.types import PolicySpec
 
@@ -407,3 +407,15 @@ print(int(kept), resident() - before)
         assert left < 2**26 < held
     else:
         assert platform.libc_ver()[0] != "glibc"
+
+
+def test_norms_are_learned_behind_a_frozen_convolution():
+    """Where PyTorch's own is killed: on a CPU, with channels last and an input that needs no gradient."""
+    x, grads = torch.randn(2, 8, 6, 6, generator=generator(0)), []
+    norm = make_norm("group", 8)
+    for frozen in (x.contiguous(memory_format=torch.channels_last), x):
+        norm.zero_grad()
+        norm(frozen).square().sum().backward()
+        grads.append([p.grad.clone() for p in norm.parameters()])
+    for a, b in zip(*grads, strict=True):
+        torch.testing.assert_close(a, b)

@@ -41,6 +41,17 @@ def test_a_loaded_policy_acts_as_the_algorithm_does(tmp_path, algo):
         assert torch.equal(policy.predict(batch), answers[1]), "on other tasks as on the last"
 
 
+def test_a_task_that_occurs_twice_is_acted_on_by_position(tmp_path):
+    _, states, batch, answers = make_run(
+        tmp_path / "run", "algo=single_task", "benchmark.tasks=[0,0]", "language=onehot"
+    )
+    found = restore(tmp_path / "run")
+    for position, answer in enumerate(answers):
+        with found.acting(position) as policy, torch.no_grad():
+            assert torch.equal(policy.predict(batch), answer)
+        assert found.embed(position).tolist() == np.eye(2)[position].tolist()
+
+
 def test_instructions_are_embedded_as_in_the_run(tmp_path):
     tasks, *_ = make_run(tmp_path / "run", "language=onehot")
     found = restore(tmp_path / "run")
@@ -82,7 +93,8 @@ def test_saliency_sheet_of_a_run(tmp_path):
     with Image.open(path) as sheet:
         assert sheet.size == (3 * (128 + 4), 4 * (128 + 4))
         assert np.asarray(sheet).std() > 10
-    assert "failure, after learning 2 tasks; start 0, steps 0, 2, 3" in path.with_suffix(".txt").read_text()
+    said = f"failure within 4 steps, and the run's horizon is {restore(request.run).eval.horizon}, after learning 2"
+    assert f"{said} tasks; start 0, steps 0, 2, 3" in path.with_suffix(".txt").read_text()
     with pytest.raises(ConfigError, match="tasks 0 to 1"):
         draw_saliency(replace(request, task=2))
 

@@ -9,11 +9,13 @@ import torch
 from lifelong import algorithms as algos
 from lifelong.report.tables import COST_COLUMNS
 from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
+from lifelong.seeding import generator
 from lifelong.settings import build
 from lifelong.training.fit import fit
 from tests.harness.algorithms import (
     SMALL,
     assert_resumed_equals_uninterrupted,
+    frame,
     learn_frames,
     make_policy,
     predict,
@@ -59,6 +61,15 @@ def test_the_first_task_is_learned_as_by_fine_tuning(name):
     assert_same(dict(policy.state_dict()), dict(plain.state_dict()))
 
 
+def actions(policy, windows):
+    """Return the actions of an episode in which the windows' last frames are seen, (T, 7)."""
+    policy.eval().reset(1)
+    frames = [windows.batch(torch.tensor([k])).observation for k in range(0, 20, 4)]
+    return torch.cat(
+        [policy.act(frame(seen, seen.images.shape[1] - 1), [generator(k)]) for k, seen in enumerate(frames)]
+    )
+
+
 @pytest.mark.parametrize("make", EVERY.values(), ids=EVERY)
 def test_acting_leaves_the_policy_as_it_was(make):
     policy, algorithm = make_policy(), make()
@@ -66,6 +77,9 @@ def test_acting_leaves_the_policy_as_it_was(make):
     before, names = copy.deepcopy(dict(policy.state_dict())), set(vars(policy))
     for task in (0, 1):
         predict(algorithm, policy, dataset(task).batch(range(20)), task)
+    with algorithm.policy_for(1, policy) as acting:
+        own, copied = (actions(one, dataset(1)) for one in (acting, copy.deepcopy(acting)))
+    assert torch.equal(own, copied)
     assert_same(dict(policy.state_dict()), before)
     assert set(vars(policy)) == names and not any(m._forward_hooks for m in policy.modules())
 

@@ -182,6 +182,16 @@ def test_rendered_demonstrations_are_made_once_and_again_when_they_are_outdated(
     new, same = read_episodes(path)
     assert (new.obs["agentview_rgb"][0] != whole["demo_0"][0]).any()
     np.testing.assert_array_equal(same.obs["agentview_rgb"], whole["demo_1"])
+    for change in ("removed", "relabelled"):
+        with h5py.File(own, "r+") as file:
+            if change == "removed":
+                del file["data/demo_1"]
+            else:
+                file["data/demo_0/expert_actions"][...] = 0.25
+        assert not RenderJob(own, task, 1, config).is_complete(1), change
+        ensure_rendered([RenderJob(own, task, 1, config)], workers=1, progress=False)
+        (left,), (now,) = read_episodes(path), read_episodes(own)
+        np.testing.assert_array_equal(left.labels, now.labels)
 
 
 @pytest.mark.sim
