@@ -3,7 +3,8 @@
 import hashlib
 import json
 import threading
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 
 import h5py
@@ -23,12 +24,19 @@ from libero_eval import relearning
 from libero_eval.requests import RelearnRequest
 from lifelong import experiment
 from lifelong.data import demonstrations
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, DataError
 from lifelong.evaluation.environments import held_out_shift
 from lifelong.evaluation.restore import read_config, restore
 from lifelong.language import LanguageEncoder, encoder
 from lifelong.results.log import ResultLog
-from lifelong.results.records import EvalRecord, RunRecord, from_line, signed_line, to_line
+from lifelong.results.records import (
+    DemonstrationsRecord,
+    EvalRecord,
+    RunRecord,
+    from_line,
+    signed_line,
+    to_line,
+)
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_scores
 from lifelong.sequence.learning import TaskSequence
@@ -390,6 +398,14 @@ def test_copies_are_further_windows_of_the_same_actions(folder, tmp_path, quick)
     assert ResultLog(path / "results.jsonl").read().finished
     (said,) = [x for x in ResultLog(path / "results.jsonl").read().records if isinstance(x, RunRecord)]
     assert said.perturbed == ()
+    learned, log = restore(path), ResultLog(path / "results.jsonl")
+    windows = partial(relearning.task_windows, learned, 0, 0, read_config(path / "config.yaml", ()))
+    training, _ = windows()
+    assert len(training) == 3 * n, "relearning is on the copies, too"
+    (before,) = log.read().of(DemonstrationsRecord)
+    log.append(replace(before, digests=("another", *before.digests[1:])))
+    with pytest.raises(DataError, match="has other demonstrations than .* learned 'pick_up"):
+        windows()
 
 
 def test_settings_of_copies():
