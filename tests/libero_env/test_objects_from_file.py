@@ -11,6 +11,7 @@ import trimesh
 from PIL import Image
 
 from libero_env.cli.main import main
+from libero_env.demos.config import DemoConfig
 from libero_env.design.objects import add_object, register_object_file
 from libero_env.design.objects.collision import boxes_of, collision_pieces, is_closed, volume_filled
 from libero_env.design.objects.mesh_file import bounds, read_mesh
@@ -335,7 +336,9 @@ def test_what_is_kept_of_a_scene_depends_on_the_files(tmp_path):
             scene="floor", objects=["brick"], place={"brick": (0, 0)}, goal="Up brick_1", language="x"
         )
         assert build_scene(task.problem) is build_scene(task.problem)
-        return build_scene(task.problem).digest
+        found = build_scene(task.problem).digest
+        assert DemoConfig(task, (16, 16)).header()["own_models"] == found, "demonstrations are recorded again"
+        return found
 
     (tmp_path / "brick.xml").write_text(ORIGINAL)
     place = add_object(tmp_path / "brick.xml").folder
