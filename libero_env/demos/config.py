@@ -201,10 +201,9 @@ class DemoConfig:
         extra = self.render_config.header() | self.render_config.mask_names(scene)
         if variation := changed_options(self.variation):
             extra["variation"] = json.dumps(variation)
+        # the user's models also have regions, grasps, ... that are in no compiled model
         if scene.workspace.own or any(item.digest for item in scene.entities.values()):
-            extra["own_models"] = (
-                scene.digest
-            )  # the user's also have regions, grasps, ... that no compiled model has
+            extra["own_models"] = scene.digest
         if self.backend.is_warp:  # files without it are of MuJoCo
             extra["backend"] = self.backend.name
         return make_header(
