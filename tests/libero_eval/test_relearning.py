@@ -17,7 +17,7 @@ from libero_eval.requests import DiagnoseRequest, RelearnRequest
 from lifelong.algorithms import Sequential
 from lifelong.checkpoints import load
 from lifelong.data.settings import DataSettings
-from lifelong.errors import ConfigError, LifelongError
+from lifelong.errors import ConfigError, DataError, LifelongError
 from lifelong.evaluation.restore import LoadedRun
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.report.page import write_report
@@ -430,3 +430,12 @@ def test_demonstrations_are_asked_for_with_all_tasks_as_files_of_all_may_be_name
     with pytest.raises(Asked) as asked:
         relearning.task_windows(run, 1, 2, config)
     assert asked.value.args == (["a", "b", "c"], [4, 6, 4])
+
+    def few(*_):
+        raise DataError("a.hdf5 has 4 demonstrations and 6 are required")
+
+    monkeypatch.setattr(relearning, "find_demos", few)
+    with pytest.raises(
+        DataError, match=r"2 demonstrations more than were learned .* \(--held-out\): a.hdf5 has 4"
+    ):
+        relearning.task_windows(run, 1, 2, config)
