@@ -81,7 +81,7 @@ def kill_and_finish(args: argparse.Namespace, out: Path) -> Counter[str]:
         starting = draws.random() < START_UP
         done = min(finished(out) + draws.choice((0, 0, 1, 2)), units - args.workers)
         while not starting and (finished(out) < done or not holders(out) & {p.pid for p in processes}):
-            time.sleep(0.01)
+            time.sleep(0.05)
             assert any(process.poll() is None for process in processes), f"all have ended\n{log(out)}"
         working = [i for i, process in enumerate(processes) if process.pid in holders(out)]
         chosen = draws.choice(working) if working and not starting else draws.randrange(args.workers)
