@@ -3,7 +3,8 @@
 Greydanus et al., "Visualizing and understanding Atari agents" (ICML 2018). Around a place (i, j) the image I is mixed
 with a blurred copy A of it by a Gaussian mask M centred there,
     I' = I (1 - M) + A M                                   (eq. 1),
-which removes the local content without introducing new edges or colours. Saliency is the change of the output, the mean action,
+which removes the local content without introducing new edges or colours. Saliency is the change of the output, here
+the mean action,
     S(i, j) = 1/2 |π(I) - π(I')|²                          (eq. 2).
 
 A place is blurred in every frame of the window. Blurred pixels are rounded to integers, the input type of the

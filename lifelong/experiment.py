@@ -55,7 +55,7 @@ from lifelong.streams import TaskPlan, plan_tasks
 from lifelong.tracking import Tracker
 from lifelong.training.distributed import Ranks
 from lifelong.training.memory import check_memory, policy_bytes, training_needs
-from lifelong.training.precision import check_compiler, deterministic, keep_freed_memory
+from lifelong.training.precision import check_compiler, check_precision, deterministic, keep_freed_memory
 from lifelong.training.settings import FitSettings
 
 PRETRAIN_KEYS = ("pretrain", "policy", "data", "augmentation", "train", "language", "seed", "init_from")
@@ -240,6 +240,8 @@ def _build_contexts(
         perturb=plan.perturb if plan.stream.perturb else (),
         shift=shift,
     )
+    precisions = {"train.precision": parts.fit.precision, "eval.precision": evaluation.precision}
+    check_precision(context.policy, device, precisions)
     if not first:
         return context, None
     pretrain = config.build("pretrain")

@@ -16,6 +16,7 @@ ROLLOUT = 3  # actions of a policy that draws them
 BLUR = 4  # windows of other tasks at blurred boundaries
 RELEARN = 5  # batches of relearning
 LATENCY = 6  # time that inference takes
+BEGIN_TASK = 7  # what an algorithm draws when the first task begins
 EVALUATION = 4  # the same as ROLLOUT in `libero eval`, whose seed is not a run's
 
 

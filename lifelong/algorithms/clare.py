@@ -40,7 +40,8 @@ class CLARE(RoutedExperts):
     * The paper adapts feed-forward networks of a pretrained transformer. Here `adapted` says which, and may name
       other linear layers and convolutions; of a convolution's input, a sample is the mean over the image.
     * Inputs of the base's own task have autoencoders as well, which choose the base without an adapter. A pretrained
-      base (`base_tasks=0`) has none, as in the paper.
+      base (`base_tasks=0`) has none, as in the paper. Of several tasks that the base learns one after the other, those
+      of all but the last are of a base that then went on learning.
     * Mean and standard deviation of the errors are those of the samples after training, not running averages.
     * The autoencoders learn from up to 512 samples of a layer, collected from `windows` windows.
     """

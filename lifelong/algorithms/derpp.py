@@ -69,6 +69,8 @@ class DERpp(Rehearsal):
         outputs: dict[str, Tensor] = {}
         for task, kept in self._kept.items():
             self._kept[task] = kept = to_device(kept, batch.window_ids.device)
+            if not len(kept):  # its share of the budget
+                continue
             rows = (batch.window_ids[:, None] == kept).int().argmax(1)
             for name, values in self.outputs[task].items():
                 found = values[rows].to(batch.actions)

@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from lifelong.algorithms.frozen_base import RoutedExperts
 from lifelong.data.windows import TaskWindows, of_episodes
-from lifelong.errors import CheckpointError
+from lifelong.errors import CheckpointError, ConfigError
 from lifelong.nn.experts import adapted_layers, expert_output, weights_of
 from lifelong.nn.routing import SigmoidRouter
 from lifelong.nn.tokens import standardise
@@ -91,6 +91,11 @@ class DMPEL(RoutedExperts):
             base_tasks: Number of tasks that train the whole policy, which is frozen afterwards; 0 for a pretrained
                 policy.
         """
+        if 0 < top_k < experts:
+            raise ConfigError(
+                f"algo.top_k={top_k} experts cannot act while the {experts} of a task (algo.experts) are learned "
+                "together; use 0, all, or at least as many"
+            )
         super().__init__(rank=rank, alpha=alpha, adapted=adapted, base_tasks=base_tasks)
         self.experts, self.top_k, self.hidden, self.pool = experts, top_k, hidden, pool
         self.recall_steps, self.recall_lr, self.replay_size = recall_steps, recall_lr, replay_size

@@ -26,7 +26,8 @@ class FrozenBase(Algorithm):
         """Create the algorithm; see the subclasses for the arguments."""
         self.rank, self.scale, self.adapted = rank, alpha / rank, tuple(adapted)
         self.task_index, self.base_left = -1, base_tasks
-        self.seed = 0  # of the draws at the next task's beginning, drawn when a task ends
+        # of the draws at the next task's beginning; drawn when a task ends, before the first one when it begins
+        self.seed = -1
         self.library = ExpertLibrary()
 
     def _begin(self, task_index: int, policy: Policy) -> torch.Generator | None:
@@ -35,6 +36,8 @@ class FrozenBase(Algorithm):
         if self.base_left:
             self.base_left -= 1
             return None
+        if self.seed < 0:
+            self.seed = int(torch.randint(2**62, ()))
         policy.zero_grad()  # the optimiser, which does it at each step, no longer has the base
         return torch.Generator().manual_seed(self.seed)
 

@@ -36,7 +36,8 @@ class IsCiL(RoutedExperts):
     * A task is one skill, as in the adaptation of IsCiL to LIBERO by Lei et al. 2025 (arXiv:2506.05985); the paper
       divides demonstrations into skills by annotated sub-goals.
     * The paper embeds states with given encoders; here the base does it, so its prototypes are those of the tasks it
-      was learned with, which need no adapter. Without such tasks (`base_tasks=0`) there are none.
+      was learned with, which need no adapter. Without such tasks (`base_tasks=0`) there are none; of several that are
+      learned one after the other, those of all but the last embed with a base that then went on learning.
     * Linear layers and convolutions have adapters; an LSTM stays as in the base.
     """
 

@@ -16,6 +16,8 @@ from lifelong.nn.experts import Pair, matches, matching
 from lifelong.policies.base import Policy
 from lifelong.types import Natural, NonNegative, Width
 
+OWN = ("*bias*", "*norm*")  # patterns of which some policies have none
+
 
 class LoRA(FrozenBase):
     """Learn the first task with the whole policy, and every later one with a small adapter on it.
@@ -56,7 +58,7 @@ class LoRA(FrozenBase):
         rank: Width = 16,
         alpha: NonNegative = 32.0,
         adapted: Sequence[str] = ("*",),
-        own: Sequence[str] = ("*bias*", "*norm*"),
+        own: Sequence[str] = OWN,
         base_tasks: Natural = 1,
         adapters: Literal["own", "shared", "averaged"] = "own",
     ):
@@ -175,6 +177,8 @@ class LoRA(FrozenBase):
         learned = {n: p for n, p in policy.named_parameters() if p.requires_grad}
         matrices = [n for n, p in learned.items() if p.dim() >= 2 and not matches(n, self.own)]
         adapted = matching(matrices, self.adapted, "matrix")
+        if self.own and self.own != OWN:
+            matching(list(learned), self.own, "parameter", "algo.own")
         return [n for n in learned if n in adapted or matches(n, self.own)]
 
     @torch.no_grad()

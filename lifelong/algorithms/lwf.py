@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import Weights
-from lifelong.data.windows import TaskWindows
+from lifelong.data.windows import TaskWindows, instructions_of
 from lifelong.policies.base import Policy, copy_weights, device_of
 from lifelong.types import Batch, NonNegative, to_device
 
@@ -79,7 +79,9 @@ class LwF(Algorithm):
         """
         self.strength, self.own = strength, instruction == "own"
         self.teacher = Teacher()
-        self.languages: dict[int, Tensor] = {}  # position of each learned task -> (L,)
+        self.languages: dict[
+            int, Tensor
+        ] = {}  # position of the last task of each stage -> its instructions, (n, L)
         self.distilled: Batch | None = None  # made by `mix`, used by `penalty`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:
@@ -87,8 +89,8 @@ class LwF(Algorithm):
         if self.languages and self.own:
             self.distilled = batch
         elif self.languages:
-            drawn = torch.randint(len(self.languages), (len(batch),), generator=generator)
-            languages = torch.stack(list(self.languages.values()))
+            languages = torch.cat(list(self.languages.values()))
+            drawn = torch.randint(len(languages), (len(batch),), generator=generator)
             language = languages[to_device(drawn, languages.device)].to(batch.observation.language)
             self.distilled = replace(batch, observation=replace(batch.observation, language=language))
         return batch
@@ -105,6 +107,6 @@ class LwF(Algorithm):
     def end_task(
         self, task_index: int, dataset: TaskWindows, policy: Policy, generator: torch.Generator
     ) -> None:
-        """Make the present weights the teacher's, and add the task's instruction to the earlier ones."""
+        """Make the present weights the teacher's, and add the task's instructions to the earlier ones."""
         self.teacher.become(copy_weights(policy))
-        self.languages[task_index] = dataset.batch(torch.tensor([0])).observation.language[0].clone()
+        self.languages[task_index] = instructions_of(dataset)

@@ -9,6 +9,7 @@ from torch import Tensor
 from lifelong.algorithms.base import acting_with
 from lifelong.algorithms.er import ER
 from lifelong.data.memory import ReplayMemory
+from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.types import Batch, Positive
 
@@ -45,6 +46,10 @@ class MIR(ER):
                 5 in the paper (50 for 10).
             rate: Length of the virtual step as a factor of the gradient; 0.05 in the paper.
         """
+        if getattr(memory, "batch_size", None):
+            raise ConfigError(
+                "algo.memory.batch_size and algo.candidates both say how many windows are drawn; leave the first out"
+            )
         super().__init__(memory=memory, ratio=ratio)
         self.candidates, self.rate = candidates, rate
         self._policy: Policy | None = None

@@ -14,6 +14,7 @@ from torch.nn import functional
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.latents import LATENTS_FORM, LatentMemory
 from lifelong.data.windows import TaskWindows
+from lifelong.nn.tokens import ProprioScaling
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.policies.history import HistoryPolicy, with_features
 from lifelong.types import Batch, Count, Natural, NonNegative, Observation, Positive, Share, to_device
@@ -117,7 +118,7 @@ class MLR(Algorithm):
         frozen = {id(p) for name, p in policy.named_parameters() if name in self.frozen}
         for module in policy.modules():
             own = [id(p) for p in module.parameters()]
-            if own and frozen.issuperset(own):
+            if (own and frozen.issuperset(own)) or (frozen and isinstance(module, ProprioScaling)):
                 module.eval()
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:

@@ -71,7 +71,6 @@ class LatentWindows:
         if not (
             self.codes.dtype == torch.uint8
             and self.codes.dim() > 2
-            and len(self) > 0
             and self.codes.shape[2:] == self.low.shape == self.step.shape
             and self.actions.dim() == 3
             and self.actions.shape[:2] == self.codes.shape[:2]

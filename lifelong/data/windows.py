@@ -231,7 +231,8 @@ def frames_of(dataset: WindowDataset, readings: Sequence[str], most: int = 20_00
         batches = [dataset.batch(part) for part in chosen.split(256)]
         proprio = {n: torch.cat([b.observation.proprio[n][:, 0] for b in batches]) for n in readings}
         actions = torch.cat([b.actions[:, 0] for b in batches])
-    return torch.cat([proprio[name] for name in readings], dim=1).cpu(), actions.cpu()
+    none = actions.new_zeros(len(actions), 0)
+    return torch.cat([none, *(proprio[name] for name in readings)], dim=1).cpu(), actions.cpu()
 
 
 def frame_moments(frames: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
@@ -270,6 +271,19 @@ def gripper_phases(dataset: WindowDataset) -> Tensor:
     passed = switched.cumsum(0)
     first = torch.where(same, 0, torch.arange(len(last))).cummax(0).values
     return passed - passed[first]
+
+
+def instructions_of(dataset: WindowDataset) -> Tensor:
+    """Return the embedded instructions of the tasks that are learned together, (n, L); not those of blurred neighbours.
+
+    Args:
+        dataset: Windows of a task or of a stage.
+    """
+    parts = dataset.datasets if isinstance(dataset, JoinedWindows) else [dataset]
+    if isinstance(parts[0], WindowSubset):  # at a blurred boundary the stage's own windows come first
+        return instructions_of(parts[0].dataset)
+    first = torch.zeros(1, dtype=torch.int64)
+    return torch.cat([part.batch(first).observation.language for part in parts]).unique(dim=0)
 
 
 def tasks_of(dataset: WindowDataset) -> Tensor:

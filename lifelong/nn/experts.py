@@ -276,13 +276,13 @@ def matching(
     """Return the names that match one of the patterns, which are those of a key.
 
     Raises:
-        ConfigError: There is none; the message lists some of the names that exist.
+        ConfigError: One of the patterns matches none; the message lists some of the names that exist.
     """
-    chosen = [name for name in names if matches(name, patterns)]
-    if not chosen:
+    idle = [p for p in patterns if not any(fnmatchcase(name, p) for name in names)]
+    if idle or not patterns:
         some = ", ".join(list(names)[:5])
-        raise ConfigError(f"{key}={list(patterns)} matches no {kind} of the policy, which has {some}, ...")
-    return chosen
+        raise ConfigError(f"{key}={idle} matches no {kind} of the policy, which has {some}, ...")
+    return [name for name in names if matches(name, patterns)]
 
 
 def freeze_statistics(policy: nn.Module) -> None:

@@ -21,7 +21,7 @@ from lifelong.data.settings import Statistics
 from lifelong.data.windows import TaskWindows, frame_moments, frames_of
 from lifelong.policies.base import Policy
 from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
-from lifelong.seeding import END_TASK, FIT, generator, seeded
+from lifelong.seeding import BEGIN_TASK, END_TASK, FIT, generator, seeded
 from lifelong.sequence.measuring import Evaluator
 from lifelong.sequence.recovery import Recovery, say
 from lifelong.sequence.stages import TrainingPhase, lacks_row, mean_rate, missing_points, training_phases
@@ -115,7 +115,8 @@ class TaskSequence:
         costs.reset_peak(context.device)
         if saved is None:
             self._meet(number)
-            context.algorithm.begin_task(task, dataset, context.policy)
+            with seeded(context.seed, BEGIN_TASK, task):
+                context.algorithm.begin_task(task, dataset, context.policy)
             self._meet(number)  # again: it may have gone back to weights that do not know the stage
         first, resume = (0, None) if saved is None else (saved["phase"], saved["fit"])
         for phase in phases[first:]:

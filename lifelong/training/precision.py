@@ -4,7 +4,7 @@ import ctypes
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from functools import cache
 
@@ -110,6 +110,21 @@ def deterministic(on: bool) -> Iterator[None]:
         torch.backends.cudnn.benchmark = benchmark
         if workspace is None:
             os.environ.pop(_CUBLAS, None)
+
+
+def check_precision(policy: torch.nn.Module, device: torch.device, precisions: Mapping[str, str]) -> None:
+    """Check that a policy's layers run in the given precisions.
+
+    Args:
+        precisions: Key of the configuration -> precision, see `autocast`.
+
+    Raises:
+        ConfigError: Recurrent layers have no bfloat16 kernel on this CPU.
+    """
+    asked = [key for key, precision in precisions.items() if precision == "bf16"]
+    recurrent = any(isinstance(module, torch.nn.RNNBase) for module in policy.modules())
+    if asked and recurrent and device.type == "cpu" and not bf16_runs_on_cpu():
+        raise ConfigError(f"{asked[0]}=bf16: this CPU has no bfloat16 for recurrent layers; use auto or fp32")
 
 
 def check_compiler(device: torch.device) -> None:

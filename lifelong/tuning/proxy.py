@@ -25,7 +25,7 @@ from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
 from lifelong.results.provenance import source_digest
-from lifelong.seeding import END_TASK, FIT, INIT, generator, seeded
+from lifelong.seeding import BEGIN_TASK, END_TASK, FIT, INIT, generator, seeded
 from lifelong.sequence.learning import meet
 from lifelong.settings import Configuration
 from lifelong.training.fit import fit
@@ -225,7 +225,8 @@ def _learn(trial: Trial, data: StreamData, folder: Path) -> Errors:
             ends, text = range(len(data.training)), trial.stream[task].language
             met = partial(meet, policy, data.training, ends, task, text, statistics, frames)
             met()
-            algorithm.begin_task(task, windows, policy)
+            with seeded(seed, BEGIN_TASK, task):
+                algorithm.begin_task(task, windows, policy)
             met()  # again: it may have gone back to weights that do not know the task
             _train(algorithm, policy, task, windows, settings, seed)
             if task == 0:

@@ -490,6 +490,18 @@ def test_dmpel_computes_the_experts_that_count_and_no_others():
         torch.testing.assert_close(acting.eval().predict(batch), answer, rtol=1e-5, atol=1e-6)
 
 
+def test_dmpel_refuses_more_experts_of_a_task_than_act():
+    with pytest.raises(ConfigError, match=r"algo.top_k=3 experts cannot act while the 4 of a task"):
+        DMPEL(experts=4)
+    assert DMPEL(experts=4, top_k=0).experts == DMPEL(experts=4, top_k=4).experts == 4
+
+
+def test_patterns_of_own_copies_have_to_match():
+    policy = make_policy()
+    with pytest.raises(ConfigError, match=r"algo.own=\['\*baias\*'\] matches no parameter"):
+        learn_frames(LoRA(rank=2, own=("*norm*", "*baias*")), policy, 0, 1)
+
+
 def test_policies_that_dmpel_cannot_route_are_named():
     policy, algorithm = DeepPolicy(), DMPEL()
     algorithm.router = small_router(1, 0)

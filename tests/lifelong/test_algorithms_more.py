@@ -14,11 +14,13 @@ from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.seeding import generator
 from lifelong.sequence.stages import training_phases
+from lifelong.streams import StageData, StreamSettings
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from tests.harness import sequences
 from tests.harness.algorithms import SETTINGS, learn
 from tests.harness.fakes import DeepPolicy, LinearPolicy, Windows
+from tests.harness.sequences import dataset as frames
 
 
 class Distilled:
@@ -257,6 +259,18 @@ def test_self_distillation_asks_with_the_windows_own_instruction():
     assert algorithm.penalty(policy).item() == pytest.approx(3.0 * 0.25)
 
 
+def test_lwf_asks_with_all_instructions_of_a_stage_and_none_of_its_neighbours():
+    stages, spec = [(0, 1), (2,)], StreamSettings(blur=0.2)
+    windows = {task: frames(task) for task in range(3)}
+    texts = [windows[task].batch(torch.tensor([0])).observation.language for task in range(3)]
+    for settings in (StreamSettings(), spec):
+        data, algorithm = StageData(windows, stages, settings, 1), LwF()
+        for last in data:
+            algorithm.end_task(last, data[last], Linear(), generator(0))
+        found = [algorithm.languages[last] for last in (1, 2)]
+        assert torch.equal(found[0], torch.cat(texts[:2]).unique(dim=0)) and torch.equal(found[1], texts[2])
+
+
 def test_lwf_teacher_is_constant_while_the_policy_learns():
     torch.manual_seed(0)
     policy, algorithm = Deep(), LwF()
@@ -267,7 +281,8 @@ def test_lwf_teacher_is_constant_while_the_policy_learns():
     teacher = algorithm.teacher.like(policy)
     assert not teacher.training and not any(p.requires_grad for p in teacher.parameters())
     assert all(p.requires_grad for p in policy.parameters())
-    assert torch.equal(teacher.predict(everything(0)), before)
+    with torch.no_grad():  # some processors have other kernels for it
+        assert torch.equal(teacher.predict(everything(0)), before)
 
 
 # --- SI

@@ -12,6 +12,7 @@ from lifelong.algorithms.base import load_algorithm
 from lifelong.algorithms.mlr import adjust, describe, encoded, feature_parameters, similar_pairs
 from lifelong.data.latents import LatentMemory, LatentWindows
 from lifelong.errors import CheckpointError, ConfigError, DataError, PolicyError
+from lifelong.nn.tokens import ProprioScaling
 from lifelong.policies.history import HistoryPolicy
 from lifelong.seeding import generator
 from lifelong.settings import Configuration, plain_data
@@ -39,6 +40,19 @@ def random_observation(spec, windows: int = 2):
     proprio = {name: torch.randn(windows, 3, size, generator=draws) for name, size in spec.proprio.items()}
     observation = sequences.dataset(0).batch(torch.arange(windows)).observation
     return replace(observation, images=images, proprio=proprio)
+
+
+@pytest.mark.parametrize("kind", POLICIES)
+def test_frozen_features_have_no_dropout_of_readings(kind):
+    policy, algorithm = learned(1, kind)
+    for module in policy.modules():
+        if isinstance(module, ProprioScaling):
+            module.dropout = 0.5
+    algorithm.begin_task(1, sequences.dataset(1), policy)
+    algorithm.mode_train(policy)
+    batch = sequences.dataset(1).batch(torch.arange(16)).observation
+    first, second = (policy.encode(batch).flatten() for _ in range(2))
+    assert torch.equal(first, second)
 
 
 # --- parts of the features

@@ -4,6 +4,8 @@ import math
 import platform
 import subprocess
 import sys
+from contextlib import nullcontext
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,7 @@ import torch
 from torch import nn
 
 from lifelong.data import fake_batch
-from lifelong.errors import PolicyError
+from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn import (
     ColorJitter,
     Compose,
@@ -27,10 +29,11 @@ from lifelong.nn import (
     TemporalTransformer,
 )
 from lifelong.nn.augmentation import jitter
+from lifelong.nn.experts import matching
 from lifelong.nn.tokens import standardise
 from lifelong.nn.transformer import TransformerLayer, attend, block_causal_mask
 from lifelong.nn.vision import FlatReadout, make_norm, to_network
-from lifelong.training.precision import bf16_runs_on_cpu
+from lifelong.training.precision import bf16_runs_on_cpu, check_precision
 from lifelong.types import PolicySpec
 
 SPEC = PolicySpec(image_size=(16, 20), language_dim=6, seq_len=4)
@@ -419,3 +422,18 @@ def test_norms_are_learned_behind_a_frozen_convolution():
         grads.append([p.grad.clone() for p in norm.parameters()])
     for a, b in zip(*grads, strict=True):
         torch.testing.assert_close(a, b)
+
+
+def test_bf16_of_recurrent_layers_is_refused_where_the_processor_has_none(monkeypatch):
+    for runs, layer, asked in product((True, False), (nn.LSTM(2, 2), nn.Linear(2, 2)), ("bf16", "auto")):
+        monkeypatch.setattr("lifelong.training.precision.bf16_runs_on_cpu", lambda runs=runs: runs)
+        refused = not runs and asked == "bf16" and isinstance(layer, nn.LSTM)
+        with pytest.raises(ConfigError, match="eval.precision=bf16: this") if refused else nullcontext():
+            check_precision(layer, torch.device("cpu"), {"train.precision": "fp32", "eval.precision": asked})
+
+
+def test_every_pattern_of_names_has_to_match():
+    assert matching(["a.x", "b.x"], ["a.*", "b.*"], "weight") == ["a.x", "b.x"]
+    for patterns, idle in ((["a.*", "heed.*"], r"\['heed.*'\]"), ([], r"\[\]")):
+        with pytest.raises(ConfigError, match=f"algo.adapted={idle} matches no weight"):
+            matching(["a.x", "b.x"], patterns, "weight")

@@ -9,8 +9,15 @@ import torch
 from lifelong.algorithms import MIR
 from lifelong.algorithms.mir import interference
 from lifelong.data.memory import FirstWindows, PhaseMemory, ReplayMemory
-from lifelong.data.windows import JoinedWindows, StageWindows, WindowSubset, gripper_phases
-from lifelong.errors import DataError
+from lifelong.data.windows import (
+    JoinedWindows,
+    StageWindows,
+    WindowSubset,
+    frame_moments,
+    frames_of,
+    gripper_phases,
+)
+from lifelong.errors import ConfigError, DataError
 from lifelong.seeding import generator
 from tests.harness.algorithms import by_hand, learn_frames, make_policy
 from tests.harness.fakes import LinearPolicy, Windows
@@ -48,6 +55,17 @@ def test_interference_is_what_a_gradient_step_adds_to_each_windows_loss():
     mixed = algorithm.mix(new.batch(rows), generator(1))
     assert len(mixed) == 25 and torch.equal(mixed.window_ids[:20], rows)
     assert set(mixed.window_ids[20:].tolist()) == set(expected.topk(5).indices.tolist())
+
+
+def test_mir_refuses_a_memory_that_says_how_many_windows_are_drawn():
+    with pytest.raises(ConfigError, match=r"algo.memory.batch_size and algo.candidates both say"):
+        MIR(memory=FirstWindows(10, batch_size=4))
+    assert MIR(memory=FirstWindows(10)).candidates == 5
+
+
+def test_frames_without_readings_have_their_actions():
+    readings, actions = frames_of(dataset(0), ())
+    assert readings.shape == (len(actions), 0) and len(frame_moments([(readings, actions)])[0]) == 7
 
 
 def test_without_a_choice_mir_draws_as_er_does():

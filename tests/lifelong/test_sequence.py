@@ -117,3 +117,28 @@ def test_select_last_keeps_the_last_weights(tmp_path):
     sequence(p).run()
     assert not p.directory.checkpoints.best_path.exists()
     assert {r.best_epoch for r in p.directory.log.read().of(TaskEndRecord)} == {2}
+
+
+@pytest.mark.parametrize("name", ["lora", "omla", "dmpel", "iscil", "clare"])
+def test_a_pretrained_base_has_adapters_drawn_by_the_runs_seed(tmp_path, name):
+    found = []
+    for seed in (1, 2, 2):
+        context = run_context(tmp_path / str(len(found)), EVERY[name], tasks=1)
+        context.algorithm.base_left = 0
+        object.__setattr__(context, "seed", seed)
+        torch.manual_seed(len(found))
+        sequence(context).run(evaluate=False)
+        found.append(context.algorithm.state_dict()["seed"])
+        assert context.algorithm.library and not torch.equal(torch.tensor(found[0]), torch.tensor(-1))
+    if name == "lora":  # others draw the next seed from the run's at their end, too
+        assert found[1] == found[2] != found[0]
+
+
+@pytest.mark.parametrize("name", ["er", "derpp", "mlr", "m2distill", "agem", "mir", "phase_er"])
+def test_a_budget_of_fewer_windows_than_tasks_is_learned_with_and_read_back(name):
+    policy, algorithm = make_policy(), EVERY[name]()
+    algorithm.memory.budget = 2
+    learn_frames(algorithm, policy, 0, 1, 2, 3)
+    again = EVERY[name]()
+    again.load_state_dict(algorithm.state_dict(), {task: dataset(task) for task in range(4)})
+    assert_same(again.state_dict(), algorithm.state_dict())
