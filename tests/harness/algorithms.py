@@ -26,7 +26,8 @@ def make_policy(kind: str = "bc_transformer", head: str = "gmm", spec=sequences.
 def learn(algorithm: Algorithm, policy, task: int, dataset=None, settings: FitSettings = SETTINGS) -> None:
     """Learn a task from beginning to end, as `TaskSequence` does; by default one of pairs."""
     dataset = Windows(task) if dataset is None else dataset
-    algorithm.begin_task(task, dataset, policy)
+    with seeded(task):
+        algorithm.begin_task(task, dataset, policy)
     for number, phase in enumerate(algorithm.phases()):
         algorithm.begin_phase(phase, policy)
         fit(policy, dataset, algorithm, settings=settings, seed=(task, number), augment=algorithm.augment)
