@@ -315,8 +315,10 @@ def task_windows(
     try:
         recorded = find_demos(run.tasks, needed, data, None)[task]  # data.files may name files of every task
     except DataError as error:
-        asked = f"{held_out} demonstrations more than were learned are held out to measure on (--held-out)"
-        raise DataError(f"{asked}: {error}" if held_out else str(error)) from None
+        if not held_out:
+            raise
+        more = f"--held-out reads {held_out} demonstrations more than the run learned from"
+        raise DataError(f"{error}; {more}") from None
     _require_learned(run, task, recorded, learned_from)
     tasks, perturb = [run.tasks[task]], [run.perturbations(task)]
     (path,) = perturb_demos([recorded], tasks, [needed[task]], perturb, data, None)

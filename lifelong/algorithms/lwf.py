@@ -79,9 +79,7 @@ class LwF(Algorithm):
         """
         self.strength, self.own = strength, instruction == "own"
         self.teacher = Teacher()
-        self.languages: dict[
-            int, Tensor
-        ] = {}  # position of the last task of each stage -> its instructions, (n, L)
+        self.languages: dict[int, Tensor] = {}  # last task of each learned stage -> its instructions, (n, L)
         self.distilled: Batch | None = None  # made by `mix`, used by `penalty`
 
     def mix(self, batch: Batch, generator: torch.Generator) -> Batch:

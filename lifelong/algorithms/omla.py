@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from lifelong.algorithms.base import put_weights
-from lifelong.algorithms.lora import LoRA, check_pairs
+from lifelong.algorithms.lora import OWN, LoRA, check_pairs
 from lifelong.checkpoints import Weights
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError
@@ -52,7 +52,7 @@ class OMLA(LoRA):
         rank: Width = 16,
         alpha: NonNegative = 32.0,
         adapted: Sequence[str] = ("*",),
-        own: Sequence[str] = ("*bias*", "*norm*"),
+        own: Sequence[str] = OWN,
         base_tasks: Natural = 1,
     ):
         """Create the algorithm.

@@ -436,6 +436,6 @@ def test_demonstrations_are_asked_for_with_all_tasks_as_files_of_all_may_be_name
 
     monkeypatch.setattr(relearning, "find_demos", few)
     with pytest.raises(
-        DataError, match=r"2 demonstrations more than were learned .* \(--held-out\): a.hdf5 has 4"
+        DataError, match="6 are required; --held-out reads 2 demonstrations more than the run"
     ):
         relearning.task_windows(run, 1, 2, config)

@@ -1094,6 +1094,25 @@ def test_a_page_has_one_estimate_of_forward_transfer(tmp_path: Path):
     assert "as measured" not in text and "chosen without the start that measures it" in text
 
 
+def test_what_is_lost_in_several_orders_is_their_mean(tmp_path: Path) -> None:
+    runs, final, lost = [], [], []
+    for order, rate in enumerate((0.9, 0.5, 0.1)):
+        run = make_run(tmp_path / f"er{order}", "er", 1, tasks=3, order=order)
+        log, rng = ResultLog(run / "results.jsonl"), np.random.default_rng(order)
+        records = [_evaluation(rng, "matrix", 2, 10, task, rate) for task in range(3)]
+        for record in records:
+            log.append(replace(record, phase="shift", shift="light=0.5"))
+        final.append(np.mean([log.read().evaluation("matrix", 2, task).rate for task in range(3)]))
+        lost.append(final[-1] - np.mean([record.rate for record in records]))
+        runs.append(run)
+    page = write_report(runs, tmp_path / "page" / "report.html", Plan())
+    (group,) = json.loads((page.parent / "comparison.json").read_text())["groups"].values()
+    found = group["shifts"]["light=0.5"]
+    assert found["runs"] == 3 and found["final"] == pytest.approx(np.mean(final))
+    assert found["final"] == pytest.approx(group["metrics"]["final_success"]["mean"])
+    assert found["lost"]["value"] == pytest.approx(np.mean(lost))
+
+
 def test_what_methods_lose_under_a_held_out_shift_is_compared(tmp_path: Path) -> None:
     """Student's interval of what is lost, and of what is lost less the reference's, over the seeds of both."""
     runs, lost = [], {"er": {}, "ewc": {}}
