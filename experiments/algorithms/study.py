@@ -89,7 +89,7 @@ def _memories(megabytes: float) -> dict[str, tuple[str, ...]]:
 
 
 LONG = (
-    *("benchmark=libero_130", "data.demos=20", "train.steps_per_epoch=75", "eval.episodes=2"),
+    *("benchmark=libero_130", "data.demos=10", "train.steps_per_epoch=75", "eval.episodes=1"),
     *("eval.cells=sampled", "eval.cells_share=0.02", "eval.curve=none", "eval.horizon=300"),
 )
 SMALL = ("train.steps_per_epoch=75", "eval.episodes=10")
