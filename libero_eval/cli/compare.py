@@ -15,7 +15,6 @@ from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
     from libero_eval.judging.comparability import Group
-    from lifelong.stats.power import Question
 
 _Signed = Annotated[float, Field(ge=-1, le=1)]
 
@@ -94,6 +93,7 @@ class PowerOptions:
 def power(options: PowerOptions) -> None:
     """Print how many episodes a difference needs, a table of them, or the difference that can be shown."""
     from libero_eval.judging import power_text
+    from lifelong.stats.power import Question, discordance_of
 
     if options.discordance is not None and options.correlation is not None:
         raise ConfigError("--correlation stands for --discordance; give one of them")
@@ -104,13 +104,26 @@ def power(options: PowerOptions) -> None:
         raise ConfigError(
             "--discordance and --correlation are of one case; name it with --difference or --episodes"
         )
-    question = _question(options)
-    if options.episodes:
-        print(power_text.shown(question, options.episodes, options.correlation))
-    elif options.difference is None and not options.results:
-        print(power_text.table(question))
-    else:
-        print(power_text.answer(question))
+    base, gap, discordance = _observed(options.results) if options.results else (0.9, None, None)
+    base = base if options.base is None else options.base
+    gap = gap if options.difference is None else options.difference
+    discordance = discordance if options.discordance is None else options.discordance
+    levels = {"power": options.power, "alpha": options.alpha, "tests": options.tests}
+    if options.episodes or gap is None:
+        question = Question(base, -base / 1000, **levels)
+        if options.episodes:
+            pairs = {"discordance": discordance, "correlation": options.correlation}
+            print(power_text.shown(question, options.episodes, **pairs))
+        else:
+            print(power_text.table(question))
+        return
+    if gap > 0 and base + gap > 1:
+        raise ConfigError(
+            f"--base {base:g} and --difference {gap:g} give a success of {base + gap:g}, above 1"
+        )
+    if options.correlation is not None:
+        discordance = discordance_of(base, gap, options.correlation)
+    print(power_text.answer(Question(base, gap, discordance, **levels)))
 
 
 def board(
@@ -190,24 +203,6 @@ def export(
         content, folder, format, dataset, source
     )
     print(*written, sep="\n")
-
-
-def _question(options: PowerOptions) -> "Question":
-    from lifelong.stats.power import Question, discordance_of
-
-    usual = _observed(options.results) if options.results else (0.9, None, None)
-    base = usual[0] if options.base is None else options.base
-    gap = usual[1] if options.difference is None else options.difference
-    if gap is None or options.episodes:  # which is asked for
-        gap = -base / 1000
-    discordance = usual[2] if options.discordance is None else options.discordance
-    if gap > 0 and base + gap > 1:
-        raise ConfigError(
-            f"--base {base:g} and --difference {gap:g} give a success of {base + gap:g}, above 1"
-        )
-    if options.correlation is not None:
-        discordance = None if options.episodes else discordance_of(base, gap, options.correlation)
-    return Question(base, gap, discordance, options.power, options.alpha, options.tests)
 
 
 def _observed(words: Sequence[str]) -> tuple[float, float | None, float | None]:

@@ -294,8 +294,7 @@ def _shown(total: Difference, alpha: float, tests: int) -> float:
         return math.nan
     # downwards: near 100 % there is no room above
     question = Question(base, -base / 1000, alpha=alpha, tests=tests)
-    share = min(total.counts.discordant / total.counts.pairs, question.discordance_range[1])
-    return shown_difference(replace(question, discordance=max(share, base / 1000)), total.pairs)
+    return shown_difference(question, total.pairs, discordance=total.counts.discordant / total.pairs)
 
 
 def _rate(group: Group) -> Rate:

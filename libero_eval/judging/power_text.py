@@ -39,13 +39,16 @@ def answer(question: Question) -> str:
     return "\n".join(lines)
 
 
-def shown(question: Question, episodes: int, correlation: float | None = None) -> str:
-    """Say which difference a number of episodes of each policy in the same starts shows."""
-    downwards = replace(question, difference=-question.base / 1000)
-    upwards = replace(question, difference=(1 - question.base) / 1000)
+def shown(question: Question, episodes: int, **outcomes: float | None) -> str:
+    """Say which difference a number of episodes of each policy in the same starts shows.
+
+    Args:
+        outcomes: How the outcomes of a pair go together, see `shown_difference`.
+    """
+    ways = {"worse": -question.base / 1000, "better": (1 - question.base) / 1000}
     sizes = {
-        name: shown_difference(one, episodes, correlation)
-        for name, one in (("worse", downwards), ("better", upwards))
+        name: shown_difference(replace(question, difference=gap), episodes, **outcomes)
+        for name, gap in ways.items()
     }
     lines = [
         f"{episodes} pairs, success {100 * question.base:.1f} %, power {100 * question.power:.0f} %, alpha "

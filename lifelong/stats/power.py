@@ -137,17 +137,23 @@ def unpaired_episodes(question: Question) -> int:
     return math.ceil(((pooled + apart) / question.difference) ** 2)
 
 
-def shown_difference(question: Question, pairs: int, correlation: float | None = None) -> float:
+def shown_difference(
+    question: Question, pairs: int, *, discordance: float | None = None, correlation: float | None = None
+) -> float:
     """Return the smallest difference, in steps of 0.001, that so many pairs show with the power; NaN if none.
 
-    The discordance is that of independent outcomes, or the given one, or that of the outcomes' correlation, as far as
-    the rates of each difference allow it.
+    Args:
+        question: Success rate of the one policy, power and level; of its difference, the sign counts.
+        pairs: Number of pairs.
+        discordance: Share of pairs that differ, as far as the rates of each difference allow it; None: as if outcomes
+            were independent.
+        correlation: Correlation of the outcomes (phi), from which the discordance follows.
     """
     sign = math.copysign(1.0, question.difference)
     room = (1 - question.base) if sign > 0 else question.base
     for step in range(1, math.floor(1000 * room + 1e-9) + 1):
         moved = replace(question, difference=sign * step / 1000, discordance=None)
-        share = question.discordance
+        share = discordance
         if correlation is not None:
             share = discordance_of(moved.base, moved.difference, correlation)
         if share is not None:

@@ -17,6 +17,7 @@ from libero_eval.judging.group_scores import group_scores  # noqa: E402
 from libero_eval.judging.page import forest_figure, gate_text, render  # noqa: E402
 from libero_integrations.exports.results import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
 from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
+from lifelong.stats.power import Question, paired_power, shown_difference  # noqa: E402
 from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
 
 
@@ -61,6 +62,18 @@ def test_policies_that_never_win_the_same_start_are_compared(wins, turned):
     ]
     total = compare_groups(sides).comparisons[0].total.difference
     assert total.value == pytest.approx(rows[0].mean() - rows[1].mean())
+
+
+def test_what_would_have_been_shown_is_of_the_discordance_that_was_seen(tmp_path, capsys):
+    rows = [[1] * 40 + [1] * 12 + [0] * 8, [1] * 40 + [0] * 12 + [1] * 8]
+    results = [result_of(task_result("libero_goal/0", row), policy=f"p{n}") for n, row in enumerate(rows)]
+    shown = compare_groups([side(f"p{n}", one) for n, one in enumerate(results)]).comparisons[0].shown
+    base = 52 / 60
+    assert shown == shown_difference(Question(base, -0.1), 60, discordance=20 / 60)
+    assert paired_power(Question(base, -shown, 20 / 60), 60) >= 0.8
+    files = [str(one.write(tmp_path / f"{n}.json")) for n, one in enumerate(results)]
+    assert main(["power", *files, "--episodes", "60"]) == 0
+    assert f"worse by {100 * shown:.1f} points" in capsys.readouterr().out
 
 
 def test_one_policy_twice_is_the_control_arm(found):

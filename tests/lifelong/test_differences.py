@@ -160,7 +160,7 @@ def test_the_number_of_pairs_is_the_first_with_the_power():
     assert paired_power(question, count) >= 0.8 > paired_power(question, count - 1)
     assert paired_episodes(Question(0.9, 0.03, 0.1, tests=4)) > count
     assert paired_episodes(Question(0.9, 0.03, 0.05)) < count < paired_episodes(Question(0.9, 0.03))
-    assert shown_difference(question, count) == pytest.approx(0.03, abs=0.001)
+    assert shown_difference(question, count, discordance=0.1) == pytest.approx(0.03, abs=0.001)
 
 
 def test_episodes_in_other_starts_are_as_in_textbooks():
@@ -176,10 +176,19 @@ def test_correlated_outcomes_differ_less():
     assert discordance_of(0.9, 0.03, 0) == pytest.approx(0.9 * 0.07 + 0.93 * 0.1)
     assert discordance_of(0.9, 0.03, 0.5) < discordance_of(0.9, 0.03, 0.1)
     count = paired_episodes(Question(0.9, -0.1, discordance_of(0.9, -0.1, 0.5)))
-    assert shown_difference(Question(0.9, -0.1), count, 0.5) == pytest.approx(0.1, abs=0.002)
-    assert f"worse by {100 * shown_difference(Question(0.9, -0.1), 50, 0.5):.1f} p" in shown(
-        Question(0.9, -0.1), 50, 0.5
+    assert shown_difference(Question(0.9, -0.1), count, correlation=0.5) == pytest.approx(0.1, abs=0.002)
+    assert f"worse by {100 * shown_difference(Question(0.9, -0.1), 50, correlation=0.5):.1f} p" in shown(
+        Question(0.9, -0.1), 50, correlation=0.5
     )
+
+
+def test_a_discordance_counts_as_far_as_each_difference_allows():
+    """A third of the pairs cannot differ between 90 and 89.9 %, but can between 90 and 70 %."""
+    found = shown_difference(Question(0.9, -0.1), 60, discordance=1 / 3)
+    assert paired_power(Question(0.9, -found, 1 / 3), 60) >= 0.8
+    assert paired_power(Question(0.9, 0.001 - found, min(1 / 3, 0.2 + found - 0.001)), 60) < 0.8
+    assert found > shown_difference(Question(0.9, -0.1), 60, discordance=0.2)
+    assert "worse by" in shown(Question(0.9, -0.1), 60, discordance=1 / 3)
 
 
 def test_the_sequential_test_stops_earlier_for_larger_differences():
