@@ -242,7 +242,7 @@ class ServedPolicy:
         """
         prompt, name, words = (_words(message, key) for key in ("prompt", "task", "instruction"))
         if prompt is None and name is None and before is not None:
-            return before
+            return before if words is None else replace(before, language=words)
         by_id = {task.id: task for task in self.run.tasks}
         if name is not None:
             tasks = [by_id[name]] if name in by_id else [t for t in _tasks() if t.id == name]

@@ -150,6 +150,10 @@ def test_what_begins_an_episode(folder):
     assert ask(prompt=first.language, task=first.id, seed=[3]) not in (started, went_on)
     ask(prompt=second.language)
     assert ask(prompt=first.language, seed=[3]) == started, "another prompt began an episode"
+    reworded = ask(instruction="move it", seed=[3])
+    assert reworded not in (started, went_on), "other words alone, for the same task"
+    assert ask(reset=True, task=first.id, instruction="move it", seed=[3]) == reworded
+    assert ask(instruction="move it", seed=[3]) != reworded, "the same words: the episode goes on"
     other = served.session().infer(request(obs, prompt=first.language))["actions"]
     again = served.session().infer(request(obs, prompt=first.language))["actions"]
     assert not np.array_equal(other, again), "without a seed each client draws by itself"
