@@ -66,7 +66,8 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
     rows = [(s.label, r) for s in groups for r in s.results]
     base_label, base = rows[0]
     check_same_back_end({label: result.backend for label, result in rows})
-    expected, refused, notes = {key: (base_label, value) for key, value in settings(base).items()}, {}, {}
+    expected = {key: (base_label, value) for key, value in settings(base).items()}
+    refused, notes = dict[str, str](), list[str]()
     for label, result in rows[1:]:
         others = settings(result)
         for key in sorted(expected.keys() | others.keys()):
@@ -79,18 +80,20 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
             one, other = (shorten(str(value), 60) for value in values)
             text = f"{key}: {one} in {first_label}, {other} in {label}"
             if UNKNOWN in values and key.startswith("environment."):
-                notes[key] = f"{text}; taken to be the same"
+                notes.append(f"{text}; taken to be the same")
             elif any(key == a or key.startswith(a + ".") for a in allow):
-                notes[key] = f"{text}; allowed"
+                notes.append(f"{text}; allowed")
             else:
-                refused[key] = text
-        for key, pair in _lesser_differences(base, result).items():
-            notes[key] = f"{key}: {pair[0]} in {base_label}, {pair[1]} in {label}"
+                refused[text] = key
+        notes += [
+            f"{key}: {first} in {base_label}, {other} in {label}"
+            for key, (first, other) in _lesser_differences(base, result).items()
+        ]
         tasks = {key: (label, value) for key, value in others.items() if key.startswith("tasks.")}
         expected = tasks | expected
     if refused:
-        names = " ".join(f"--allow {key}" for key in refused)
-        lines = "\n  ".join(refused.values())
+        names = " ".join(f"--allow {key}" for key in dict.fromkeys(refused.values()))
+        lines = "\n  ".join(refused)
         raise ComparisonError(
             f"these results cannot be compared, as they were made differently:\n  {lines}\n"
             f"evaluate again with the same settings, or compare nevertheless with {names}"
@@ -101,7 +104,7 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
         for label, result in rows
         if result.stopped
     ]
-    return [*notes.values(), *remarks]
+    return [*dict.fromkeys(notes), *remarks]
 
 
 def settings(result: EvaluationResult) -> dict[str, Any]:

@@ -314,14 +314,14 @@ class Robustness:
 
 
 def differences(policies: Sequence[Robustness]) -> list[str]:
-    """Return a line for each difference of the tasks, starts and settings of policies from those of the first."""
+    """Return a line for each difference of the tasks, starts, severities and settings of policies from the first."""
     first, *others = policies
     lines = []
     for other in others:
         a, b = (_compared(policy) for policy in (first, other))
         for key in sorted(a.keys() | b.keys()):
-            if key.startswith("tasks.") and not (key in a and key in b):
-                continue  # "tasks" says it
+            if key.startswith(("tasks.", "severities of ")) and not (key in a and key in b):
+                continue  # "tasks" says it; a kind that one was not evaluated under is not drawn for it
             one, two = (str(values.get(key, "none")) for values in (a, b))
             if one != two:
                 lines.append(
@@ -336,6 +336,9 @@ def _compared(policy: Robustness) -> dict[str, Any]:
         **policy.settings,
         "tasks": ", ".join(sorted(outcomes.tasks)),
         "starts": ", ".join(map(str, sorted(outcomes.starts))),
+        **{
+            f"severities of {axis.kind}": ", ".join(f"{s:g}" for s in axis.severities) for axis in policy.axes
+        },
     }
 
 

@@ -57,6 +57,27 @@ def test_results_of_one_policy_on_other_suites_are_a_row():
     assert board.shared == 100 and row.success.value == pytest.approx(1.0), "the first 50 starts of each"
 
 
+def test_a_suite_that_not_all_ran_is_left_empty(tmp_path):
+    both = (task_result(f"{suite}/0", first(50)) for suite in ("libero_goal", "libero_object"))
+    entries = [won("a", first(50)), entry("b", result_of(*both, policy="b:make"))]
+    board = make_board(entries, ["starts"])
+    text = write_board(board, entries, tmp_path / "board.html").read_text()
+    assert '<td class="num" data-name="libero_object">–</td>' in text
+    assert render_board(board).splitlines()[1].split()[-2:] == ["–", "100"]
+
+
+def test_every_result_that_differs_is_noted():
+    entries = [won("a", first(5))]
+    entries += [
+        won(name, first(5), protocol=PROTOCOL | {"settle_steps": n}) for name, n in (("b", 5), ("c", 7))
+    ]
+    assert check_comparable(entries, ["protocol"]) == [
+        f"protocol.settle_steps: 10 in a, {text}; allowed" for text in ("5 in b", "7 in c")
+    ]
+    with pytest.raises(ComparisonError, match=r"5 in b\n.*7 in c\n.* with --allow protocol.settle_steps$"):
+        check_comparable(entries)
+
+
 def test_instructions_of_a_task_that_the_first_lacks_and_other_task_files_are_compared():
     one = [task_result("libero_goal/0", first(50))]
     ours, theirs = (

@@ -157,6 +157,8 @@ def test_policies_beside_each_other_tell_what_differs_besides(tmp_path) -> None:
     base = {"protocol.episode.horizon": 5, "tasks.libero_goal/0.digest": "a"}
     first = Robustness("a", found, settings=base)
     assert differences([first, Robustness("b", found, settings=base)]) == []
+    further = Robustness("b", outcomes({(): 10, A: 6, B: 3}), settings=base)
+    assert differences([first, further]) == ["severities of camera: 0, 0.5 in a, 0, 0.5, 1 in b"]
     tasks, other = ("libero_goal/0", "libero_goal/7"), {**base, "tasks.libero_goal/7.digest": "b"}
     second = Robustness("b", replace(found, tasks=tasks), settings={**other, "protocol.episode.horizon": 6})
     third = Robustness("c", replace(found, starts=tuple(range(1, 11))), settings=base)
