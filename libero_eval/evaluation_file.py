@@ -242,9 +242,10 @@ class EvaluationResult:
     @property
     def success(self) -> Estimate:
         """Mean success over tasks; see `overall`. Where it could be stopped, the interval is an always-valid one."""
-        return self._success(self.tasks)
+        return self.success_of(self.tasks)
 
-    def _success(self, tasks: Sequence[TaskResult]) -> Estimate:
+    def success_of(self, tasks: Sequence[TaskResult]) -> Estimate:
+        """Return the mean success over some of the tasks, with an interval as of `success`."""
         if self.stopped is None:
             return overall(tasks)
         wins, count = (sum(sum(task.successes) for task in tasks), sum(len(t.successes) for t in tasks))
@@ -264,7 +265,7 @@ class EvaluationResult:
     def suites(self) -> dict[str, Estimate]:
         """Mean success over the tasks of each suite, with intervals as of `success`."""
         names = dict.fromkeys(task.suite for task in self.tasks)
-        return {name: self._success([task for task in self.tasks if task.suite == name]) for name in names}
+        return {name: self.success_of([task for task in self.tasks if task.suite == name]) for name in names}
 
     @property
     def world(self) -> dict[str, Any]:

@@ -73,17 +73,30 @@ class UserPolicy(PolicyUnderTest):
 
     def protocol(self, base: EvalProtocol) -> EvalProtocol:
         """Return the protocol with the policy's own image size, if it has one; see `PolicyUnderTest`."""
-        size = self._attribute("camera_size", tuple[_Side, _Side] | None, None)
-        if self.request.size:
-            size = (self.request.size, self.request.size)
-        return base if size is None else base.changed({"pixels.render_size": size})
+        own, asked = self._attribute("camera_size", tuple[_Side, _Side] | None, None), self.request.size
+        if own and asked:
+            raise ConfigError(
+                f"--size {asked}: {self.request.policy_name} has a size of its own, camera_size {own[0]} x {own[1]}"
+            )
+        size = own or ((asked, asked) if asked else None)
+        protocol = base if size is None else base.changed({"pixels.render_size": size})
+        unlike = [name for name in self.observations if name.startswith(("depth", "segmentation"))]
+        if unlike and self._names(protocol) == "original":
+            raise ConfigError(
+                f"the original's {' and '.join(unlike)} are in other units and numbers: --names native gives "
+                f"{self.request.policy_name} this package's"
+            )
+        return protocol
+
+    def _names(self, protocol: EvalProtocol) -> str:
+        upright = protocol.pixels.orientation == "upright"
+        return self.request.names or ("native" if upright else "original")
 
     @contextmanager
     def planner(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Planner]:
         """Yield what gives the policy its observations under the names it takes."""
         views = tuple(map(view_of, self.cameras or ()))
-        names = self.request.names or ("native" if protocol.pixels.orientation == "upright" else "original")
-        words = self.seeds(task, states)
+        names, words = self._names(protocol), self.seeds(task, states)
         seeds = tuple(int(np.random.SeedSequence(one).generate_state(1)[0]) for one in words)
         if names == "protocol":
             adapter = ProtocolAdapter(protocol, task)
@@ -125,9 +138,11 @@ def as_original(obs: Obs) -> dict[str, np.ndarray]:
     for name, value in obs.items():
         if name.endswith("_rgb"):
             value = value[:, ::-1]
-        elif name == "ee_quat":
+        elif name.endswith("_quat"):
+            if name.endswith("_to_ee_quat"):  # of a rotation matrix, so that w is not negative
+                value = np.where(value[..., :1] < 0, -value, value)
             value = np.roll(value, -1, axis=-1)
-        renamed[ORIGINAL_NAMES.get(name, name)] = value
+        renamed[ORIGINAL_NAMES.get(name, name.replace("_to_ee_", "_to_robot0_eef_"))] = value
     return renamed
 
 

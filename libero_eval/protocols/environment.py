@@ -13,6 +13,7 @@ from libero_env.init_states.store import load_original_states
 from libero_env.sim.controller import get_controller
 from libero_env.sim.scene import Scene, default_drawing
 from libero_env.tasks import Task
+from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from lifelong.errors import ConfigError, ProtocolMismatchError
 
@@ -194,8 +195,9 @@ def run_protocol(
 ) -> EvalProtocol:
     """Return a protocol as it is run with a policy of this package.
 
-    The policy sees upright images of the size that it was trained on, and predicts an action for each step. Under
-    `libero`, episodes have the run's own length, settling and robot.
+    The policy sees upright images of the size that it was trained on, is told the words of the task's name, and
+    predicts an action for each step. Under the package's `libero`, episodes have the run's own length, settling and
+    robot.
 
     Args:
         image_size: Height and width of the policy's images, [pixels].
@@ -212,11 +214,13 @@ def run_protocol(
         "pixels.resize": "none",
         "pixels.resize_size": None,
         "pixels.crop": 1.0,
+        "language.source": "file_name",
+        "language.template": "{instruction}",
         "action.gripper": "as_predicted",
         "action.chunk": 1,
         "action.replan": 1,
     }
-    if base.name == "libero":
+    if base == load_protocol("libero"):
         changes |= {"episode.horizon": horizon, "episode.settle_steps": settle_steps}
         changes["world.robot"] = robot
         changes["episode.settle_action"] = base.episode.settle_action if settle_steps else None

@@ -419,10 +419,13 @@ class EvalProtocol:
         """Number of steps before the policy acts."""
         return self.episode.settle_steps or 0
 
+    def words(self, task: Task) -> str:
+        """Return the instruction of a task."""
+        return task.problem.language if self.language.source == "bddl" else task.language
+
     def prompt(self, task: Task) -> str:
-        """Return the instruction of a task that a policy receives."""
-        text = task.problem.language if self.language.source == "bddl" else task.language
-        return self.language.template.replace("{instruction}", text)
+        """Return the text that a policy receives: the instruction in the template."""
+        return self.language.template.replace("{instruction}", self.words(task))
 
     def env_seed(self, task: Task, init_state: int) -> int | None:
         """Return the seed that the environment gets for an initial state; None where the poses are stored.

@@ -286,7 +286,7 @@ class Evaluation:
         result = TaskResult(
             task=unit.task.id,
             name=unit.task.name,
-            instruction=_instruction(env, unit),
+            instruction=self._instruction(env, unit),
             digest=unit.task.digest,
             errors=kept if any(kept) else (),
             actions=tuple(e.actions for e in done.counted),
@@ -299,6 +299,11 @@ class Evaluation:
         )
         environment, versions = describe_environment(env), dict(self.versions)
         return UnitResult(result, environment, versions, this_process(), started, time.time())
+
+    def _instruction(self, env: VectorEnv, unit: Unit) -> str:
+        """Return what a policy is told, with what an event tells it later."""
+        told = [_acted_task(env, unit), *filter(None, [getattr(env, "later", None)])]
+        return ", then: ".join(map(self.protocol.words, told))
 
     def _times(self, done: Mapping[str, UnitResult]) -> dict[str, Any]:
         spans = {unit: done[unit.name] for unit in self.units if unit.name in done}
@@ -337,12 +342,6 @@ def _acted_task(env: VectorEnv, unit: Unit) -> Task:
     """Return the task that a policy is told: that of the environment, which perturbations may have changed."""
     task = getattr(env, "task", None)
     return task if isinstance(task, Task) else unit.task
-
-
-def _instruction(env: VectorEnv, unit: Unit) -> str:
-    """Return what a policy is told, with what an event tells it later."""
-    later = getattr(env, "later", None)
-    return _acted_task(env, unit).language + (f", then: {later.language}" if later else "")
 
 
 def iso_time(seconds: float) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from libero_env.tasks.published import parse_plus_id
 from libero_env.text import duration, shorten
-from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, overall
+from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.work.store import UnitResult, WorkStore, read_plan, read_unit
 from lifelong.results.failures import causes_text, safety_text
 from lifelong.stats.intervals import Estimate
@@ -147,8 +147,7 @@ def total_rows(result: EvaluationResult) -> list[str]:
             f"  ({failed} of {episodes + failed} ended by a simulation error, not counted)" if failed else ""
         )
         note += f"  ({result.stop_note})" if tasks is results and result.stopped else ""
-        success = result.success if tasks is results else overall(tasks)
-        lines.append(f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(success)}{note}")
+        lines.append(f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(result.success_of(tasks))}{note}")
     found = {"failed because": causes_text(results), "costs": safety_text(results)}
     return [*lines, *(f"{name:<18} {text}" for name, text in found.items() if text)]
 

@@ -68,10 +68,13 @@ class StoppingRule:
             here, there = flatten(json_safe(protocol.resolved())), flatten(dict(result.protocol))
             differ = sorted(k for k in here.keys() | there.keys() if here.get(k) != there.get(k))
             raise ConfigError(f"--until {text}: the protocol there differs in {', '.join(differ)}")
-        here = {task.id: (task.language, task.digest) for task in tasks}
+        here = {task.id: (protocol.words(task), task.digest) for task in tasks}
         for one in result.tasks:
-            language, digest = here.get(one.task, (one.instruction, one.digest))
-            if one.instruction != language or one.digest not in (None, digest):
+            words, digest = here.get(one.task, (one.instruction, one.digest))
+            reworded = (
+                one.instruction != words and not protocol.world.perturb
+            )  # perturbations draw other words
+            if reworded or one.digest not in ("", digest):
                 raise ConfigError(f"--until {text}: {one.task} there is another task, or has other objects")
         known = {(task.task, start) for task in result.tasks for start in task.starts}
         if lacking := [(task, start) for start in starts for task in here if (task, start) not in known]:

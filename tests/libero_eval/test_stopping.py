@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from libero_env.errors import LiberoError
-from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.evaluation_file import EvaluationResult, Stopped
 from libero_eval.judging.comparability import Group
 from libero_eval.judging.comparison import compare_groups
 from libero_eval.judging.evaluation_page import write_evaluation_page
@@ -17,6 +17,7 @@ from libero_eval.work.worker import Worker
 from lifelong.errors import ConfigError
 from lifelong.stats.sequential import anytime_interval, log_evidence
 from tests.harness.evaluations import QUICK, TASKS, Countdown, evaluate, evaluation
+from tests.harness.results import result_of, task_result
 
 IDS = [task.id for task in TASKS]
 STARTS = tuple(range(1, 31))  # those after 10 steps fail: the horizon
@@ -60,6 +61,15 @@ def test_it_stops_after_the_round_that_makes_the_interval_narrow(tmp_path):
     everything = stopping(tmp_path / "it", "width=0.2", unit_starts=1, until=None)  # it goes on
     assert everything.init_states == STARTS and everything.stopped is None
     assert everything.tasks[0].of_starts(STARTS[:need]) == result.tasks[0]
+
+
+def test_rows_of_suites_have_the_interval_of_the_rule_too():
+    tasks = [task_result(f"{suite}/0", [1] * 6) for suite in ("libero_goal", "libero_object")]
+    result = result_of(*tasks, stopped=Stopped("width=0.5", "known", 100))
+    end = anytime_interval(6, 6)
+    assert {*result.suites.values()} == {end}
+    rows = [row for row in total_rows(result) if row.startswith("libero_")]
+    assert len(rows) == 2 and all(f"[{100 * end.low:.1f}, 100.0]" in row for row in rows)
 
 
 @pytest.mark.parametrize("size", [2, 4, 7, 30])
@@ -111,6 +121,11 @@ def test_it_is_compared_with_the_same_tasks_in_the_same_world_only(tmp_path):
     replace(other, tasks=tuple(changed)).write(tmp_path / "ref" / "eval.json")
     with pytest.raises(ConfigError, match=f"{IDS[0]} there is another task"):
         rule(text)
+    perturbed = QUICK.changed({"world.perturb": "instruction=0.5"})
+    told = replace(changed[0], digest="")  # in drawn words, of a time that recorded no digest
+    again = replace(other, protocol=perturbed.resolved(), tasks=(told, *other.tasks[1:]))
+    again.write(tmp_path / "ref" / "eval.json")
+    assert StoppingRule.read(text, perturbed, TASKS, STARTS).other[IDS[0], STARTS[0]]
     replace(other, environment={**other.environment, "robot": "another"}).write(
         tmp_path / "ref" / "eval.json"
     )

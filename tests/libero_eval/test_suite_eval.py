@@ -5,6 +5,7 @@ import json
 import shutil
 import signal
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,10 +13,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from libero_env import memory
+from libero_env import LiberoEnv, memory
 from libero_env.cli import main as cli
 from libero_env.sim.scene import build_scene
-from libero_env.tasks import get_task
+from libero_env.tasks import get_suite, get_task
 from libero_eval.evaluation_file import EvaluationResult, Stopped, overall
 from libero_eval.plan import choose_init_states, plan_evaluation, repeated
 from libero_eval.plan import evaluate as evaluate_request
@@ -199,6 +200,35 @@ def test_a_result_is_run_again_as_it_was_and_in_no_other_way(changes, tmp_path):
         repeated(request, EvaluationResult.read(file))
 
 
+@pytest.mark.parametrize(
+    "changes", [{"horizon": 77}, {"robot": "robosuite-1.4.1"}], ids=lambda c: next(iter(c))
+)
+def test_a_result_of_a_run_is_run_again_with_the_episodes_it_had(learned, changes, tmp_path):
+    first = plan_evaluation(EvalRequest(policy=str(learned), suite=("libero_goal/0",), **changes))
+    values = {"evaluated": dict(first.identity), "versions": dict(first.versions)}
+    task = task_result("libero_goal/0", [True], digest=first.tasks[0].digest)
+    file = result_of(task, protocol=first.protocol.resolved(), **values).write(tmp_path / "eval.json")
+    assert plan_evaluation(EvalRequest(policy=str(file))).protocol == first.protocol
+
+
+def test_a_file_of_the_name_libero_is_a_protocol_of_its_own(learned, tmp_path):
+    own = tmp_path / "libero.yaml"
+    own.write_text("extends: libero\nepisode: {horizon: 33}\nlanguage: {source: bddl}\n")
+    plan = plan_evaluation(
+        EvalRequest(policy=str(learned), suite=("libero_goal/0",), protocol=str(own), out=tmp_path)
+    )
+    assert plan.protocol.episode.horizon == 33
+    assert plan.protocol.language.source == "file_name", "what a run is told"
+
+
+def test_a_result_states_the_words_that_were_told(tmp_path):
+    task = next(task for task in get_suite("libero_goal").tasks if task.language != task.problem.language)
+    told = QUICK.changed({"language.source": "bddl", "language.template": "Task: {instruction}"})
+    for protocol, words in ((QUICK, task.language), (told, task.problem.language)):
+        result = evaluate(tmp_path / protocol.language.source, tasks=[task], protocol=protocol)
+        assert result.tasks[0].instruction == words
+
+
 def test_task_files_are_evaluated_one_by_one_and_named_again(tmp_path):
     files = [tmp_path / f"{name}.bddl" for name in ("one", "two")]
     for file in files:
@@ -334,6 +364,40 @@ def test_names_and_conventions_of_the_original():
     np.testing.assert_array_equal(found["agentview_image"], frames[:, ::-1])
     np.testing.assert_array_equal(found["robot0_eef_quat"], [[0, 0, 0, 1]])
     assert "other" in found and set(ORIGINAL_NAMES) >= {"agentview_rgb", "ee_quat"}
+
+
+def test_objects_and_the_robot_are_those_of_the_facade_under_the_original_s_names(tmp_path):
+    from libero.libero.envs import OffScreenRenderEnv
+
+    task, file = get_task("libero_goal/4"), tmp_path / "task.bddl"
+    file.write_text(task.bddl_text)
+    native = LiberoEnv(task, cameras=(), observations=("proprioception", "ee_quat", "objects"))
+    with closing(native), closing(OffScreenRenderEnv(bddl_file_name=str(file))) as original:
+        original.reset()
+        seen, _ = native.reset(options={"init_state": 0})
+        model = native.scene.model
+        wanted = original.set_init_state(native.get_state()[: 1 + model.nq + model.nv])
+        found = as_original({name: value[None] for name, value in seen.items()})
+        names = [name for name in found if name in wanted and name.endswith(("_pos", "_quat", "_qpos"))]
+        assert any("_to_robot0_eef_quat" in name for name in names)
+        for name in names:
+            np.testing.assert_allclose(found[name][0], wanted[name], atol=1e-5, err_msg=name)
+
+
+@pytest.mark.parametrize(("more", "options", "message"), [
+    ('observations = ("rgb", "depth")', {}, "the original's depth are in other units.*--names native"),
+    ("camera_size = (32, 48)", {"size": 64}, "--size 64: .* has a size of its own, camera_size 32 x 48"),
+])  # fmt: skip
+def test_what_a_policy_would_misread_is_refused(more, options, message, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    name = f"odd_{next(iter(options), 'depth')}"
+    (tmp_path / f"{name}.py").write_text(
+        f"class make:\n    {more}\n    def predict(self, observations): ...\n"
+    )
+    words = {"policy": f"{name}:make", "suite": ("libero_goal/0",), "protocol": "openpi"}
+    with pytest.raises(ConfigError, match=message):
+        plan_evaluation(EvalRequest(**words, **options))
+    assert plan_evaluation(EvalRequest(**words, names="native"))
 
 
 @pytest.mark.parametrize(
