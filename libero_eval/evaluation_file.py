@@ -33,17 +33,6 @@ FILE_NAME = "eval.json"
 # What the outcome of an episode depends on by design. Other entries of the environment (renderer, processor) and
 # versions change little; a difference in them is told, and the comparison goes on.
 WORLD = ("models", "robot", "drawing")
-UNMEASURED = (
-    "digest",
-    "actions",
-    "limits_reached",
-    "failures",
-    "costs",
-    "began",
-    "atoms_at_start",
-    "solved",
-    "timing",
-)  # columns that are not part of `outcomes`
 
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
 _Id = Annotated[
@@ -88,15 +77,13 @@ class TaskResult(Episodes):
     solved: tuple[tuple[Annotated[int, Field(ge=-1, le=1)], ...], ...] = ()
     timing: tuple[tuple[Count, ...], ...] = ()
 
-    OPTIONAL: ClassVar[tuple[str, ...]] = (
-        *Episodes.OPTIONAL,
+    OUTCOMES: ClassVar[tuple[str, ...]] = (
         "errors",
-        "actions",
         "attempts",
-        "began",
-        "atoms_at_start",
-        "solved",
-        "timing",
+    )  # the columns below that `outcomes` depends on
+    OPTIONAL: ClassVar[tuple[str, ...]] = (
+        *(*Episodes.OPTIONAL, *OUTCOMES),
+        *("actions", "began", "atoms_at_start", "solved", "timing"),
     )
 
     def __post_init__(self) -> None:
@@ -281,7 +268,8 @@ class EvaluationResult:
     @property
     def outcomes(self) -> str:
         """Digest of everything that was measured, without actions, times, versions and the environment."""
-        rows = [{k: v for k, v in asdict(r).items() if k not in UNMEASURED} for r in self.tasks]
+        unmeasured = {"digest", "limits_reached", *TaskResult.OPTIONAL} - {*TaskResult.OUTCOMES}
+        rows = [{k: v for k, v in asdict(r).items() if k not in unmeasured} for r in self.tasks]
         return _digest(sorted(rows, key=lambda row: row["task"]))
 
     @property
@@ -384,10 +372,8 @@ def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
     """Return how often atoms of the goals held at any time, by predicate: means over atoms."""
     rates: dict[str, list[float]] = {}
     for result in results:
-        for i, atom in enumerate(result.atoms):
-            rates.setdefault(predicate_of(atom), []).append(
-                float(np.mean([row[i] for row in result.atoms_ever]))
-            )
+        for atom, held in zip(result.atoms, zip(*result.atoms_ever, strict=True), strict=True):
+            rates.setdefault(predicate_of(atom), []).append(float(np.mean(held)))
     return {name: float(np.mean(values)) for name, values in rates.items()}
 
 

@@ -293,10 +293,13 @@ def _episodes(request: EvalRequest, tasks: Sequence[Task], protocol: EvalProtoco
 def resolve_protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[Task]) -> EvalProtocol:
     """Return the protocol on this machine, with what the request changes; what was chosen is printed."""
     protocol, notes = resolve_world(base, tasks, request.assets)
-    changes: dict[str, object] = {}
+    asked = {
+        "episode.horizon": request.horizon,
+        "world.control_freq": request.control_freq,
+        "world.robot": request.robot,
+    }
+    changes: dict[str, object] = {name: value for name, value in asked.items() if value}
     perturb = protocol.world.perturb
-    if request.horizon:
-        changes["episode.horizon"] = request.horizon
     if request.perturb is not None:
         perturb = format_perturbations(parse_perturbations(request.perturb, request.perturb_seed))
         changes["world.perturb"] = perturb
@@ -310,10 +313,6 @@ def resolve_protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[T
         changes["world.perturb"] = format_perturbations((*known, *events))
     if request.clock is not None:
         changes["action.clock"] = str(Clock.read(request.clock)) if request.clock else ""
-    if request.control_freq:
-        changes["world.control_freq"] = request.control_freq
-    if request.robot:
-        changes["world.robot"] = request.robot
     if request.backend is not None:
         changes["world.backend"] = Backend.read(request.backend).name
     protocol = protocol.changed(changes)
@@ -331,9 +330,9 @@ def _check_options(request: EvalRequest, earlier: EvaluationResult | None) -> No
         ConfigError: One is; the message says what it is of.
     """
     kind = _kind(request.policy_name)
-    for name, of in _OF_KIND.items():
-        if of != kind and (given := _given(request, (name,))):
-            raise ConfigError(f"{given[0]} is of {_KINDS[of]}, and {request.policy} is {_KINDS[kind]}")
+    for of, (text, options) in _KINDS.items():
+        if of != kind and (given := _given(request, options)):
+            raise ConfigError(f"{given[0]} is of {text}, and {request.policy} is {_KINDS[kind][0]}")
     if request.allow and kind != "run" and earlier is None:
         raise ConfigError("--allow is of runs, and of results that are run again")
     if request.perturb_seed and request.perturb is None and not request.event and earlier is None:
@@ -350,16 +349,11 @@ def _given(request: EvalRequest, names: Iterable[str]) -> list[str]:
     return [f"--{name.replace('_', '-')}" for name in names if getattr(request, name) != getattr(plain, name)]
 
 
-_KINDS = {
-    "run": "a run",
-    "module": "a policy of your own",
-    "server": "a policy server",
-    "expert": "the expert",
-}
-_OF_KIND = {
-    **{"after": "run", "device": "run"},
-    **{"names": "module", "size": "module"},
-    **{"timeout": "server", "in_flight": "server"},
+_KINDS: dict[str, tuple[str, tuple[str, ...]]] = {  # with the options that are of it alone
+    "run": ("a run", ("after", "device")),
+    "module": ("a policy of your own", ("names", "size")),
+    "server": ("a policy server", ("timeout", "in_flight")),
+    "expert": ("the expert", ()),
 }
 # What a result states, so that it is run again with this
 _STATED = (

@@ -128,12 +128,7 @@ def relearn(request: RelearnRequest, initial: Policy) -> list[RelearnRecord]:
         starts = [start for start in STARTS if (task, start) not in known]
         if not starts:
             continue
-        before = restore(
-            run.path,
-            after=next(stage for stage in run.stages if task in stage)[-1],
-            device=device,
-            allow=allow,
-        )
+        before = restore(run.path, after=_stage_end(run, task), device=device, allow=allow)
         training, held_out = task_windows(run, task, request.demos_held_out, config)
         with measured_on(run, task, held_out, request.episodes) as measure:
             with before.acting(task) as then:
@@ -150,11 +145,15 @@ def relearn(request: RelearnRequest, initial: Policy) -> list[RelearnRecord]:
 def _met(run: LoadedRun, initial: Policy, task: int, config: Configuration) -> Policy:
     """Return a copy of the initial policy that has met a task as the run had before it learned it."""
     policy = copy.deepcopy(initial)
-    last = next(stage for stage in run.stages if task in stage)[-1]
+    last = _stage_end(run, task)
     instruction = run.learned_task(last).language
     windows = stage_windows(run, config)
     meet(policy, windows, list(windows), last, instruction, run.data.statistics, {})
     return policy
+
+
+def _stage_end(run: LoadedRun, task: int) -> int:
+    return next(stage for stage in run.stages if task in stage)[-1]
 
 
 def _relearned(

@@ -45,7 +45,7 @@ _MASK_RADIUS = 3.0  # [standard deviations] beyond which a mask is zero
 
 @dataclass(frozen=True)
 class SaliencySettings:
-    """Resolution of saliency maps; lengths in pixels of an image of height 128, scaled for other heights.
+    """Resolution of saliency maps; lengths above 0, in pixels of an image of height 128, scaled for others.
 
     Attributes:
         stride: Distance between two places (5 in the paper, for images of height 80).
@@ -56,11 +56,6 @@ class SaliencySettings:
     stride: float = 8.0
     sigma: float = 6.0
     blur: float = 5.0
-
-    def __post_init__(self) -> None:
-        for name in ("stride", "sigma", "blur"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"saliency: {name} is {getattr(self, name)}; it must be above 0")
 
 
 @torch.no_grad()
@@ -123,11 +118,8 @@ def overlay(image: np.ndarray, heat: np.ndarray, strongest: float) -> np.ndarray
     grey = np.repeat(image.mean(-1, keepdims=True), 3, axis=-1)
     colour = 255 * np.asarray(colormaps["plasma"](share))[..., :3]
     weight = 0.75 * np.sqrt(share)[..., None]
-    return (
-        np.clip((1 - weight) * (0.35 * image + 0.65 * grey) + weight * colour, 0, 255)
-        .round()
-        .astype(np.uint8)
-    )
+    mixed = (1 - weight) * (0.35 * image + 0.65 * grey) + weight * colour
+    return np.clip(mixed, 0, 255).round().astype(np.uint8)
 
 
 def contact_sheet(

@@ -16,8 +16,8 @@ from libero_eval.judging.evaluation_page import facts
 from libero_eval.judging.page import interval_text, p_text
 from lifelong.errors import ComparisonError
 from lifelong.report.tables import percent, save_page
-from lifelong.stats.episodes import ALPHA, Difference, Pairs, difference
-from lifelong.stats.intervals import Estimate, holm, wilson_interval
+from lifelong.stats.episodes import Difference, Pairs, difference
+from lifelong.stats.intervals import ALPHA, Estimate, holm, wilson_interval
 
 STARTS = "starts"  # what `allow` names where policies ran other episodes
 

@@ -13,18 +13,12 @@ from libero_env.sim.backend import MUJOCO
 from libero_env.storage import write_json
 from libero_env.text import json_safe
 from libero_eval.evaluation_file import by_start
-from libero_eval.judging.comparability import (
-    Group,
-    check_comparable,
-    match,
-    same_policy,
-    settings,
-)
+from libero_eval.judging.comparability import Group, check_comparable, match, same_policy, settings
 from libero_eval.judging.group_scores import GroupScores, group_scores
 from lifelong.errors import ConfigError, writing
 from lifelong.results.failures import count_causes, count_quadrants
-from lifelong.stats.episodes import ALPHA, Difference, difference, score_interval
-from lifelong.stats.intervals import Estimate, holm, wilson_interval
+from lifelong.stats.episodes import Difference, difference, score_interval
+from lifelong.stats.intervals import ALPHA, Estimate, holm, wilson_interval
 from lifelong.stats.power import Question, shown_difference
 from lifelong.stats.sequential import SequentialTest, sequential_test
 
@@ -267,22 +261,22 @@ def _compare(a: Group, b: Group, alpha: float, tests: int = 1) -> Contrast:
 
 def _adjusted(comparisons: Sequence[Contrast]) -> list[Contrast]:
     """Adjust the p-values by Holm: totals together, suites of all comparisons together, tasks of each comparison."""
-    totals = holm([c.total.difference.p_value for c in comparisons])
-    suites = iter(holm([p.difference.p_value for c in comparisons for p in c.suites]))
+    totals = iter(_family([c.total for c in comparisons]))
+    suites = iter(_family([row for c in comparisons for row in c.suites]))
     return [
         replace(
             contrast,
-            total=replace(contrast.total, adjusted=adjusted),
-            suites=tuple(replace(row, adjusted=next(suites)) for row in contrast.suites),
-            tasks=tuple(
-                replace(row, adjusted=value)
-                for row, value in zip(
-                    contrast.tasks, holm([row.difference.p_value for row in contrast.tasks]), strict=True
-                )
-            ),
+            total=next(totals),
+            suites=tuple(next(suites) for _ in contrast.suites),
+            tasks=tuple(_family(contrast.tasks)),
         )
-        for contrast, adjusted in zip(comparisons, totals, strict=True)
+        for contrast in comparisons
     ]
+
+
+def _family(rows: Sequence[Row]) -> list[Row]:
+    adjusted = holm([row.difference.p_value for row in rows])
+    return [replace(row, adjusted=value) for row, value in zip(rows, adjusted, strict=True)]
 
 
 def _shown(total: Difference, alpha: float, tests: int) -> float:
@@ -298,18 +292,18 @@ def _shown(total: Difference, alpha: float, tests: int) -> float:
 
 
 def _rate(group: Group) -> Rate:
-    wins = sum(sum(t.successes) for r in group.results for t in r.tasks)
-    episodes = sum(len(t.successes) for r in group.results for t in r.tasks)
-    low, high = wilson_interval(wins, episodes)
+    tasks = [task for result in group.results for task in result.tasks]
+    won = [one for task in tasks for one in task.successes]
+    low, high = wilson_interval(sum(won), len(won))
     return Rate(
         label=group.label,
         paths=group.paths,
         runs=len(group.results),
-        episodes=episodes,
-        errors=sum(sum(e is not None for e in t.errors) for r in group.results for t in r.tasks),
-        success=Estimate(wins / episodes, float(low), float(high)),
-        causes=count_causes(t for r in group.results for t in r.tasks),
-        safety=count_quadrants(t for r in group.results for t in r.tasks),
+        episodes=len(won),
+        errors=sum(error is not None for task in tasks for error in task.errors),
+        success=Estimate(sum(won) / len(won), float(low), float(high)),
+        causes=count_causes(tasks),
+        safety=count_quadrants(tasks),
     )
 
 

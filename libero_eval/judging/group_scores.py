@@ -58,12 +58,11 @@ class GroupScores:
     profiles: Mapping[str, Profile]
 
 
-def group_scores(scores: Mapping[str, Floats], *, seed: int = SEED) -> GroupScores:
+def group_scores(scores: Mapping[str, Floats]) -> GroupScores:
     """Aggregate the runs of each group.
 
     Args:
         scores: (runs, tasks) success rates of each group, in [0, 1]; the same tasks in each, at least two runs.
-        seed: Seed of the bootstrap.
 
     Raises:
         MissingPackageError: rliable is not installed.
@@ -71,7 +70,7 @@ def group_scores(scores: Mapping[str, Floats], *, seed: int = SEED) -> GroupScor
     require_package("rliable", "judge")
     from rliable import library, metrics
 
-    with _seeded(seed):
+    with _seeded():
         values, ends = library.get_interval_estimates(
             dict(scores),
             lambda x: np.array([metrics.aggregate_mean(x), metrics.aggregate_iqm(x)]),
@@ -112,10 +111,10 @@ def _estimate(values: Floats, ends: Floats, place: int) -> Estimate:
 
 
 @contextmanager
-def _seeded(seed: int) -> Iterator[None]:
+def _seeded() -> Iterator[None]:
     """Seed NumPy's global generator, which rliable 1.2 draws from, and leave it as it was."""
     before = np.random.get_state()  # noqa: NPY002
-    np.random.seed(seed)  # noqa: NPY002
+    np.random.seed(SEED)  # noqa: NPY002
     try:
         yield
     finally:

@@ -50,26 +50,27 @@ def shown(question: Question, episodes: int, **outcomes: float | None) -> str:
         name: shown_difference(replace(question, difference=gap), episodes, **outcomes)
         for name, gap in ways.items()
     }
-    lines = [
+    head = (
         f"{episodes} pairs, success {100 * question.base:.1f} %, power {100 * question.power:.0f} %, alpha "
         f"{question.alpha:g}{_tests(question)}: shown are"
+    )
+    found = [
+        f"  {name} by {100 * size:.1f} points"
+        if math.isfinite(size)
+        else f"  {name}: no difference that is possible"
+        for name, size in sizes.items()
     ]
-    for name, size in sizes.items():
-        text = f"{100 * size:.1f} points" if math.isfinite(size) else "no difference that is possible"
-        lines.append(f"  {name} by {text}" if math.isfinite(size) else f"  {name}: {text}")
-    return "\n".join(lines)
+    return "\n".join([head, *found])
 
 
 def table(question: Question) -> str:
     """Return a table: episodes of each policy by difference and by the share of pairs that differ."""
-    heads = ["difference", *(f"{100 * d:.0f} % differ" for d in DISCORDANCES), "independent", "other starts"]
-    rows = [heads]
+    rows = [["difference", *(f"{100 * d:.0f} % differ" for d in DISCORDANCES), "independent", "other starts"]]
     for size in DIFFERENCES:
         gap = size if question.base + size <= 1 else -size
-        cells = [f"{100 * gap:+.0f} points".replace("-", "−")]
-        for share in (*DISCORDANCES, None):
-            cells.append(_episodes(question, gap, share))
-        rows.append([*cells, str(unpaired_episodes(replace(question, difference=gap, discordance=None)))])
+        name = f"{100 * gap:+.0f} points".replace("-", "−")
+        paired = [_episodes(question, gap, share) for share in (*DISCORDANCES, None)]
+        rows.append([name, *paired, str(unpaired_episodes(replace(question, difference=gap)))])
     return (
         f"episodes of each policy, success {100 * question.base:g} %, power {100 * question.power:.0f} %, "
         f"alpha {question.alpha:g}{_tests(question)}\n"

@@ -7,8 +7,9 @@ stated.
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from operator import attrgetter
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field
@@ -84,7 +85,7 @@ class Simulation:
     def problems(self) -> Iterator[str]:
         """Yield which values contradict each other."""
         if self.perturb:
-            yield from _perturbation_problems(self.perturb)
+            yield from _unlike_stored("world.perturb", self.perturb, _stored_perturbations)
         if self.fixture_poses == "stored" and self.init_states == "original":
             yield "world.fixture_poses are stored, but world.init_states are original, with which none are stored"
         if self.fixture_poses == "stored" and self.env_seed is not None:
@@ -264,7 +265,7 @@ class Actions:
     def problems(self) -> Iterator[str]:
         """Yield which values contradict each other."""
         if self.clock:
-            yield from _clock_problems(self.clock)
+            yield from _unlike_stored("action.clock", self.clock, lambda text: str(Clock.read(text)))
         if self.chunk is not None and self.replan is not None and self.replan > self.chunk:
             yield (
                 f"action.replan is {self.replan}, but action.chunk is {self.chunk}: there are not as many actions"
@@ -307,19 +308,6 @@ class Counting:
     interval: str | None
     checkpoint: str | None
     dataset: str | None
-
-
-SECTIONS: dict[str, Any] = {
-    "world": Simulation,
-    "episode": Episodes,
-    "pixels": Pixels,
-    "proprioception": Proprioception,
-    "language": Language,
-    "action": Actions,
-    "sampling": Sampling,
-    "counting": Counting,
-}
-FIELDS = tuple(f"{section}.{field.name}" for section, kind in SECTIONS.items() for field in fields(kind))
 
 
 @dataclass(frozen=True)
@@ -384,9 +372,7 @@ class EvalProtocol:
 
     def flat(self) -> dict[str, Any]:
         """Return the values of all sections by dotted name, such as `world.env_seed`."""
-        return {
-            name: getattr(getattr(self, name.partition(".")[0]), name.partition(".")[2]) for name in FIELDS
-        }
+        return {name: attrgetter(name)(self) for name in FIELDS}
 
     def resolved(self) -> dict[str, Any]:
         """Return the protocol as plain data, with a digest of everything that decides a result."""
@@ -505,22 +491,20 @@ class EvalProtocol:
             )
 
 
-def _clock_problems(text: str) -> Iterator[str]:
+SECTIONS: dict[str, Any] = {part.name: part.type for part in fields(EvalProtocol) if is_dataclass(part.type)}
+FIELDS = tuple(f"{section}.{field.name}" for section, kind in SECTIONS.items() for field in fields(kind))
+
+
+def _unlike_stored(name: str, text: str, store: Callable[[str], str]) -> Iterator[str]:
+    """Yield what is wrong with a text that is not written as it is stored."""
     try:
-        if text != (stored := str(Clock.read(text))):
-            yield f"action.clock is {shown(text)}; in the words that are stored it is {shown(stored)}"
+        if text != (stored := store(text)):
+            yield f"{name} is {shown(text)}; in the words that are stored it is {shown(stored)}"
     except LiberoError as error:
-        yield f"action.clock: {error}"
+        yield f"{name}: {error}"
 
 
-def _perturbation_problems(text: str) -> Iterator[str]:
-    from libero_env.perturbations.perturbation import (  # slow to import
-        format_perturbations,
-        parse_perturbations,
-    )
+def _stored_perturbations(text: str) -> str:
+    from libero_env.perturbations import format_perturbations, parse_perturbations  # slow to import
 
-    try:
-        if text != (ordered := format_perturbations(parse_perturbations(text, events=True))):
-            yield f"world.perturb is {text!r}; in the order of application it is {ordered!r}"
-    except LiberoError as error:
-        yield f"world.perturb: {error}"
+    return format_perturbations(parse_perturbations(text, events=True))

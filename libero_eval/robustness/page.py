@@ -28,9 +28,8 @@ from lifelong.report.figures import (
     shorten,
 )
 from lifelong.report.tables import percent, save_page
-from lifelong.stats.intervals import Estimate
+from lifelong.stats.intervals import ALPHA, Estimate
 
-ALPHA = 0.05  # of the kinds together
 COLUMNS = 4
 EVENTS_TEXT = (
     "In how many episodes each event began, and in how many of these the expert, planning anew from the state just "
@@ -62,7 +61,7 @@ def render(policy: Robustness) -> str:
         ["kind", *(f"{s:g}" for s in severities), "area", "95 %", "kept", "half at", "Holm"]
     ]
     for axis in policy.axes:
-        successes = [policy.at(axis, s) for s in severities]
+        successes = [axis.at(s) for s in severities]
         rows.append(
             [
                 axis.kind,
@@ -169,10 +168,9 @@ def _lost_text(outcomes: Outcomes) -> str:
 
 
 def _horizons_text(policies: Sequence[Robustness]) -> str:
-    texts = [_horizon_text(policy) for policy in policies]
-    if len(set(texts)) == 1:
-        return texts[0]
-    return ", ".join(f"{text} ({policy.label})" for text, policy in zip(texts, policies, strict=True))
+    texts = {policy.label: _horizon_text(policy) for policy in policies}
+    named = [f"{text} ({label})" for label, text in texts.items()]
+    return ", ".join(named) if len({*texts.values()}) > 1 else texts[policies[0].label]
 
 
 def _horizon_text(policy: Robustness) -> str:
@@ -201,7 +199,7 @@ def _content(policy: Robustness) -> dict[str, Any]:
         "label": policy.label,
         "tasks": outcomes.tasks,
         "starts": outcomes.starts,
-        "success": asdict(policy.base),
+        "success": asdict(outcomes.success(())),
         "axes": [{**asdict(axis), "adjusted": policy.adjusted[axis.kind]} for axis in policy.axes],
         "interactions": [
             {**asdict(pair), "condition": name_of(pair.condition)} for pair in policy.interactions

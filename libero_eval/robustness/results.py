@@ -15,14 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from libero_env.text import flatten, plain, shorten
-from libero_eval.evaluation_file import EvaluationResult
+from libero_eval.evaluation_file import EvaluationResult, by_start
 from libero_eval.judging.comparability import settings
 from libero_eval.protocols.clock import Clock, Latency
 from lifelong.errors import ResultsError
 from lifelong.stats.episodes import Counts, mcnemar_exact, score_interval
-from lifelong.stats.intervals import UNKNOWN, Estimate, Floats, combine_intervals, holm, wilson_interval
+from lifelong.stats.intervals import (
+    CONFIDENCE,
+    UNKNOWN,
+    Estimate,
+    Floats,
+    combine_intervals,
+    holm,
+    wilson_interval,
+)
 
-DRAWS, SEED, CONFIDENCE = 2000, 2023, 0.95
+DRAWS, SEED = 2000, 2023
+ENDS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)  # quantiles
 ONE_EPISODE = 0.96  # z²/4 at 95 %: the variance that Wilson's interval adds, in units of one episode
 PLAIN = "without perturbations"
 LATENCY = "clock"  # the kind that is no perturbation, but a setting of the protocol
@@ -51,6 +60,10 @@ class Axis:
     kept: Estimate
     half: Estimate
     p_value: float
+
+    def at(self, severity: float) -> Estimate | None:
+        """Return the success at a severity; None if it was not measured."""
+        return dict(zip(self.severities, self.success, strict=True)).get(severity)
 
 
 @dataclass(frozen=True)
@@ -121,14 +134,7 @@ class Outcomes:
                     f"{name_of(condition)} was run under other settings than the base ({'; '.join(odd)}): run all "
                     "conditions again with --again, or these with an --out of their own"
                 )
-        won = [
-            {
-                (t.task, s): won
-                for t in results[c].tasks
-                for s, won in zip(t.init_states, t.successes, strict=True)
-            }
-            for c in conditions
-        ]
+        won = [by_start(results[condition].tasks) for condition in conditions]
         outcomes = [[[row[task, start] for start in starts] for task in tasks] for row in won]
         return cls(tasks, starts, conditions, np.array(outcomes), len(base.init_states) - len(starts))
 
@@ -180,17 +186,13 @@ class Outcomes:
         columns = [self.conditions.index(c) for c in conditions]
         severities = tuple(c[0][1] if c else 0.0 for c in conditions)
         rates, draws = self.rates[columns], self.draws[:, columns]
-        weights = _trapezoid(np.array(severities))
-        area = _estimate(float(rates @ weights), draws @ weights, self._least, 0.0, 1.0)
-        kept = _estimate(
-            _share(float(rates @ weights), float(rates[0])),
-            _shares(draws @ weights, draws[:, 0]),
-            self._least,
-            0.0,
-            np.inf,
-        )
+        weights = np.trapezoid(np.eye(len(severities)), severities) / severities[-1]  # of the area
+        mean, drawn = float(rates @ weights), draws @ weights
+        area = _estimate(mean, drawn, self._least, 0.0, 1.0)
+        shares = _share(mean, float(rates[0])), _shares(drawn, draws[:, 0])
+        kept = _estimate(*shares, self._least, 0.0, np.inf)
         halves = np.array([half_severity(severities, row) for row in draws])
-        low, high = np.quantile(halves, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], method="nearest")
+        low, high = np.quantile(halves, ENDS, method="nearest")
         half = Estimate(half_severity(severities, rates), float(low), float(high))
         p_value = _exchange_test(self.successes[columns].reshape(len(columns), -1).T, weights)
         return Axis(kind, severities, tuple(map(self.success, conditions)), area, kept, half, p_value)
@@ -280,11 +282,6 @@ class Robustness:
             rows.append(EventRow(name_of(condition), len(keys), int(began.sum()), int(solved.sum()), counts))
         return tuple(rows)
 
-    @property
-    def base(self) -> Estimate:
-        """Success without perturbation."""
-        return self.outcomes.success(())
-
     @cached_property
     def axes(self) -> tuple[Axis, ...]:
         """Every kind that was run by itself, the most harmful first."""
@@ -306,11 +303,6 @@ class Robustness:
     def severities(self) -> tuple[float, ...]:
         """All severities of any kind, ascending, from 0."""
         return tuple(sorted({s for axis in self.axes for s in axis.severities}))
-
-    @staticmethod
-    def at(axis: Axis, severity: float) -> Estimate | None:
-        """Return the success of a kind at a severity; None if it was not measured."""
-        return dict(zip(axis.severities, axis.success, strict=True)).get(severity)
 
 
 def differences(policies: Sequence[Robustness]) -> list[str]:
@@ -377,14 +369,6 @@ def half_severity(severities: Sequence[float], rates: Floats) -> float:
     return float("inf")
 
 
-def _trapezoid(places: Floats) -> Floats:
-    """Return the weights of the trapezoidal rule, divided by the range; 1 for a single place."""
-    if len(places) == 1:
-        return np.ones(1)
-    gaps = np.diff(places) / (places[-1] - places[0])
-    return np.concatenate([gaps, [0.0]]) / 2 + np.concatenate([[0.0], gaps]) / 2
-
-
 def _exchange_test(outcomes: NDArray[np.bool_], weights: Floats) -> float:
     """Return the p-value of the area less the base's success, where the outcomes of a start are permuted.
 
@@ -412,6 +396,6 @@ def _estimate(value: float, draws: Floats, least: float, low: float, high: float
     """Return a value with the quantiles of its draws, to whose distances the variance `least` is added."""
     if np.isnan(value):
         return UNKNOWN
-    ends = np.quantile(draws, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    ends = np.quantile(draws, ENDS)
     down, up = np.hypot(np.maximum([value - ends[0], ends[1] - value], 0), 1.96 * np.sqrt(least))
     return Estimate(value, max(low, float(value - down)), min(high, float(value + up)))

@@ -204,11 +204,7 @@ class Evaluation:
         if self.until is not None and known:
             for unit in rounds[0]:
                 self.until.check_world(world_of(done[unit.name].environment))
-            tasks = [
-                TaskResult.joined([done[unit.name].result for unit in units])
-                for units in zip(*rounds, strict=True)
-            ]
-            if count := self.until.starts_needed(tasks, known):
+            if count := self.until.starts_needed(_by_task(rounds, done), known):
                 return known[:count]
         return known if len(known) == len(self.init_states) else None
 
@@ -227,10 +223,7 @@ class Evaluation:
             raise ConfigError(f"{len(done)} of {len(self.units)} units are done: there is no result yet")
         rounds = [units for units in self._rounds if units[0].init_states[0] in starts]
         units = {unit.name: done[unit.name] for part in rounds for unit in part}
-        tasks = [
-            TaskResult.joined([units[unit.name].result for unit in part]).of_starts(starts)
-            for part in zip(*rounds, strict=True)
-        ]
+        tasks = [task.of_starts(starts) for task in _by_task(rounds, done)]
         if lost := next((task for task in tasks if not task.init_states), None):
             raise EvaluationIncompleteError(
                 f"simulation errors ended all episodes of {lost.task}, which has no success: "
@@ -321,21 +314,27 @@ class Evaluation:
 
     def is_filmed(self, unit: Unit) -> bool:
         """Return whether the episodes of a unit that are to be filmed have been."""
-        starts, folder = {*unit.init_states} & {*self.init_states[: self.videos]}, self.out / "videos"
-        name = f"{unit.task.suite}_{unit.task.index:02d}_start_"
-        return all(any(folder.glob(f"{name}{start:02d}_*")) for start in starts)
+        starts = {*unit.init_states} & {*self.init_states[: self.videos]}
+        return all(any((self.out / "videos").glob(_video(unit, start, "*"))) for start in starts)
 
     def _save_videos(self, unit: Unit, done: Rollouts) -> None:
-        folder, seconds = self.out / "videos", self.record_every / self.protocol.world.control_freq
+        seconds = self.record_every / self.protocol.world.control_freq
         filmed = [e for e in done.episodes if e.init_state in self.init_states[: self.videos]]
         for frames, episode in zip(done.recordings, filmed, strict=False):
             if frames:
                 outcome = "success" if episode.success else "failure"
                 outcome = "simulation_error" if episode.simulation_error else outcome
-                name = (
-                    f"{unit.task.suite}_{unit.task.index:02d}_start_{episode.init_state:02d}_{outcome}.webp"
-                )
-                save_animation(frames, folder / name, seconds_per_frame=seconds)
+                name = _video(unit, episode.init_state, f"{outcome}.webp")
+                save_animation(frames, self.out / "videos" / name, seconds_per_frame=seconds)
+
+
+def _by_task(rounds: Sequence[Sequence[Unit]], done: Mapping[str, UnitResult]) -> list[TaskResult]:
+    of_tasks = zip(*rounds, strict=True)
+    return [TaskResult.joined([done[unit.name].result for unit in units]) for units in of_tasks]
+
+
+def _video(unit: Unit, start: int, ending: str) -> str:
+    return f"{unit.task.suite}_{unit.task.index:02d}_start_{start:02d}_{ending}"
 
 
 def _acted_task(env: VectorEnv, unit: Unit) -> Task:

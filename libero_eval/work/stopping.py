@@ -12,7 +12,7 @@ from libero_env.text import flatten, json_safe, shorten, shown
 from libero_eval.evaluation_file import EvaluationResult, TaskResult, by_start
 from libero_eval.protocols.protocol import EvalProtocol
 from lifelong.errors import ConfigError
-from lifelong.stats.episodes import ALPHA
+from lifelong.stats.intervals import ALPHA
 from lifelong.stats.sequential import anytime_interval, log_evidence
 
 _EXPECTED = "expected width=0.05, against=RESULT, or against=RESULT,margin=0.05; numbers are between 0 and 1"
@@ -124,10 +124,8 @@ class StoppingRule:
         """Return how many episodes were won, lost, and counted after each start: (3, starts); of pairs, against one."""
         found, counts = by_start(tasks), np.zeros((3, len(starts)), np.int64)
         for k, start in enumerate(starts):
-            for key in [(task.task, start) for task in tasks]:
-                if key in found and (
-                    self.width is not None or key in self.other
-                ):  # no simulation error ended it
-                    other = self.width is None and self.other[key]
+            for key in ((task.task, start) for task in tasks):
+                if key in found and (self.width or key in self.other):  # no simulation error ended it
+                    other = self.other.get(key, False)
                     counts[:, k] += (found[key] and not other, other and not found[key], 1)
         return counts.cumsum(axis=1)

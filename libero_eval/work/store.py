@@ -17,6 +17,7 @@ import shutil
 import socket
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any
@@ -74,13 +75,11 @@ def partition(tasks: Iterable[Task], init_states: Sequence[int], size: int) -> t
 
     Args:
         init_states: Indices of the initial states of each task.
-        size: Number of initial states of a unit; the last one of a task may have fewer.
+        size: Number of initial states of a unit, at least 1; the last one of a task may have fewer.
 
     Raises:
-        ConfigError: The size is not positive, there are no initial states, or one is named twice.
+        ConfigError: There are no initial states, or one is named twice.
     """
-    if size < 1:
-        raise ConfigError(f"{size} initial states in a unit; a unit needs at least 1")
     if not init_states or len(set(init_states)) != len(init_states):
         raise ConfigError(f"initial states {list(init_states)}: name at least one, and each once")
     parts = [tuple(init_states[i : i + size]) for i in range(0, len(init_states), size)]
@@ -246,7 +245,7 @@ class WorkStore:
         for name in sorted(_names(self.path / "errors") - _names(self.path / "units")):
             path = self.path / "errors" / f"{name}.json"
             if entries := _read_errors(path):
-                errors[name] = UnitErrors(len(entries), entries[-1]["error"], path)
+                errors[name] = UnitErrors(len(entries), entries[-1].get("error", "unknown"), path)
         return errors
 
     def take(self, units: Iterable[Unit]) -> tuple[Unit, Claim] | None:
@@ -373,24 +372,12 @@ def _names(folder: Path) -> set[str]:
         return set()
 
 
-class _Error(TypedDict):
-    error: str
-    process: str
-    when: str
-    traceback: str
-
-
-class _Errors(TypedDict):
-    unit: str
-    errors: list[_Error]
-
-
-def _read_errors(path: Path) -> list[_Error]:
+def _read_errors(path: Path) -> list[dict[str, str]]:
     """Return the errors in a file; a broken one says nothing that counts."""
-    try:
-        return validate(_Errors, read_json(path, most=MAX_BYTES))["errors"]
-    except InvalidInputError:
-        return []
+    with suppress(InvalidInputError):
+        found = validate(dict[str, Any], read_json(path, most=MAX_BYTES)).get("errors")
+        return validate(list[dict[str, str]], found)
+    return []
 
 
 def _shown(value: Any) -> str:

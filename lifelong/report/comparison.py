@@ -65,13 +65,15 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
     )
     if not plan.other_worlds:
         check_same_world(groups)
-    found = _statistics({label: runs_of(runs) for label, runs in measured.items() if runs}, plan)
+    planned = {"all_pairs": plan.all_pairs, "margin": plan.margin}
+    methods = {label: runs_of(runs) for label, runs in measured.items() if runs}
+    found = statistics(methods, plan.references, **planned)
     later = {
-        label: [replace(m, scores=m.scores.without_first()) for m in runs_of(runs)]
-        for label, runs in measured.items()
-        if runs and all(r.results.has_later_tasks() for r in runs)
+        label: [replace(m, scores=m.scores.without_first()) for m in runs]
+        for label, runs in methods.items()
+        if all(r.results.has_later_tasks() for r in measured[label])
     }
-    plan_later = replace(plan, references=tuple(r for r in plan.references if r in later))
+    references = tuple(r for r in plan.references if r in later)
     reference = _reference(measured)
     compared = {
         g.label: _group(g, measured[g.label], found["metrics"].get(g.label), reference) for g in groups
@@ -85,16 +87,9 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
         "groups": compared,
         "differences": found["differences"],
         "statistics": found["statistics"],
-        "after_base_stage": _statistics(later, plan_later) if later else None,
+        "after_base_stage": statistics(later, references, **planned) if later else None,
         "conditions": unlike(groups),
     }
-
-
-def _statistics(methods: Mapping[str, Sequence[MethodRun]], plan: Plan) -> dict[str, Any]:
-    try:
-        return statistics(methods, plan.references, all_pairs=plan.all_pairs, margin=plan.margin)
-    except ValueError as error:
-        raise ComparisonError(str(error)) from error
 
 
 def runs_of(runs: Sequence[Run]) -> list[MethodRun]:
@@ -148,28 +143,28 @@ def _known(value: float | None) -> bool:
     return value is not None and bool(np.isfinite(value))
 
 
-# settings -> (seed, data_seed), or None for all together -> task -> success
-_Rates = Mapping[Hashable, Mapping[tuple[int, int | None] | None, Mapping[str, float]]]
+_References = Mapping[Hashable, Sequence[Run]]  # by settings
 
 
-def _reference(measured: Mapping[str, Sequence[Run]]) -> _Rates:
-    """Return the mean success on each task of policies that learned it alone, or else with all others."""
-    rates: dict[Hashable, dict[tuple[int, int | None] | None, dict[str, float]]] = {}
-    for algo in ("multitask", "singletask"):
-        found: dict[Hashable, dict[tuple[int, int | None] | None, dict[str, list[float]]]] = {}
-        for run in (run for runs in measured.values() for run in runs if algorithm_of(run) == algo):
-            of_settings = found.setdefault(_besides_algorithm(run), {})
-            for key in ((run.record.seed, run.record.data_seed), None):
-                for name, rate in zip(run.record.tasks, _just_learned(run), strict=True):
-                    of_settings.setdefault(key, {}).setdefault(name, []).append(rate)
-        rates |= {
-            settings: {
-                key: {name: float(np.mean(values)) for name, values in by_task.items()}
-                for key, by_task in by_seed.items()
-            }
-            for settings, by_seed in found.items()
-        }
-    return rates
+def _reference(measured: Mapping[str, Sequence[Run]]) -> _References:
+    """Return the runs whose policies learned each task alone, or else all together, by their settings."""
+    of_algorithm: dict[str, dict[Hashable, list[Run]]] = {"multitask": {}, "singletask": {}}
+    for run in (run for runs in measured.values() for run in runs if algorithm_of(run) in of_algorithm):
+        of_algorithm[algorithm_of(run)].setdefault(_besides_algorithm(run), []).append(run)
+    return of_algorithm["multitask"] | of_algorithm["singletask"]
+
+
+def _success_alone(run: Run, reference: _References) -> dict[str, float]:
+    """Return the mean success by task of the reference with a run's settings: of its own seeds, else of all."""
+    fitting = reference.get(_besides_algorithm(run), ())
+    own = [
+        r for r in fitting if (r.record.seed, r.record.data_seed) == (run.record.seed, run.record.data_seed)
+    ]
+    found: dict[str, list[float]] = {}
+    for one in own or fitting:
+        for name, rate in zip(one.record.tasks, _just_learned(one), strict=True):
+            found.setdefault(name, []).append(rate)
+    return {name: float(np.mean(rates)) for name, rates in found.items()}
 
 
 def _besides_algorithm(run: Run) -> Hashable:
@@ -182,17 +177,12 @@ def _just_learned(run: Run) -> list[float]:
     return [float(matrix[stage_of(run, task)[-1], task]) for task in range(len(matrix))]
 
 
-def _conventions(runs: Sequence[Run], reference: _Rates) -> dict[str, dict[str, float]]:
-    """Return what other papers print, by its name in `lifelong.stats.metrics`, over the runs.
-
-    Intransigence is that against the reference of the same settings: of a run's own seeds, where there is one, else of
-    all.
-    """
+def _conventions(runs: Sequence[Run], reference: _References) -> dict[str, dict[str, float]]:
+    """Return what other papers print, by its name in `lifelong.stats.metrics`, over the runs."""
     rows = []
     for run in runs:
-        fitting = reference.get(_besides_algorithm(run), {})
-        paired = fitting.get((run.record.seed, run.record.data_seed), fitting.get(None, {}))
-        alone = [paired.get(name, np.nan) for name in run.record.tasks[: run.learned]]
+        success = _success_alone(run, reference)
+        alone = [success.get(name, np.nan) for name in run.record.tasks[: run.learned]]
         learned = np.diag(_just_learned(run)[: run.learned])
         rows.append(run.results.other_conventions() | {"intransigence": intransigence(learned, alone)})
     means = {name: _mean([row[name] for row in rows]) for name in (rows[0] if rows else {})}
@@ -200,7 +190,7 @@ def _conventions(runs: Sequence[Run], reference: _Rates) -> dict[str, dict[str, 
 
 
 def _group(
-    group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None, reference: _Rates
+    group: Group, runs: Sequence[Run], metrics: Mapping[str, Any] | None, reference: _References
 ) -> dict[str, Any]:
     return {
         "runs": [str(r.path) for r in group.runs],
@@ -211,7 +201,7 @@ def _group(
         "told_task": group.told_task,
         "metrics": metrics or {name: dict(_UNKNOWN) for name in METRIC_NAMES},
         "other_conventions": _conventions(runs, reference),
-        "published": _published(runs),
+        "published": published_metrics(runs),
         "forgetting_by_task": _forgetting(runs),
         "subgoals": _subgoals(runs),
         "costs": costs_of(runs),
@@ -221,7 +211,7 @@ def _group(
 _UNKNOWN = {**dict.fromkeys(("mean", "standard_error", "low", "high"), float("nan")), "values": []}
 
 
-def _published(runs: Sequence[Run]) -> dict[str, float]:
+def published_metrics(runs: Sequence[Run]) -> dict[str, float]:
     """Return the means of FWT and AUC as eq. 3 is written, for comparison with published numbers."""
     values = [metric_values(r.results.scores("curve", "published")) for r in runs]
     return {name: float(np.mean([v[name] for v in values])) if values else np.nan for name in ("fwt", "auc")}

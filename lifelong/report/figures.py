@@ -160,7 +160,7 @@ def learning_figure(
 
 
 def forgetting_figure(lines: Sequence[Line]) -> Figure:
-    """Draw average success over the tasks learned so far against their number, with Student's 95 % band over seeds.
+    """Draw average success over the tasks learned so far against their number, with Student's 95 % band over runs.
 
     Lines of the same colour differ in dashes and markers.
     """

@@ -14,7 +14,7 @@ from libero_env.errors import InvalidInputError
 from libero_env.storage import atomic_write_text, read_bounded, require_own_folders, write_json
 from libero_env.text import duration, quantity
 from lifelong.errors import LifelongError
-from lifelong.report.comparison import MUJOCO, Plan, compare, findings
+from lifelong.report.comparison import MUJOCO, Plan, compare, findings, published_metrics
 from lifelong.report.figures import (
     Line,
     Panel,
@@ -48,7 +48,7 @@ from lifelong.results.shifts import shift_scores
 from lifelong.results.summary import write_episodes
 from lifelong.stats.intervals import Estimate
 from lifelong.stats.methods import compared_transfer
-from lifelong.stats.metrics import METRIC_NAMES, Metrics, Transfer, lifelong_metrics, metric_values
+from lifelong.stats.metrics import METRIC_NAMES, Metrics, Transfer, lifelong_metrics
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -296,11 +296,8 @@ def _success_of(group: Group) -> tuple[Panel, dict[str, Any], Line]:
 def _rank(group: Group) -> tuple[float, float]:
     """Return by what methods are sorted, best first: mean AUC, of those without one mean final success."""
     found = [r.metrics for r in group.runs if r.metrics is not None]
-    means = [
-        np.mean([getattr(m, name).value for m in found]) if found else np.nan
-        for name in ("auc", "final_success")
-    ]
-    return tuple(np.nan_to_num(means, nan=-np.inf) * -1)
+    values = [(m.auc.value, m.final_success.value) for m in found] or [(np.nan, np.nan)]
+    return tuple(-np.nan_to_num(np.mean(values, axis=0), nan=-np.inf))
 
 
 def _metric_texts(runs: Sequence[Run]) -> dict[str, tuple[str, str, str]]:
@@ -329,22 +326,25 @@ def _points(results: Results) -> str:
 
 def _kept(run: Run) -> dict[int, int]:
     """Return the epoch whose weights are kept of each task that is learned."""
-    ends = {t: run.results.task_end(run.results.last_of_group(t)) for t in range(len(run.record.tasks))}
-    return {task: end.best_epoch for task, end in ends.items() if end is not None}
+    results, tasks = run.results, range(len(run.record.tasks))
+    return {t: end.best_epoch for t in tasks if (end := results.task_end(results.last_of_group(t)))}
 
 
 def _facts(run: Run) -> list[tuple[str, Any]]:
     record, found = run.record, run.results.demonstrations
-    facts = [("policy", record.policy), ("preset", record.preset), ("seed", record.seed)]
-    facts += [("last task under", record.perturbed[-1])] if any(record.perturbed) else []
-    facts += [("simulated by", record.backend)] if record.backend != MUJOCO else []
-    facts += [
-        ("tasks", len(record.tasks)),
-        ("started", record.started.replace("T", " ").replace("+00:00", " UTC")),
-    ]
-    by = ", ".join(dict.fromkeys(filter(None, found.generators))) if found else ""
-    facts += [("demonstrations by", by)] if by else []
-    return facts + [("CPUs", record.cpu_count)] + ([("commit", record.commit[:10])] if record.commit else [])
+    facts = {
+        "policy": record.policy,
+        "preset": record.preset,
+        "seed": str(record.seed),
+        "last task under": record.perturbed[-1] if any(record.perturbed) else "",
+        "simulated by": record.backend if record.backend != MUJOCO else "",
+        "tasks": len(record.tasks),
+        "started": record.started.replace("T", " ").replace("+00:00", " UTC"),
+        "demonstrations by": ", ".join(dict.fromkeys(filter(None, found.generators))) if found else "",
+        "CPUs": record.cpu_count,
+        "commit": (record.commit or "")[:10],
+    }
+    return [(name, value) for name, value in facts.items() if value]
 
 
 def _base_tasks(record: RunRecord) -> int:
@@ -360,24 +360,20 @@ def _published(run: Run) -> dict[str, float] | None:
     """Return FWT and AUC as eq. 3 is written; None if these are the run's own, or unknown."""
     if run.metrics is None or run.results.transfer == "published":
         return None
-    values = metric_values(run.results.scores("curve", "published"))
+    values = published_metrics([run])
     return values if np.isfinite(values["fwt"]) else None
 
 
 def _group_rows(metrics: Mapping[str, dict[str, Any]], found: dict[str, Any]) -> list[dict[str, Any]]:
     """Return a row of metrics for each group."""
-    return [
-        {
-            "label": label,
-            "count": found["groups"][label]["measured"],
-            "told": found["groups"][label]["told_task"],
-            "stored": quantity(size, "B")
-            if (size := found["groups"][label]["costs"].get("stored_bytes")) is not None
-            else "–",
-            "cells": cells,
-        }
-        for label, cells in metrics.items()
-    ]
+    rows = []
+    for label, cells in metrics.items():
+        group = found["groups"][label]
+        size = group["costs"].get("stored_bytes")
+        stored = "–" if size is None else quantity(size, "B")
+        told, count = group["told_task"], group["measured"]
+        rows.append({"label": label, "count": count, "told": told, "stored": stored, "cells": cells})
+    return rows
 
 
 def _stored(found: dict[str, Any]) -> dict[str, tuple[float, Estimate]]:
@@ -385,7 +381,7 @@ def _stored(found: dict[str, Any]) -> dict[str, tuple[float, Estimate]]:
     points = {}
     for label, group in found["groups"].items():
         auc, size = group["metrics"]["auc"], group["costs"].get("stored_bytes", np.nan)
-        if np.isfinite(size) and np.isfinite(auc["mean"]):
+        if np.isfinite([size, auc["mean"]]).all():
             points[label] = size, Estimate(auc["mean"], auc["low"], auc["high"])
     return points if len(points) > 1 else {}
 

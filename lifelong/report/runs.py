@@ -311,11 +311,11 @@ def _unlike_demonstrations(groups: Sequence[Group]) -> list[str]:
 def _unlike_settings(groups: Sequence[Group]) -> list[str]:
     """Return a sentence with the settings that differ between methods, and that their names do not tell."""
     known = [(group.label, settings_of(group.runs[0])) for group in groups if group.runs[0].config]
-    keys = {key for _, settings in known for key in settings} - set(_BASICS)
-    # keys of another policy mean something else
     one_policy = len({settings["policy"] for _, settings in known}) == 1
+    named = ("algo.",) if one_policy else ("algo.", "policy.")  # keys of another policy mean something else
+    keys = {key for _, settings in known for key in settings if not key.startswith(named)}
     untold = []
-    for key in sorted(keys):
+    for key in sorted(keys - set(_BASICS)):
         found: dict[Any, list[str]] = {}
         for label, settings in known:
             found.setdefault(settings.get(key), []).append(label)
@@ -324,12 +324,7 @@ def _unlike_settings(groups: Sequence[Group]) -> list[str]:
             for label, settings in known
             if key in settings
         )
-        if (
-            len(found) > 1
-            and not told
-            and not key.startswith("algo.")
-            and (one_policy or key[:7] != "policy.")
-        ):
+        if len(found) > 1 and not told:
             values = ", ".join(f"{value} of {few_of(labels)}" for value, labels in found.items())
             untold.append(f"{key.rstrip('.')} ({values})")
     return [f"Settings differ that no method's name tells: {few_of(untold, 6)}."] if untold else []

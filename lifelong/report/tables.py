@@ -96,17 +96,11 @@ def cost_table(rows: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, Any
     }
     if not columns:
         return None
-    texts = [
-        (
-            label,
-            [
-                show(costs[name]) if np.isfinite(costs.get(name, np.nan)) else "–"
-                for name, (_, _, show) in columns.items()
-            ],
-        )
-        for label, costs in rows
-        if costs
-    ]
+
+    def text(costs: Mapping[str, float], name: str) -> str:
+        return columns[name][2](costs[name]) if np.isfinite(costs.get(name, np.nan)) else "–"
+
+    texts = [(label, [text(costs, name) for name in columns]) for label, costs in rows if costs]
     return {"columns": [(head, title) for head, title, _ in columns.values()], "rows": texts}
 
 
@@ -144,19 +138,16 @@ def shift_table(score: ShiftScore, labels: Sequence[str]) -> dict[str, Any]:
         score: Success under the shift.
         labels: Short names of the run's tasks.
     """
-    names = ("learned", "learned_shifted", "final", "final_shifted")
+    names, ways = ("learned", "learned_shifted", "final", "final_shifted"), (False, True)
     rows = [
         {
             "number": task.task + 1,
             "label": labels[task.task],
-            "cells": [
-                *(task.rate(name) for name in names),
-                *(task.forgotten(shifted=shifted) for shifted in (False, True)),
-            ],
+            "cells": [*map(task.rate, names), *(task.forgotten(shifted=way) for way in ways)],
         }
         for task in score.tasks
     ]
-    means = [*map(score.success, names), *(score.forgetting(shifted=shifted) for shifted in (False, True))]
+    means = [*map(score.success, names), *(score.forgetting(shifted=way) for way in ways)]
     return {"name": score.shift, "rows": rows, "means": means}
 
 
@@ -207,7 +198,7 @@ def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:
 
 
 def mean_heatmap(matrices: np.ndarray, mean: np.ndarray, labels: Sequence[str]) -> dict[str, Any]:
-    """Return the cells of the mean over seeds, with Student's t interval as the tooltip."""
+    """Return the cells of the mean over runs, with Student's t interval as the tooltip."""
 
     def spread(i: int, j: int) -> tuple[float, int]:
         values = matrices[:, i, j][~np.isnan(matrices[:, i, j])]
@@ -215,7 +206,7 @@ def mean_heatmap(matrices: np.ndarray, mean: np.ndarray, labels: Sequence[str]) 
 
     def hint(i: int, j: int) -> str:
         half, count = spread(i, j)
-        return f"mean of {count} seeds ± {half:.1f} (95 %)" if count > 1 else "one seed"
+        return f"mean of {count} runs ± {half:.1f} (95 %)" if count > 1 else "one run"
 
     return _grid(mean, labels, hint, lambda i, j: "")
 

@@ -13,11 +13,9 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 from numpy.typing import NDArray
 
-from lifelong.stats.intervals import UNKNOWN, Estimate, Floats
+from lifelong.stats.intervals import CONFIDENCE, UNKNOWN, Estimate, Floats
 
-ALPHA = 0.05
 DRAWS = 9999
-CONFIDENCE = 0.95
 SEED = 2023
 
 
@@ -162,11 +160,8 @@ def mcnemar_exact(counts: Counts) -> float:
     Given the number of discordant pairs, those that the first policy wins are binomial with share 1/2 if both are
     equally good in every start. Where they are equal on average only, the test rejects less often than it may.
     """
-    return (
-        float(scipy.stats.binomtest(counts.only_first, counts.discordant).pvalue)
-        if counts.discordant
-        else 1.0
-    )
+    m = counts.discordant
+    return float(scipy.stats.binomtest(counts.only_first, m).pvalue) if m else 1.0
 
 
 def sign_flip_test(differences: Floats, draws: int = DRAWS, seed: int = SEED) -> float:
@@ -270,8 +265,8 @@ def _bootstrap(strata: Sequence[Floats], draws: int, seed: int) -> Estimate:
     return Estimate(value, float(found.confidence_interval.low), float(found.confidence_interval.high))
 
 
-def chance_difference(counts: Counts, confidence: float = CONFIDENCE) -> float:
+def chance_difference(counts: Counts) -> float:
     """Return the absolute difference that two equal policies with as many discordant pairs exceed in 1 of 20 cases."""
     m = counts.discordant
-    most = scipy.stats.binom.ppf(0.5 + confidence / 2, m, 0.5)
+    most = scipy.stats.binom.ppf(0.5 + CONFIDENCE / 2, m, 0.5)
     return float(abs(2 * most - m) / counts.pairs)

@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 Floats = NDArray[np.float64]
+ALPHA = 0.05  # of tests
+CONFIDENCE = 0.95
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ UNKNOWN = Estimate(float("nan"), float("nan"), float("nan"))
 
 
 def wilson_interval(
-    successes: ArrayLike, episodes: ArrayLike, confidence: float = 0.95
+    successes: ArrayLike, episodes: ArrayLike, confidence: float = CONFIDENCE
 ) -> tuple[Floats, Floats]:
     """Return Wilson's score interval of a success rate; its width is above 0 also at 0 % and 100 %.
 
@@ -76,11 +78,11 @@ def mean_and_standard_error(values: ArrayLike) -> tuple[float, float]:
     return mean, float(v.std(ddof=1) / np.sqrt(v.size)) if v.size > 1 else float("nan")
 
 
-def mean_and_half_width(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float]:
+def mean_and_half_width(values: ArrayLike) -> tuple[float, float]:
     """Return the mean over seeds and half of Student's t interval; NaN for the interval of one seed."""
     mean, error = mean_and_standard_error(values)
     df = np.size(values) - 1
-    return mean, float(special.stdtrit(df, 0.5 + confidence / 2)) * error if df > 0 else float("nan")
+    return mean, float(special.stdtrit(df, 0.5 + CONFIDENCE / 2)) * error if df > 0 else float("nan")
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

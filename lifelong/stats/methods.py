@@ -10,14 +10,16 @@ on their normal distribution. Error rates by simulation: experiments/comparisons
 
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 from scipy import special
 
+from lifelong.errors import ComparisonError
 from lifelong.stats.intervals import (
+    ALPHA,
+    CONFIDENCE,
     UNKNOWN,
     Estimate,
     Floats,
@@ -35,8 +37,6 @@ from lifelong.stats.metrics import (
     metric_values,
 )
 
-ALPHA = 0.05
-CONFIDENCE = 0.95
 MARGIN = 0.05  # success, within which two methods count as equivalent
 POWER = 0.8
 LEAST_SEEDS = 3  # of a test
@@ -88,12 +88,12 @@ def mean_over_seeds(values: Floats, episodes: int, possible: tuple[float, float]
         episodes: Number of different episodes of all seeds together, see `Scores.episodes_of`.
         possible: Least and largest value of the metric; a success rate's are (0, 1).
     """
-    mean, half = mean_and_half_width(values, CONFIDENCE)
+    mean, half = mean_and_half_width(values)
     low, high = max(mean - half, possible[0]), min(mean + half, possible[1])
     if possible != (0.0, 1.0):
         return Estimate(mean, low, high) if half > 1e-9 or mean == 0 else replace(UNKNOWN, value=mean)
     if len(values) > 1:
-        ends = wilson_interval(mean * episodes, episodes, CONFIDENCE)
+        ends = wilson_interval(mean * episodes, episodes)
         low, high = min(low, float(ends[0])), max(high, float(ends[1]))
     return Estimate(mean, low, high)
 
@@ -150,8 +150,7 @@ def _tested(value: float, error: float, df: float, margin: float, spread: float)
 def seeds_needed(difference: float, spread: float, level: float = ALPHA, power: float = POWER) -> int | None:
     """Return the number of seeds with which a paired t test would show a difference; None for more than 100.
 
-    By the noncentral t distribution, as R's `power.t.test`: T = (Z + shift) / sqrt(V / df), with Z normal and V of the
-    chi-squared distribution, over which is averaged. The spread of a few seeds is itself uncertain, so the
+    By the noncentral t distribution, as R's `power.t.test`. The spread of a few seeds is itself uncertain, so the
     number is an order of magnitude.
 
     Args:
@@ -165,16 +164,9 @@ def seeds_needed(difference: float, spread: float, level: float = ALPHA, power: 
     counts = np.arange(LEAST_SEEDS, MOST_SEEDS + 1)
     limit = special.stdtrit(counts - 1, 1 - level / 2)
     shift = abs(difference) / spread * np.sqrt(counts)
-    shown = special.ndtr(shift[:, None] - limit[:, None] * _relative_spreads()).mean(axis=1)
-    enough = np.flatnonzero(shown >= power)
+    missed = special.nctdtr(counts - 1, shift, limit)  # NaN where it is next to 0
+    enough = np.flatnonzero(~(missed > 1 - power))
     return int(counts[enough[0]]) if len(enough) else None
-
-
-@cache
-def _relative_spreads() -> Floats:
-    """Return (98, 500) quantiles of the estimated standard deviation over the true one, for 3 to 100 seeds."""
-    df = np.arange(LEAST_SEEDS, MOST_SEEDS + 1)[:, None] - 1
-    return np.asarray(np.sqrt(special.chdtri(df, (np.arange(500) + 0.5) / 500) / df))
 
 
 def statistics(
@@ -199,16 +191,16 @@ def statistics(
         `metrics` by label, `differences`, `statistics`: how they were computed. NaN where something is unknown.
 
     Raises:
-        ValueError: A reference is not a method, or given with `all_pairs`; or the margin is not between 0 and 1.
+        ComparisonError: A reference is not a method, or given with `all_pairs`; or the margin is not between 0 and 1.
     """
     if all_pairs and references:
-        raise ValueError(
+        raise ComparisonError(
             f"--all-pairs and --reference {' '.join(references)} name different pairs to compare; leave one out"
         )
     if unknown := [name for name in references if name not in methods]:
-        raise ValueError(f"{unknown[0]!r} is not a method; there are {', '.join(methods)}")
+        raise ComparisonError(f"{unknown[0]!r} is not a method; there are {', '.join(methods)}")
     if not 0 < margin < 1:
-        raise ValueError(
+        raise ComparisonError(
             f"the margin of equivalence is {margin:g}; it is a difference in success, above 0 and below 1"
         )
     methods = _comparable(methods)

@@ -138,7 +138,7 @@ class Metrics:
     auc_by_task: Floats
 
 
-def lifelong_metrics(scores: Scores, confidence: float = 0.95) -> Metrics:
+def lifelong_metrics(scores: Scores) -> Metrics:
     """Compute FWT, NBT, AUC (eq. 3), final average success and mean just-learned success.
 
     Success rates have Wilson's interval over their episodes, which says what other episodes of these weights would
@@ -151,7 +151,7 @@ def lifelong_metrics(scores: Scores, confidence: float = 0.95) -> Metrics:
         low = high = np.nan
         if name in ("final_success", "just_learned") and np.isfinite(values[name]):
             count = scores.episodes_of(name)
-            low, high = map(float, wilson_interval(values[name] * count, count, confidence))
+            low, high = map(float, wilson_interval(values[name] * count, count))
         estimates[name] = Estimate(values[name], low, high)
     if scores.group_sizes:  # every task has the value of its group
         fwt, nbt, auc = (np.repeat(v, scores.group_sizes) for v in (fwt, nbt, auc))

@@ -13,8 +13,8 @@ import numpy as np
 import scipy  # its parts are imported when they are first used
 from numpy.typing import NDArray
 
-from lifelong.stats.episodes import ALPHA, CONFIDENCE, Pairs
-from lifelong.stats.intervals import Estimate, Floats
+from lifelong.stats.episodes import Pairs
+from lifelong.stats.intervals import ALPHA, CONFIDENCE, Estimate, Floats
 
 _STAKES = 1000  # shares that a bet is spread over
 

@@ -97,12 +97,10 @@ def test_a_blurred_place_is_half_the_squared_difference_of_actions():
         assert heat[1, 0, column].item() == pytest.approx(0.5 * 7 * difference**2, rel=1e-3)
 
 
-def test_invalid_batches_and_settings_are_refused():
+def test_a_batch_of_several_windows_is_refused():
     policy = OnePatch(SPEC)
     with pytest.raises(ConfigError, match="one window; this one has 2"):
         saliency(policy, fake_batch(SPEC, 2, generator(0)))
-    with pytest.raises(ConfigError, match="stride is 0"):
-        SaliencySettings(stride=0)
 
 
 def test_overlays_are_grey_where_saliency_is_zero():
