@@ -35,9 +35,8 @@ FILE_NAME = "eval.json"
 WORLD = ("models", "robot", "drawing")
 
 _Name = Annotated[str, Field(min_length=1, max_length=1000)]
-_Id = Annotated[
-    str, Field(pattern=r"^[^/\x00]+/[^\x00]+$", max_length=1000)
-]  # also part of the names of files
+# also part of the names of files
+_Id = Annotated[str, Field(pattern=r"^[^/\x00]+/[^\x00]+$", max_length=1000)]
 
 
 @dataclass(frozen=True)
@@ -77,10 +76,8 @@ class TaskResult(Episodes):
     solved: tuple[tuple[Annotated[int, Field(ge=-1, le=1)], ...], ...] = ()
     timing: tuple[tuple[Count, ...], ...] = ()
 
-    OUTCOMES: ClassVar[tuple[str, ...]] = (
-        "errors",
-        "attempts",
-    )  # the columns below that `outcomes` depends on
+    # of the columns below, those that `outcomes` depends on
+    OUTCOMES: ClassVar[tuple[str, ...]] = ("errors", "attempts")
     OPTIONAL: ClassVar[tuple[str, ...]] = (
         *(*Episodes.OPTIONAL, *OUTCOMES),
         *("actions", "began", "atoms_at_start", "solved", "timing"),

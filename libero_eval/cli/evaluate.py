@@ -33,6 +33,7 @@ class EvalOptions(EvalRequest):
 
 def evaluate(options: EvalOptions) -> Answer:
     """Evaluate a policy; print a row for each task, the mean, the file of the results, and their page."""
+    from libero_env.parallel import tell_progress
     from libero_eval.evaluation_file import FILE_NAME
     from libero_eval.judging.evaluation_page import write_evaluation_page
     from libero_eval.plan import evaluate as run
@@ -51,7 +52,8 @@ def evaluate(options: EvalOptions) -> Answer:
 
     early = evaluation.until is not None  # rows are known at the end only
     on_task = (lambda _: None) if early else print_row
-    result = run(options, evaluation, on_task=on_task, on_progress=_print_progress)
+    tell = lambda progress: tell_progress(str(progress))  # noqa: E731
+    result = run(options, evaluation, on_task=on_task, on_progress=tell)
     for task in result.tasks if early else ():
         print_row(task)
     for name in ("renderer", "instruction_set"):
@@ -69,12 +71,6 @@ def evaluate(options: EvalOptions) -> Answer:
         "result": file,
     }
     return Answer("", data, write_evaluation_page(result, evaluation.out))
-
-
-def _print_progress(progress: object) -> None:
-    from libero_env.parallel import tell_progress
-
-    tell_progress(str(progress))
 
 
 @dataclass(frozen=True, kw_only=True)

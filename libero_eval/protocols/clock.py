@@ -27,11 +27,7 @@ from lifelong.evaluation.environments import Obs
 from lifelong.seeding import LATENCY
 
 DISTRIBUTIONS = ("normal", "lognormal", "uniform")  # of two numbers
-UNITS = {
-    "ms": 1.0,
-    "steps": 1.0,
-    "s": 1000.0,
-}  # what a number of it is in the unit that is stored, ms or steps
+UNITS = {"ms": 1.0, "steps": 1.0, "s": 1000.0}  # of a number, in the unit that is stored, ms or steps
 EXPECTED = (
     "expected 120ms, 0.12s or 3steps, normal:120/20ms (mean, deviation), lognormal:120/0.4ms (median, deviation of the "
     "logarithm), uniform:50/150ms, or trace:FILE"
@@ -267,9 +263,8 @@ class _Episode:
     now: int = 0
     due: int = 0
     since: int = 0  # actions that were executed since the last request
-    chunks: list[_Chunk] = field(
-        default_factory=list
-    )  # those that are there and have actions left, oldest first
+    # those that are there and have actions left, oldest first
+    chunks: list[_Chunk] = field(default_factory=list)
     coming: _Chunk | None = None
     delays: deque[int] = field(default_factory=lambda: deque(maxlen=_REMEMBERED))
     counts: list[int] = field(default_factory=lambda: [0, 0, 0])  # requests, answers used, steps waited

@@ -122,11 +122,10 @@ def table_row(result: TaskResult) -> str:
     wins = f"{sum(result.successes)}/{len(result.successes)}"
     steps = f"{result.steps:.0f}" if math.isfinite(result.steps) else "-"
     raised = sum(error is not None for error in result.errors)
-    note = f"  ({raised} ended with an error)" if raised else ""
-    note += f"  ({result.error_note})" if result.error_note else ""
-    for told in filter(None, (result.event_note, result.clock_note)):
-        note += f"  ({told})"
-    return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}{note}"
+    notes = [f"{raised} ended with an error"] if raised else []
+    notes += filter(None, (result.error_note, result.event_note, result.clock_note))
+    text = "".join(f"  ({note})" for note in notes)
+    return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}{text}"
 
 
 def total_rows(result: EvaluationResult) -> list[str]:

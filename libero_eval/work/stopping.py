@@ -71,9 +71,8 @@ class StoppingRule:
         here = {task.id: (protocol.words(task), task.digest) for task in tasks}
         for one in result.tasks:
             words, digest = here.get(one.task, (one.instruction, one.digest))
-            reworded = (
-                one.instruction != words and not protocol.world.perturb
-            )  # perturbations draw other words
+            drawn = bool(protocol.world.perturb)  # other words are
+            reworded = one.instruction != words and not drawn
             if reworded or one.digest not in ("", digest):
                 raise ConfigError(f"--until {text}: {one.task} there is another task, or has other objects")
         known = {(task.task, start) for task in result.tasks for start in task.starts}

@@ -124,9 +124,8 @@ class Worker:
         def preference(unit: Unit) -> tuple:
             task = unit.task.id
             tried, others = self._tries(unit, errors) > 0, task in busy
-            turn = (
-                unit.init_states[0] if self._evaluation.until else 0
-            )  # rounds over all tasks, to stop after one
+            # rounds over all tasks, to stop after one
+            turn = unit.init_states[0] if self._evaluation.until else 0
             return tried, turn, task != self._task, others, -counts[task] if others else 0
 
         return sorted(left, key=preference)

@@ -3,7 +3,7 @@
 Intervals and tests are those of `lifelong.stats.methods`.
 """
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -293,16 +293,10 @@ def costs_of(runs: Sequence[Run]) -> dict[str, float]:
     """
     tables = [_costs_by_task(run) for run in runs]
     by_task, last = [row for rows in tables for row in rows], [row for rows in tables for row in rows[-1:]]
-    reduced: dict[str, tuple[list[dict[str, float]], Callable[[Any], Any]]] = {
-        "stored_bytes": (last, np.mean),
-        "peak_gpu_bytes": (by_task, np.max),
-        "peak_memory_bytes": (by_task, np.max),
-    }
-    names = dict.fromkeys(name for row in by_task for name in row)
     found = {}
-    for name in names:
-        rows, reduce = reduced.get(name, (by_task, np.mean))
-        values = [row[name] for row in rows if name in row]
+    for name in dict.fromkeys(name for row in by_task for name in row):
+        values = [row[name] for row in (last if name == "stored_bytes" else by_task) if name in row]
+        reduce = np.max if name.startswith("peak_") else np.mean
         found[name] = float(reduce(values)) if values else float("nan")
     return found
 
