@@ -198,8 +198,17 @@ class RobustnessRequest(Request):
         return EvalRequest(**{**shared, "perturb": start, "event": events, "out": out})
 
 
+@dataclass(frozen=True, kw_only=True)
 class _Checked:
-    """Options whose values are checked when they are given; messages begin with the command's name."""
+    """Options whose values are checked when they are given; messages begin with the command's name.
+
+    Attributes:
+        device: auto, cpu, cuda, cuda:1.
+        allow: Packages of others whose classes a run's configuration may name (default: none; their code is executed).
+    """
+
+    device: Device = "auto"
+    allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         command = type(self).__name__.removesuffix("Request").lower()
@@ -220,9 +229,6 @@ class RelearnRequest(_Checked):
         held_out: Demonstrations to measure the error on, after those that were learned from (default: 5).
         episodes: Rollouts to measure success by, instead of the error; 0: the error.
         initial: The pretrained weights that the run began with: a finished run, or one of its checkpoints.
-        device: auto, cpu, cuda, cuda:1.
-        allow: Packages of others whose classes the run's configuration may name (default: none; their code is
-            executed).
 
     Raises:
         ConfigError: A value is of another kind or outside of its range.
@@ -236,8 +242,6 @@ class RelearnRequest(_Checked):
     held_out: Annotated[int, Field(ge=1, le=1000)] | None = None
     episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
     initial: FilePath | None = None
-    device: Device = "auto"
-    allow: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -260,9 +264,6 @@ class DiagnoseRequest(_Checked):
         run: The directory of a run with checkpoints after its tasks.
         held_out: Demonstrations to measure on, after those that were learned from.
         episodes: Rollouts to measure success by, besides the error; 0: none.
-        device: auto, cpu, cuda, cuda:1.
-        allow: Packages of others whose classes the run's configuration may name (default: none; their code is
-            executed).
 
     Raises:
         ConfigError: A value is of another kind or outside of its range.
@@ -271,8 +272,6 @@ class DiagnoseRequest(_Checked):
     run: Positional[RunFolder]
     held_out: Annotated[int, Field(ge=1, le=1000)] = 5
     episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
-    device: Device = "auto"
-    allow: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -287,9 +286,6 @@ class SaliencyRequest(_Checked):
         moments: Number of images.
         stride: Distance of two places in pixels of a 128-pixel image.
         horizon: Maximum number of control steps (default: the run's).
-        device: auto, cpu, cuda, cuda:1.
-        allow: Packages of others whose classes the run's configuration may name (default: none; their code is
-            executed).
     """
 
     run: Positional[FilePath]
@@ -299,8 +295,6 @@ class SaliencyRequest(_Checked):
     moments: Annotated[int, Field(ge=1, le=100)] = 6
     stride: Annotated[float, Field(ge=1, le=128)] = 8.0
     horizon: Horizon | None = None
-    device: Device = "auto"
-    allow: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,9 +311,6 @@ class ViewRequest(_Checked):
         bddl: Task file of demonstrations that do not state their task.
         seed: Seed of stochastic policies.
         assets: `builtin`, `original`, or the folder of the original's models.
-        device: auto, cpu, cuda, cuda:1.
-        allow: Packages of others whose classes a run's configuration may name (default: none; their code is
-            executed).
         host: Address to listen on; others than this machine's own let everybody who reaches it in.
         port: Port to listen on, 0 for a free one.
 
@@ -336,7 +327,5 @@ class ViewRequest(_Checked):
     bddl: FilePath | None = None
     seed: Seed = 0
     assets: str | None = None
-    device: Device = "auto"
-    allow: tuple[str, ...] = ()
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65535)] = 8080

@@ -61,11 +61,11 @@ def main() -> None:
                 CONDITIONS,
                 rng.random(p.shape) < p,
             )
-            axes = {axis.kind: axis for axis in outcomes.axes()}
+            axes = {axis.kind: axis for axis in outcomes.axes}
             found = {
                 "area": axes["a"].area,
                 "kept": axes["a"].kept,
-                "excess": outcomes.interactions()[0].excess,
+                "excess": outcomes.interactions[0].excess,
             }
             for name, e in found.items():
                 covered[name].append(e.low <= known[name] <= e.high)

@@ -40,7 +40,7 @@ EVENTS_TEXT = (
 
 def verdict(policy: Robustness) -> str:
     """Return two sentences on what the kinds take."""
-    axes = [axis for axis in policy.axes if not math.isnan(axis.kept.value)]
+    axes = [axis for axis in policy.outcomes.axes if not math.isnan(axis.kept.value)]
     if not axes:
         return "Without perturbation nothing succeeds, so there is nothing to lose."
     lost = [axis for axis in axes if axis.kept.value < 1 and policy.adjusted[axis.kind] <= ALPHA]
@@ -60,7 +60,7 @@ def render(policy: Robustness) -> str:
     rows: list[list[object]] = [
         ["kind", *(f"{s:g}" for s in severities), "area", "95 %", "kept", "half at", "Holm"]
     ]
-    for axis in policy.axes:
+    for axis in policy.outcomes.axes:
         successes = [axis.at(s) for s in severities]
         rows.append(
             [
@@ -86,7 +86,7 @@ def render(policy: Robustness) -> str:
         *(
             f"{name_of(pair.condition)}: {percent(pair.success.value, 0)}, expected {percent(pair.expected, 0)}, "
             f"excess {percent(pair.excess.value, 0)} {interval_text(pair.excess)}".rstrip()
-            for pair in policy.interactions
+            for pair in policy.outcomes.interactions
         ),
     ]
     return "\n".join([*lines, "", verdict(policy)])
@@ -105,10 +105,10 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
     Raises:
         ResultsError: The files cannot be written.
     """
-    first, axes = policies[0], {policy.label: policy.axes for policy in policies}
-    kinds = {axis.kind: KINDS.get(axis.kind.partition("@")[0]) for axis in first.axes}
-    units = {name: f"{kind.at_one:g} {kind.unit}" if kind else "1 s" for name, kind in kinds.items()}
+    first, axes = policies[0], {policy.label: policy.outcomes.axes for policy in policies}
     outcomes = first.outcomes
+    kinds = {axis.kind: KINDS.get(axis.kind.partition("@")[0]) for axis in outcomes.axes}
+    units = {name: f"{kind.at_one:g} {kind.unit}" if kind else "1 s" for name, kind in kinds.items()}
     suites = ", ".join(dict.fromkeys(task.partition("/")[0] for task in outcomes.tasks))
     episodes = len(outcomes.tasks) * len(outcomes.starts)
     page = save_page(
@@ -127,11 +127,11 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         policies=policies,
         units=units,
         curves=as_svg(curves_figure(axes, units)),
-        radar=as_svg(radar_figure(axes)) if len(first.axes) > 2 else "",
+        radar=as_svg(radar_figure(axes)) if len(outcomes.axes) > 2 else "",
         interactions=[
             {"label": policy.label, "name": name_of(pair.condition), "pair": pair}
             for policy in policies
-            for pair in policy.interactions
+            for pair in policy.outcomes.interactions
         ],
         event_cells=_event_cells,
         events_text=EVENTS_TEXT,
@@ -200,9 +200,9 @@ def _content(policy: Robustness) -> dict[str, Any]:
         "tasks": outcomes.tasks,
         "starts": outcomes.starts,
         "success": asdict(outcomes.success(())),
-        "axes": [{**asdict(axis), "adjusted": policy.adjusted[axis.kind]} for axis in policy.axes],
+        "axes": [{**asdict(axis), "adjusted": policy.adjusted[axis.kind]} for axis in policy.outcomes.axes],
         "interactions": [
-            {**asdict(pair), "condition": name_of(pair.condition)} for pair in policy.interactions
+            {**asdict(pair), "condition": name_of(pair.condition)} for pair in policy.outcomes.interactions
         ],
         "redrawn": dict(policy.redrawn),
         "events": [

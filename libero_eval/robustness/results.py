@@ -169,13 +169,15 @@ class Outcomes:
         mean = combine_intervals(np.full(len(wins), 1 / len(wins)), wins / count, low, high)
         return Estimate(mean.value, max(0.0, mean.low), min(1.0, mean.high))
 
+    @cached_property
     def axes(self) -> tuple[Axis, ...]:
-        """Return every kind that was run by itself, the most harmful first."""
+        """Every kind that was run by itself, the most harmful first."""
         kinds = dict.fromkeys(c[0][0] for c in self.conditions if len(c) == 1)
         return tuple(sorted((self._axis(kind) for kind in kinds), key=lambda axis: axis.kept.value))
 
+    @cached_property
     def interactions(self) -> tuple[Interaction, ...]:
-        """Return every pair of perturbations of which each was run by itself at the same severity."""
+        """Every pair of perturbations of which each was run by itself at the same severity."""
         alone = {c[0] for c in self.conditions if len(c) == 1}
         pairs = [c for c in self.conditions if len(c) == 2 and set(c) <= alone]
         return tuple(map(self._interaction, pairs))
@@ -283,26 +285,15 @@ class Robustness:
         return tuple(rows)
 
     @cached_property
-    def axes(self) -> tuple[Axis, ...]:
-        """Every kind that was run by itself, the most harmful first."""
-        return self.outcomes.axes()
-
-    @cached_property
-    def interactions(self) -> tuple[Interaction, ...]:
-        """Every pair of which each was also run by itself."""
-        return self.outcomes.interactions()
-
-    @cached_property
     def adjusted(self) -> dict[str, float]:
         """P-value of each kind, adjusted by Holm over all of them."""
-        return dict(
-            zip((axis.kind for axis in self.axes), holm([axis.p_value for axis in self.axes]), strict=True)
-        )
+        axes = self.outcomes.axes
+        return dict(zip((axis.kind for axis in axes), holm([axis.p_value for axis in axes]), strict=True))
 
     @property
     def severities(self) -> tuple[float, ...]:
         """All severities of any kind, ascending, from 0."""
-        return tuple(sorted({s for axis in self.axes for s in axis.severities}))
+        return tuple(sorted({s for axis in self.outcomes.axes for s in axis.severities}))
 
 
 def differences(policies: Sequence[Robustness]) -> list[str]:
@@ -329,7 +320,8 @@ def _compared(policy: Robustness) -> dict[str, Any]:
         "tasks": ", ".join(sorted(outcomes.tasks)),
         "starts": ", ".join(map(str, sorted(outcomes.starts))),
         **{
-            f"severities of {axis.kind}": ", ".join(f"{s:g}" for s in axis.severities) for axis in policy.axes
+            f"severities of {axis.kind}": ", ".join(f"{s:g}" for s in axis.severities)
+            for axis in policy.outcomes.axes
         },
     }
 

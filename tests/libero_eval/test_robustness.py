@@ -47,11 +47,11 @@ def result(wins: int, starts: tuple[int, ...] = STARTS) -> EvaluationResult:
 
 
 def test_area_and_kept_are_those_of_the_trapezoids() -> None:
-    camera = outcomes({(): 10, A: 6, B: 0}).axes()[0]
+    camera = outcomes({(): 10, A: 6, B: 0}).axes[0]
     assert camera.kind == "camera" and camera.severities == (0.0, 0.5, 1.0)
     assert camera.area.value == pytest.approx((1 + 0.6) / 4 + (0.6 + 0) / 4)
     assert camera.kept.value == pytest.approx(camera.area.value)
-    halved = outcomes({(): 5, A: 3, B: 0}).axes()[0]
+    halved = outcomes({(): 5, A: 3, B: 0}).axes[0]
     assert halved.kept.value == pytest.approx(halved.area.value / 0.5)
     assert camera.area.low < camera.area.value < camera.area.high
 
@@ -66,14 +66,14 @@ def test_half_is_lost_where_the_line_first_falls_to_half(rates: tuple[float, ...
 
 
 def test_a_kind_that_changes_nothing_has_no_p_value_to_speak_of_and_keeps_all() -> None:
-    axis = outcomes({(): 7, A: 7, B: 7}).axes()[0]
+    axis = outcomes({(): 7, A: 7, B: 7}).axes[0]
     assert axis.kept.value == 1 and axis.p_value == 1 and axis.half.value == math.inf
     assert axis.kept.high - axis.kept.low < 0.25, "paired starts leave no more than one episode's doubt"
     assert axis.area.high - axis.area.low > axis.kept.high - axis.kept.low
 
 
 def test_a_kind_that_takes_everything_is_shown_to() -> None:
-    camera, light = outcomes({(): 10, A: 3, B: 0, C: 9}).axes()
+    camera, light = outcomes({(): 10, A: 3, B: 0, C: 9}).axes
     assert (camera.kind, light.kind) == ("camera", "light"), "the most harmful first"
     assert camera.p_value < 0.01 < light.p_value
     assert camera.half.value == pytest.approx(0.5 / 0.7 * 0.5)
@@ -88,17 +88,17 @@ def test_two_that_act_independently_have_no_excess() -> None:
         ((), B, C, BOTH),
         np.array([base, base & camera, base & light, base & camera & light]),
     )
-    (pair,) = found.interactions()
+    (pair,) = found.interactions
     assert pair.expected == pytest.approx(0.27, abs=0.05)
     assert pair.excess.low < 0 < pair.excess.high and abs(pair.excess.value) < 0.04
     worse = Outcomes(
         found.tasks, found.starts, found.conditions, np.array([base, base & camera, base & light, base & 0])
     )
-    assert worse.interactions()[0].excess.high < -0.2
+    assert worse.interactions[0].excess.high < -0.2
 
 
 def test_a_pair_whose_parts_were_not_run_alone_at_the_same_severity_is_no_interaction() -> None:
-    assert not outcomes({(): 10, A: 6, C: 5, BOTH: 2}).interactions()
+    assert not outcomes({(): 10, A: 6, C: 5, BOTH: 2}).interactions
 
 
 def test_results_are_paired_by_task_and_start() -> None:
@@ -149,7 +149,7 @@ def test_only_the_conditions_that_are_asked_for_are_read(tmp_path) -> None:
         read_study(tmp_path)
     for one, rate in (("gain=0.4", 0.6), ("gain=0.4@3", 0.2)):
         found = read_study(tmp_path, conditions=["", one])
-        assert found.outcomes.rates.tolist() == [1, rate] and len(found.axes) == 1
+        assert found.outcomes.rates.tolist() == [1, rate] and len(found.outcomes.axes) == 1
 
 
 def test_policies_beside_each_other_tell_what_differs_besides(tmp_path) -> None:
@@ -234,7 +234,7 @@ def test_the_radar_shows_the_area_of_each_kind_and_a_gap_where_one_was_not_measu
 
 def test_the_legend_names_a_policy_that_was_not_measured_along_the_first_kind() -> None:
     both = outcomes({(): 10, A: 3, B: 0, C: 9})
-    policies = {"a": Robustness("a", both).axes, "b": Robustness("b", outcomes({(): 10, C: 9})).axes}
+    policies = {"a": both.axes, "b": outcomes({(): 10, C: 9}).axes}
     assert policies["a"][0].kind == "camera"
     legend = curves_figure(policies, {}).legends[0]
     assert [text.get_text() for text in legend.get_texts()] == ["a", "b"]
