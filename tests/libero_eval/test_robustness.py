@@ -224,7 +224,7 @@ def test_the_radar_shows_the_area_of_each_kind_and_a_gap_where_one_was_not_measu
     colour = (("colour", 1.0),)
     first = Robustness("a", outcomes({(): 10, A: 6, B: 0, C: 8, colour: 4}))
     second = Robustness("b", outcomes({(): 10, B: 10, C: 0}))
-    (polar,) = radar_figure({"a": first.axes, "b": second.axes}).axes
+    (polar,) = radar_figure({"a": first.outcomes.axes, "b": second.outcomes.axes}).axes
     lines = [(line.get_label(), line.get_ydata().tolist()) for line in polar.get_lines()]
     assert [text.get_text() for text in polar.get_xticklabels()] == ["camera", "colour", "light"]
     assert lines[0] == ("a", pytest.approx([55, 70, 90, 55])), "closed, in % of the trapezoids"
