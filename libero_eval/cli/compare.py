@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -108,7 +108,7 @@ def power(options: PowerOptions) -> None:
     base = base if options.base is None else options.base
     gap = gap if options.difference is None else options.difference
     discordance = discordance if options.discordance is None else options.discordance
-    levels = {"power": options.power, "alpha": options.alpha, "tests": options.tests}
+    levels: dict[str, Any] = {"power": options.power, "alpha": options.alpha, "tests": options.tests}
     if options.episodes or gap is None:
         question = Question(base, -base / 1000, **levels)
         if options.episodes:

@@ -65,7 +65,7 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
     )
     if not plan.other_worlds:
         check_same_world(groups)
-    planned = {"all_pairs": plan.all_pairs, "margin": plan.margin}
+    planned: dict[str, Any] = {"all_pairs": plan.all_pairs, "margin": plan.margin}
     methods = {label: runs_of(runs) for label, runs in measured.items() if runs}
     found = statistics(methods, plan.references, **planned)
     later = {
