@@ -77,10 +77,36 @@ def compose_first(words: Sequence[str], folders: Sequence[Path]) -> DictConfig:
     Raises:
         LiberoError: An override names something that does not exist, or cannot be applied.
     """
+    first = _first(words, folders)
     try:
-        return _compose(_first(words, folders), folders)
+        config = _compose(first, folders)
     except REFUSALS as error:
         raise explained(error, words, folders) from error
+    _check_compat(config, first, folders)
+    return config
+
+
+def _check_compat(config: DictConfig, words: Sequence[str], folders: Sequence[Path]) -> None:
+    """Check that a file that is chosen within a group, as by algo/estimator=sample, is not replaced by `compat`.
+
+    Raises:
+        ConfigError: It is.
+    """
+    compat, pairs = config.hydra.runtime.choices.compat, [word.partition("=") for word in words]
+    inner = [
+        key
+        for key, _, name in pairs
+        if any((f / key / f"{name}.yaml").is_file() for f in folders) and "/" in key
+    ]
+    if compat == "none" or not inner:
+        return
+    plain = _compose([*(word for word in words if not word.startswith("compat=")), "compat=none"], folders)
+    for key in inner:
+        target = f"{key.replace('/', '.')}._target_"
+        if (found := OmegaConf.select(config, target)) != OmegaConf.select(plain, target):
+            raise ConfigError(
+                f"{key} has no effect with compat={compat}, which has {found} there; leave one of them out"
+            )
 
 
 def _first(words: Sequence[str], folders: Sequence[Path]) -> list[str]:

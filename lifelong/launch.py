@@ -105,8 +105,9 @@ def _launch(options: argparse.Namespace, ranks: Ranks) -> int:
     folders = config_folders(None if options.config_dir is None else Path(options.config_dir))
     words, sweep = list(options.overrides), None
     lists = swept(words, folders)
-    # a plain run's configuration is composed by Hydra alone
-    config = compose_first(words, folders) if options.multirun or options.cfg else DictConfig({})
+    # a plain run's configuration is composed by Hydra alone, unless a file within a group is to be checked
+    needed = options.multirun or options.cfg or any("/" in word.partition("=")[0] for word in words)
+    config = compose_first(words, folders) if needed else DictConfig({})
     job = Job(ranks, [word for word in words if not word.startswith("hydra")])
     if options.multirun:
         folder = config.hydra.sweep.dir

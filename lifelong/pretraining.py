@@ -24,7 +24,10 @@ from lifelong.types import PolicySpec
 
 _ROUTED = ("clare", "dmpel", "iscil")
 # keys that decide what a policy reads, of which weights with the same shapes may differ
-INPUTS = ("language.model", "language.numbered", "language.pad_to", "data.views", "data.proprio")
+INPUTS = (
+    *("language.model", "language.numbered", "language.pad_to", "data.views", "data.proprio"),
+    *("policy.encoder.pixels", "policy.normalise_proprio", "policy.standardise_language"),
+)
 
 
 def load_initial_weights(path: Path) -> tuple[dict[str, Tensor], Path]:
@@ -68,12 +71,11 @@ def initial_policy(run: Path, *, weights: Path | None = None, allow: Sequence[st
         CheckpointError: There are no such weights, or they are those of another policy.
     """
     loaded, config = restore(run, device="cpu", allow=allow), read_config(run / "config.yaml", allow)
-    before = weights or config.values.get("init_from")
-    if before is None and config.build("pretrain").sequence():
+    if weights is None and config.build("pretrain").sequence():
         raise ConfigError(
             f"{run} began with pretrained weights; name them with --initial, such as a folder in runs/pretrain"
         )
-    return policy_at_start(config, loaded.policy.spec, loaded.seed, before)
+    return policy_at_start(config, loaded.policy.spec, loaded.seed, weights or config.values.get("init_from"))
 
 
 def policy_at_start(config: Configuration, spec: PolicySpec, seed: int, weights: str | Path | None) -> Policy:

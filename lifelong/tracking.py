@@ -32,6 +32,13 @@ class Tracker:
         """End the run."""
 
 
+def _identity(name: str, directory: str) -> str:
+    """Return a name that runs in other folders do not have, nor one that was begun anew in the same folder."""
+    begun = Path(directory, "config.yaml")  # written once
+    stamp = begun.stat().st_mtime_ns if begun.is_file() else 0
+    return f"{name}-{hashlib.sha256(f'{os.path.abspath(directory)} {stamp}'.encode()).hexdigest()[:8]}"
+
+
 class WandB(Tracker):
     """Logs to Weights & Biases.
 
@@ -58,13 +65,6 @@ class WandB(Tracker):
         """Start a run; see `Tracker`."""
         import wandb
 
-        # an identifier of W&B has no slash; runs of one name in two folders are two
-        mark = hashlib.sha256(os.path.abspath(directory).encode()).hexdigest()[:8]
-        options: dict[str, Any] = {
-            "id": f"{name.replace('/', '-')}-{mark}",
-            "resume": "allow",
-            "dir": directory,
-        }
         try:
             self._run = wandb.init(
                 mode=self.mode,
@@ -72,7 +72,9 @@ class WandB(Tracker):
                 entity=self.entity,
                 name=name,
                 config=dict(config),
-                **options,
+                id=_identity(name, directory).replace("/", "-"),  # an identifier of W&B has no slash
+                resume="allow",
+                dir=directory,
             )
         except (wandb.Error, OSError) as error:
             raise LifelongError(
@@ -108,7 +110,11 @@ class Trackio(Tracker):
         import trackio
 
         self._run = trackio.init(
-            project=self.project, name=name, space_id=self.space_id, config=dict(config), resume="allow"
+            project=self.project,
+            name=_identity(name, directory),  # by which trackio knows it
+            space_id=self.space_id,
+            config=dict(config),
+            resume="allow",
         )
 
     def log(self, values: Mapping[str, float], step: int) -> None:

@@ -141,7 +141,9 @@ def tune(request: TuneRequest) -> None:
     print(f"\n{keys} of {algo}: {MEASUREMENT}\n\n{render(frontier, default)}\n")
     best = frontier.chosen
     print("chosen: " + " ".join(f"{key}={value}" for key, value in best.settings.items()))
-    if frontier.at_edge():
+    if len(values) > 1 and all(one.trials == best.trials for one in frontier.outcomes):
+        print(f"all values have the same errors: {keys} has no effect on what is measured", file=sys.stderr)
+    elif frontier.at_edge():
         print("the chosen value is the first or the last one: try values beyond it", file=sys.stderr)
     about = _about(request, proxy.streams, choices, plain)
     names = "-".join(key.rpartition(".")[2].replace("/", "-") for key in best.settings)

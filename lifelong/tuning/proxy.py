@@ -24,7 +24,7 @@ from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
 from lifelong.policies.base import Policy
-from lifelong.results.provenance import source_digest
+from lifelong.results.provenance import installed_versions, source_digest
 from lifelong.seeding import BEGIN_TASK, END_TASK, FIT, INIT, generator, seeded
 from lifelong.sequence.learning import meet
 from lifelong.settings import Configuration
@@ -127,7 +127,7 @@ class Trial:
     held_out: float
 
     def key(self) -> str:
-        """Return a digest of all that the trial depends on: its settings and the source, the expert's included."""
+        """Return a digest of all that the trial depends on: its settings, the source, packages and models."""
         return self._digest(self.config["algo"])
 
     def start_key(self, algorithm: Algorithm) -> str:
@@ -138,7 +138,7 @@ class Trial:
     def _digest(self, algo: Mapping[str, Any]) -> str:
         groups = {group: self.config[group] for group in _GROUPS} | {"algo": algo}
         stream = [task.id for task in self.stream]
-        rest = [FORMAT, stream, self.seed, self.steps, self.held_out, source_digest()]
+        rest = [FORMAT, stream, self.seed, self.steps, self.held_out, source_digest(), installed_versions()]
         return hashlib.sha256(json.dumps([groups, rest], sort_keys=True).encode()).hexdigest()[:16]
 
 

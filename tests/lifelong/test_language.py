@@ -9,6 +9,7 @@ import torch
 from lifelong.errors import LanguageError
 from lifelong.language import encoder as language
 from lifelong.language.encoder import LanguageEncoder, embed, normal_form, shipped
+from lifelong.seeding import seeded
 from lifelong.settings import build
 from tests.harness.configs import composed
 
@@ -123,6 +124,21 @@ def test_transformers_encode_each_text_by_itself(
     assert not torch.allclose(together[0], together[1])
     for text, row in zip(texts, together, strict=True):  # to the bit, so that it may be kept
         assert torch.equal(embed([text], str(models[name]))[0], row)
+
+
+def test_weights_that_a_models_files_lack_are_the_same_in_every_process(tmp_path: Path) -> None:
+    """Those of roberta-base have no pooler, whose output is the embedding."""
+    transformers = pytest.importorskip("transformers")
+    sizes = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
+    config = transformers.RobertaConfig(vocab_size=5, max_position_embeddings=90, pad_token_id=0, **sizes)
+    transformers.RobertaForMaskedLM(config).save_pretrained(tmp_path)
+    (tmp_path / "vocab.txt").write_text("[PAD]\n[UNK]\n[CLS]\n[SEP]\nturn\n")
+    transformers.BertTokenizer(str(tmp_path / "vocab.txt")).save_pretrained(tmp_path)
+    found = []
+    for seed in (1, 2):
+        with seeded(seed):
+            found.append(embed(["turn"], str(tmp_path)))
+    assert torch.equal(*found)
 
 
 def test_padding_is_not_attended_to_and_gpt2_takes_its_state(models: dict[str, Path]) -> None:

@@ -71,6 +71,7 @@ MISTAKES = {
     "algo=er algo.budget=5": ("algo.budget", "Did you mean 'algo.memory.budget'?"),
     "foo/bar=x": ("foo/bar", "Valid: algo"),
     "algo=er algo/estimator=batch": ("algo/estimator", "algo=NAME"),
+    "compat=libero algo=ewc algo/estimator=sample": ("algo/estimator has no effect with compat=libero", "BatchFisher"),
     "policy.head_hidden=5": ("policy.head_hidden", "Did you mean 'policy.head.hidden'?"),
     "policy.encoder.width=17": ("17 channels", "a multiple of 8"),
     "train.lr=${nothing}": ("train.lr", "'nothing' not found"),

@@ -3,6 +3,7 @@
 import json
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -280,6 +281,16 @@ def test_only_the_cells_that_are_asked_for_are_measured(tmp_path, whole, cells, 
     assert f"{results.episodes()[0]} episodes were run" in write_report([tmp_path / "some"]).read_text()
     _, again = learn(tmp_path / "some", Sequential(), cells=cells)
     assert again == [] and "nan" not in capsys.readouterr().out
+
+
+def test_trackers_are_told_the_mean_over_all_tasks_or_none(tmp_path):
+    told = []
+    context = run_context(tmp_path, Sequential)
+    settings = replace(context.eval, cells="diagonal_and_last_row", curve="none", select="last")
+    tracker = SimpleNamespace(log=lambda values, step: told.append(values))
+    sequence(replace(context, eval=settings, tracker=tracker)).run()
+    after = [values for values in told if "success/just_learned" in values]
+    assert ["success/mean" in values for values in after] == [True, False, True]
 
 
 def test_a_run_that_measures_the_end_only_counts_what_is_learned(tmp_path):

@@ -56,11 +56,15 @@ def test_readings_are_normalised_by_the_tasks_that_count(tmp_path, kind, tasks, 
     assert normalised.mean().abs() < 1e-4
 
 
-def test_a_policy_that_was_pretrained_keeps_its_first_statistics(tmp_path):
-    made = context(tmp_path, "first")
+@pytest.mark.parametrize("kind", ["first", "stream"])
+def test_a_policy_that_was_pretrained_keeps_its_first_statistics_but_takes_those_of_the_stream(
+    tmp_path, kind
+):
+    made = context(tmp_path, kind)
     made.policy.normalise(torch.full((4, 9), 3.0), once=True)
     sequence(made).run()
-    assert scaling(made.policy).centre_x.tolist() == [3.0, 3.0]
+    expected = torch.full((2,), 3.0) if kind == "first" else readings([0, 1, 2]).mean(0)
+    torch.testing.assert_close(scaling(made.policy).centre_x, expected)
 
 
 def test_by_default_nothing_is_measured_or_stored(tmp_path):

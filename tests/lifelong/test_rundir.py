@@ -2,6 +2,7 @@
 
 import errno
 import os
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -11,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.results.run_directory import RunDirectory
 from lifelong.settings import build
-from lifelong.tracking import TensorBoard, WandB
+from lifelong.tracking import TensorBoard, Trackio, WandB
 
 CONFIG = {"seed": 1, "train": {"lr": 0.1, "epochs": 3}, "device": "cpu", "runs_dir": "a"}
 
@@ -135,6 +136,27 @@ def test_wandb_keeps_the_steps_in_the_directory_of_the_run(tmp_path, monkeypatch
     assert tracker._run.step == 3 and tracker._run.id.startswith("libero_object-er-")
     tracker.finish()
     assert list((tmp_path / "wandb").glob("offline-run-*/*.wandb"))
+
+
+def test_trackers_tell_apart_runs_of_one_name_in_other_folders_and_begun_anew(tmp_path, monkeypatch):
+    """A killed run goes on under its identity."""
+    seen = []
+    fake = SimpleNamespace(init=lambda **how: seen.append(how.get("id") or how["name"]), Error=OSError)
+    for number, folder in enumerate(("a", "b")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "config.yaml").write_text("")
+        os.utime(tmp_path / folder / "config.yaml", ns=(0, number))
+    for kind, package in ((WandB, "wandb"), (Trackio, "trackio")):
+        monkeypatch.setitem(sys.modules, package, fake)
+        tracker = object.__new__(kind)
+        vars(tracker).update(mode="offline", project="p", entity=None, space_id=None)
+        for folder in ("a", "a", "b"):
+            tracker.start("libero_object/er", str(tmp_path / folder), {})
+        (tmp_path / "b" / "config.yaml").write_text("")  # as by resume=false
+        tracker.start("libero_object/er", str(tmp_path / "b"), {})
+        first, again, other, anew = seen[-4:]
+        assert first == again and len({first, other, anew}) == 3
+        os.utime(tmp_path / "b" / "config.yaml", ns=(0, 1))
 
 
 def test_wandb_ends_a_run_with_an_error_as_failed():

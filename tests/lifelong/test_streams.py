@@ -16,7 +16,7 @@ from lifelong.algorithms import ER, DERpp, Multitask, Sequential, SingleTask
 from lifelong.context import RunContext
 from lifelong.data.memory import ReplayMemory
 from lifelong.errors import CheckpointError, ConfigError, DataError, LiberoError
-from lifelong.pretraining import load_initial_weights, policy_at_start, pretraining_context
+from lifelong.pretraining import initial_policy, load_initial_weights, policy_at_start, pretraining_context
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import utc_now
@@ -31,7 +31,7 @@ from tests.harness.algorithms import assert_resumed_equals_uninterrupted
 from tests.harness.configs import composed
 from tests.harness.fakes import Windows
 from tests.harness.records import evaluation, run_start
-from tests.harness.runs import TINY
+from tests.harness.runs import TINY, make_run
 from tests.harness.sequences import Killed, Killer, assert_same, dataset, run_context, sequence
 
 pytestmark = pytest.mark.usefixtures("uncounted")
@@ -371,7 +371,8 @@ def test_orders_by_seed_hold_the_same_tasks():
 
 @pytest.mark.parametrize("word", [
     "language.numbered=true", "language.model=bert", "data.views=[eye_in_hand_rgb,agentview_rgb]",
-    "data.proprio=[ee_pos,gripper_states,joint_states]"
+    "data.proprio=[ee_pos,gripper_states,joint_states]", "policy.encoder.pixels=libero",
+    "policy.normalise_proprio=false", "policy.standardise_language=false"
 ])  # fmt: skip
 def test_weights_that_were_learned_with_other_inputs_of_the_same_shapes_are_refused(tmp_path, word) -> None:
     run = RunDirectory(tmp_path / "run")
@@ -386,6 +387,16 @@ def test_weights_that_were_learned_with_other_inputs_of_the_same_shapes_are_refu
     other = Configuration(plain_data(composed(*TINY, word)))
     with pytest.raises(CheckpointError, match=f"learned with {word.partition('=')[0]}="):
         policy_at_start(other, spec, 1, run.checkpoints.task_path(0))
+
+
+def test_a_run_that_was_pretrained_did_not_begin_with_the_weights_that_the_pretraining_began_with(
+    tmp_path,
+) -> None:
+    make_run(
+        tmp_path / "run", "pretrain.suite=libero_object", "pretrain.tasks=1", f"init_from={tmp_path}/other"
+    )
+    with pytest.raises(ConfigError, match="began with pretrained weights; name them with --initial"):
+        initial_policy(tmp_path / "run")
 
 
 @pytest.mark.parametrize(("language", "shared"), [("onehot", False), ("minilm", True)])

@@ -244,12 +244,30 @@ def test_tasks_are_met_and_readings_normalised_as_in_a_run(
 # --- what is typed wrongly
 
 
-def test_trials_of_another_source_or_expert_are_measured_again(monkeypatch) -> None:
+@pytest.mark.parametrize("changed", ["source_digest", "installed_versions"])
+def test_trials_of_another_source_or_expert_and_of_other_models_are_measured_again(
+    changed, monkeypatch
+) -> None:
     trial = Trial(plain_data(composed("algo=ewc")), (), 1, 10, 0.25)
     algorithm = Configuration(trial.config).build("algo")
     before = trial.key(), trial.start_key(algorithm)
-    monkeypatch.setattr(proxy, "source_digest", lambda: "0" * 12)
+    monkeypatch.setattr(proxy, changed, lambda: "0" * 12)
     assert trial.key() != before[0] and trial.start_key(algorithm) != before[1]
+
+
+def test_values_that_change_nothing_are_named(capsys, tmp_path, fake_streams) -> None:
+    assert tune(*WORDS, "train.last_batch=short,filled", *FAST, "--out", str(tmp_path)) == 0
+    assert "all values have the same errors: train.last_batch has no effect" in capsys.readouterr().err
+    assert tune(*WORDS, "train.lr=1e-3,2e-3", *FAST, "--out", str(tmp_path)) == 0
+    assert "same errors" not in capsys.readouterr().err
+
+
+def test_a_preset_prevails_over_the_tuned_value_of_a_head(tmp_path) -> None:
+    (tmp_path / "preset").mkdir()
+    text = "# @package _global_\ndefaults: [laptop]\nalgo: {strength: 5.0}\n"
+    (tmp_path / "preset" / "mine.yaml").write_text(text)
+    assert compose_run(["algo=lwf"])[0].algo.strength == 1.0  # that of the mixture
+    assert compose_run(["algo=lwf", "preset=mine"], tmp_path)[0].algo.strength == 5.0
 
 
 def test_lists_of_values_are_found_and_others_are_left() -> None:
