@@ -27,13 +27,8 @@ LAUNCHERS = {
 }
 # errors by which Hydra says that an override cannot be applied
 REFUSALS = (
-    HydraException,
-    OmegaConfBaseException,
-    AssertionError,
-    AttributeError,
-    OSError,
-    TypeError,
-    ValueError,
+    *(HydraException, OmegaConfBaseException),
+    *(AssertionError, AttributeError, OSError, TypeError, ValueError),
 )
 # of LeRobot, which users name as policies
 LEROBOT_TYPES = ("act", "diffusion", "vqbet", "tdmpc", "smolvla", "pi0", "pi0_fast", "pi05", "groot")

@@ -5,7 +5,6 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,19 +20,12 @@ from libero_env.memory import memory_limit
 from libero_env.perturbations import format_perturbations
 from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
-from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
 from lifelong.data.demonstrations import DemoDatasets, check_folder, demo_copies, find_demos, perturb_demos
 from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError, DataError
-from lifelong.evaluation.environments import (
-    EnvPool,
-    held_out_shift,
-    renderer_name_or_none,
-    run_environment,
-)
-from lifelong.evaluation.settings import EvalSettings
+from lifelong.evaluation.environments import EnvPool, held_out_shift, renderer_name_or_none, run_environment
 from lifelong.policies.base import Policy
 from lifelong.pretraining import policy_at_start, pretraining_context
 from lifelong.report.page import write_report
@@ -52,7 +44,6 @@ from lifelong.results.summary import write_summary
 from lifelong.sequence import TaskSequence, is_measured
 from lifelong.settings import Configuration, RunSettings, plain_data
 from lifelong.streams import TaskPlan, plan_tasks
-from lifelong.tracking import Tracker
 from lifelong.training.distributed import Ranks
 from lifelong.training.memory import check_memory, policy_bytes, training_needs
 from lifelong.training.precision import check_compiler, check_precision, deterministic, keep_freed_memory
@@ -84,8 +75,7 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
     directory = RunDirectory(Path(settings.runs_dir) / _run_name(names, settings))
     _check_writable(directory.path)
     keep_freed_memory()
-    with deterministic(settings.deterministic), _restored_threads():
-        _set_threads(settings, directory.path)
+    with deterministic(settings.deterministic), _threads(settings, directory.path):
         # before anything is written: an invalid configuration leaves no trace
         context, pretraining = _build_contexts(configuration, settings, directory, ranks)
         with _held(context, plain, settings.resume):
@@ -117,11 +107,10 @@ def check(config: DictConfig) -> None:
     """
     configuration = Configuration(_with_drawing(plain_data(config)))
     settings = configuration.settings()
-    parts = _checked_parts(configuration, Ranks().device(settings.device))
-    for group in ("language", "augmentation"):
-        configuration.build(group)
+    _, parts = _checked_parts(configuration, Ranks().device(settings.device))
+    configuration.build("language")
     if not configuration.is_own("policy"):  # others are checked with the memory that they need
-        configuration.build("policy", spec=parts.data.spec(EXAMPLE_DIM))
+        configuration.build("policy", spec=parts["data"].spec(EXAMPLE_DIM))
 
 
 def _with_drawing(config: dict[str, Any]) -> dict[str, Any]:
@@ -152,25 +141,23 @@ def _check_writable(directory: Path) -> None:
 
 
 @contextmanager
-def _restored_threads() -> Iterator[None]:
-    """Give PyTorch its number of threads back afterwards: the next job of a sweep may ask for the default."""
-    before = torch.get_num_threads()
+def _threads(settings: RunSettings, directory: Path) -> Iterator[None]:
+    """Give PyTorch its threads within the context; a resumed run has those that it was started with, as its bits need.
+
+    They are given back, as the next job of a sweep may ask for the default.
+    """
+    before, threads = torch.get_num_threads(), settings.threads
+    if not threads and settings.resume:
+        results = ResultLog(directory / "results.jsonl").read()
+        threads = 0 if results.finished else recorded_threads(results) or 0
+        if threads not in (0, before):
+            print(f"threads={threads}, as when this run was started: its bits depend on their number")
+    if threads:
+        torch.set_num_threads(threads)
     try:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _set_threads(settings: RunSettings, directory: Path) -> None:
-    """Give PyTorch its threads; a resumed run has those that it was started with, on which its bits depend."""
-    threads = settings.threads
-    if not threads and settings.resume:
-        results = ResultLog(directory / "results.jsonl").read()
-        threads = 0 if results.finished else recorded_threads(results) or 0
-        if threads not in (0, torch.get_num_threads()):
-            print(f"threads={threads}, as when this run was started: its bits depend on their number")
-    if threads:
-        torch.set_num_threads(threads)
 
 
 def _warn_of_cpu(data: DataSettings, fit: FitSettings) -> None:
@@ -191,10 +178,10 @@ def _build_contexts(
 ) -> tuple[RunContext, RunContext | None]:
     """Return the context of the run, and that of the pretraining before it if there is any."""
     device = ranks.device(settings.device)
-    parts = _checked_parts(config, device)
-    plan, data, evaluation = parts.plan, parts.data, parts.eval
+    plan, parts = _checked_parts(config, device)
+    data, evaluation = parts["data"], parts["eval"]
     if ranks.first and settings.device == "auto" and device.type == "cpu":
-        _warn_of_cpu(data, parts.fit)
+        _warn_of_cpu(data, parts["fit"])
 
     first, said = len(plan.before), list(plan.instructions)
     languages = ranks.broadcast(lambda: config.build("language").embed(said))
@@ -210,37 +197,26 @@ def _build_contexts(
     )
     spec = data.spec(languages.shape[1])
 
-    def make_env(
-        key: Any,
-    ) -> BatchEnv:  # of (task, number of simulations), with any third part under the shift
+    def make_env(key: Any) -> BatchEnv:
+        """Build the environment of (task, number of simulations), with any third part under the shift."""
         task, simulations, *shifted = key
         perturb = shift.perturb if shifted and shift is not None else plan.perturb
         return run_environment(plan.tasks[task], simulations, spec, evaluation, data, perturb[task])
 
     progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
     context = RunContext(
-        tasks=plan.tasks,
+        **parts,
         languages=languages[first:],
-        demos=parts.demos,
-        data=data,
         policy=policy_at_start(config, spec, settings.seed, settings.init_from).to(device),
-        algorithm=parts.algorithm,
-        fit=parts.fit,
-        eval=evaluation,
-        augment=config.build("augmentation"),
-        stream=plan.stream,
-        group_sizes=plan.group_sizes,
         envs=EnvPool(make_env, evaluation.open_environments),
         directory=directory,
-        tracker=parts.tracker,
         seed=settings.seed,
         device=device,
         progress=progress if ranks.first and not is_quiet() else False,
         ranks=ranks,
-        perturb=plan.perturb if plan.stream.perturb else (),
         shift=shift,
     )
-    precisions = {"train.precision": parts.fit.precision, "eval.precision": evaluation.precision}
+    precisions = {"train.precision": context.fit.precision, "eval.precision": evaluation.precision}
     check_precision(context.policy, device, precisions)
     if not first:
         return context, None
@@ -254,21 +230,11 @@ def _build_contexts(
     )
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """What a run is made of, as far as its configuration alone decides it."""
+def _checked_parts(config: Configuration, device: torch.device) -> tuple[TaskPlan, dict[str, Any]]:
+    """Return the tasks, and the fields of the context that the configuration alone decides.
 
-    plan: TaskPlan
-    data: DataSettings
-    fit: FitSettings
-    eval: EvalSettings
-    algorithm: Algorithm
-    tracker: Tracker
-    demos: tuple[int, ...]
-
-
-def _checked_parts(config: Configuration, device: torch.device) -> _Parts:
-    """Build what a run is made of; refuse what cannot fit into memory, or needs a package that is not there."""
+    What cannot fit into memory, or needs a package that is not there, is refused.
+    """
     robot_assets()
     plan, data = plan_tasks(config), config.build("data")
     check_folder(data)
@@ -282,7 +248,12 @@ def _checked_parts(config: Configuration, device: torch.device) -> _Parts:
     check_memory(needs, memory_limit() + on_gpu)
     if fit.compile != "off":
         check_compiler(device)
-    return _Parts(plan, data, fit, evaluation, algorithm, config.build("tracker"), demos)
+    parts = {
+        name: config.build(group) for name, group in (("tracker", "tracker"), ("augment", "augmentation"))
+    }
+    parts |= {"tasks": plan.tasks, "stream": plan.stream, "group_sizes": plan.group_sizes, "demos": demos}
+    parts |= {"data": data, "fit": fit, "eval": evaluation, "algorithm": algorithm}
+    return plan, parts | {"perturb": plan.perturb if plan.stream.perturb else ()}
 
 
 def _held(context: RunContext, plain: Mapping[str, Any], resume: bool) -> AbstractContextManager[Any]:

@@ -3,7 +3,7 @@
 Shape legend: B batch, T time, V views, H W C image, A action, D size of a reading, L language embedding.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Annotated
@@ -96,11 +96,14 @@ class Observation:
     proprio: Mapping[str, Tensor]
     language: Tensor
 
+    def map(self, change: Callable[[Tensor], Tensor]) -> "Observation":
+        """Return the observation with every tensor changed."""
+        proprio = {name: change(reading) for name, reading in self.proprio.items()}
+        return Observation(change(self.images), proprio, change(self.language))
+
     def to(self, device: torch.device | str) -> "Observation":
         """Return the observation on another device."""
-        move = partial(to_device, device=device)
-        proprio = {name: move(reading) for name, reading in self.proprio.items()}
-        return Observation(move(self.images), proprio, move(self.language))
+        return self.map(partial(to_device, device=device))
 
 
 @dataclass(frozen=True)
@@ -125,19 +128,20 @@ class Batch:
     def __len__(self) -> int:
         return self.actions.shape[0]
 
+    def map(self, change: Callable[[Tensor], Tensor]) -> "Batch":
+        """Return the batch with every tensor changed."""
+        rest = (change(x) for x in (self.actions, self.task_ids, self.window_ids))
+        return Batch(
+            self.observation.map(change), *rest, None if self.is_pad is None else change(self.is_pad)
+        )
+
     def to(self, device: torch.device | str) -> "Batch":
         """Return the batch on another device."""
-        move = partial(to_device, device=device)
-        moved = self.observation.to(device)
-        is_pad = None if self.is_pad is None else move(self.is_pad)
-        return Batch(moved, move(self.actions), move(self.task_ids), move(self.window_ids), is_pad)
+        return self.map(partial(to_device, device=device))
 
     def rows(self, rows: slice | Tensor) -> "Batch":
         """Return some of the windows: those of a slice as views, those of indices as copies in the given order."""
-        obs = self.observation
-        part = Observation(obs.images[rows], {k: v[rows] for k, v in obs.proprio.items()}, obs.language[rows])
-        is_pad = None if self.is_pad is None else self.is_pad[rows]
-        return Batch(part, self.actions[rows], self.task_ids[rows], self.window_ids[rows], is_pad)
+        return self.map(lambda x: x[rows])
 
     def padding(self) -> Tensor:
         """Return `is_pad`, False where it is not known, (B, T) bool."""

@@ -10,6 +10,7 @@ from libero_env.cli.doctor import COMPILE_SECONDS, Finding, run_probe
 from lifelong.algorithms import Sequential
 from lifelong.cli.runs import check_torch
 from lifelong.data.dataset import SequenceVLDataset
+from lifelong.data.fake import fake_observation
 from lifelong.nn import DeterministicHead, ResNetFiLMEncoder
 from lifelong.policies import BCMLP
 from lifelong.seeding import seeded
@@ -89,11 +90,10 @@ PROBES = {  # what is run, the remedy, whether nothing works without it
 def _windows() -> SequenceVLDataset:
     """Return 16 windows of two cameras."""
     draws = torch.Generator().manual_seed(0)
-    images = torch.randint(0, 256, (16, 2, 32, 32, 3), dtype=torch.uint8, generator=draws)
-    actions = torch.rand(16, 7, generator=draws) * 2 - 1
-    readings = {name: torch.randn(16, size, generator=draws) for name, size in _SPEC.proprio.items()}
-    language = torch.randn(_SPEC.language_dim, generator=draws)
-    return SequenceVLDataset(images, readings, actions, torch.full((16,), 15), language, 0, 1)
+    seen = fake_observation(_SPEC, 16, draws)
+    readings = {name: values[:, 0] for name, values in seen.proprio.items()}
+    actions, last = torch.rand(16, 7, generator=draws) * 2 - 1, torch.full((16,), 15)
+    return SequenceVLDataset(seen.images[:, 0], readings, actions, last, seen.language[0], 0, 1)
 
 
 def _loss(device: str) -> float:

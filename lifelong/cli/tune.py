@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from lifelong.settings import Configuration
     from lifelong.tuning.proxy import Candidate
 
-SUITE, STEPS, HELD_OUT = "libero_90", 160, 0.25  # the defaults
 MEASUREMENT = (
     "for each value, the geometric mean over the streams of the factor on the error that fine-tuning leaves on a task "
     "it has just learned"
@@ -62,11 +61,11 @@ class TuneRequest:
     """
 
     overrides: Positional[Annotated[tuple[str, ...], Field(min_length=1)]]
-    suite: str = SUITE
+    suite: str = "libero_90"
     stream: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     seeds: str = "1"
-    steps: Annotated[int, Field(ge=1, le=1_000_000)] = STEPS
-    held_out: Probability = HELD_OUT
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 160
+    held_out: Probability = 0.25
     beside: tuple[str, ...] = ("er",)
     out: FilePath = Path("runs/tuning")
     config_dir: FilePath | None = None
@@ -254,12 +253,12 @@ def _about(
 
 def _options(request: TuneRequest) -> list[str]:
     """Return the options that results depend on and that are not the default ones."""
-    options = {"--suite": request.suite, "--seeds": request.seeds, "--steps": str(request.steps)}
-    options |= {"--held-out": f"{request.held_out:g}"}
-    defaults = {"--suite": SUITE, "--seeds": "1", "--steps": str(STEPS), "--held-out": f"{HELD_OUT:g}"}
-    chosen = [(name, value) for name, value in options.items() if value != defaults[name]]
+    defaults = TuneRequest(overrides=("algo=er",))
+    names = ("suite", "seeds", "steps", "held_out")
+    differing = [name for name in names if getattr(request, name) != getattr(defaults, name)]
+    chosen = [(f"--{name.replace('_', '-')}", f"{getattr(request, name)}") for name in differing]
     chosen += [("--stream", tasks) for tasks in request.stream]
-    beside = [] if request.beside == ("er",) else ["--beside", *request.beside]
+    beside = [] if request.beside == defaults.beside else ["--beside", *request.beside]
     return [*(word for pair in chosen for word in pair), *beside]
 
 

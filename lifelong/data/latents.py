@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from lifelong.data.memory import TaskMemory, even_shares
+from lifelong.data.windows import divided
 from lifelong.errors import DataError
 
 _TENSORS = ("codes", "low", "step", "actions")
@@ -104,13 +105,10 @@ class LatentMemory(TaskMemory[LatentWindows]):
 
     def sample(self, n: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return latents (n, T, ...) and actions (n, T, A) of windows, on the CPU; see `ReplayMemory.sample`."""
-        drawn, start = self._draw(n, generator), 0
-        latents, actions = [], []
-        for windows in self.tasks.values():
-            rows = drawn[(drawn >= start) & (drawn < start + len(windows))] - start
-            start += len(windows)
-            latents.append(windows.values(rows))
-            actions.append(windows.actions[rows])
+        parts = list(divided(list(self.tasks.values()), self._draw(n, generator)))
+        latents, actions = zip(
+            *((windows.values(rows), windows.actions[rows]) for windows, rows in parts), strict=True
+        )
         return torch.cat(latents), torch.cat(actions)
 
     def load_state_dict(self, state: Mapping[str, Any], datasets: object = None) -> None:

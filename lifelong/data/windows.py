@@ -1,16 +1,18 @@
 """Datasets of windows, whatever reads and holds them: what they have in common, parts and joins of them."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import zip_longest
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from lifelong.errors import DataError
 from lifelong.types import Batch, to_device
+
+Part = TypeVar("Part", bound=Sized)
 
 _CHUNK = 8  # windows that are read at a time
 
@@ -52,6 +54,21 @@ def _expect(dataset: WindowDataset, indices: Tensor) -> None:
         expect(indices)
 
 
+def divided(parts: Sequence[Part], indices: Tensor) -> Iterator[tuple[Part, Tensor]]:
+    """Yield each part of which there are windows, with their indices in it.
+
+    Args:
+        parts: Windows, which are counted through all parts.
+        indices: The windows, (n,) int64.
+    """
+    start = 0
+    for part in parts:
+        chosen = indices[(indices >= start) & (indices < start + len(part))] - start
+        start += len(part)
+        if len(chosen):
+            yield part, chosen
+
+
 class JoinedWindows:
     """The windows of several datasets as one dataset; indices are counted through the datasets in order."""
 
@@ -63,22 +80,14 @@ class JoinedWindows:
 
     def batch(self, indices: Tensor) -> Batch:
         """Return the windows of the given indices ((B,) int64), those of one dataset after those of another."""
-        return reduce(Batch.join, [dataset.batch(chosen) for dataset, chosen in self.divided(indices)])
+        return reduce(
+            Batch.join, [dataset.batch(chosen) for dataset, chosen in divided(self.datasets, indices)]
+        )
 
     def expect(self, indices: Tensor) -> None:
         """Read the windows of the given indices, (B,) int64, ahead where datasets can."""
-        for dataset, chosen in self.divided(indices):
+        for dataset, chosen in divided(self.datasets, indices):
             _expect(dataset, chosen)
-
-    def divided(self, indices: Tensor) -> Iterator[tuple[WindowDataset, Tensor]]:
-        """Yield each dataset of which there are windows, with their indices in it."""
-        start = 0
-        for dataset in self.datasets:
-            end = start + len(dataset)
-            chosen = indices[(indices >= start) & (indices < end)] - start
-            start = end
-            if len(chosen):
-                yield dataset, chosen
 
 
 class StageWindows(JoinedWindows):
@@ -308,7 +317,7 @@ def count_frames(dataset: WindowDataset, indices: Tensor) -> int:
     if not len(indices):
         return 0
     if isinstance(dataset, JoinedWindows):
-        return sum(count_frames(part, chosen) for part, chosen in dataset.divided(indices))
+        return sum(count_frames(part, chosen) for part, chosen in divided(dataset.datasets, indices))
     if isinstance(dataset, WindowSubset):
         return count_frames(dataset.dataset, dataset.chosen[indices])
     if frames := getattr(dataset, "frames", None):

@@ -1,7 +1,7 @@
 """Loading of a run's policy for acting, from the run's directory or one of its checkpoints."""
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,15 +110,8 @@ class LoadedRun:
             simulations: Number of episodes that run side by side.
             horizon: Maximum number of control steps of the policy.
         """
-        return run_environment(
-            self.tasks[position],
-            simulations,
-            self.policy.spec,
-            self.eval,
-            self.data,
-            self.perturbations(position),
-            horizon,
-        )
+        task, perturb = self.tasks[position], self.perturbations(position)
+        return run_environment(task, simulations, self.policy.spec, self.eval, self.data, perturb, horizon)
 
     @contextmanager
     def acting(self, task: Task | int) -> Iterator[Policy]:
@@ -234,17 +227,11 @@ def read_config(file: Path, allow: Sequence[str]) -> Configuration:
     return Configuration(values, source=str(file), allowed=tuple(allow))
 
 
-class _NoWindows(Mapping[int, TaskWindows]):
+class _NoWindows(dict[int, TaskWindows]):
     """Raises an error if an algorithm reads demonstrations, which are not available for acting."""
 
     def __init__(self, path: Path):
         self._path = path
 
-    def __getitem__(self, task: int) -> TaskWindows:
+    def __missing__(self, task: int) -> TaskWindows:
         raise CheckpointError(f"{self._path}: the algorithm needs the demonstrations of task {task} to act")
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(())
-
-    def __len__(self) -> int:
-        return 0

@@ -253,22 +253,12 @@ def run_episodes(
     bar.close()
     _draw(env, True)
     _tell(actor, tracker, env)
-    timing = getattr(actor, "timing", ())
-    done = tracker.episodes(init_states, lengths, [digest.hexdigest()[:16] for digest in digests])
-    episodes = tuple(
-        replace(
-            one,
-            attempts=tuple(map(int, tracker.attempts[i])),
-            simulation_error=tracker.errors.get(i, ""),
-            failure=tracker.failure(i),
-            began=tuple(map(int, tracker.began[i])),
-            costs=tracker.costs(i),
-            timing=timing[i] if timing else (),
-        )
-        for i, one in enumerate(done)
-    )
+    timing = getattr(actor, "timing", None) or [()] * env.num_envs
     return Rollouts(
-        episodes,
+        tuple(
+            tracker.episode(i, int(start), int(lengths[i]), digests[i].hexdigest()[:16], timing[i])
+            for i, start in enumerate(init_states)
+        ),
         time.perf_counter() - started,
         tracker.atoms,
         tuple(map(tuple, recordings)),
@@ -345,15 +335,21 @@ class EpisodeTracker:
         """Return what an episode has cost so far; None where the environment does not show its state."""
         return None if self._watch is None else self._watch.costs[i]
 
-    def episodes(
-        self, init_states: Sequence[int], lengths: np.ndarray, actions: Sequence[str]
-    ) -> tuple[Episode, ...]:
-        """Return the outcome of each simulation."""
-        atoms = [list(map(tuple, a.tolist())) for a in (self._start, self._ever, self._now)]
-        rows = zip(
-            map(int, init_states), self.success.tolist(), lengths.tolist(), *atoms, actions, strict=True
+    def episode(self, i: int, start: int, length: int, actions: str, timing: tuple[int, ...]) -> Episode:
+        """Return the outcome of a simulation; for the arguments see `Episode`."""
+        return Episode(
+            start,
+            bool(self.success[i]),
+            length,
+            *(tuple(atoms[i].tolist()) for atoms in (self._start, self._ever, self._now)),
+            actions,
+            attempts=tuple(map(int, self.attempts[i])),
+            simulation_error=self.errors.get(i, ""),
+            failure=self.failure(i),
+            began=tuple(map(int, self.began[i])),
+            costs=self.costs(i),
+            timing=timing,
         )
-        return tuple(Episode(*row) for row in rows)
 
     def _progress(self, info: Mapping[str, Any]) -> np.ndarray:
         """Return whether each atom holds, (B, atoms) bool."""

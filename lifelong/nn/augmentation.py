@@ -113,8 +113,8 @@ class ColorJitter(Augmentation):
         hue: NonNegative = 0.3,
         keep: Share = 0.1,
     ) -> None:
-        self.brightness, self.contrast, self.saturation = brightness, contrast, saturation
-        self.hue, self.keep = hue, keep
+        self.limits = (brightness, contrast, saturation, 2 * math.pi * hue)
+        self.keep = keep
 
     def images(self, images: Tensor, generator: torch.Generator | None = None) -> Tensor:
         b, t, v, h, w, c = images.shape
@@ -130,8 +130,7 @@ class ColorJitter(Augmentation):
         """Draw colour matrices (n, 3, 3) to multiply from the right, contrast and brightness factors (n, 1, 1)."""
         uniform = torch.rand(5, n, 1, 1, generator=generator)
         drawn = torch.where(uniform[4] < self.keep, torch.zeros(4, n, 1, 1), 2 * uniform[:4] - 1)
-        limits = torch.tensor([self.brightness, self.contrast, self.saturation, 2 * math.pi * self.hue])
-        brightness, contrast, saturation, angle = drawn * limits[:, None, None, None]
+        brightness, contrast, saturation, angle = drawn * torch.tensor(self.limits)[:, None, None, None]
         cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
         turn = torch.cat([zero + 1, zero, zero, zero, cos, -sin, zero, sin, cos], dim=-1).view(n, 3, 3)
         hue = torch.linalg.inv(_YIQ) @ turn @ _YIQ

@@ -48,13 +48,7 @@ class BCMLP(VectorPolicy):
         standardise_language: bool = True,
     ) -> None:
         super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
-        size = self.build_inputs(
-            encoder,
-            image_embed=image_embed,
-            text_embed=text_embed,
-            normalise=normalise_proprio,
-            dropout=proprio_dropout,
-        )
+        size = self.build_inputs(encoder, image_embed, text_embed, normalise_proprio, proprio_dropout)
         self.head = self.build_head(head, in_dim=size)
 
     def over_time(self, features: Tensor) -> Tensor:

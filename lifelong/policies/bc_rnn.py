@@ -60,13 +60,7 @@ class BCRNN(VectorPolicy):
         standardise_language: bool = True,
     ) -> None:
         super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
-        size = self.build_inputs(
-            encoder,
-            image_embed=image_embed,
-            text_embed=text_embed,
-            normalise=normalise_proprio,
-            dropout=proprio_dropout,
-        )
+        size = self.build_inputs(encoder, image_embed, text_embed, normalise_proprio, proprio_dropout)
         self.memory = memory
         self.rnn: nn.LSTM = temporal(in_dim=size)
         self.head = self.build_head(head, in_dim=self.rnn.hidden_size)

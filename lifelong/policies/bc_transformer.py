@@ -55,8 +55,7 @@ class BCTransformer(TokenPolicy):
         super().__init__(spec, stochastic=stochastic, standardise_language=standardise_language)
         sizes = {"image_size": spec.image_size, "language_dim": spec.language_dim, "latent_dim": embed_dim}
         self.encoders = nn.ModuleDict({view: encoder(**sizes) for view in spec.views})
-        readings = {"normalise": normalise_proprio, "dropout": proprio_dropout}
-        self.build_rest(spec.views, embed_dim, temporal, head, readout, **readings)
+        self.build_rest(spec.views, embed_dim, temporal, head, readout, normalise_proprio, proprio_dropout)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""

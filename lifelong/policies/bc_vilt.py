@@ -72,8 +72,7 @@ class BCViLT(TokenPolicy):
         self.spatial_language = LanguageToken(language_dim=spec.language_dim, dim=patch_embed)
         patches = encoders[spec.views[0]].patches
         self.spatial = spatial(views=len(encoders), patches=patches, dim=patch_embed, out_dim=embed_dim)
-        readings = {"normalise": normalise_proprio, "dropout": proprio_dropout}
-        self.build_rest(("images",), embed_dim, temporal, head, readout, **readings)
+        self.build_rest(("images",), embed_dim, temporal, head, readout, normalise_proprio, proprio_dropout)
 
     def encode(self, observation: Observation) -> Tensor:
         """Return the tokens of every time step, (B, T, M, E); each step by itself."""

@@ -197,7 +197,7 @@ class VectorPolicy(HistoryPolicy):
     """Policy whose features are one vector per frame: the cameras' latents, the instruction's, and the readings."""
 
     def build_inputs(
-        self, encoder: Component, *, image_embed: int, text_embed: int, normalise: bool, dropout: float
+        self, encoder: Component, image_embed: int, text_embed: int, normalise: bool, dropout: float
     ) -> int:
         """Build what reads the observation; return the size of a frame's vector, F."""
         spec = self.spec
@@ -237,13 +237,16 @@ class TokenPolicy(HistoryPolicy):
         temporal: Component,
         head: Component,
         readout: Readout,
-        **proprio: Any,
+        normalise: bool,
+        dropout: float,
     ) -> None:
         """Build all but what reads the images, whose tokens of `dim` numbers have the names `cameras`."""
         spec, self.readout = self.spec, readout
         self.uses_history = readout == "instruction"  # all tokens of a frame are enough to act on
         self.language = LanguageToken(language_dim=spec.language_dim, dim=dim)
-        self.proprio = ProprioTokens(proprio=spec.proprio, dim=dim, measured=spec.measured, **proprio)
+        self.proprio = ProprioTokens(
+            proprio=spec.proprio, dim=dim, normalise=normalise, dropout=dropout, measured=spec.measured
+        )
         self.transformer = temporal(dim=dim, max_length=spec.seq_len)
         self._sizes = {"language": 1, "proprio": len(spec.proprio)} | dict.fromkeys(cameras, 1)
         tokens = 1 + (sum(self._sizes.values()) if readout == "all" else 0)

@@ -43,37 +43,15 @@ VOLATILE = (
     "language.cache_dir",
     "eval.shift",  # evaluations besides all others
 )
-VERSIONED_PACKAGES = (
-    "libero-lifelong",
-    "mujoco",
-    "torch",
-    "numpy",
-    "gymnasium",
-    "h5py",
-    "transformers",
-)
-_PACKAGES = (
-    "libero_env",
-    "lifelong",
-    "libero_eval",
-)  # whose files decide results; the facade only calls them
+VERSIONED_PACKAGES = ("libero-lifelong", "mujoco", "torch", "numpy", "gymnasium", "h5py", "transformers")
+# whose files decide results; the facade only calls them
+_PACKAGES = ("libero_env", "lifelong", "libero_eval")
 _ENDINGS = (".py", ".yaml", ".npz", ".json")
 _VARIABLES = (
-    "MKL_CBWR",
-    "MKL_ENABLE_INSTRUCTIONS",
-    "ONEDNN_MAX_CPU_ISA",
-    "ATEN_CPU_CAPABILITY",
+    *("MKL_CBWR", "MKL_ENABLE_INSTRUCTIONS", "ONEDNN_MAX_CPU_ISA", "ATEN_CPU_CAPABILITY"),
     "NVIDIA_TF32_OVERRIDE",
 )
-_DECISIVE_VERSIONS = (
-    "python",
-    "mujoco",
-    "torch",
-    "numpy",
-    "transformers",
-    "models",
-    "models_digest",
-)
+_DECISIVE_VERSIONS = ("python", "mujoco", "torch", "numpy", "transformers", "models", "models_digest")
 _ROOT = Path(__file__).parents[2]
 
 

@@ -39,14 +39,8 @@ COLUMNS = (
     *("phase", "row", "epoch", "position", "task", "start", "success", "length"),
 )
 _OF_EPISODES = (
-    "phase",
-    "learned",
-    "epoch",
-    "task",
-    "init_states",
-    "successes",
-    "lengths",
-    "simulation_errors",
+    *("phase", "learned", "epoch", "task"),
+    *("init_states", "successes", "lengths", "simulation_errors"),
 )
 
 

@@ -49,107 +49,103 @@ class Evaluator:
             task: Position of the task to act on.
             epoch: Number of epochs trained on the task that was learned last.
         """
-        shift = self._shift(phase)
+        context, (shift, languages) = self._context, self._told(phase)
         known = epoch if phase == "curve" else None
         found = self._log.read().evaluation(phase, learned, task, known, shift=shift)
         if found is not None:
             return found
-        context = self._context
+        key: dict[str, Any] = {
+            "phase": phase,
+            "learned": learned,
+            "epoch": epoch,
+            "task": task,
+            "shift": shift,
+        }
         stage = next(stage for stage in self._stages if task in stage)
         with context.algorithm.policy_for(stage[-1], context.policy) as acting:
             decided_by = ""
             if context.eval.reuse:
                 more = context.algorithm.acting_state(stage[-1], acting)
                 decided_by = digest({**self._circumstances(phase, task), "more": more}, acting)
-            record = self._copied(decided_by, phase, learned, task, epoch)
-            if record is None:
-                record = self._measured(acting, decided_by, phase, learned, task, epoch)
+            record = self._copied(decided_by, key) or self._measured(acting, decided_by, key, languages[task])
         self._log.append(record)
         for note in Results((record,)).error_notes:
             say(context, note)
         return record
 
-    def _shift(self, phase: Phase) -> str:
-        """Return the held-out shift of rollouts, as text; empty for those without it."""
+    def _told(self, phase: Phase) -> tuple[str, Tensor]:
+        """Return the held-out shift of rollouts as text, empty for those without, and what policies are told (K, L)."""
         shift = self._context.shift
-        return shift.text if phase == "shift" and shift is not None else ""
-
-    def _language(self, phase: Phase, task: int) -> Tensor:
-        """Return the embedding of what the policy is told on a task."""
-        shift = self._context.shift
-        found = shift.languages if phase == "shift" and shift is not None else self._context.languages
-        return found[task]
+        return (
+            ("", self._context.languages)
+            if phase != "shift" or shift is None
+            else (shift.text, shift.languages)
+        )
 
     def _circumstances(self, phase: Phase, task: int) -> dict[str, Any]:
         """Return what rollouts depend on besides what acts, within one run."""
-        context, settings = self._context, self._context.eval
+        context, settings, (shift, languages) = self._context, self._context.eval, self._told(phase)
         starts = self._log.read().of(RunRecord)
         perturb = format_perturbations(context.perturbed[task])
         return {
             **({"perturb": perturb} if perturb else {}),
-            **({"shift": self._shift(phase)} if phase == "shift" else {}),
+            **({"shift": shift} if phase == "shift" else {}),
             **({"backend": settings.backend} if settings.back_end.is_warp else {}),
             "task": task,
-            "language": self._language(phase, task),
+            "language": languages[task],
             "init_states": str(list(settings.init_states(phase))),
             "settings": f"{settings.horizon} {settings.settle_steps} {settings.precision}",
             "conditions": all_conditions(starts[-1]) if starts else {},
         }
 
-    def _copied(
-        self, decided_by: str, phase: Phase, learned: int, task: int, epoch: int
-    ) -> EvalRecord | None:
+    def _copied(self, decided_by: str, key: Mapping[str, Any]) -> EvalRecord | None:
         """Return the record of rollouts that would repeat recorded ones; None where there are none."""
         found = self._log.read().original(decided_by)
-        if found is None or found.task != task:
+        if found is None or found.task != key["task"]:
             return None
-        if self._is_filmed(phase, learned, task) and not self._copy_video(found, learned):
+        if self._is_filmed(key) and not self._copy_video(found, key["learned"]):
             return None
-        origin = (found.phase, found.learned, found.epoch)
-        return replace(found, phase=phase, learned=learned, epoch=epoch, seconds=0.0, same_as=origin)
+        return replace(found, seconds=0.0, same_as=(found.phase, found.learned, found.epoch), **key)
 
     def _measured(
-        self, acting: Policy, decided_by: str, phase: Phase, learned: int, task: int, epoch: int
+        self, acting: Policy, decided_by: str, key: Mapping[str, Any], language: Tensor
     ) -> EvalRecord:
         """Run the rollouts and return their record."""
-        context, settings = self._context, self._context.eval
-        states, shift = settings.init_states(phase), self._shift(phase)
+        context, settings, task, shift = self._context, self._context.eval, key["task"], key["shift"]
+        states = settings.init_states(key["phase"])
         done = rollout(
             acting,
             context.envs.get((task, len(states), shift) if shift else (task, len(states))),
             states,
-            language=self._language(phase, task),
+            language=language,
             horizon=settings.horizon,
             settle_steps=settings.settle_steps,
-            seed=(context.seed, ROLLOUT, learned, epoch, task),
+            seed=(context.seed, ROLLOUT, key["learned"], key["epoch"], task),
             device=context.device,
             precision=settings.precision,
-            record_every=settings.record_every if self._is_filmed(phase, learned, task) else 0,
+            record_every=settings.record_every if self._is_filmed(key) else 0,
             label=f"rollouts on task {task + 1}",
             progress=bool(context.progress),
         )
         if not done.counted:
             raise SimulationError(done.failed)
         record = EvalRecord(
-            shift=shift,
-            phase=phase,
-            learned=learned,
-            epoch=epoch,
-            task=task,
             seconds=done.seconds,
             atoms_at_start=tuple(e.at_start for e in done.counted),
             decided_by="" if done.random else decided_by,
+            **key,
             **done.columns(),
         )
         if done.frames:
-            path = self._video(learned, task)
-            save_animation(done.frames, path, seconds_per_frame=CONTROL_PERIOD * context.eval.record_every)
+            path = self._video(record.learned, task)
+            save_animation(done.frames, path, seconds_per_frame=CONTROL_PERIOD * settings.record_every)
             self._write_caption(path, record)
         return record
 
-    def _is_filmed(self, phase: Phase, learned: int, task: int) -> bool:
+    def _is_filmed(self, key: Mapping[str, Any]) -> bool:
         last = len(self._context.tasks) - 1
-        return bool(self._context.eval.record_every) and phase == "matrix" and learned in (task, last)
+        wanted = self._context.eval.record_every and key["phase"] == "matrix"
+        return bool(wanted) and key["learned"] in (key["task"], last)
 
     def _video(self, learned: int, task: int) -> Path:
         return self._context.directory.videos / f"task_{task:02d}_after_{learned:02d}.webp"

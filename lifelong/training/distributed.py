@@ -67,16 +67,15 @@ class Ranks:
             device = torch.device(name)
         except (RuntimeError, ValueError) as error:
             raise ConfigError(f"device is {name!r}; valid: auto, cpu, cuda, cuda:<number>") from error
-        if device.type == "cpu" or (device.type == "mps" and torch.backends.mps.is_available()):
+        if device.type == "cpu":
             return device
-        if device.type == "mps":
-            raise ConfigError(
-                f"device={name}, but torch finds no Metal device; use device=auto or device=cpu"
-            )
-        if device.type != "cuda":  # such as meta, which holds no values
+        if device.type not in ("cuda", "mps"):  # such as meta, which holds no values
             raise ConfigError(f"device is {name!r}; valid: auto, cpu, cuda, cuda:<number>")
-        if not torch.cuda.is_available():
-            raise ConfigError(f"device={name}, but torch finds no GPU; use device=auto or device=cpu")
+        what, found = ("GPU", torch.cuda) if device.type == "cuda" else ("Metal device", torch.backends.mps)
+        if not found.is_available():
+            raise ConfigError(f"device={name}, but torch finds no {what}; use device=auto or device=cpu")
+        if device.type == "mps":
+            return device
         if (device.index or 0) >= (count := torch.cuda.device_count()):
             raise ConfigError(f"device={name}, but this machine has {count} GPUs, counted from 0")
         return device if self.size == 1 else self._own_gpu(device)

@@ -2,10 +2,9 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import count
 from typing import Any
 
 import torch
@@ -110,44 +109,35 @@ def fit(
     steps, windows = _epoch_size(len(dataset), settings)
     first, loss, penalty = 0, math.nan, 0.0
     if resume is not None:
-        first, loss, penalty = _load(policy, optimizer, resume)
+        load_weights(policy, resume["policy"], "the training state")
+        _load_optimizer(optimizer, resume["optimizer"])
+        first, loss, penalty = resume["epoch"], resume["loss"], resume["penalty"]
     elif settings.statistics_first:
         with seeded(*seed, 0, 2, device=device), float32_products(settings.precision):
             _adapt_statistics(policy, dataset, algorithm, size, augment, generator(*seed, 0, 3))
     own_draws = () if ranks.first else (ranks.rank,)  # dropout differs between ranks
     on_epoch(EpochEnd(first, loss, penalty, 0.0, policy, optimizer))
     make_bar = partial(tqdm, desc=progress, disable=progress is None, unit="step", leave=False)
-    with make_bar(total=settings.epochs * steps, initial=first * steps) as bar:
+    total = settings.epochs * steps
+    with make_bar(total=total, initial=first * steps) as bar:
         for epoch in range(first, settings.epochs):
             began, draws = time.perf_counter(), generator(*seed, epoch, 0)
             order = _shuffled_indices(len(dataset), windows, draws)
             default_step.synchronise()
             algorithm.mode_train(policy)
+            losses: list[Tensor] = []  # of the policy, and the penalty
             with seeded(*seed, epoch, 1, *own_draws, device=device), float32_products(settings.precision):
-                rates = _rates(epoch, steps, settings)
-                losses = _take_steps(step, load(order.split(size)), rates, draws, bar)
-            loss, penalty = ranks.sum(losses.mean(0)).tolist()
-            _require_finite(loss)
+                for number, batch in enumerate(load(order.split(size)), epoch * steps):
+                    rate = learning_rate(number, total, settings, epoch * steps)
+                    losses.append(torch.stack(step(batch, draws, rate)))
+                    bar.update()
+            loss, penalty = ranks.sum(torch.stack(losses).mean(0)).tolist()
+            if not math.isfinite(loss):
+                raise TrainingError(
+                    f"the loss is {loss}: lower train.lr or algo.strength, or set train.precision=fp32"
+                )
             bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
             on_epoch(EpochEnd(epoch + 1, loss, penalty, time.perf_counter() - began, policy, optimizer))
-
-
-def _take_steps(
-    step: TrainStep, batches: Iterable[Batch], rates: Iterator[float], draws: torch.Generator, bar: tqdm
-) -> Tensor:
-    """Make a step with each batch; return the policy's loss and the penalty of each, (steps, 2)."""
-    losses = []
-    for batch in batches:
-        losses.append(torch.stack(step(batch, draws, next(rates))))
-        bar.update()
-    return torch.stack(losses)
-
-
-def _require_finite(loss: float) -> None:
-    if not math.isfinite(loss):
-        raise TrainingError(
-            f"the loss is {loss}: lower train.lr or algo.strength, or set train.precision=fp32"
-        )
 
 
 def _epoch_size(windows: int, settings: FitSettings) -> tuple[int, int]:
@@ -155,13 +145,6 @@ def _epoch_size(windows: int, settings: FitSettings) -> tuple[int, int]:
     steps = settings.steps_per_epoch or math.ceil(windows / settings.batch_size)
     short = settings.last_batch == "short" and not settings.steps_per_epoch
     return steps, windows if short else steps * settings.batch_size
-
-
-def _rates(epoch: int, steps: int, settings: FitSettings) -> Iterator[float]:
-    """Yield the learning rate of each step of an epoch, without end."""
-    first = epoch * steps
-    for number in count(first):
-        yield learning_rate(number, settings.epochs * steps, settings, first)
 
 
 def learning_rate(step: int, total: int, settings: FitSettings, epoch_start: int = 0) -> float:
@@ -228,13 +211,6 @@ def _make_optimizer(
         betas=tuple(settings.betas),
         weight_decay=settings.weight_decay,
     )
-
-
-def _load(policy: Policy, optimizer: torch.optim.AdamW, state: dict[str, Any]) -> tuple[int, float, float]:
-    """Load a state from `EpochEnd.state`; return its epoch, loss and penalty."""
-    load_weights(policy, state["policy"], "the training state")
-    _load_optimizer(optimizer, state["optimizer"])
-    return state["epoch"], state["loss"], state["penalty"]
 
 
 def _load_optimizer(optimizer: torch.optim.AdamW, state: dict[str, Any]) -> None:
