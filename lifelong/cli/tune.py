@@ -90,12 +90,14 @@ def tune(request: TuneRequest) -> None:
     """Measure all values and write table, picture, JSON file and the chosen value."""
     import torch
 
-    from lifelong.composition import compose_run, config_folder, swept
+    from lifelong.composition import compose_run, config_folder, config_folders, swept
     from lifelong.settings import Configuration, plain_data
     from lifelong.tuning.frontier import draw_frontier, render, write_frontier, write_tuned
     from lifelong.tuning.proxy import ProxySettings, check_obeyed, measure_frontier
 
-    lists = swept(request.overrides)
+    lists = swept(request.overrides, config_folders(request.config_dir))
+    if empty := [key for key, found in lists.items() if not found]:
+        raise ConfigError(f"{empty[0]} lists no values to try; write them out, such as {empty[0]}=V1,V2")
     words = [word for word in request.overrides if word.partition("=")[0] not in lists]
     for key in (word.lstrip("+~").partition("=")[0] for word in words):
         # a preset may set them for the runs

@@ -98,7 +98,11 @@ def embed(
     if numbered:
         texts = [f"Task {number}" for number in range(1, len(texts) + 1)]
     if model == "onehot":
-        return _one_hot(len(texts), dim)
+        if dim is not None and dim < len(texts):
+            raise LanguageError(
+                f"onehot of dimension {dim} cannot distinguish {len(texts)} texts; set dim to {len(texts)} or more"
+            )
+        return torch.eye(len(texts), dim or len(texts))
     if model == "minilm":
         return _minilm(texts, cache_dir)
     if model not in _HUB_NAMES and not Path(model).is_dir():
@@ -139,15 +143,6 @@ def encode_minilm(texts: Sequence[str], folder: Path) -> Tensor:
     """
     means = [output.last_hidden_state.mean(1) for output in _outputs(texts, str(folder))]
     return functional.normalize(torch.cat(means), dim=-1)
-
-
-def _one_hot(count: int, dim: int | None) -> Tensor:
-    dim = count if dim is None else dim
-    if dim < count:
-        raise LanguageError(
-            f"onehot of dimension {dim} cannot distinguish {count} texts; set dim to {count} or more"
-        )
-    return torch.eye(count, dim)
 
 
 def _minilm(texts: Sequence[str], cache_dir: str | Path | None) -> Tensor:
@@ -192,14 +187,13 @@ def _cached(
 
 def _stored(path: Path) -> Tensor | None:
     """Return an embedding of the cache; None where there is none that is intact."""
-    stored = read_cache(path, _is_embedding)
+
+    def is_embedding(arrays: dict[str, np.ndarray]) -> bool:
+        kinds = {name: (a.ndim, a.dtype, a.size > 0) for name, a in arrays.items()}
+        return kinds == {"embedding": (1, np.float32, True)}
+
+    stored = read_cache(path, is_embedding)
     return None if stored is None else torch.from_numpy(stored["embedding"])
-
-
-def _is_embedding(arrays: dict[str, np.ndarray]) -> bool:
-    return set(arrays) == {"embedding"} and all(
-        a.ndim == 1 and a.size > 0 and a.dtype == np.float32 for a in arrays.values()
-    )
 
 
 def _fingerprint(name: str) -> str:
@@ -221,12 +215,8 @@ def _run_transformer(texts: Sequence[str], name: str, pad_to: int = 0) -> Tensor
     """
     rows = []
     for output in _outputs(texts, name, pad_to):
-        if getattr(output, "text_embeds", None) is not None:
-            rows.append(output.text_embeds)
-        elif getattr(output, "pooler_output", None) is not None:
-            rows.append(output.pooler_output)
-        else:
-            rows.append(output.last_hidden_state[:, -1])
+        chosen = (getattr(output, kind, None) for kind in ("text_embeds", "pooler_output"))
+        rows.append(next((row for row in chosen if row is not None), output.last_hidden_state[:, -1]))
     return torch.cat(rows)
 
 

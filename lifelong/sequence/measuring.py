@@ -143,9 +143,10 @@ class Evaluator:
         return record
 
     def _is_filmed(self, key: Mapping[str, Any]) -> bool:
-        last = len(self._context.tasks) - 1
+        """Return whether rollouts are filmed: those of a task just learned, and those at the end."""
         wanted = self._context.eval.record_every and key["phase"] == "matrix"
-        return bool(wanted) and key["learned"] in (key["task"], last)
+        learned = next(stage[-1] for stage in self._stages if key["task"] in stage)
+        return bool(wanted) and key["learned"] in (learned, len(self._context.tasks) - 1)
 
     def _video(self, learned: int, task: int) -> Path:
         return self._context.directory.videos / f"task_{task:02d}_after_{learned:02d}.webp"

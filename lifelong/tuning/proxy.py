@@ -246,11 +246,12 @@ def _train(
     for number, phase in enumerate(algorithm.phases()):
         algorithm.begin_phase(phase, policy)
         epochs = max(1, round(settings.epochs * phase.share))
+        adapts = settings.statistics_first and not number
         fit(
             policy,
             windows,
             algorithm,
-            settings=replace(settings, epochs=epochs),
+            settings=replace(settings, epochs=epochs, statistics_first=adapts),
             seed=(seed, FIT, task, number),
             augment=algorithm.augment,
         )

@@ -234,6 +234,10 @@ def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorit
         for epoch in (0, 1)
     }
     assert [r.task for r in results.of(TaskEndRecord)] == [1, 3]
+    filmed = {path.stem for path in (tmp_path / "whole" / "videos").glob("*.webp")}
+    assert filmed == {
+        f"task_0{task}_after_0{last}" for last, task in ((1, 0), (1, 1), *((3, k) for k in range(4)))
+    }
 
 
 def test_metrics_count_a_group_as_one_task(tmp_path) -> None:

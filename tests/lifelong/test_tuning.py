@@ -241,6 +241,16 @@ def test_tasks_are_met_and_readings_normalised_as_in_a_run(
     assert list(dict.fromkeys(met)) == [task.language for task in STREAM]
 
 
+def test_statistics_adapt_before_the_first_phase_alone_as_in_a_run(tmp_path, monkeypatch) -> None:
+    config = plain_data(composed(*TINY, "algo=packnet", "train.statistics_first=true"))
+    spec, found = Configuration(config).build("data").spec(384), []
+    windows = tuple(make_windows(task, spec) for task in range(2))
+    data = StreamData(spec, windows, tuple(w.batch(torch.arange(8)) for w in windows))
+    monkeypatch.setattr(proxy, "fit", lambda *_, settings, **rest: found.append(settings.statistics_first))
+    measure(Trial(config, STREAM, 1, 2, 0.25), lambda: data, tmp_path)
+    assert found == [True, False, True, False]
+
+
 # --- what is typed wrongly
 
 
@@ -287,6 +297,7 @@ def test_lists_of_values_are_found_and_others_are_left() -> None:
     (["algo=ewc", "--suite", "own", "--stream", "0,1"], "unknown suite 'own'"),
     (["algo=multitask", "train.lr=1e-3,2e-3"], "several tasks together"),
     (["algo=ewc", "algo.strength=[1"], "["),
+    (["algo=ewc", "algo.strength=interval(1,2)"], "algo.strength lists no values to try"),
 ])  # fmt: skip
 def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> None:
     assert tune(*TRAINED, *words, "--steps", "1", "--beside", "--out", str(tmp_path)) != 0
