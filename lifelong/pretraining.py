@@ -23,10 +23,12 @@ from lifelong.tracking import Tracker
 from lifelong.types import PolicySpec
 
 _ROUTED = ("clare", "dmpel", "iscil")
-# keys that decide what a policy reads, of which weights with the same shapes may differ
+# keys that decide what a policy reads and what it makes of it, whose values do not show in the shapes of weights
 INPUTS = (
     *("language.model", "language.numbered", "language.pad_to", "data.views", "data.proprio"),
-    *("policy.encoder.pixels", "policy.normalise_proprio", "policy.standardise_language"),
+    *(f"policy.encoder.{key}" for key in ("pixels", "stem_stride", "stem_pool", "temperature", "rectify")),
+    *("policy.temporal.heads", "policy.spatial.heads"),
+    *("policy.normalise_proprio", "policy.standardise_language"),
 )
 
 

@@ -1,7 +1,6 @@
 """Actors of rollouts: what answers observations with actions, such as a policy of this package."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -110,8 +109,7 @@ class PolicyActor:
 
     def act(self, obs: Obs) -> np.ndarray:
         """Return (B, A) float64 actions; see `Actor`."""
-        with self._computing():
-            return _array(self.policy.act(self._observe(obs), self.draws))
+        return self._compute(obs, lambda seen: self.policy.act(seen, self.draws))
 
     def plan(
         self, obs: Obs, rows: Sequence[int], before: Mapping[int, tuple[np.ndarray, int]] | None = None
@@ -126,20 +124,13 @@ class PolicyActor:
         unfinished: dict[int, Unfinished] | None = None
         if before is not None:
             unfinished = {i: Unfinished(torch.from_numpy(left), delay) for i, (left, delay) in before.items()}
-        with self._computing():
-            return _array(self.policy.plan(self._observe(obs), rows, self.draws, unfinished))
+        return self._compute(obs, lambda seen: self.policy.plan(seen, rows, self.draws, unfinished))
 
-    def _observe(self, obs: Obs) -> Observation:
-        return observe(obs, self.policy.spec, self.language, self.device)
-
-    @contextmanager
-    def _computing(self) -> Iterator[None]:
+    def _compute(self, obs: Obs, answer: Callable[[Observation], Tensor]) -> np.ndarray:
+        """Return what the policy answers to an observation, float64, in its precision."""
+        seen = observe(obs, self.policy.spec, self.language, self.device)
         with autocast(self.device, self.precision), float32_products(self.precision):
-            yield
-
-
-def _array(actions: Tensor) -> np.ndarray:
-    return actions.cpu().numpy().astype(np.float64)
+            return answer(seen).cpu().numpy().astype(np.float64)
 
 
 def observe(obs: Obs, spec: PolicySpec, language: Tensor, device: torch.device) -> Observation:

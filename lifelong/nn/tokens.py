@@ -4,6 +4,7 @@ Shape legend: B batch, T time, L language embedding, D one modality's dimension,
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -92,19 +93,9 @@ class ProprioScaling(nn.Module):
 class ProprioTokens(nn.Module):
     """One token per modality: a linear map to E numbers (`dim`) of the reading, scaled by `ProprioScaling`."""
 
-    def __init__(
-        self,
-        *,
-        proprio: Mapping[str, int],
-        dim: int,
-        normalise: bool = True,
-        dropout: float = 0.0,
-        measured: bool = False,
-    ) -> None:
+    def __init__(self, *, proprio: Mapping[str, int], dim: int, **scaling: Any) -> None:
         super().__init__()
-        self.scaling = ProprioScaling(
-            proprio=proprio, normalise=normalise, dropout=dropout, measured=measured
-        )
+        self.scaling = ProprioScaling(proprio=proprio, **scaling)
         self.linears = nn.ModuleDict({name: nn.Linear(size, dim) for name, size in proprio.items()})
 
     def forward(self, proprio: Mapping[str, Tensor]) -> list[Tensor]:

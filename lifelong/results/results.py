@@ -275,17 +275,13 @@ class Results:
 
         Evaluation is that while and after learning the task.
         """
-        costs = {
-            task: self.costs(task) | {"training_seconds": 0.0, "evaluation_seconds": 0.0}
+        losses, evaluations = self.of(LossRecord), self.of(EvalRecord)
+        return {
+            task: self.costs(task)
+            | {"training_seconds": sum((r.seconds for r in losses if r.task == task), 0.0)}
+            | {"evaluation_seconds": sum((r.seconds for r in evaluations if r.learned == task), 0.0)}
             for task in sorted({r.task for r in self.of(CostRecord)})
         }
-        for r in self.of(LossRecord):
-            if r.task in costs:
-                costs[r.task]["training_seconds"] += r.seconds
-        for r in self.of(EvalRecord):
-            if r.learned in costs:
-                costs[r.learned]["evaluation_seconds"] += r.seconds
-        return costs
 
     def subgoals(self) -> Subgoals:
         """Return how often parts of the goals of the tasks learned so far were reached, and forgotten."""

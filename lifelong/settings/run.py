@@ -11,6 +11,7 @@ from libero_env.errors import UnknownNameError
 from libero_env.tasks import Suite, Task, get_suite, suite_names
 from libero_env.tasks.suites import OWN, read_suite
 from libero_env.validation import checked
+from lifelong.data.settings import require_switched_on
 from lifelong.errors import ConfigError
 from lifelong.types import Count, Natural, PathText
 
@@ -133,11 +134,7 @@ class PretrainSettings:
     epochs: Count | None = None
 
     def __post_init__(self) -> None:
-        for key in ("tasks", "demos", "epochs"):
-            if self.suite is None and getattr(self, key) is not None:
-                raise ConfigError(
-                    f"pretrain.{key} has no effect without pretrain.suite; leave it out, or use pretrain=libero_90"
-                )
+        require_switched_on(self, "pretrain", suite=("tasks", "demos", "epochs"))
 
     def sequence(self) -> tuple[Task, ...]:
         """Return the tasks; none without pretraining.

@@ -376,7 +376,8 @@ def test_orders_by_seed_hold_the_same_tasks():
 @pytest.mark.parametrize("word", [
     "language.numbered=true", "language.model=bert", "data.views=[eye_in_hand_rgb,agentview_rgb]",
     "data.proprio=[ee_pos,gripper_states,joint_states]", "policy.encoder.pixels=libero",
-    "policy.normalise_proprio=false", "policy.standardise_language=false"
+    "policy.normalise_proprio=false", "policy.standardise_language=false", "policy.encoder.temperature=0.2",
+    "policy.encoder.stem_pool=true", "policy.temporal.heads=8"
 ])  # fmt: skip
 def test_weights_that_were_learned_with_other_inputs_of_the_same_shapes_are_refused(tmp_path, word) -> None:
     run = RunDirectory(tmp_path / "run")
