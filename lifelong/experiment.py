@@ -318,8 +318,11 @@ def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Ma
     with context.envs:
         TaskSequence(context, datasets, prepare=lambda: _pretrain(pretraining, context, plain)).run()
     if context.ranks.first:
-        seconds = time.perf_counter() - began
-        context.directory.log.append(RunEndRecord(seconds=seconds, finished=utc_now()))
+        _record_end(context, began)
+
+
+def _record_end(context: RunContext, began: float) -> None:
+    context.directory.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
 
 
 def _open_datasets(context: RunContext, others: Sequence[Task], learned: bool = False) -> DemoDatasets:
@@ -343,8 +346,7 @@ def _find_demos(
     own = (context.tasks, context.demos, context.perturbed, context.data, context.progress)
     paths, copies = perturb_demos(recorded, *own), demo_copies(recorded, *own)
     _record_demonstrations(context, recorded, learned)
-    seconds = time.perf_counter() - began
-    context.directory.log.append(PhaseRecord(phase="demos", seconds=seconds))
+    context.directory.log.append(PhaseRecord(phase="demos", seconds=time.perf_counter() - began))
     return paths, copies
 
 
@@ -386,8 +388,7 @@ def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mappin
             _record_start(pretraining, names, config)
         TaskSequence(pretraining, _open_datasets(pretraining, context.tasks, done)).run(evaluate=False)
         if not done and ranks.first:
-            seconds = time.perf_counter() - began
-            directory.log.append(RunEndRecord(seconds=seconds, finished=utc_now()))
+            _record_end(pretraining, began)
     if ranks.first:
         seconds = time.perf_counter() - began
         context.directory.log.append(PhaseRecord(phase="pretrain", seconds=seconds))

@@ -89,7 +89,7 @@ class CheckpointFolder:
             DamagedCheckpointError: The file is damaged, or no checkpoint.
             CheckpointError: The file is missing, or belongs to another task or run.
         """
-        state = self._checked(checkpoints.load(path, device), _TASK, path)
+        state = self._load(path, _TASK, device)
         if path.stem.startswith("task_") and path.name != self.task_path(state["task"]).name:
             raise CheckpointError(
                 f"{path} was written after task {state['task']}: checkpoints were exchanged or renamed. Put the "
@@ -99,12 +99,11 @@ class CheckpointFolder:
 
     def load_progress(self, path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
         """Return the state in `progress_path` or `previous_path`; errors are those of `load_task`."""
-        return self._checked(checkpoints.load(path, device), _PROGRESS, path)
+        return self._load(path, _PROGRESS, device)
 
     def load_best(self, device: torch.device | str = "cpu") -> dict[str, Any]:
         """Return the state in `best_path`; errors are those of `load_task`."""
-        state = checkpoints.load(self.best_path, device)
-        return self._checked(state, _BEST, self.best_path)
+        return self._load(self.best_path, _BEST, device)
 
     def set_aside(self, path: Path) -> Path:
         """Give a damaged checkpoint a name under which nothing reads it, and return that."""
@@ -112,7 +111,8 @@ class CheckpointFolder:
         os.replace(path, target)
         return target
 
-    def _checked(self, state: dict[str, Any], form: Any, path: Path) -> dict[str, Any]:
+    def _load(self, path: Path, form: Any, device: torch.device | str) -> dict[str, Any]:
+        state = checkpoints.load(path, device)
         checkpoints.check(state, form, path)
         known = self._run()
         if None not in (known, state["run"]) and state["run"] != known:

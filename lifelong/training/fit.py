@@ -2,9 +2,10 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import count
 from typing import Any
 
 import torch
@@ -125,19 +126,27 @@ def fit(
             order = _shuffled_indices(len(dataset), windows, draws)
             default_step.synchronise()
             algorithm.mode_train(policy)
-            losses: list[Tensor] = []  # of the policy, and the penalty
+            rates = (learning_rate(n, total, settings, epoch * steps) for n in count(epoch * steps))
             with seeded(*seed, epoch, 1, *own_draws, device=device), float32_products(settings.precision):
-                for number, batch in enumerate(load(order.split(size)), epoch * steps):
-                    rate = learning_rate(number, total, settings, epoch * steps)
-                    losses.append(torch.stack(step(batch, draws, rate)))
-                    bar.update()
-            loss, penalty = ranks.sum(torch.stack(losses).mean(0)).tolist()
+                losses = _take_steps(step, load(order.split(size)), rates, draws, bar)
+            loss, penalty = ranks.sum(losses.mean(0)).tolist()
             if not math.isfinite(loss):
                 raise TrainingError(
                     f"the loss is {loss}: lower train.lr or algo.strength, or set train.precision=fp32"
                 )
             bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
             on_epoch(EpochEnd(epoch + 1, loss, penalty, time.perf_counter() - began, policy, optimizer))
+
+
+def _take_steps(
+    step: TrainStep, batches: Iterable[Batch], rates: Iterator[float], draws: torch.Generator, bar: tqdm
+) -> Tensor:
+    """Make a step with each batch; return the policy's loss and the penalty of each, (steps, 2)."""
+    losses = []
+    for batch in batches:
+        losses.append(torch.stack(step(batch, draws, next(rates))))
+        bar.update()
+    return torch.stack(losses)
 
 
 def _epoch_size(windows: int, settings: FitSettings) -> tuple[int, int]:
