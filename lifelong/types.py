@@ -106,6 +106,9 @@ class Observation:
         return self.map(partial(to_device, device=device))
 
 
+_COLUMNS = ("actions", "task_ids", "window_ids", "is_pad")  # of a batch, beside its observation
+
+
 @dataclass(frozen=True)
 class Batch:
     """Windows of demonstrations, as the loss takes them.
@@ -130,10 +133,9 @@ class Batch:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "Batch":
         """Return the batch with every tensor changed."""
-        rest = (change(x) for x in (self.actions, self.task_ids, self.window_ids))
-        return Batch(
-            self.observation.map(change), *rest, None if self.is_pad is None else change(self.is_pad)
-        )
+        known = [name for name in _COLUMNS if getattr(self, name) is not None]
+        changed = {name: change(getattr(self, name)) for name in known}
+        return replace(self, observation=self.observation.map(change), **changed)
 
     def to(self, device: torch.device | str) -> "Batch":
         """Return the batch on another device."""
@@ -157,8 +159,7 @@ class Batch:
             {k: torch.cat([a.proprio[k], b.proprio[k]]) for k in a.proprio},
             torch.cat([a.language, b.language]),
         )
-        names = ("actions", "task_ids", "window_ids")
-        rest = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in names}
+        rest = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in _COLUMNS[:3]}
         known = self.is_pad is not None or other.is_pad is not None
         is_pad = torch.cat([self.padding(), other.padding()]) if known else None
         return replace(self, observation=joined, is_pad=is_pad, **rest)

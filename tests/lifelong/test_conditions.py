@@ -93,16 +93,17 @@ def test_a_resume_with_other_demonstrations_is_told(tmp_path):
 
 def test_a_resumed_run_takes_over_the_threads_that_it_was_started_with(tmp_path, threads, capsys):
     run = write(tmp_path, changed(threads=str(threads + 1))).path.parent
-    experiment._set_threads(SETTINGS, run)
-    assert torch.get_num_threads() == threads + 1
+    with experiment._threads(SETTINGS, run):
+        assert torch.get_num_threads() == threads + 1
+    assert torch.get_num_threads() == threads
     assert f"threads={threads + 1}, as when this run was started" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("settings", [{"threads": 3}, {"resume": False}])
 def test_threads_that_are_named_and_new_runs_take_nothing_over(settings, tmp_path, threads):
     run = write(tmp_path, changed(threads="7")).path.parent
-    experiment._set_threads(replace(SETTINGS, **settings), run)
-    assert torch.get_num_threads() == settings.get("threads", threads)
+    with experiment._threads(replace(SETTINGS, **settings), run):
+        assert torch.get_num_threads() == settings.get("threads", threads)
 
 
 @pytest.mark.parametrize("recorded", ["", "0", "-1", "two", "99999999999"])
