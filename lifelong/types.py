@@ -106,7 +106,7 @@ class Observation:
         return self.map(partial(to_device, device=device))
 
 
-_COLUMNS = ("actions", "task_ids", "window_ids", "is_pad")  # of a batch, beside its observation
+_COLUMNS = ("actions", "task_ids", "window_ids")  # of every batch, beside its observation
 
 
 @dataclass(frozen=True)
@@ -133,9 +133,9 @@ class Batch:
 
     def map(self, change: Callable[[Tensor], Tensor]) -> "Batch":
         """Return the batch with every tensor changed."""
-        known = [name for name in _COLUMNS if getattr(self, name) is not None]
-        changed = {name: change(getattr(self, name)) for name in known}
-        return replace(self, observation=self.observation.map(change), **changed)
+        changed = {name: change(getattr(self, name)) for name in _COLUMNS}
+        is_pad = None if self.is_pad is None else change(self.is_pad)
+        return replace(self, observation=self.observation.map(change), is_pad=is_pad, **changed)
 
     def to(self, device: torch.device | str) -> "Batch":
         """Return the batch on another device."""
@@ -159,7 +159,7 @@ class Batch:
             {k: torch.cat([a.proprio[k], b.proprio[k]]) for k in a.proprio},
             torch.cat([a.language, b.language]),
         )
-        rest = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in _COLUMNS[:3]}
+        rest = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in _COLUMNS}
         known = self.is_pad is not None or other.is_pad is not None
         is_pad = torch.cat([self.padding(), other.padding()]) if known else None
         return replace(self, observation=joined, is_pad=is_pad, **rest)
