@@ -168,7 +168,8 @@ def recorded_threads(results: Results) -> int | None:
 def changed_conditions(first: RunRecord, later: RunRecord) -> list[str]:
     """Return what differs between two starts of a run that decides its bits, such as `torch 2.12.0 -> 2.13.0`."""
     was, now = all_conditions(first), all_conditions(later)
-    return [
+    pairs = zip(first.instructions, later.instructions, strict=True)  # of task files, which may be edited
+    return [f"instruction {old!r} -> {new!r}" for old, new in pairs if old != new] + [
         f"{name.replace('_', ' ')} {was.get(name, 'none')} -> {now.get(name, 'none')}"
         for name in {**was, **now}
         if was.get(name) != now.get(name)

@@ -275,7 +275,7 @@ class Results:
 
         Evaluation is that while and after learning the task.
         """
-        losses, evaluations = self.of(LossRecord), self.of(EvalRecord)
+        losses, evaluations = self.of(LossRecord), [r for r in self.of(EvalRecord) if r.phase != "initial"]
         return {
             task: self.costs(task)
             | {"training_seconds": sum((r.seconds for r in losses if r.task == task), 0.0)}

@@ -224,9 +224,7 @@ class TaskSequence:
         under = [self.evaluator.evaluate("shift", task, seen, best) for seen in shifted]
         if results.task_end(task) is None:
             spent = sum(r.seconds for r in results.of(LossRecord) if r.task == task)
-            done = [*row, *under]
-            spent += sum(r.seconds for r in results.of(EvalRecord) if r.learned == task and r not in done)
-            spent += sum(r.seconds for r in done)
+            spent += sum(r.seconds for r in self.log.read().of(EvalRecord) if r.learned == task)
             self.log.append(TaskEndRecord(task=task, best_epoch=best, seconds=spent))
         new, mean = mean_rate([r for r in row if r.task in stage]), mean_rate(row)
         whole = mean if len(row) == task + 1 else math.nan  # of a part of the tasks it is another number

@@ -73,6 +73,12 @@ def test_a_resume_under_other_conditions_is_told(tmp_path):
     assert "bits differ" in note and note in load_run(tmp_path).notes, "the report shows it"
 
 
+def test_a_resume_with_other_instructions_is_told(tmp_path):
+    """Task files may be edited meanwhile."""
+    (note,) = resume_notes(write(tmp_path, START, replace(START, instructions=("other words",))).read())
+    assert f"(instruction {START.instructions[0]!r} -> 'other words')" in note
+
+
 def test_the_same_conditions_say_nothing(tmp_path):
     assert resume_notes(write(tmp_path, START, START).read()) == []
 

@@ -327,3 +327,9 @@ def test_evaluations_without_episodes_are_refused():
         evaluation("curve", 0, 0, 0, 0, episodes=0)
     with pytest.raises(ValueError, match="is one of curve, matrix, unseen, initial, shift, not 'test'"):
         evaluation("test", 0, 0, 0, 0)
+
+
+def test_rollouts_before_the_first_task_are_no_cost_of_it() -> None:
+    before, after = evaluation("initial", 0, 0, 1, 0), evaluation("matrix", 0, 5, 0, 3)
+    results = Results((run_start("ab"), CostRecord(task=0, costs={"parameters": 1.0}), before, after))
+    assert results.costs_by_task()[0]["evaluation_seconds"] == after.seconds
