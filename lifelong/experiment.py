@@ -31,6 +31,7 @@ from lifelong.pretraining import policy_at_start, pretraining_context
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import (
+    all_conditions,
     changed_conditions,
     changed_demonstrations,
     present_conditions,
@@ -381,6 +382,8 @@ def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mappin
     config, suite = {key: plain[key] for key in PRETRAIN_KEYS}, str(plain["pretrain"]["suite"])
     with _held(pretraining, config, resume=True):
         done = ranks.broadcast(lambda: directory.log.read().finished)
+        if done and ranks.first:
+            _compare_conditions(pretraining, context)
         if not done and ranks.first:
             count = len(pretraining.tasks)
             print(f"Before the sequence: {count} tasks of {suite} in {directory.path}", flush=True)
@@ -392,6 +395,18 @@ def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mappin
     if ranks.first:
         seconds = time.perf_counter() - began
         context.directory.log.append(PhaseRecord(phase="pretrain", seconds=seconds))
+
+
+def _compare_conditions(pretraining: RunContext, context: RunContext) -> None:
+    """Say where weights that were pretrained earlier come from other conditions than those of this run."""
+    starts = [one.directory.log.read().of(RunRecord)[-1:] for one in (pretraining, context)]
+    was, now = (all_conditions(found[0]) if found else {} for found in starts)
+    if differing := [name for name in {**was, **now} if was.get(name) != now.get(name)]:
+        print(
+            f"the weights in {pretraining.directory.path} were pretrained under other conditions than those of this "
+            f"run: {', '.join(differing)}",
+            file=sys.stderr,
+        )
 
 
 def _write_results(directory: RunDirectory, config: Mapping[str, Any]) -> None:

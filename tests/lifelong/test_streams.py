@@ -420,6 +420,20 @@ def test_runs_share_a_pretraining_with_embeddings_of_the_same_size(tmp_path, lan
     assert (len(folders) == 1) == shared
 
 
+def test_weights_that_were_pretrained_under_other_conditions_are_named(tmp_path, monkeypatch, capsys) -> None:
+    pretraining, context = (run_context(tmp_path / name, "sequential") for name in ("before", "run"))
+    monkeypatch.setattr(experiment, "TaskSequence", lambda *_: SimpleNamespace(run=lambda evaluate: None))
+    monkeypatch.setattr(experiment, "_open_datasets", lambda *_: None)
+    plain = dict.fromkeys(experiment.PRETRAIN_KEYS) | {"pretrain": {"suite": "libero_90"}}
+    pretraining.directory.log.append(run_start("abc", conditions={"source": "older", "threads": "2"}))
+    pretraining.directory.log.append(RunEndRecord(seconds=1.0, finished=utc_now()))
+    for source, said in (("older", ""), ("newer", "other conditions than those of this run: source\n")):
+        context.directory.log.append(run_start("abc", conditions={"source": source, "threads": "2"}))
+        experiment._pretrain(pretraining, context, plain)
+        err = capsys.readouterr().err
+        assert err.endswith(said) if said else not err
+
+
 def test_a_pretraining_is_not_shared_by_runs_with_other_demonstrations(tmp_path, monkeypatch) -> None:
     context = run_context(tmp_path, "sequential")
     monkeypatch.setattr(
