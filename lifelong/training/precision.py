@@ -5,7 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 
 import torch
@@ -86,18 +86,14 @@ def deterministic(on: bool) -> Iterator[None]:
     if not on:
         yield
         return
-    before = (
-        torch.are_deterministic_algorithms_enabled(),
-        torch.is_deterministic_algorithms_warn_only_enabled(),
-    )
+    before = torch.are_deterministic_algorithms_enabled()
+    warns = torch.is_deterministic_algorithms_warn_only_enabled()
     benchmark, workspace = torch.backends.cudnn.benchmark, os.environ.get(_CUBLAS)
     os.environ.setdefault(_CUBLAS, ":4096:8")
     torch.backends.cudnn.benchmark = False
     torch.use_deterministic_algorithms(True)
     try:
-        with ExitStack() as stack:
-            if torch.cuda.is_available():
-                stack.enter_context(sdpa_kernel(SDPBackend.MATH))
+        with sdpa_kernel(SDPBackend.MATH) if torch.cuda.is_available() else nullcontext():
             yield
     except RuntimeError as error:
         if "does not have a deterministic implementation" not in str(error):
@@ -106,7 +102,7 @@ def deterministic(on: bool) -> Iterator[None]:
             f"deterministic=true, but {str(error).splitlines()[0]} Use device=cpu or deterministic=false"
         ) from error
     finally:
-        torch.use_deterministic_algorithms(before[0], warn_only=before[1])
+        torch.use_deterministic_algorithms(before, warn_only=warns)
         torch.backends.cudnn.benchmark = benchmark
         if workspace is None:
             os.environ.pop(_CUBLAS, None)
