@@ -129,8 +129,10 @@ class TaskSequence:
 
     def _meet(self, number: int) -> None:
         """Tell the policy of a stage, and normalise it, see `meet`."""
-        context, ends = self.context, [stage[-1] for stage in self.stages]
-        last = ends[number]
+        context, ends, tasks = self.context, [stage[-1] for stage in self.stages], self.stages[number]
+        last = tasks[-1]
+        for task in tasks if len(tasks) > 1 else ():  # each by its own text
+            context.policy.meet_task(self.data.datasets[task], context.instructions[task])
         text, statistics = context.instructions[last], context.data.statistics
         meet(context.policy, self.data, ends, last, text, statistics, self._frames)
 

@@ -240,6 +240,16 @@ def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorit
     }
 
 
+def test_a_policy_meets_each_of_the_tasks_that_are_learned_together(tmp_path) -> None:
+    """A policy that reads texts knows them by the embeddings in the windows."""
+    context, met = four(tmp_path, Sequential()), {}
+    embedding = lambda windows: tuple(windows.batch(torch.tensor([0])).observation.language[0].tolist())  # noqa: E731
+    context.policy.meet_task = lambda windows, text: met.setdefault(embedding(windows), text)
+    sequence(context).run()
+    texts = zip(context.languages, context.instructions, strict=True)
+    assert met == {tuple(language.tolist()): text for language, text in texts}
+
+
 def test_metrics_count_a_group_as_one_task(tmp_path) -> None:
     log = ResultLog(tmp_path / "results.jsonl")
     log.append(run_start("abcd", group_sizes=(2, 2)))
