@@ -27,12 +27,12 @@ from libero_env.init_states.store import load_init_states
 from libero_env.memory import require_memory
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.episodes import TRIES
-from libero_env.perturbations.events import NEVER, has_begun, require_moment
+from libero_env.perturbations.events import NEVER, PHASES, has_begun, require_moment
 from libero_env.perturbations.kinds import start_name
 from libero_env.sim.engine import Goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward
-from libero_env.sim.scene import BUFFER_SIDE, InitialStates
+from libero_env.sim.scene import BUFFER_SIDE, InitialStates, ground
 from libero_env.sim.simulation import Indices, Watch
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.tasks import Task
@@ -183,6 +183,7 @@ class BatchEnv(LiberoVectorEnv):
         self._progress = np.zeros((num, len(self.atoms)), bool)
         triggers = [one.trigger for one in self.perturbed.perturbations] if self.perturbed is not None else []
         self._watched = any(triggers)
+        self._waits = not {*triggers}.isdisjoint(PHASES)
         for trigger in triggers:
             require_moment(trigger, config.horizon)
         self._moved = np.zeros(num, bool)
@@ -304,9 +305,13 @@ class BatchEnv(LiberoVectorEnv):
         """Return all that the rest of the episode in simulation i depends on, see `LiberoEnv.get_state`."""
         self.require_open()
         i = checked_index(i, self.num_envs)
-        began = [] if self.perturbed is None else self.perturbed.began[i]
-        memory = [history.memory[i].ravel() for history in self._histories]
-        return np.concatenate([self.simulations.get_state(i), [self._steps[i]], began, *memory])
+        seen = [self.watch.memory(i)] if self._waits else []
+        return np.concatenate([self.simulations.get_state(i), *self._kept(i), *seen])
+
+    def _kept(self, i: int) -> list[np.ndarray]:
+        """Return views of the whole numbers that belong to an episode beside its simulation."""
+        perturbed = [] if self.perturbed is None else self.perturbed.kept(i)
+        return [self._steps[i : i + 1], *perturbed, *(one.memory[i].ravel() for one in self._histories)]
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Restore a state in simulation i; see `LiberoEnv.set_state`.
@@ -318,25 +323,26 @@ class BatchEnv(LiberoVectorEnv):
         i, state = checked_index(i, self.num_envs), self._checked_state(state)
         self._running[i] = False
         self._errors.pop(i, None)
-        size, began = self.simulations.state_size, np.zeros(0)
         self._forget(np.array([i]))
-        if state.size > size:
-            self.simulations.set_state(i, state[:size])
-            events = 0 if self.perturbed is None else len(self.perturbed.events)
-            self._steps[i], began, memory = int(state[size]), *np.split(state[size + 1 :], [events])
-            for history in self._histories:
-                row = history.memory[i]
-                row[:], memory = memory[: row.size].reshape(row.shape), memory[row.size :]
+        kept, is_whole = self._kept(i), state.size > self.simulations.state_size
+        sizes = np.cumsum([self.simulations.state_size, *(part.size for part in kept)])
+        simulation, *values, seen = np.split(state, sizes)
+        if is_whole:
+            self.simulations.set_state(i, simulation)
+            for part, value in zip(kept, values, strict=True):
+                part[:] = value
         else:
             self.simulations.set_physics_state(i, state)
             self._steps[i] = 0
         if self.perturbed is not None:
-            self.perturbed.resume(i, int(self._steps[i]), began.astype(int) if began.size else NEVER)
+            self.perturbed.resume(i, int(self._steps[i]), begins=not is_whole)
             self.observer.set_appearance(i, self.perturbed.appearance(i))
         if self._watched:
             self.watch.goals[i] = self._goal_atoms(i)
             self.watch.begin(i)
-        if state.size <= size and any(history.memory.size for history in self._histories):
+        if is_whole and self._waits:
+            self.watch.recall(i, seen)
+        if not is_whole and any(history.memory.size for history in self._histories):
             self._goals_reached(np.array([i]))  # the first moment
         self._running[i], self._success[i] = True, False
 
@@ -431,13 +437,13 @@ class BatchEnv(LiberoVectorEnv):
 
     def _checked_state(self, state: object) -> np.ndarray:
         """Return a vector of `get_state`, or [time, qpos, qvel], as float64."""
-        model, steps = self.scene.model, self.simulations.state_size
-        size = steps + 1 + (0 if self.perturbed is None else len(self.perturbed.events))
-        size += sum(history.memory[0].size for history in self._histories)
+        model, first = self.scene.model, self.simulations.state_size
+        last = first + sum(part.size for part in self._kept(0))
+        size = last + (self.watch.memory(0).size if self._waits else 0)
         name = f"state of {self.task.id} (get_state, or [time, qpos, qvel])"
         array = checked_numbers(state, name, ((size,), (1 + model.nq + model.nv,)))
         _check_range(array, self.task)
-        counts = array[steps:] if array.size == size else np.zeros(1)
+        counts = array[first:last] if array.size == size else np.zeros(1)
         if not (counts[0] >= 0 and (counts >= NEVER).all() and (counts % 1 == 0).all()):
             raise InvalidInputError(
                 "a state ends with its number of steps, those before each event, and what the goal remembers; got "
@@ -493,8 +499,7 @@ class BatchEnv(LiberoVectorEnv):
         return self.later if changed and self.later is not None else self.task
 
     def _goal_atoms(self, i: int) -> tuple[Atom, ...]:
-        own = self.task_of(i).problem.goal.wanted()
-        return tuple(atom for atom in self.goals.atoms if atom in own)
+        return ground(self.task_of(i).problem.goal, self.scene).wanted()
 
     def _begin_events(self, ids: np.ndarray) -> None:
         """Let the events begin whose moment has come, before a control step."""

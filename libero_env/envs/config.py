@@ -14,9 +14,11 @@ from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.errors import InvalidInputError, require_known
 from libero_env.perturbations.appearance import CAMERA
 from libero_env.perturbations.episodes import checked_perturbations
+from libero_env.perturbations.filters import ActionDelay, ActionGain, ActionNoise
+from libero_env.perturbations.kinds import Kind
 from libero_env.perturbations.perturbation import Perturbation
 from libero_env.sim.backend import Backend
-from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
+from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS, IMAGES
 from libero_env.sim.predicates import SEMANTICS
 from libero_env.sim.scene import DRAWINGS
 from libero_env.tasks.cameras import camera_name, camera_text, distinct_cameras
@@ -133,13 +135,21 @@ class EnvConfig:
                 f"{_LARGEST_OBSERVED_WITHIN}, or observed={AFTER}"
             )
         is_seen = not self.cameras or CAMERA in map(camera_name, self.cameras)
-        for one in (one for one in self.perturb if isinstance(one, Perturbation)):
-            if one.kind in ("camera", "fov") and not is_seen:
+        images = {*self.observations} & {*IMAGES} if self.cameras else set()
+        for one in self.perturb:
+            kind = one.definition if isinstance(one, Perturbation) else one
+            if images and "rgb" not in images and getattr(kind, "only_rgb", False):
+                raise InvalidInputError(
+                    f"perturb={one} changes colours only, and observations={', '.join(self.observations)} have none: "
+                    "add rgb, or leave the perturbation out"
+                )
+            if getattr(one, "kind", "") in ("camera", "fov") and not is_seen:
                 raise InvalidInputError(
                     f"perturb={one} changes the camera {CAMERA}, which is not among cameras={', '.join(self.cameras)}; "
                     "add it, or leave the perturbation out"
                 )
-            if one.layer == "action" and not self.control_delta:
+            relative = isinstance(kind, ActionDelay | ActionGain | ActionNoise) or isinstance(kind, Kind)
+            if relative and kind.layer == "action" and not self.control_delta:
                 raise InvalidInputError(
                     f"perturb={one} changes how far relative actions move the arm; with control_delta=False they are "
                     "goals: leave control_delta=True"

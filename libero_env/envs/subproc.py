@@ -26,6 +26,7 @@ from libero_env.validation import validate
 
 EnvSpec = Mapping[str, Any] | Callable[[], gymnasium.Env]
 Seconds = Annotated[float, Field(gt=0, le=1e6)]
+_PERTURBED = ("attempts", "began", "moved")  # what perturbed environments tell in their infos
 Outcome = tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 
 
@@ -56,7 +57,8 @@ class SubprocEnv(LiberoVectorEnv):
 
     There is no autoreset: an environment whose episode is over does not move, and returns reward 0 until it is reset.
     Entries of observations whose shapes differ between environments, such as poses of their objects, are in
-    `info["own"]`, one dictionary for each environment; `observation_space` has the others.
+    `info["own"]`, one dictionary for each environment; `observation_space` has the others. `info["progress"]` and, with
+    perturbations, `attempts`, `began` and `moved` are lists of what each `LiberoEnv` tells.
 
     Args:
         specs: Arguments of the `LiberoEnv` of each environment, `{"task": "libero_object/0", ...}`; or a function that
@@ -140,6 +142,7 @@ class SubprocEnv(LiberoVectorEnv):
         self._running = np.zeros(self.num_envs, bool)
         self._success = np.zeros(self.num_envs, bool)
         self._progress: list[dict[str, bool]] = [{} for _ in specs]
+        self._perturbed: list[dict[str, Any]] = [{} for _ in specs]
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -309,6 +312,7 @@ class SubprocEnv(LiberoVectorEnv):
         for key, row in self._rows[i].items():
             row[...] = observation[key]
         self._progress[i] = info.get("progress", {})
+        self._perturbed[i] = {key: info[key] for key in _PERTURBED if key in info}
 
     def _observe(self) -> dict[str, np.ndarray]:
         return {key: np.stack([rows[key] for rows in self._rows]) for key in self._common}
@@ -318,6 +322,8 @@ class SubprocEnv(LiberoVectorEnv):
             "success": self._success.copy(),
             "progress": [dict(p) for p in self._progress],
         }
+        told = [key for key in _PERTURBED if any(key in one for one in self._perturbed)]
+        info |= {key: [one.get(key) for one in self._perturbed] for key in told}
         own = [
             {key: row.copy() for key, row in rows.items() if key not in self._common} for rows in self._rows
         ]

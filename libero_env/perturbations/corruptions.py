@@ -211,6 +211,7 @@ class Corruption(ObservationFilter):
         severity: Severity, 1 to 10.
     """
 
+    only_rgb = True
     kind: str
     severity: int
 

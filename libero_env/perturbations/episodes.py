@@ -18,6 +18,7 @@ from libero_env.tasks.problem import Problem
 from libero_env.text import shown
 
 TRIES = 200  # samples of a start until one is valid
+_NAME_BYTES = 32  # of an index, a digest or a demonstration
 _NEEDS_SCENE = ("appearance", "start")
 
 
@@ -91,7 +92,7 @@ class PerturbedEpisodes:
             "observation": [[] for _ in range(num)],
             "action": [[] for _ in range(num)],
         }
-        self._starts: list[object] = [""] * num
+        self._starts = np.zeros((num, _NAME_BYTES), np.uint8)  # their names in UTF-8
         sampled = [k for k, one in enumerate(self.perturbations) if one.layer == "observation"]
         filters = (*self._fixed_of("observation"), *(self._sample(k, "") for k in sampled))
         for k in self._of("start"):  # a task without what a kind needs is refused before anything runs
@@ -153,24 +154,34 @@ class PerturbedEpisodes:
 
     def open(self, i: int, start: object) -> None:
         """Begin the observations and actions of the episode of a start in simulation i."""
-        self._starts[i] = start
-        self.resume(i, 0)
+        self._starts[i] = np.frombuffer(str(start).encode().ljust(_NAME_BYTES, b"\0")[:_NAME_BYTES], np.uint8)
+        self.resume(i, 0, begins=True)
 
-    def resume(self, i: int, steps: int, began: np.ndarray | int = NEVER) -> None:
+    def resume(self, i: int, steps: int, *, begins: bool) -> None:
         """Go on with the episode of simulation i after so many steps; filters with a memory begin a new one.
 
         Args:
             i: Index of the simulation.
             steps: Number of control steps since the reset.
-            began: Number of control steps before each event, (events,).
+            begins: Whether no event has begun or failed to; otherwise `kept` says which.
         """
-        self.steps[i], self.began[i] = steps, began
+        self.steps[i] = steps
+        if begins:
+            self.began[i], self.attempts[i, self.events] = NEVER, 0
         for layer, filters in self._filters.items():
-            filters[i] = self._opened(layer, self._starts[i], i)
+            filters[i] = self._opened(layer, self._start(i), i)
+
+    def kept(self, i: int) -> list[np.ndarray]:
+        """Return views of what belongs to the state of simulation i: its start, samples, and steps of events."""
+        return [self._starts[i], self.attempts[i], self.began[i]]
+
+    def _start(self, i: int) -> str:
+        """Return the name of the start of simulation i."""
+        return self._starts[i].tobytes().rstrip(b"\0").decode(errors="replace")
 
     def appearance(self, i: int) -> Appearance:
         """Return the appearance of simulation i; what is sampled for its start goes before absolute changes."""
-        sampled = (self._sample(k, self._starts[i]) for k in self._of("appearance", i))
+        sampled = (self._sample(k, self._start(i)) for k in self._of("appearance", i))
         return joined([*self._fixed_of("appearance"), *sampled])
 
     def has_new_goal(self, i: int) -> bool:
@@ -188,7 +199,7 @@ class PerturbedEpisodes:
         Raises:
             PlacementError: No sample of what it moves is valid; it does not happen.
         """
-        k, start = self.events[event], self._starts[i]
+        k, start = self.events[event], self._start(i)
         one = self.perturbations[k]
         self.attempts[i, k] = TRIES  # unless one is valid
         if one.layer == "start":

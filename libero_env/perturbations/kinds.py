@@ -201,6 +201,7 @@ class Kind:
         physical: Whether what can be solved changes: physics, start, or actions.
         is_sampled: Whether anything is random, so that another sample may be solved where one is not.
         needs_materials: Whether scenes need spare materials, see `libero_env.sim.scene.build_scene`.
+        only_rgb: Whether it changes images of colours and nothing else.
         exclusive: Whether no other kind of its layer may be named beside it.
     """
 
@@ -214,6 +215,7 @@ class Kind:
     physical: bool = False
     is_sampled: bool = True
     needs_materials: bool = False
+    only_rgb: bool = False
     exclusive: bool = False
 
     @property

@@ -137,7 +137,7 @@ class Pairing:
         for name in self.scene.entities:
             if name not in self.added:
                 yield from self._boxes(row, name)
-        for atom in self.scene.problem.goal.atoms():
+        for atom in self.scene.goal_atoms:
             region = self.scene.problem.region(atom.args[-1])
             if region is not None and region.ranges and region.target == self.scene.workspace_name:
                 for centre, half in zone_boxes(region, self.scene.workspace):

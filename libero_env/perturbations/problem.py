@@ -142,9 +142,7 @@ def _by_scene() -> dict[tuple[object, ...], list[Task]]:
 def _objects(share: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
     """Return the task with others in the place of objects that neither goal nor instruction are about."""
     problem = task.problem
-    used = {
-        n for atom in problem.goal.atoms() for arg in atom.args for n in problem.objects if arg.startswith(n)
-    }
+    used = {n for atom in scene.goal_atoms for arg in atom.args for n in problem.objects if arg.startswith(n)}
     free = _unnamed(task, scene)
     roots = carried(problem)
     instructions = " ".join(_instructions(task)).lower()
@@ -220,7 +218,7 @@ def _layout(metres: float, rng: np.random.Generator, task: Task, scene: Scene) -
     rows = list(load_init_states(task, scene))
     free = [contacts(scene, row) for row in rows]
     shifts: dict[str, np.ndarray] = {}
-    for group in _groups(task.problem):
+    for group in _groups(task.problem, scene.goal_atoms):
         for _ in range(_LAYOUT_TRIES):
             step = metres * direction(rng, 2)
             moved = [_moved(scene, row, task.problem, group, step) for row in rows]
@@ -233,9 +231,9 @@ def _layout(metres: float, rng: np.random.Generator, task: Task, scene: Scene) -
     return replace(task, problem=_with_shifts(task.problem, shifts))
 
 
-def _groups(problem: Problem) -> list[list[str]]:
+def _groups(problem: Problem, atoms: Sequence[Atom]) -> list[list[str]]:
     """Return the objects that stand on the workspace and are moved; those of a group by the same."""
-    roots, atoms = carried(problem), problem.goal.atoms()
+    roots = carried(problem)
     taken = [atom.args[0] for atom in atoms if atom.args[0] in problem.objects]
     counts = Counter(problem.objects.values())
     if any(

@@ -203,7 +203,7 @@ class PartOfGoal(StartChange):
 
 def _of_goal(scene: Scene) -> tuple[list[str], list[str]]:
     """Return the objects that a goal wants somewhere, and those that it wants them on or in."""
-    atoms, objects = scene.problem.goal.atoms(), scene.problem.objects
+    atoms, objects = scene.goal_atoms, scene.problem.objects
     wanted = dict.fromkeys(atom.args[0] for atom in atoms if atom.args[0] in objects)
     owners = (scene.owner(name) for atom in atoms for name in atom.args[1:])
     return list(wanted), list(dict.fromkeys(name for name in owners if name and name in objects))

@@ -56,8 +56,8 @@ _ROBOT = {  # entry about the robot -> bound, which is never reached
 _OBJECTS = {"pos": 1e4, "quat": 1.0, "joints": 1e3}  # the same of entries about objects, by their last word
 _IMAGES = {"rgb": ((3,), np.uint8), "depth": ((), np.float32), "segmentation": ((), np.int32)}
 _BOUNDS = {np.uint8: (0, 255), np.float32: (0.0, 1e4), np.int32: (0, 2**24)}
-_IMAGE_NAMES = ("rgb", "depth", *(f"segmentation_{kind}" for kind in SEGMENTATIONS))
-NAMES = (*_IMAGE_NAMES, "proprioception", *_ROBOT, "objects")
+IMAGES = ("rgb", "depth", *(f"segmentation_{kind}" for kind in SEGMENTATIONS))
+NAMES = (*IMAGES, "proprioception", *_ROBOT, "objects")
 
 
 def is_of_joints(name: str) -> bool:
@@ -224,7 +224,7 @@ class Observer:
         Raises:
             UnknownNameError: The camera or the kind does not exist.
         """
-        require_known("image", kind, _IMAGE_NAMES)
+        require_known("image", kind, IMAGES)
         base, _, segmentation = kind.partition("_")
         channels, dtype = _IMAGES[base]
         out = np.empty((*self.camera_size, *channels), dtype)

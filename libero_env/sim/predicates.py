@@ -6,7 +6,7 @@ By default their semantics are the original's: objects are points (the origin of
 box is |R size|, and being on a region of the table needs no contact. `semantics="strict"` requires more; see `STRICT`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -17,9 +17,9 @@ from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP, OPPOSITE_STATES, ObjectModel
 from libero_env.parallel import send_to_workers
 from libero_env.sim.history import History
-from libero_env.sim.scene import ROBOT, Scene, zone_boxes
+from libero_env.sim.scene import ROBOT, ground, zone_boxes
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import OPERATORS, And, Atom, Expression, ForAll, Region, declare_predicate
+from libero_env.tasks.problem import OPERATORS, Atom, Expression, Region, declare_predicate
 
 BOX_BELOW = 0.01  # [m] depth below its box in which a region still contains a point
 ON_BELOW, ON_ABOVE = 0.005, 0.10  # [m] range of heights around the top of a box that are on the region
@@ -332,27 +332,3 @@ def state_bound(model: ObjectModel, state: str) -> tuple[float, bool]:
     opposite = OPPOSITE_STATES[state]
     upwards = opposite not in ranges or low + high > sum(ranges[opposite])
     return (low if upwards else high), upwards
-
-
-def ground(expression: Expression, scene: Scene) -> Expression:
-    """Return a goal with quantifiers replaced by conjunctions over the objects of a scene."""
-    if isinstance(expression, ForAll):
-        bindings = _bindings(expression.variables, scene)
-        return And(tuple(ground(_bind(expression.body, binding), scene) for binding in bindings))
-    return expression.map(lambda part: ground(part, scene))
-
-
-def _bindings(variables: tuple[tuple[str, str], ...], scene: Scene) -> list[dict[str, str]]:
-    """Return all assignments of objects of the right category to the variables of a quantifier."""
-    bindings: list[dict[str, str]] = [{}]
-    for variable, category in variables:
-        names = [name for name, item in scene.objects.items() if item.category == category]
-        bindings = [{**binding, variable: name} for binding in bindings for name in names]
-    return bindings
-
-
-def _bind(expression: Expression, binding: Mapping[str, str]) -> Expression:
-    """Replace variables by the names of objects."""
-    if isinstance(expression, Atom):
-        return Atom(expression.predicate, tuple(binding.get(arg, arg) for arg in expression.args))
-    return expression.map(lambda part: _bind(part, binding))

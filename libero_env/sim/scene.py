@@ -11,6 +11,7 @@ from collections.abc import Hashable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from threading import RLock
 from typing import Any
 
@@ -25,7 +26,7 @@ from libero_env.mujoco_compat import log_warnings, mujoco, set_damping
 from libero_env.objects.catalog import version_of
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY, ObjectModel
 from libero_env.tasks.cameras import Camera, require_own_names
-from libero_env.tasks.problem import Atom, Problem, ProblemError, Region, Violation
+from libero_env.tasks.problem import And, Atom, Expression, ForAll, Problem, ProblemError, Region, Violation
 from libero_env.text import suggest
 from libero_env.timing import TIMESTEP
 from libero_env.workspaces import WORKSPACES
@@ -154,12 +155,8 @@ class Scene:
 
     @cached_property
     def goal_atoms(self) -> tuple[Atom, ...]:
-        """Atoms of the goal, except those with variables of quantifiers."""
-        goal = self.problem.goal
-        variables = goal.fold(
-            lambda node, parts: {name for name, _ in getattr(node, "variables", ())}.union(*parts)
-        )
-        return tuple(atom for atom in goal.atoms() if variables.isdisjoint(atom.args))
+        """Atoms of the goal; a quantifier has those of each object that it stands for."""
+        return ground(self.problem.goal, self).atoms()
 
     @property
     def state_size(self) -> int:
@@ -201,6 +198,23 @@ class Scene:
             return address
         region = self.problem.region(address)
         return region.target if region is not None and region.target in self.entities else None
+
+
+def ground(expression: Expression, scene: Scene) -> Expression:
+    """Return a goal with quantifiers replaced by conjunctions over the objects of a scene."""
+    if isinstance(expression, ForAll):
+        variables, categories = zip(*expression.variables, strict=True)
+        names = [[n for n, item in scene.objects.items() if item.category == one] for one in categories]
+        bindings = (dict(zip(variables, chosen, strict=True)) for chosen in product(*names))
+        return And(tuple(ground(_bind(expression.body, binding), scene) for binding in bindings))
+    return expression.map(lambda part: ground(part, scene))
+
+
+def _bind(expression: Expression, binding: Mapping[str, str]) -> Expression:
+    """Replace variables by the names of objects."""
+    if isinstance(expression, Atom):
+        return Atom(expression.predicate, tuple(binding.get(arg, arg) for arg in expression.args))
+    return expression.map(lambda part: _bind(part, binding))
 
 
 def build_scene(

@@ -292,10 +292,11 @@ class Simulations(ABC):
     def get_state(self, i: int) -> np.ndarray:
         """Return all that the future of simulation i depends on, (state_size,).
 
-        It consists of time, qpos, qvel, fixtures, warm start, controls and the state of the controller.
+        It consists of time, qpos, qvel, fixtures, warm start, controls, the state of the controller, and whether that is
+        outdated.
         """
         parts = [self.physics_state(i), self.fixtures[i].ravel(), *self._warm_start(i)]
-        return np.concatenate([*parts, self.controller_state.pack(i)])
+        return np.concatenate([*parts, self.controller_state.pack(i), self._outdated[i : i + 1]])
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Restore a state of `get_state`; the simulation continues from there to the same bits."""
@@ -304,7 +305,8 @@ class Simulations(ABC):
         time, qpos, qvel, fixtures, *warm_start, controller = np.split(state, sizes)
         self.reset([i], qpos[None], qvel[None], float(time[0]), fixtures.reshape(1, nfixtures, 7))
         self._set_warm_start(i, warm_start)
-        self.controller_state.unpack(i, controller)
+        self.controller_state.unpack(i, controller[:-1])
+        self._outdated[i] = controller[-1]
 
     def physics_state(self, i: int) -> np.ndarray:
         """Return [time, qpos, qvel] of simulation i, the original's layout."""
@@ -320,7 +322,7 @@ class Simulations(ABC):
         """Length of the vector of `get_state`."""
         model, fixtures = self.model, 7 * len(self.fixture_bodies)
         warm_start = model.nv + model.nu
-        return 1 + model.nq + model.nv + fixtures + warm_start + self.controller_state.controller.state_size
+        return 2 + model.nq + model.nv + fixtures + warm_start + self.controller_state.controller.state_size
 
     def _grip_site(self, fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Return position (num, 3) and orientation (num, 9) of the grip site."""

@@ -89,6 +89,22 @@ class EpisodeWatch:
         vertical = np.tile([0.0, 0.0, 1.0], (len(poses), 1))
         self._stood[i], self._uprights[i] = poses[:, :3], quat_rotate(poses[:, 3:] * _CONJUGATE, vertical)
 
+    def memory(self, i: int) -> np.ndarray:
+        """Return what triggers of events depend on beside the present state of simulation i, for `recall`."""
+        trace, objects = self.traces[i], self._scene.objects
+        seen = [name in trace.touched for name in self._scene.entities]
+        seen += [name in trace.lifted for name in objects] + [name == trace.in_hand for name in objects]
+        return np.array([*self._heights[i].values(), *seen], float)
+
+    def recall(self, i: int, memory: np.ndarray) -> None:
+        """Go on with the episode of simulation i, which has begun anew, as `memory` says."""
+        trace, objects, entities = self.traces[i], self._scene.objects, self._scene.entities
+        heights, *seen = np.split(memory, np.cumsum([len(objects), len(entities), len(objects)]))
+        self._heights[i] = dict(zip(objects, heights.tolist(), strict=True))
+        trace.touched = {name for name, yes in zip(entities, seen[0], strict=True) if yes}
+        trace.lifted = {name: None for name, yes in zip(objects, seen[1], strict=True) if yes}
+        trace.in_hand = next((name for name, yes in zip(objects, seen[2], strict=True) if yes), None)
+
     def wanted(self, i: int) -> list[str]:
         """Return the objects and fixtures that the goal of simulation i is about."""
         return [name for atom in self.goals[i] if (name := self._scene.owner(atom.args[0]))]

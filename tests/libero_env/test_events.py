@@ -1,5 +1,7 @@
 """Perturbations that begin during an episode: bits before them, their moments, what they move, what is refused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,8 @@ from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.expert import Expert
 from libero_env.expert.expert import solved_from_events
 from libero_env.perturbations import Perturbation, format_perturbations, parse_perturbations
+from libero_env.tasks import get_task
+from libero_env.tasks.problem import Atom, ForAll
 
 TASK = "libero_goal/6"  # the cream cheese into the bowl
 
@@ -130,7 +134,7 @@ def test_a_restored_state_has_the_events_that_had_begun():
         for _ in range(12):
             seen = env.step(action)[0]["agentview_rgb"][0]
             states.append(env.get_state(0))
-        assert states[5][-3:].tolist() == [5, 3, -1]
+        assert states[5][-2:].tolist() == [3, -1]
         env.set_state(0, states[2])
         for k in range(2, 12):
             again, *_, info = env.step(action)
@@ -140,6 +144,87 @@ def test_a_restored_state_has_the_events_that_had_begun():
         assert env.perturbed.began[1].tolist() == [3, -1] and info["began"][0].tolist() == [3, 8]
         with pytest.raises(InvalidInputError, match="ends with its number of steps, those before each event"):
             env.set_state(0, np.append(states[5][:-1], 0.5))
+
+
+def roll(env, actions):
+    """Return the infos and positions after each action, and the last pictures."""
+    infos, positions, obs = [], [], {}
+    for action in actions:
+        obs, *_, info = env.step(action)
+        infos.append(info["began"][0].tolist())
+        positions.append(env.simulations.fields["qpos"][0].copy())
+    return infos, positions, obs["agentview_rgb"][0]
+
+
+def test_a_state_goes_on_to_the_same_bits_in_an_environment_that_has_seen_nothing_of_its_episode():
+    options = {"cameras": ("agentview",), "camera_size": (32, 32), "horizon": 300}
+    with BatchEnv(TASK, 1, perturb="camera=0.6,gain=0.3,action_noise=0.2@lifted", **options) as env:
+        env.reset(options={"init_state": [1], "outdated_controller": True})
+        expert, states, actions = Expert(env.task, np.random.default_rng(0)), [], []
+        while not actions or env.perturbed.began[0, 0] < 0:
+            states.append(env.get_state(0))
+            actions.append(expert.act(env.views[0])[None])
+            env.step(actions[-1])
+        env.set_state(0, states[0])
+        expected = roll(env, actions)
+        assert expected[0][-2:] == [[-1], [len(actions) - 1]], "it was raised in the last step but one"
+    for start in (0, len(states) - 1):  # the controller is outdated; raised, and the event is due
+        with BatchEnv(TASK, 1, perturb="camera=0.6,gain=0.3,action_noise=0.2@lifted", **options) as other:
+            other.reset(options={"init_state": [0]})
+            other.set_state(0, states[start])
+            infos, positions, seen = roll(other, actions[start:])
+            assert infos == expected[0][start:]
+            np.testing.assert_array_equal(positions, expected[1][start:])
+            np.testing.assert_array_equal(seen, expected[2])
+
+
+def test_an_event_that_did_not_happen_is_tried_again_after_a_state_before_it(monkeypatch):
+    monkeypatch.setattr("libero_env.perturbations.episodes.TRIES", 1)
+    monkeypatch.setattr("libero_env.envs.batch.TRIES", 1)
+    still = np.zeros((1, 7))
+    with BatchEnv(TASK, 1, cameras=(), perturb="object=1@step2") as env:
+        env.reset(options={"init_state": [1]})  # whose first draw is valid
+        state, short = env.get_state(0), env.simulations.physics_state(0)
+        for before in (state, short):
+            env.reset(options={"init_state": [0]})
+            for _ in range(4):
+                info = env.step(still)[-1]
+            assert info["began"].tolist() == [[-1]] and info["attempts"].tolist() == [[1]]
+            failed = env.get_state(0)
+            env.reset(options={"init_state": [1]})
+            env.set_state(0, failed)
+            assert env.step(still)[-1]["attempts"].tolist() == [[1]], "it is not tried again later"
+            env.set_state(0, before)
+            for _ in range(4):
+                info = env.step(still)[-1]
+            assert info["began"].tolist() == [[2]] and info["attempts"].tolist() == [[0]]
+
+
+def test_objects_that_a_quantifier_stands_for_are_those_that_the_goal_is_about():
+    """The same goal, said of each object of a category: triggers, draws, causes and progress are the same."""
+    task = get_task(TASK)
+    (atom,) = task.problem.goal.atoms()
+    every = ForAll((("?x", task.problem.objects[atom.args[0]]),), Atom("On", ("?x", atom.args[1])))
+    seen = []
+    for goal in (task.problem.goal, every):
+        said = replace(task, problem=replace(task.problem, goal=goal))
+        perturb = "light=1@touched,camera=0.2@over_goal,object=1@step5,obstacle=0.5@step6"
+        with BatchEnv(said, 1, cameras=(), horizon=300, perturb=perturb) as env:
+            env.reset(options={"start": get_starts()})
+            expert, infos = Expert(task, np.random.default_rng(0)), []
+            while env.running[0]:
+                infos.append(env.step(expert.act(env.views[0])[None])[-1])
+                if infos[-1]["moved"][0]:
+                    expert.replan(task)
+            assert (infos[-1]["began"] >= 0).all() and env.atoms == (str(atom),)
+            seen.append([[info[key].tolist() for info in infos] for key in ("began", "progress", "success")])
+            assert env.watch.wanted(0) == ["cream_cheese_1"]
+    assert seen[0] == seen[1]
+
+
+def get_starts():
+    with BatchEnv(TASK, 1, cameras=()) as env:
+        return env.init_states[:1]
 
 
 def test_the_expert_tells_whether_the_rest_can_be_solved():
