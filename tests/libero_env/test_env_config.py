@@ -7,6 +7,8 @@ import pytest
 
 from libero_env.envs import BatchEnv, EnvConfig, LiberoEnv, SubprocEnv
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.perturbations.corruptions import Corruption
+from libero_env.perturbations.filters import ActionDelay, ActionGain
 
 TASK = "libero_object/0"
 FIELDS = [field.name for field in dataclasses.fields(EnvConfig)]
@@ -37,7 +39,9 @@ def test_an_unknown_option_is_an_error_that_names_the_nearest(make):
         make(camera_siz=(64, 64))
 
 
-@pytest.mark.parametrize("perturb", ["delay=1", "noise=1,gain=0.5", "action_noise=1@step3"])
+@pytest.mark.parametrize(
+    "perturb", ["delay=1", "noise=1,gain=0.5", "action_noise=1@step3", [ActionDelay(2)], [ActionGain(0.5)]]
+)
 def test_perturbed_actions_are_relative(perturb):
     with pytest.raises(InvalidInputError, match="moves? the arm; with control_delta=False they are goals"):
         EnvConfig(perturb=perturb, control_delta=False)
@@ -51,6 +55,16 @@ def test_a_camera_that_is_perturbed_is_seen(perturb):
         EnvConfig(perturb=perturb, cameras=("birdview",))
     for cameras in ((), ("birdview", "agentview")):
         assert EnvConfig(perturb=perturb, cameras=cameras)
+
+
+@pytest.mark.parametrize("perturb", ["light=1", "camera=1,noise=1@step3", [Corruption("fog", 3)]])
+def test_what_changes_colours_only_is_refused_where_pictures_have_none(perturb):
+    seen = {"observations": ("depth", "segmentation_class", "ee_pos")}
+    with pytest.raises(InvalidInputError, match="changes colours only, and observations=depth, .* add rgb, or"):
+        EnvConfig(perturb=perturb, **seen)
+    for options in ({"cameras": (), **seen}, {"observations": ("rgb", "depth")}, {"observations": ("ee_pos",)}):
+        assert EnvConfig(perturb=perturb, **options)
+    assert EnvConfig(perturb="camera=1,latency=1,dropped_frames=1", **seen)
 
 
 def test_an_event_at_a_step_that_no_episode_has_is_refused(closing):
