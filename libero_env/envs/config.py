@@ -15,7 +15,6 @@ from libero_env.errors import InvalidInputError, require_known
 from libero_env.perturbations.appearance import CAMERA
 from libero_env.perturbations.episodes import checked_perturbations
 from libero_env.perturbations.filters import ActionDelay, ActionGain, ActionNoise
-from libero_env.perturbations.kinds import Kind
 from libero_env.perturbations.perturbation import Perturbation
 from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS, IMAGES
@@ -148,8 +147,8 @@ class EnvConfig:
                     f"perturb={one} changes the camera {CAMERA}, which is not among cameras={', '.join(self.cameras)}; "
                     "add it, or leave the perturbation out"
                 )
-            relative = isinstance(kind, ActionDelay | ActionGain | ActionNoise) or isinstance(kind, Kind)
-            if relative and kind.layer == "action" and not self.control_delta:
+            own = isinstance(one, Perturbation | ActionDelay | ActionGain | ActionNoise)
+            if own and one.layer == "action" and not self.control_delta:
                 raise InvalidInputError(
                     f"perturb={one} changes how far relative actions move the arm; with control_delta=False they are "
                     "goals: leave control_delta=True"

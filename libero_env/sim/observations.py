@@ -116,9 +116,7 @@ class Observer:
         self.renderer = Renderer(scene.model, *self.camera_size, faithful=scene.drawing == FAITHFUL)
         self.segmentation = kinds[0] if kinds else None
         self._kinds = [k for k in ("rgb", "depth") if k in observations] + (["segmentation"] if kinds else [])
-        # those of the scene first: where images share the headlight, it is at the first of them
-        drawn = sorted(cameras, key=lambda text: camera_name(text) in scene.added_cameras)
-        self._cameras = {name: self.renderer.camera_id(name) for name in map(camera_name, drawn)}
+        self._cameras = {name: self.renderer.camera_id(name) for name in map(camera_name, cameras)}
         selected = {*observations, *(PROPRIOCEPTION if "proprioception" in observations else ())}
         self._robot = [name for name in _ROBOT if name in selected]
         self._entities = tuple(scene.entities) if "objects" in observations else ()

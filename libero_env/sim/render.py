@@ -33,6 +33,7 @@ FORKED = (
     "this process was forked from one that has rendered, and OpenGL does not survive that. Render first in the new "
     "process, or start processes with multiprocessing.get_context('spawn')"
 )
+HEADLIGHT_CAMERA = "agentview"  # so that a picture does not depend on which others are drawn with it
 _opened_in: set[int] = set()  # processes, this one or those it was forked from, that have opened a context
 _unreachable: list[Any] = []  # contexts of other threads and processes: to free them here would free others
 
@@ -162,7 +163,8 @@ class Renderer:
         model: Model to render.
         height: Height of the images, pixels.
         width: Width of the images, pixels.
-        faithful: Whether reflections are drawn, and sites as the original does. Multisampling is the model's.
+        faithful: Whether reflections are drawn, sites as the original does, and the headlight at each camera instead of
+            always at `agentview`, or in a model without it at the first camera. Multisampling is the model's.
         cull: Whether what the camera cannot show is left out; images do not depend on it.
 
     Raises:
@@ -181,6 +183,8 @@ class Renderer:
                 f"{largest} here"
             )
         self._model, self._height, self._width, self._faithful = model, height, width, faithful
+        agent = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, HEADLIGHT_CAMERA)
+        self._lit_from = None if faithful or agent < 0 else agent
         self._culling = Culling(model) if cull else None
         self._gl: GLContext | None = None
         self._owner = 0, threading.current_thread()
@@ -228,8 +232,8 @@ class Renderer:
         self._gl.make_current()
         all_categories = mujoco.mjtCatBit.mjCAT_ALL
         for k, target in enumerate(targets):
-            self._camera.fixedcamid = target.camera
             if k == 0 or self._faithful:
+                self._camera.fixedcamid = target.camera if self._lit_from is None else self._lit_from
                 mujoco.mjv_updateScene(
                     self._model, data, self._options, None, self._camera, all_categories, self._scene
                 )
@@ -237,7 +241,8 @@ class Renderer:
                     self._add_site(data, site)
                 if appearance is not None:
                     appearance.apply(self._scene, self._geoms[: self._scene.ngeom])
-            else:  # without the headlight, which stays at the first camera
+            if not self._faithful:  # without the headlight
+                self._camera.fixedcamid = target.camera
                 mujoco.mjv_updateCamera(self._model, data, self._camera, self._scene)
             fovy = None if appearance is None else appearance.apply_to_camera(self._scene, target.camera)
             left_out = []

@@ -54,7 +54,6 @@ class Scene:
         drawing: How images are drawn, one of `DRAWINGS`.
         robot: Model of the arm, one of `libero_env.assets.robot.ROBOTS`.
         spare_materials: Whether the model has materials that nothing has, see `build_scene`.
-        added_cameras: Names of the cameras that are added to those of workspace and robot.
     """
 
     problem: Problem
@@ -67,7 +66,6 @@ class Scene:
     drawing: str
     robot: str
     spare_materials: bool = False
-    added_cameras: frozenset[str] = frozenset()
 
     @property
     def nq_robot(self) -> int:
@@ -278,10 +276,7 @@ def _compile_scene(
         ) from error
     objects = {n: entities[n] for n in problem.objects}
     fixtures = {n: entities[n] for n in problem.fixtures if n != name}
-    added = frozenset(camera.name for camera in (*problem.cameras, *cameras))
-    scene = Scene(
-        problem, pack, workspace, name, model, objects, fixtures, drawing, robot, spare_materials, added
-    )
+    scene = Scene(problem, pack, workspace, name, model, objects, fixtures, drawing, robot, spare_materials)
     _check_sites(scene)
     _check_states(scene)
     return scene

@@ -57,6 +57,19 @@ def centre_of(mask):
     return np.argwhere(mask).mean(axis=0) + 0.5
 
 
+@pytest.mark.parametrize("drawing", ["fast", "faithful"])
+def test_a_picture_does_not_depend_on_which_others_are_drawn_with_it(closing, drawing):
+    both = ("agentview", "robot0_eye_in_hand")
+    sets = (both, both[::-1], both[:1], both[1:], (TOP, *both))
+    envs = [closing(LiberoEnv(TASK, cameras=cameras, camera_size=32, drawing=drawing)) for cameras in sets]
+    expected = start(envs[0])
+    for env in envs:
+        seen = start(env)
+        for name in {*seen} & {"agentview_rgb", "eye_in_hand_rgb"}:
+            np.testing.assert_array_equal(seen[name], expected[name])
+        np.testing.assert_array_equal(env.observer.render(0, both[1]), expected["eye_in_hand_rgb"])
+
+
 @pytest.mark.parametrize(("fovy", "height"), [(60, 120), (30, 200)])
 def test_a_point_is_where_a_pinhole_camera_has_it(closing, fovy, height):
     """A plate beside the optical axis, seen straight from above, and another camera that looks at it."""

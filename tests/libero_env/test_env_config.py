@@ -60,9 +60,15 @@ def test_a_camera_that_is_perturbed_is_seen(perturb):
 @pytest.mark.parametrize("perturb", ["light=1", "camera=1,noise=1@step3", [Corruption("fog", 3)]])
 def test_what_changes_colours_only_is_refused_where_pictures_have_none(perturb):
     seen = {"observations": ("depth", "segmentation_class", "ee_pos")}
-    with pytest.raises(InvalidInputError, match="changes colours only, and observations=depth, .* add rgb, or"):
+    with pytest.raises(
+        InvalidInputError, match="changes colours only, and observations=depth, .* add rgb, or"
+    ):
         EnvConfig(perturb=perturb, **seen)
-    for options in ({"cameras": (), **seen}, {"observations": ("rgb", "depth")}, {"observations": ("ee_pos",)}):
+    for options in (
+        {"cameras": (), **seen},
+        {"observations": ("rgb", "depth")},
+        {"observations": ("ee_pos",)},
+    ):
         assert EnvConfig(perturb=perturb, **options)
     assert EnvConfig(perturb="camera=1,latency=1,dropped_frames=1", **seen)
 

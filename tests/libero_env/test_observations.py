@@ -104,18 +104,6 @@ def test_the_hands_camera_moves_with_the_hand(kitchen):
     np.testing.assert_allclose(pose[:3, 2], -data.cam_xmat[camera].reshape(3, 3)[:, 2], atol=1e-9)
 
 
-def test_each_camera_has_its_own_headlight():
-    """Drawn faithfully, an image does not depend on the camera that was drawn before it."""
-    both, alone = (
-        LiberoEnv(TASK, cameras=cameras, camera_size=(32, 32), drawing="faithful")
-        for cameras in (("agentview", "robot0_eye_in_hand"), ("robot0_eye_in_hand",))
-    )
-    images = [env.reset(options={"init_state": 0})[0]["eye_in_hand_rgb"] for env in (both, alone)]
-    np.testing.assert_array_equal(*images)
-    both.close()
-    alone.close()
-
-
 def test_kinds_of_segmentation_agree(kitchen):
     of = {
         kind: kitchen.observer.render(0, "agentview", f"segmentation_{kind}")
