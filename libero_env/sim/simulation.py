@@ -292,8 +292,8 @@ class Simulations(ABC):
     def get_state(self, i: int) -> np.ndarray:
         """Return all that the future of simulation i depends on, (state_size,).
 
-        It consists of time, qpos, qvel, fixtures, warm start, controls, and the state of the controller, which ends with
-        whether it is outdated.
+        It consists of time, qpos, qvel, fixtures, warm start, controls, the state of the controller, and whether it is
+        outdated.
         """
         parts = [self.physics_state(i), self.fixtures[i].ravel(), *self._warm_start(i)]
         return np.concatenate([*parts, self.controller_state.pack(i), self._outdated[i : i + 1]])
