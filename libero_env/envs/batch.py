@@ -33,7 +33,7 @@ from libero_env.sim.engine import Goals, make_observer, make_simulations
 from libero_env.sim.observations import is_of_joints
 from libero_env.sim.rewards import Reward
 from libero_env.sim.scene import BUFFER_SIDE, InitialStates, ground
-from libero_env.sim.simulation import Indices, Watch
+from libero_env.sim.simulation import Indices
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.tasks import Task
 from libero_env.tasks.problem import And, Atom, Expression, Or
@@ -286,7 +286,7 @@ class BatchEnv(LiberoVectorEnv):
         running, ids = self._running.copy(), np.flatnonzero(self._running)
         self._running[:] = False  # until it is done: a step that is interrupted has moved some substeps
         reached, rewards = np.zeros(self.num_envs, bool), np.zeros(self.num_envs)
-        entries = None
+        entries = {} if ids.size else self.proprioception()
         if ids.size:
             self._begin_events(ids)
             entries = self._step_and_observe(ids, actions)
@@ -401,19 +401,16 @@ class BatchEnv(LiberoVectorEnv):
         """Start a simulation from what the perturbations make of a state; the goal does not hold there."""
         perturbed = self.perturbed
         assert perturbed is not None
-        paired, again = perturbed.paired(i, name, state), 0
-        while True:
+        paired = perturbed.paired(i, name, state)
+        for again in range(TRIES if perturbed.samples_starts else 1):
             start = perturbed.begin(i, name, paired, again)
             qpos, qvel, fixtures = self.scene.split_states(start[None])
             self.simulations.reset([i], qpos, qvel, fixtures=fixtures)
             self._forget(np.array([i]))
             if not perturbed.is_physical or not self.goals.check([i])[0][0]:
                 break
-            again += 1
-            if not perturbed.samples_starts or again == TRIES:
-                raise PlacementError(
-                    f"{self.base_task.id}, start {name}: the perturbed goal holds at the start"
-                )
+        else:
+            raise PlacementError(f"{self.base_task.id}, start {name}: the perturbed goal holds at the start")
         self.observer.set_appearance(i, perturbed.appearance(i))
 
     def _stored_states(self, indices: np.ndarray) -> InitialStates:
@@ -495,8 +492,9 @@ class BatchEnv(LiberoVectorEnv):
 
     def task_of(self, i: int) -> Task:
         """Return the task of simulation i, whose goal an event may have changed."""
-        changed = self.later is not None and self.perturbed is not None and self.perturbed.has_new_goal(i)
-        return self.later if changed and self.later is not None else self.task
+        if self.later is not None and self.perturbed is not None and self.perturbed.has_new_goal(i):
+            return self.later
+        return self.task
 
     def _goal_atoms(self, i: int) -> tuple[Atom, ...]:
         return ground(self.task_of(i).problem.goal, self.scene).wanted()
@@ -534,10 +532,8 @@ class BatchEnv(LiberoVectorEnv):
         """Advance simulations by one control period, and observe them when `config.observed` says."""
         if self.perturbed is not None:
             actions = self.perturbed.act(ids, actions)
-        if self.config.observed == AFTER:
-            self._step_simulations(ids, actions)
-            return self._observe(ids)
-        seen, (first, second) = self.proprioception(), self.simulations.watched
+        is_after, (first, second) = self.config.observed == AFTER, self.simulations.watched
+        seen = {} if is_after else self.proprioception()
 
         def watch(done: int, rows: np.ndarray) -> None:
             if done not in (first, second):
@@ -549,15 +545,11 @@ class BatchEnv(LiberoVectorEnv):
                 if (done == second) == is_of_joints(name):
                     seen[name][rows] = values[rows]
 
-        self._step_simulations(ids, actions, watch)
-        return seen
-
-    def _step_simulations(self, ids: np.ndarray, actions: np.ndarray, watch: Watch | None = None) -> None:
-        """Advance simulations; note those that fail, whose episodes end."""
         try:
-            self.simulations.step(ids, actions, watch=watch)
+            self.simulations.step(ids, actions, watch=None if is_after else watch)
         except SimulationError as error:
             self._errors |= error.failed
+        return self._observe(ids) if is_after else seen
 
     def _observe(self, ids: Indices) -> dict[str, np.ndarray]:
         """Render the images of simulations, and return all observations except images."""
@@ -580,10 +572,9 @@ class BatchEnv(LiberoVectorEnv):
         if self.perturbed is not None:
             self.perturbed.see_images(ids, images)
 
-    def _with_images(self, entries: dict[str, np.ndarray] | None) -> dict[str, np.ndarray]:
-        """Return copies of the images, with the given observations of the state or those of the present one."""
-        images = {name: values.copy() for name, values in self._images.items()}
-        return {**images, **(self.proprioception() if entries is None else entries)}
+    def _with_images(self, entries: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return copies of the images, with the given observations of the state."""
+        return {name: values.copy() for name, values in self._images.items()} | entries
 
     def _info(self) -> dict[str, Any]:
         info = {"success": self._success.copy(), "progress": self._progress.copy()}

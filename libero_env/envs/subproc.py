@@ -108,22 +108,19 @@ class SubprocEnv(LiberoVectorEnv):
         devices = validate(list[Annotated[int, Field(ge=0)]], list(gl_devices), prefix=("gl_devices",))
         if not isinstance(specs, Sequence) or isinstance(specs, str) or not specs:
             raise InvalidInputError("SubprocEnv needs a list of at least one environment")
-        for spec in specs:
-            if not (callable(spec) or isinstance(spec, Mapping)):
-                raise InvalidInputError(
-                    f"{shown(spec)} is not an environment; expected a dictionary or a function"
-                )
+        if odd := [spec for spec in specs if not (callable(spec) or isinstance(spec, Mapping))]:
+            raise InvalidInputError(
+                f"{shown(odd[0])} is not an environment; expected a dictionary or a function"
+            )
         if (config is not None or options) and all(map(callable, specs)):
             raise InvalidInputError(
                 f"{', '.join([*['config'] * (config is not None), *options])}: for environments that are dictionaries; "
                 "these are functions, which configure theirs themselves"
             )
-        for spec in specs:
-            if options and isinstance(spec, Mapping) and "config" in spec:
-                raise InvalidInputError(
-                    f"{', '.join(options)}: a dictionary has a config of its own, which would replace them; name them "
-                    "in it"
-                )
+        if options and any(isinstance(spec, Mapping) and "config" in spec for spec in specs):
+            raise InvalidInputError(
+                f"{', '.join(options)}: a dictionary has a config of its own, which would replace them; name them in it"
+            )
         common = {"config": EnvConfig.from_options(config, options)}
         self.metadata = {**self.metadata, "render_fps": common["config"].control_freq}
         factories = [spec if callable(spec) else _factory({**common, **spec}) for spec in specs]
@@ -247,9 +244,8 @@ class SubprocEnv(LiberoVectorEnv):
             raise WorkerError({i: f.reason for i, f in failures.items()}, self.tasks)
         observed = [answers[i][0] for i in range(self.num_envs)]
         for task, space in zip(self.tasks, observed, strict=True):
-            if not (
-                isinstance(space, spaces.Dict) and all(isinstance(s, spaces.Box) for s in space.values())
-            ):
+            is_dict = isinstance(space, spaces.Dict)
+            if not is_dict or any(not isinstance(box, spaces.Box) for box in space.values()):
                 raise LiberoError(f"{task}: observations must be a dictionary of arrays, not {space}")
         first = answers[0][1]
         if different := [self.tasks[i] for i in range(self.num_envs) if answers[i][1] != first]:

@@ -36,18 +36,16 @@ def checked_perturbations(value: object) -> tuple[Perturbation | Change, ...]:
         return tuple(one for one in parse_perturbations(value, events=True) if one.severity)
     if not isinstance(value, Iterable) or isinstance(value, Mapping | bytes):
         raise InvalidInputError(f"perturb is {shown(value)}; expected a text such as camera=0.3,light=0.5")
-    sampled: list[Perturbation] = []
-    fixed: list[Change] = []
-    for one in value:
-        if not isinstance(one, Perturbation | Change):
-            raise InvalidInputError(
-                f"perturb has {shown(one)}; expected a Perturbation, or a change such as an Appearance"
-            )
-        if isinstance(one, Perturbation):
-            sampled.append(one)
-        else:
-            fixed.append(one)
-    return (*(one for one in in_order(sampled) if one.severity), *fixed)
+    given = tuple(value)
+    if odd := [one for one in given if not isinstance(one, Perturbation | Change)]:
+        raise InvalidInputError(
+            f"perturb has {shown(odd[0])}; expected a Perturbation, or a change such as an Appearance"
+        )
+    sampled = in_order(one for one in given if isinstance(one, Perturbation))
+    return (
+        *(one for one in sampled if one.severity),
+        *(one for one in given if not isinstance(one, Perturbation)),
+    )
 
 
 def needs_materials(changes: Iterable[Perturbation | Change]) -> bool:

@@ -75,22 +75,19 @@ class Pairing:
 
     def _paired(self, row: np.ndarray) -> np.ndarray:
         """Return the start with everything that both scenes have; what is new is at its model's origin."""
-        base, model = self.base, self.scene.model
-        qpos, qvel, fixtures = (part[0].copy() for part in base.split_states(row[None]))
-        now, speed = model.qpos0.copy(), np.zeros(model.nv)
-        for j in range(base.model.njnt):
-            name = base.model.joint(j).name
-            if mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name) < 0:
-                continue  # of an object that the perturbed task does not have
-            size, freedom = (7, 6) if base.model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE else (1, 1)
-            old, new = base.model.jnt_qposadr[j], model.joint(name).qposadr[0]
-            now[new : new + size] = qpos[old : old + size]
-            old, new = base.model.jnt_dofadr[j], model.joint(name).dofadr[0]
-            speed[new : new + freedom] = qvel[old : old + freedom]
+        base, model = self.base.model, self.scene.model
+        before, after = mujoco.MjData(base), mujoco.MjData(model)
+        before.qpos[:], before.qvel[:], fixtures = (part[0] for part in self.base.split_states(row[None]))
+        there = {model.joint(j).name for j in range(model.njnt)}  # not of objects that are taken away
+        for name in there & {base.joint(j).name for j in range(base.njnt)}:
+            after.joint(name).qpos[:], after.joint(name).qvel[:] = (
+                before.joint(name).qpos,
+                before.joint(name).qvel,
+            )
         for name, shift in self._shifts.items():
             address = self.scene.pose_address(name)
-            now[address : address + 2] += shift
-        return np.concatenate([row[:1], now, speed, fixtures.ravel()])
+            after.qpos[address : address + 2] += shift
+        return np.concatenate([row[:1], after.qpos, after.qvel, fixtures.ravel()])
 
     def _placed(self, row: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Return a state in which what was exchanged stands in its place, and what is new over a free place."""

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
-from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -294,26 +293,6 @@ def posed(scene: Scene, row: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData]
     return model, data
 
 
-def _robot(radians: float, rng: np.random.Generator, scene: Scene) -> RobotOffset:
-    return RobotOffset(tuple((radians * direction(rng, 7)).tolist()))
-
-
-def _object_pose(metres: float, rng: np.random.Generator, scene: Scene) -> ScatteredObjects:
-    return ScatteredObjects(metres, _FULL_TURN * metres / _FULL_STEP, int(rng.integers(2**63)))
-
-
-def _put_aside(metres: float, rng: np.random.Generator, scene: Scene, *, receptacle: bool) -> PutAside:
-    return PutAside(metres, receptacle, int(rng.integers(2**63)))
-
-
-def _gathered(count: float, rng: np.random.Generator, scene: Scene) -> Gathered:
-    return Gathered(int(count), int(rng.integers(2**63)))
-
-
-def _obstacle(nearness: float, rng: np.random.Generator, scene: Scene) -> Obstacle:
-    return Obstacle((1 - nearness) * _BESIDE, int(rng.integers(2**63)))
-
-
 def _part_of_goal(share: float, rng: np.random.Generator, scene: Scene) -> PartOfGoal:
     goal = scene.problem.goal
     if not (isinstance(goal, And) and len(goal.parts) > 1 and all(isinstance(p, Atom) for p in goal.parts)):
@@ -321,15 +300,21 @@ def _part_of_goal(share: float, rng: np.random.Generator, scene: Scene) -> PartO
             f"{scene.problem.language!r}: perturbation partial: no part of the goal {goal} can hold alone; expected an "
             "And of several atoms"
         )
-    return PartOfGoal(share, int(rng.integers(2**63)))
+    return PartOfGoal(share, _seed(rng))
 
 
-SAMPLERS: dict[str, Callable[..., StartChange]] = {
-    "robot": _robot,
-    "object_pose": _object_pose,
-    "object": partial(_put_aside, receptacle=False),
-    "receptacle": partial(_put_aside, receptacle=True),
-    "distractor": _gathered,
-    "obstacle": _obstacle,
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**63))
+
+
+SAMPLERS: dict[str, Callable[[float, np.random.Generator, Scene], StartChange]] = {
+    "robot": lambda radians, rng, scene: RobotOffset(tuple((radians * direction(rng, 7)).tolist())),
+    "object_pose": lambda metres, rng, scene: ScatteredObjects(
+        metres, _FULL_TURN * metres / _FULL_STEP, _seed(rng)
+    ),
+    "object": lambda metres, rng, scene: PutAside(metres, False, _seed(rng)),
+    "receptacle": lambda metres, rng, scene: PutAside(metres, True, _seed(rng)),
+    "distractor": lambda count, rng, scene: Gathered(int(count), _seed(rng)),
+    "obstacle": lambda nearness, rng, scene: Obstacle((1 - nearness) * _BESIDE, _seed(rng)),
     "partial": _part_of_goal,
 }
