@@ -80,10 +80,8 @@ class Pairing:
         before.qpos[:], before.qvel[:], fixtures = (part[0] for part in self.base.split_states(row[None]))
         there = {model.joint(j).name for j in range(model.njnt)}  # not of objects that are taken away
         for name in there & {base.joint(j).name for j in range(base.njnt)}:
-            after.joint(name).qpos[:], after.joint(name).qvel[:] = (
-                before.joint(name).qpos,
-                before.joint(name).qvel,
-            )
+            old, new = before.joint(name), after.joint(name)
+            new.qpos[:], new.qvel[:] = old.qpos, old.qvel
         for name, shift in self._shifts.items():
             address = self.scene.pose_address(name)
             after.qpos[address : address + 2] += shift

@@ -215,13 +215,14 @@ def _layout(metres: float, rng: np.random.Generator, task: Task, scene: Scene) -
     Raises:
         PlacementError: An object cannot be moved so far without touching another in one of the stored initial states.
     """
-    rows = list(load_init_states(task, scene))
+    rows, loads = list(load_init_states(task, scene)), carried(task.problem)
     free = [contacts(scene, row) for row in rows]
     shifts: dict[str, np.ndarray] = {}
-    for group in _groups(task.problem, scene.goal_atoms):
+    for group in _groups(task.problem, scene):
+        together = [name for one in group for name in (one, *loads[one])]
         for _ in range(_LAYOUT_TRIES):
             step = metres * direction(rng, 2)
-            moved = [_moved(scene, row, task.problem, group, step) for row in rows]
+            moved = [shifted(scene, row, together, step) for row in rows]
             if all(contacts(scene, row) <= before for row, before in zip(moved, free, strict=True)):
                 rows = moved
                 shifts |= dict.fromkeys(group, step)
@@ -231,9 +232,9 @@ def _layout(metres: float, rng: np.random.Generator, task: Task, scene: Scene) -
     return replace(task, problem=_with_shifts(task.problem, shifts))
 
 
-def _groups(problem: Problem, atoms: Sequence[Atom]) -> list[list[str]]:
+def _groups(problem: Problem, scene: Scene) -> list[list[str]]:
     """Return the objects that stand on the workspace and are moved; those of a group by the same."""
-    roots = carried(problem)
+    roots, atoms = carried(problem), scene.goal_atoms
     taken = [atom.args[0] for atom in atoms if atom.args[0] in problem.objects]
     counts = Counter(problem.objects.values())
     if any(
@@ -243,27 +244,11 @@ def _groups(problem: Problem, atoms: Sequence[Atom]) -> list[list[str]]:
     on_table = any(
         (region := problem.region(name)) and region.ranges for atom in atoms for name in atom.args[1:]
     )
-    fixed = {name for atom in atoms for name in _objects_of(problem, atom.args[1:])}
+    fixed = {scene.owner(name) for atom in atoms for name in atom.args[1:]}
     if on_table:  # such as `to the right of the plate`: what is named beside it is a landmark
         words = set(problem.language.lower().split())
         fixed |= {n for n, c in problem.objects.items() if words & set(c.split("_")) and n not in taken}
     return [[name] for name in roots if name not in fixed]
-
-
-def _objects_of(problem: Problem, names: Sequence[str]) -> list[str]:
-    """Return the objects of names and regions."""
-    regions = [problem.region(name) for name in names]
-    targets = [name if region is None else region.target for name, region in zip(names, regions, strict=True)]
-    return [name for name in targets if name in problem.objects]
-
-
-def _moved(
-    scene: Scene, row: np.ndarray, problem: Problem, group: Sequence[str], step: np.ndarray
-) -> np.ndarray:
-    loads = carried(problem)
-    for name in group:
-        row = shifted(scene, row, (name, *loads[name]), step)
-    return row
 
 
 def _with_shifts(problem: Problem, shifts: dict[str, np.ndarray]) -> Problem:

@@ -109,17 +109,17 @@ class SceneAppearance:
         model = scene.model
         self.appearance = appearance
         self._views = [
-            (_index(model, "camera", name), view, None if view.quat is None else _matrix(view.quat))
+            (element_index(model, "camera", name), view, None if view.quat is None else _matrix(view.quat))
             for name, view in appearance.cameras.items()
         ]
         self._fovy = {index: view.fovy for index, view, _ in self._views if view.fovy is not None}
         self._lights = {
-            -1 if name == HEADLIGHT else _index(model, "light", name): light
+            -1 if name == HEADLIGHT else element_index(model, "light", name): light
             for name, light in appearance.lights.items()
         }
         self._active_lights = np.flatnonzero(model.light_active).tolist()
         self._materials = {
-            _index(model, "material", old): _material(model, _index(model, "material", new))
+            element_index(model, "material", old): _material(model, element_index(model, "material", new))
             for old, new in appearance.materials.items()
         }
         self._colours: dict[int, tuple[np.ndarray, float]] = {}
@@ -128,7 +128,7 @@ class SceneAppearance:
             if name in scene.entities:
                 geoms = np.flatnonzero(np.isin(model.geom_bodyid, scene.bodies[name]))
             else:
-                geoms = np.flatnonzero(model.geom_matid == _index(model, "material", name))
+                geoms = np.flatnonzero(model.geom_matid == element_index(model, "material", name))
             self._colours |= dict.fromkeys(geoms.tolist(), own)
 
     def place_cameras(self, data: mujoco.MjData) -> None:
@@ -186,7 +186,12 @@ class SceneAppearance:
                     getattr(light, name)[:] = vector
 
 
-def _index(model: mujoco.MjModel, what: str, name: str) -> int:
+def element_index(model: mujoco.MjModel, what: str, name: str) -> int:
+    """Return the index of a camera, a light or a material.
+
+    Raises:
+        UnknownNameError: The model has none of this name; the message lists those that it has.
+    """
     kind = getattr(mujoco.mjtObj, f"mjOBJ_{what.upper()}")
     index = mujoco.mj_name2id(model, kind, name)
     if index < 0:

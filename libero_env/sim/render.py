@@ -17,10 +17,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from libero_env.errors import RenderError, UnknownNameError
+from libero_env.errors import RenderError
 from libero_env.mujoco_compat import forget_opengl, mujoco
 from libero_env.parallel import after_forks, first_picture
-from libero_env.sim.appearance import SceneAppearance
+from libero_env.sim.appearance import SceneAppearance, element_index
 from libero_env.sim.culling import Culling
 
 # those of MuJoCo on this system; the last one needs a display, and is used unasked only where it is the only one
@@ -197,12 +197,7 @@ class Renderer:
         Raises:
             UnknownNameError: The model has no such camera; the message lists its cameras.
         """
-        index = mujoco.mj_name2id(self._model, mujoco.mjtObj.mjOBJ_CAMERA, name)
-        if index < 0:
-            raise UnknownNameError(
-                "camera", name, [self._model.camera(i).name for i in range(self._model.ncam)]
-            )
-        return index
+        return element_index(self._model, "camera", name)
 
     @first_picture()
     def render(
