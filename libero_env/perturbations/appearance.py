@@ -19,8 +19,8 @@ _LIGHT_ANGLE = 60.0  # [degrees] by which lights turn at the full ratio
 _FULL_RATIO = 3.0
 
 
-def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float, camera: str = CAMERA) -> CameraView:
-    """Return the view of a camera that was moved about the point of the workspace that it looks at, and stays upright.
+def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float) -> CameraView:
+    """Return the view of the agent's camera that was moved about the point of the workspace that it looks at, and stays upright.
 
     Args:
         axis_angle: Direction of the movement in the image: 0 moves the camera to its right, pi / 2 upwards, [rad].
@@ -28,9 +28,9 @@ def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float, camera
         factor: Ratio of the distances from the point after and before.
     """
     model = scene.model
-    index = model.camera(camera).id
+    index = model.camera(CAMERA).id
     pos, mat = model.cam_pos[index], quat_to_mat(model.cam_quat[index])
-    pivot = pivot_of(scene, camera)
+    pivot = pivot_of(scene)
     across = -np.sin(axis_angle) * mat[:, 0] + np.cos(axis_angle) * mat[:, 1]  # axis of the movement
     moved = pivot + factor * rotation_about(across, np.deg2rad(degrees)) @ (pos - pivot)
     backward = (moved - pivot) / np.linalg.norm(moved - pivot)
@@ -43,10 +43,10 @@ def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float, camera
     return CameraView(pos=(x, y, z), quat=(w, axis[0], axis[1], axis[2]))
 
 
-def pivot_of(scene: Scene, camera: str = CAMERA) -> np.ndarray:
-    """Return the point (3,) where the axis of a camera meets the surface that objects stand on, [m]."""
+def pivot_of(scene: Scene) -> np.ndarray:
+    """Return the point (3,) where the axis of the agent's camera meets the surface that objects stand on, [m]."""
     model = scene.model
-    index = model.camera(camera).id
+    index = model.camera(CAMERA).id
     forward = -quat_to_mat(model.cam_quat[index])[:, 2]
     reach = (scene.workspace.surface_height - model.cam_pos[index][2]) / forward[2]
     return model.cam_pos[index] + reach * forward

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.errors import InvalidInputError, PlacementError
+from libero_env.perturbations.appearance import CAMERA
 from libero_env.perturbations.events import NEVER
 from libero_env.perturbations.kinds import Change, Episode, Layer, layer_of, sample_key
 from libero_env.perturbations.pairing import Pairing
@@ -96,6 +97,21 @@ class PerturbedEpisodes:
         for k in self._of("start"):  # a task without what a kind needs is refused before anything runs
             self._sample(k, "")
         self.has_memory = any(one.has_memory for one in filters)
+        self._require_one_view()
+
+    def _require_one_view(self) -> None:
+        """Raise where a sampled view of the agent's camera would replace one that was given."""
+        view, model = joined(self._fixed_of("appearance")).cameras.get(CAMERA), self._scene.model
+        sampled = [one for one in self.perturbations if one.kind == "camera"]
+        if view is None or not sampled:
+            return
+        index = model.camera(CAMERA).id
+        for part, own in ((view.pos, model.cam_pos[index]), (view.quat, model.cam_quat[index])):
+            if part is not None and not np.allclose(part, own, atol=1e-3):
+                raise InvalidInputError(
+                    f"{self._task.id}: perturb={sampled[0]} moves the camera {CAMERA}, which is elsewhere already: in "
+                    "this task, or by a change that was given; leave one of them out"
+                )
 
     @property
     def is_physical(self) -> bool:

@@ -144,6 +144,15 @@ def test_a_camera_is_moved_in_pictures_and_nowhere_else(plus):
     pose = camera_pose("table", task.variant.view)
     np.testing.assert_array_equal(look.cameras["agentview"].pos, pose.pos)
     np.testing.assert_array_equal(look.cameras["agentview"].quat, pose.quat_wxyz)
+    unmoved = plus["view_0_0_100_0_0_initstate_0_noise_47"]
+    for other in (unmoved, base_task()):
+        LiberoEnv(other, cameras=(), perturb="camera=0.5").close()
+    for perturb in ("camera=0.5", "light=1,camera=1@step3"):
+        with pytest.raises(
+            InvalidInputError, match="moves the camera agentview, which is elsewhere already: in this"
+        ):
+            LiberoEnv(task, cameras=(), perturb=perturb)
+    LiberoEnv(task, cameras=(), perturb="fov=0.5,light=1").close()
 
 
 @pytest.mark.sim
