@@ -20,7 +20,7 @@ _FULL_RATIO = 3.0
 
 
 def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float) -> CameraView:
-    """Return the view of the agent's camera that was moved about the point of the workspace that it looks at, and stays upright.
+    """Return the view of the agent's camera moved about the point of the workspace that it looks at, and upright.
 
     Args:
         axis_angle: Direction of the movement in the image: 0 moves the camera to its right, pi / 2 upwards, [rad].

@@ -12,7 +12,7 @@ from libero_env.perturbations.events import NEVER
 from libero_env.perturbations.kinds import Change, Episode, Layer, layer_of, sample_key
 from libero_env.perturbations.pairing import Pairing
 from libero_env.perturbations.perturbation import Perturbation, in_order, parse_perturbations
-from libero_env.sim.appearance import Appearance, joined
+from libero_env.sim.appearance import Appearance, CameraView, joined
 from libero_env.sim.scene import Scene
 from libero_env.tasks import Task
 from libero_env.tasks.problem import Problem
@@ -101,16 +101,20 @@ class PerturbedEpisodes:
 
     def _require_one_view(self) -> None:
         """Raise where a sampled view of the agent's camera would replace one that was given."""
-        view, model = joined(self._fixed_of("appearance")).cameras.get(CAMERA), self._scene.model
-        sampled = [one for one in self.perturbations if one.kind == "camera"]
-        if view is None or not sampled:
-            return
-        index = model.camera(CAMERA).id
-        for part, own in ((view.pos, model.cam_pos[index]), (view.quat, model.cam_quat[index])):
-            if part is not None and not np.allclose(part, own, atol=1e-3):
+        view, model = (
+            joined(self._fixed_of("appearance")).cameras.get(CAMERA, CameraView()),
+            self._scene.model,
+        )
+        index, by_kind = model.camera(CAMERA).id, {one.kind: one for one in self.perturbations}
+        for kind, given, own in (
+            ("camera", view.pos, model.cam_pos),
+            ("camera", view.quat, model.cam_quat),
+            ("fov", view.fovy, model.cam_fovy),
+        ):
+            if kind in by_kind and given is not None and not np.allclose(given, own[index], atol=1e-3):
                 raise InvalidInputError(
-                    f"{self._task.id}: perturb={sampled[0]} moves the camera {CAMERA}, which is elsewhere already: in "
-                    "this task, or by a change that was given; leave one of them out"
+                    f"{self._task.id}: perturb={by_kind[kind]} changes the view of {CAMERA}, which is another already, "
+                    "of the task or given as a change; leave one of them out"
                 )
 
     @property

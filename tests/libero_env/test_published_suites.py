@@ -23,6 +23,8 @@ from libero_env.errors import (
 )
 from libero_env.init_states import store
 from libero_env.init_states.store import load_init_states, load_original_states
+from libero_env.perturbations import Perturbation
+from libero_env.sim.appearance import Appearance, CameraView
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, is_suite, suite_names
 from libero_env.tasks.published import camera_pose, joint_pose, published_sizes
@@ -149,10 +151,13 @@ def test_a_camera_is_moved_in_pictures_and_nowhere_else(plus):
         LiberoEnv(other, cameras=(), perturb="camera=0.5").close()
     for perturb in ("camera=0.5", "light=1,camera=1@step3"):
         with pytest.raises(
-            InvalidInputError, match="moves the camera agentview, which is elsewhere already: in this"
+            InvalidInputError, match="changes the view of agentview, which is another already"
         ):
             LiberoEnv(task, cameras=(), perturb=perturb)
     LiberoEnv(task, cameras=(), perturb="fov=0.5,light=1").close()
+    given = Appearance(cameras={"agentview": CameraView(fovy=50.0)})
+    with pytest.raises(InvalidInputError, match="changes the view of agentview"):
+        LiberoEnv(base_task(), cameras=(), perturb=[given, Perturbation("fov", 0.5)])
 
 
 @pytest.mark.sim
