@@ -191,6 +191,11 @@ class _Face(NamedTuple):
 
 
 @compiled
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@compiled
 def _bound(boxes, kinds, sizes, bounds, positions, rotations):
     """Write the bounding boxes of geoms."""
     ids, centres, axes = boxes
@@ -208,8 +213,7 @@ def _bound(boxes, kinds, sizes, bounds, positions, rotations):
         elif kind == _MESH:
             half[:] = bounds[g, 3:]
             for r in range(3):
-                for c in range(3):
-                    centres[n, r] += rotations[g, 3 * r + c] * bounds[g, c]
+                centres[n, r] += _dot(rotations[g, 3 * r : 3 * r + 3], bounds[g])
         for r in range(3):
             for c in range(3):
                 axes[n, r, c] = rotations[g, 3 * r + c] * half[c]
@@ -222,15 +226,9 @@ def _reach_inside(boxes, apex, normals):
     inside = np.ones(len(centres), np.bool_)
     for n in range(len(centres)):
         for k in range(len(normals)):
-            reach = 0.0
-            for r in range(3):
-                reach += (centres[n, r] - apex[r]) * normals[k, r]
+            reach = _dot(centres[n], normals[k]) - _dot(apex, normals[k])
             for c in range(3):
-                reach += abs(
-                    axes[n, 0, c] * normals[k, 0]
-                    + axes[n, 1, c] * normals[k, 1]
-                    + axes[n, 2, c] * normals[k, 2]
-                )
+                reach += abs(_dot(axes[n, :, c], normals[k]))
             if reach < -_MARGIN:
                 inside[n] = False
                 break
@@ -241,20 +239,14 @@ def _reach_inside(boxes, apex, normals):
 def _is_hidden(point, face, forward):
     """Return whether the face of a box is on the way from the eye to a point, which is relative to the eye."""
     size, centre, rotation, near = face
-    down = point[0] * rotation[0, 2] + point[1] * rotation[1, 2] + point[2] * rotation[2, 2]
+    down = _dot(point, rotation[:, 2])
     if down >= 0.0:
         return False
-    share = (centre[0] * rotation[0, 2] + centre[1] * rotation[1, 2] + centre[2] * rotation[2, 2]) / down
-    ahead = 0.0
-    for r in range(3):
-        ahead += share * point[r] * forward[r]
-    if ahead < near:
+    share = _dot(centre, rotation[:, 2]) / down
+    if share * _dot(point, forward) < near:
         return False
     for c in range(2):
-        beside = 0.0
-        for r in range(3):
-            beside += (share * point[r] - centre[r]) * rotation[r, c]
-        if abs(beside) > size[c] - _MARGIN:
+        if abs(share * _dot(point, rotation[:, c]) - _dot(centre, rotation[:, c])) > size[c] - _MARGIN:
             return False
     return True
 
@@ -269,14 +261,11 @@ def _is_behind(centre, axes, normals, face):
     corners, depths, hidden = np.empty((8, 3)), np.empty((8, 4)), np.empty(8, np.bool_)
     for k in range(8):
         corners[k] = centre
-        for c in range(3):
-            for r in range(3):
-                corners[k, r] += _SIGNS[k, c] * axes[r, c]
+        for r in range(3):
+            corners[k, r] += _dot(_SIGNS[k], axes[r])
         hidden[k] = _is_hidden(corners[k], face, normals[4])
         for j in range(4):
-            depths[k, j] = _MARGIN
-            for r in range(3):
-                depths[k, j] += corners[k, r] * normals[j, r]
+            depths[k, j] = _MARGIN + _dot(corners[k], normals[j])
     if hidden.all():
         return True
     point = np.empty(3)
@@ -311,7 +300,7 @@ def _drop_hidden(face, view, boxes, costly, kinds, rotations, kept):
     """
     (ids, centres, axes), (eye, normals, rays) = boxes, view
     up = face.rotation[:, 2].copy()
-    level = (face.centre * up).sum()  # of the face over the eye
+    level = _dot(face.centre, up)  # of the face over the eye
     if level > -_MARGIN:
         return
     fills_view = True
@@ -322,13 +311,12 @@ def _drop_hidden(face, view, boxes, costly, kinds, rotations, kept):
         if not kept[n] or not (fills_view or costly[g]):
             continue
         centre = centres[n] - eye
-        top = (centre * up).sum()
+        top = _dot(centre, up)
         if kinds[g] == _PLANE:  # infinite
-            turned = abs(rotations[g, 2] * up[0] + rotations[g, 5] * up[1] + rotations[g, 8] * up[2])
-            top += 0.0 if turned > 1.0 - 1e-9 else np.inf
+            top += 0.0 if abs(_dot(rotations[g, 2::3], up)) > 1.0 - 1e-9 else np.inf
         else:
             for c in range(3):
-                top += abs(axes[n, 0, c] * up[0] + axes[n, 1, c] * up[1] + axes[n, 2, c] * up[2])
+                top += abs(_dot(axes[n, :, c], up))
         if top < level - _MARGIN:
             kept[n] = not (fills_view or _is_behind(centre, axes[n], normals, face))
 
