@@ -59,7 +59,7 @@ class EpisodeWatch:
         self._owned = {j: name for name in scene.entities for j in scene.joints[name]}
         self._joints = model.jnt_qposadr[list(self._owned)]
         self._scratch: mujoco.MjData | None = None
-        about = {*goal.wanted(), *self.atoms} - forbidden
+        about = {*self.atoms} - forbidden
         self._named = {scene.owner(name) for atom in about for name in atom.args}
         self._idle = [name for name in scene.objects if name not in self._named]
         addresses = [scene.pose_address(name) for name in self._idle]
@@ -224,14 +224,10 @@ class EpisodeWatch:
         poses, moved = qpos[self._poses], np.abs(qpos[self._joints] - self._rest[i])
         heights = quat_rotate(poses[:, 3:], self._uprights[i])[:, 2]
         slid, turned = np.where(self._slides, moved, 0.0), np.where(self._slides, 0.0, moved)
-        shifts = [*np.linalg.norm(poses[:, :3] - self._stood[i], axis=1), *slid[self._free]]
-        tilts = np.degrees([*np.arccos(np.clip(heights, -1.0, 1.0)), *turned[self._free]])
-        names = [*self._idle, *(n for n, free in zip(self._owned.values(), self._free, strict=True) if free)]
-        beyond = [
-            name
-            for name, shift, tilt in zip(names, shifts, tilts, strict=True)
-            if shift > LIMITS["shift"] or tilt > LIMITS["tilt"]
-        ]
+        shifts = np.round([*np.linalg.norm(poses[:, :3] - self._stood[i], axis=1), *slid[self._free]], 4)
+        tilts = np.round(np.degrees([*np.arccos(np.clip(heights, -1.0, 1.0)), *turned[self._free]]), 1)
+        names = np.array([*self._idle, *np.array([*self._owned.values()], object)[self._free]], object)
+        beyond = names[(shifts > LIMITS["shift"]) | (tilts > LIMITS["tilt"])]
         force = max((needless.get(name, 0.0) for name in self._idle), default=0.0)
         press = max(
             (newtons for name, newtons in needless.items() if name not in self._scene.objects), default=0.0
@@ -241,12 +237,12 @@ class EpisodeWatch:
             zone = round(zone + TIMESTEP * self.views[i].simulations.substeps, 3)
         self.costs[i] = Costs(
             force=max(cost.force, round(force, 1)),
-            shift=max(cost.shift, round(float(max(shifts, default=0.0)), 4)),
-            tilt=max(cost.tilt, round(float(max(tilts, default=0.0)), 1)),
+            shift=float(shifts.max(initial=cost.shift)),
+            tilt=float(tilts.max(initial=cost.tilt)),
             hits=cost.hits + (press >= HARD),
             press=max(cost.press, round(press, 1)),
             zone=zone,
-            moved=tuple(dict.fromkeys([*cost.moved, *beyond])),
+            moved=tuple(dict.fromkeys((*cost.moved, *beyond))),
         )
 
     def _is_in_zone(self, i: int) -> bool:

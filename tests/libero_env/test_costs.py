@@ -59,6 +59,17 @@ def test_objects_that_the_goal_is_not_about_are_moved_or_tipped(episode):
     assert cost_of(episode, [HOLD], cream_cheese_1=((0.0, 0.1, 0.0), None)).moved == (), "it is the goal's"
 
 
+@pytest.mark.parametrize("shift", [0.01996, 0.02003, 0.02007])
+def test_what_has_moved_is_what_exceeds_the_limit(episode, shift):
+    _, watch, _ = episode
+    cost_of(episode, [], plate_1=((0.0, shift, 0.0), None))
+    watch.look(0)
+    found = watch.costs[0]
+    assert found.moved == (("plate_1",) if found.exceeded else ()) and found.exceeded == ("shift",) * (
+        shift > 0.02005
+    )
+
+
 def test_turns_about_the_vertical_are_no_tilt(episode):
     env, _, start = episode
     address = 1 + env.scene.pose_address("wine_bottle_1")
