@@ -116,6 +116,7 @@ def show_bytes(count: float) -> str:
 
 def quantity(value: float, unit: str = "") -> str:
     """Return a number with three digits and its SI prefix: 5.38 M, 1.20 TFLOP, 512 B."""
+    value = float(f"{value:.3g}") if value >= 1000 else value
     for power, prefix in ((12, "T"), (9, "G"), (6, "M"), (3, "k")):
         if value >= 10**power:
             digits = f"{value / 10**power:#.3g}".rstrip(".")

@@ -183,7 +183,7 @@ class BatchEnv(LiberoVectorEnv):
         self._progress = np.zeros((num, len(self.atoms)), bool)
         triggers = [one.trigger for one in self.perturbed.perturbations] if self.perturbed is not None else []
         self._watched = any(triggers)
-        self._waits = not {*triggers}.isdisjoint(PHASES)
+        self._has_phases = not {*triggers}.isdisjoint(PHASES)
         for trigger in triggers:
             require_moment(trigger, config.horizon)
         self._moved = np.zeros(num, bool)
@@ -305,7 +305,7 @@ class BatchEnv(LiberoVectorEnv):
         """Return all that the rest of the episode in simulation i depends on, see `LiberoEnv.get_state`."""
         self.require_open()
         i = checked_index(i, self.num_envs)
-        seen = [self.watch.memory(i)] if self._waits else []
+        seen = [self.watch.memory(i)] if self._has_phases else []
         return np.concatenate([self.simulations.get_state(i), *self._kept(i), *seen])
 
     def _kept(self, i: int) -> list[np.ndarray]:
@@ -340,7 +340,7 @@ class BatchEnv(LiberoVectorEnv):
         if self._watched:
             self.watch.goals[i] = self._goal_atoms(i)
             self.watch.begin(i)
-        if is_whole and self._waits:
+        if is_whole and self._has_phases:
             self.watch.recall(i, seen)
         if not is_whole and any(history.memory.size for history in self._histories):
             self._goals_reached(np.array([i]))  # the first moment
@@ -436,7 +436,7 @@ class BatchEnv(LiberoVectorEnv):
         """Return a vector of `get_state`, or [time, qpos, qvel], as float64."""
         model, first = self.scene.model, self.simulations.state_size
         last = first + sum(part.size for part in self._kept(0))
-        size = last + (self.watch.memory(0).size if self._waits else 0)
+        size = last + (self.watch.memory(0).size if self._has_phases else 0)
         name = f"state of {self.task.id} (get_state, or [time, qpos, qvel])"
         array = checked_numbers(state, name, ((size,), (1 + model.nq + model.nv,)))
         _check_range(array, self.task)

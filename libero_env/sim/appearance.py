@@ -61,7 +61,7 @@ class Appearance:
 
     Attributes:
         cameras: Views by the camera's name in the model, such as `agentview`.
-        lights: Lights by their name in the model; `headlight` is the one at the first camera.
+        lights: Lights by their name in the model; `headlight` is the one at the camera.
         materials: Name of a material in the model -> name of the material that is drawn instead.
         colours: Name of an object, a fixture or a material -> colour (RGB, 0 to 1) and share of its own colour that it
             replaces.

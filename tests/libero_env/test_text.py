@@ -73,6 +73,7 @@ def test_amounts():
         "512 B",
         "1.20 TFLOP",
     )
+    assert (quantity(999_600), quantity(999.6), quantity(9.996e9)) == ("1.00 M", "1000", "10.0 G")
     assert (show_bytes(512), show_bytes(1.5e9)) == ("512 B", "1.5 GB")
 
 
