@@ -135,13 +135,8 @@ class LiberoEnv(gymnasium.Env):
         if "errors" in infos:
             raise SimulationError(infos["errors"])
         self._show()
-        return (
-            _first(observations),
-            float(rewards[0]),
-            bool(terminated[0]),
-            bool(truncated[0]),
-            self._info(infos),
-        )
+        end, cut = bool(terminated[0]), bool(truncated[0])
+        return _first(observations), float(rewards[0]), end, cut, self._info(infos)
 
     def get_state(self) -> np.ndarray:
         """Return all that the rest of the episode depends on: simulation, controller and number of steps."""

@@ -86,12 +86,10 @@ def serve(
             number, command, args = pipe.recv()
             try:
                 answer = ForkingPickler.dumps((number, True, getattr(host, command)(*args)))
-            except LiberoError as error:  # its text says it all
-                text = f"{type(error).__name__}: {error}"
-                said = f"it raised {text}" if not is_debugging() else f"it raised\n{traceback.format_exc()}"
-                answer = ForkingPickler.dumps((number, False, said))
-            except Exception:  # noqa: BLE001 - the other end raises it
-                answer = ForkingPickler.dumps((number, False, f"it raised\n{traceback.format_exc()}"))
+            except Exception as error:  # noqa: BLE001 - the other end raises it
+                says_all = isinstance(error, LiberoError) and not is_debugging()
+                text = f" {type(error).__name__}: {error}" if says_all else f"\n{traceback.format_exc()}"
+                answer = ForkingPickler.dumps((number, False, f"it raised{text}"))
             pipe.send_bytes(answer)
             if command == "close":
                 return

@@ -66,7 +66,9 @@ def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | 
     model = scene.model_with(fixtures)
     data = mujoco.MjData(model)
     data.qpos[:] = qpos
-    _sample_joints(scene, data, rng)
+    for atom in scene.problem.init:
+        if atom.predicate.lower() in OPPOSITE_STATES:
+            make_true(scene, data, atom, rng)
     touching: set[str] = set()
     solid = sum(len(geoms) for geoms in scene.collision_geoms.values())
     tries = fewer(_MAX_TRIES, solid, _USUAL_GEOMS)
@@ -170,13 +172,6 @@ def _place_of(scene: Scene, atom: Atom) -> Place:
     )
 
 
-def _sample_joints(scene: Scene, data: mujoco.MjData, rng: np.random.Generator) -> None:
-    """Sample the joints that init atoms require to be open, closed, turned on or off."""
-    for atom in scene.problem.init:
-        if atom.predicate.lower() in OPPOSITE_STATES:
-            make_true(scene, data, atom, rng)
-
-
 def make_true(scene: Scene, data: mujoco.MjData, atom: Atom, rng: np.random.Generator) -> list[int]:
     """Sample positions with which an atom holds, of joints or of an object, and return their addresses in `data.qpos`.
 
@@ -258,9 +253,7 @@ def _touching_entities(scene: Scene, data: mujoco.MjData) -> set[str]:
     """Return the names of objects in contact with other entities or the robot, and of these."""
     model = scene.model
     roots = model.body_rootid[model.geom_bodyid[data.contact.geom[: data.ncon]]]
-    owners = {int(scene.bodies[name][0]): name for name in scene.entities} | {
-        int(scene.bodies[ROBOT][0]): ROBOT
-    }
+    owners = {int(scene.bodies[name][0]): name for name in (*scene.entities, ROBOT)}
     touching: set[str] = set()
     for a, b in roots:
         names = {owners.get(int(body), "") for body in (a, b)}
@@ -270,7 +263,7 @@ def _touching_entities(scene: Scene, data: mujoco.MjData) -> set[str]:
 
 
 def settle(
-    simulations: Simulations, i: int, qpos: np.ndarray, nq_robot: int, fixtures: np.ndarray | None = None
+    simulations: Simulations, i: int, qpos: np.ndarray, nq_robot: int, fixtures: np.ndarray
 ) -> np.ndarray:
     """Simulate until the objects of one simulation are at rest, while the arm holds its pose.
 
@@ -278,7 +271,7 @@ def settle(
         simulations: Simulations, with a controller whose zero action holds the pose.
         i: Index of the simulation.
         qpos: Positions to start from, (nq,).
-        fixtures: Poses of the fixtures, (nfixtures, 7); None keeps them.
+        fixtures: Poses of the fixtures, (nfixtures, 7).
 
     Returns:
         Positions at rest, (nq,), with those of the robot as they were.
@@ -287,12 +280,7 @@ def settle(
         PlacementError: An object still moves after five seconds.
     """
     hold = np.zeros((simulations.num, 7))
-    simulations.reset(
-        [i],
-        qpos[None],
-        np.zeros((1, simulations.model.nv)),
-        fixtures=None if fixtures is None else fixtures[None],
-    )
+    simulations.reset([i], qpos[None], np.zeros((1, simulations.model.nv)), fixtures=fixtures[None])
     for _ in range(_MAX_HALF_SECONDS):
         before = simulations.fields["qpos"][i].copy()
         for _ in range(10):

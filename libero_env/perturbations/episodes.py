@@ -247,14 +247,13 @@ class PerturbedEpisodes:
                         rows[i] = one.image(name, rows[i], episode)
 
     def see_state(self, entries: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return what arrives of the entries that are not images, name -> (num, n)."""
-        arrived = {name: rows.copy() for name, rows in entries.items()}
+        """Return what arrives of the entries that are not images, name -> (num, n), whose rows are overwritten."""
         for i in range(len(self.steps)):
             for one, episode in self._at_step("observation", i):
-                state = one.state({name: rows[i] for name, rows in arrived.items()}, episode)
+                state = one.state({name: rows[i].copy() for name, rows in entries.items()}, episode)
                 for name, values in state.items():
-                    arrived[name][i] = values
-        return arrived
+                    entries[name][i] = values
+        return entries
 
     def _of(self, layer: Layer, i: int | None = None) -> list[int]:
         """Return the positions of the perturbations of a layer; of events those that have begun in simulation i."""

@@ -5,12 +5,9 @@ object that the goal is about: `touched`, `lifted` or `over_goal`. Before it, no
 """
 
 import re
-from collections.abc import Sequence
 
 from libero_env.errors import InvalidInputError, UnknownNameError
-from libero_env.sim.state import StateView
 from libero_env.sim.watch import EpisodeWatch, over
-from libero_env.tasks.problem import Atom
 
 PHASES = ("touched", "lifted", "over_goal")
 NEVER = -1  # step of an event that has not happened
@@ -52,10 +49,6 @@ def has_begun(trigger: str, steps: int, horizon: int, watch: EpisodeWatch, i: in
         return 100 * steps >= int(trigger.removesuffix("%")) * horizon
     trace = watch.traces[i]
     if trigger == "over_goal":
-        return _is_over_goal(watch.views[i], watch.goals[i], trace.in_hand)
+        return any(atom.args[0] == trace.in_hand and over(watch.views[i], atom) for atom in watch.goals[i])
     names = trace.touched if trigger == "touched" else trace.lifted
     return any(name in names for name in watch.wanted(i))
-
-
-def _is_over_goal(view: StateView, atoms: Sequence[Atom], in_hand: str | None) -> bool:
-    return any(atom.args[0] == in_hand and over(view, atom) for atom in atoms)

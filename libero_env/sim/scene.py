@@ -242,9 +242,8 @@ def build_scene(
         LiberoError: MuJoCo refuses the models, such as those with the same names.
     """
     pack = pack or select_pack()
-    return _build_scene(
-        problem, pack, drawing or default_drawing(pack), robot, spare_materials, tuple(cameras)
-    )
+    drawing = drawing or default_drawing(pack)
+    return _build_scene(problem, pack, drawing, robot, spare_materials, tuple(cameras))
 
 
 def default_drawing(pack: Pack) -> str:
@@ -257,8 +256,8 @@ def _compile_scene(
     pack: Pack,
     drawing: str,
     robot: str,
-    spare_materials: bool = False,
-    cameras: Sequence[Camera] = (),
+    spare_materials: bool,
+    cameras: Sequence[Camera],
 ) -> Scene:
     name, workspace = workspace_of(problem)
     entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
