@@ -138,8 +138,7 @@ class SubprocEnv(LiberoVectorEnv):
             raise
         self._running = np.zeros(self.num_envs, bool)
         self._success = np.zeros(self.num_envs, bool)
-        self._progress: list[dict[str, bool]] = [{} for _ in specs]
-        self._perturbed: list[dict[str, Any]] = [{} for _ in specs]
+        self._infos: list[Mapping[str, Any]] = [{} for _ in specs]
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -304,11 +303,10 @@ class SubprocEnv(LiberoVectorEnv):
                 row[...] = 0
 
     def _note(self, i: int, observation: Mapping[str, np.ndarray], info: Mapping[str, Any]) -> None:
-        """Keep the observation of an environment, and which atoms of its goal hold."""
+        """Keep the observation of an environment, and what it tells."""
         for key, row in self._rows[i].items():
             row[...] = observation[key]
-        self._progress[i] = info.get("progress", {})
-        self._perturbed[i] = {key: info[key] for key in _PERTURBED if key in info}
+        self._infos[i] = info
 
     def _observe(self) -> dict[str, np.ndarray]:
         return {key: np.stack([rows[key] for rows in self._rows]) for key in self._common}
@@ -316,10 +314,10 @@ class SubprocEnv(LiberoVectorEnv):
     def _info(self) -> dict[str, Any]:
         info: dict[str, Any] = {
             "success": self._success.copy(),
-            "progress": [dict(p) for p in self._progress],
+            "progress": [dict(one.get("progress", {})) for one in self._infos],
         }
-        told = [key for key in _PERTURBED if any(key in one for one in self._perturbed)]
-        info |= {key: [one.get(key) for one in self._perturbed] for key in told}
+        told = [key for key in _PERTURBED if any(key in one for one in self._infos)]
+        info |= {key: [one.get(key) for one in self._infos] for key in told}
         own = [
             {key: row.copy() for key, row in rows.items() if key not in self._common} for rows in self._rows
         ]
