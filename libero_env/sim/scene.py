@@ -256,8 +256,8 @@ def _compile_scene(
     pack: Pack,
     drawing: str,
     robot: str,
-    spare_materials: bool,
-    cameras: Sequence[Camera],
+    spare_materials: bool = False,
+    cameras: Sequence[Camera] = (),
 ) -> Scene:
     name, workspace = workspace_of(problem)
     entities = {n: pack.build(c) for n, c in {**problem.objects, **problem.fixtures}.items() if n != name}
