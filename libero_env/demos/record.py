@@ -12,7 +12,7 @@ from libero_env.demos.read import Episode
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import PlacementError
-from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError
+from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes
 from libero_env.expert.expert import MAX_STEPS, Attempt, run_experts
 from libero_env.init_states.store import NUM_INIT_STATES
 
@@ -69,9 +69,6 @@ class DemoRecorder:
 
         Returns:
             Demonstration numbers, each with what happened.
-
-        Raises:
-            UnsupportedGoalError: The expert has no skill for the goal.
         """
         placed: list[int] = []
         unplaced, experts, noises = [], [], []
@@ -160,8 +157,7 @@ recorders = RecorderCache()  # of this process
 def record_chunk(config: DemoConfig, writer: DemoWriter, numbers: list[int]) -> RecordingReport:
     """Record some demonstrations as parts of a file, with a recorder that stays open in `recorders`.
 
-    Where the expert has no skill for the goal, or fails `MAX_ATTEMPTS` times on one demonstration, the report's
-    `error` says so.
+    Where the expert fails `MAX_ATTEMPTS` times on one demonstration, the report's `error` says so.
 
     Args:
         config: What the demonstrations depend on.
@@ -173,12 +169,7 @@ def record_chunk(config: DemoConfig, writer: DemoWriter, numbers: list[int]) -> 
     report, recorder = RecordingReport(), recorders.recorder(config)
     failures = dict.fromkeys(numbers, 0)  # of the demonstrations still to be recorded
     while failures:
-        try:
-            attempts = recorder.attempt(list(failures.items()))
-        except UnsupportedGoalError as error:
-            report.error = f"the expert cannot do this task: {error}"
-            break
-        for k, attempt in attempts:
+        for k, attempt in recorder.attempt(list(failures.items())):
             report.attempts += 1
             if attempt.success:
                 writer.write(k, recorder.episode(attempt, failed_attempts=failures.pop(k)))

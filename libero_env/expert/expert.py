@@ -1,7 +1,6 @@
 """The scripted expert: it observes the whole state and acts as a policy does, with seven numbers."""
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -175,9 +174,8 @@ def solved_from_events(env: BatchEnv) -> np.ndarray:
         experts = [Expert(task, np.random.default_rng(0), shapes=shapes) for task in tasks]
         for expert in experts:
             expert.replan(expert.task)
-        with suppress(UnsupportedGoalError):
-            attempts = run_experts(env, experts, max_steps=env.config.horizon)
-            found[ids, event] = [attempts[i].success for i in ids]
+        attempts = run_experts(env, experts, max_steps=env.config.horizon)
+        found[ids, event] = [attempts[i].success for i in ids]
     return found
 
 
@@ -216,8 +214,8 @@ def run_experts(
 ) -> list[Attempt]:
     """Let experts act in a batch of simulations.
 
-    An attempt ends when the goal holds, when the expert gives up, or after the largest number of steps. It depends on
-    the start, the expert and the noise of its own simulation only.
+    An attempt ends when the goal holds, when the expert gives up or has no skill for what is left, or after the largest
+    number of steps. It depends on the start, the expert and the noise of its own simulation only.
 
     Args:
         env: Environment after `reset`; simulations beyond the number of experts stand still.
@@ -232,21 +230,26 @@ def run_experts(
     states: list[list[np.ndarray]] = [[] for _ in experts]  # of each simulation, step by step
     executed: list[list[np.ndarray]] = [[] for _ in experts]
     chosen: list[list[np.ndarray]] = [[] for _ in experts]
-    success, errors = np.zeros(len(experts), bool), dict[int, str]()
+    success, errors, unsupported = np.zeros(len(experts), bool), dict[int, str](), dict[int, str]()
     for _ in range(max_steps):
         running = map(int, np.flatnonzero(env.running[: len(experts)]))
-        live = [i for i in running if not experts[i].failure_reason]
-        if not live:
-            break
+        live = [i for i in running if not (experts[i].failure_reason or i in unsupported)]
         actions = np.zeros((env.num_envs, 7))
         for i in live:
-            action, own_noise = experts[i].act(env.views[i]), noise[i]
+            own_noise = noise[i]
+            try:
+                action = experts[i].act(env.views[i])
+            except UnsupportedGoalError as error:  # of the state that this simulation is in
+                unsupported[i] = str(error)
+                continue
             actions[i] = action if own_noise is None else own_noise.apply(action, experts[i].noise_scale)
             states[i].append(env.simulations.physics_state(i))
             executed[i].append(actions[i].copy())
             chosen[i].append(action)
+        if not (live := [i for i in live if i not in unsupported]):
+            break
         infos = env.step(actions)[-1]
-        success, errors = infos["success"][: len(experts)], infos.get("errors", {})
+        success[live], errors = infos["success"][live], infos.get("errors", {})
     return [
         Attempt(
             success=bool(success[i]),
@@ -256,7 +259,8 @@ def run_experts(
             retries=expert.retries,
             reason=""
             if success[i]
-            else expert.failure_reason
+            else unsupported.get(i)
+            or expert.failure_reason
             or errors.get(i)
             or f"in phase {expert.phase} after {len(executed[i])} steps, {expert.retries} retries",
             fixtures=env.simulations.fixtures[i].copy(),

@@ -127,6 +127,21 @@ def test_an_outcome_depends_on_its_start_alone():
 
 
 @pytest.mark.sim
+def test_a_start_from_which_no_skill_reaches_the_goal_fails_alone():
+    task = make_task(
+        scene="kitchen",
+        objects=["plate", "butter"],
+        place={"plate_1": (0.05, 0.2), "butter_1": {"at": (0.1, -0.1), "half": 0.05}},
+        regions={"kitchen_table": {"mat": {"ranges": [[0.05, -0.15, 0.1, -0.05]]}}},
+        goal="(And (On butter_1 plate_1) (Never (On butter_1 kitchen_table_mat)))",
+        language="put the butter on the plate",
+    )
+    outcomes = module.attempt(task, range(6), BuiltinPack(), False)
+    broken = [o.state for o in outcomes if "is broken, and no skill takes that back" in o.reason]
+    assert 0 < len(broken) < 6 and [o.state for o in outcomes if not o.success] == broken
+
+
+@pytest.mark.sim
 def test_a_changed_object_is_tried_in_the_scene_that_has_it():
     def block(width: float):
         spec = mujoco.MjSpec()

@@ -18,9 +18,8 @@ from libero_env.demos.rendering import rerender
 from libero_env.demos.replay import replay
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
-from libero_env.expert import UnsupportedGoalError
-from libero_env.expert.expert import Attempt
-from libero_env.tasks import get_task
+from libero_env.expert.expert import Attempt, run_experts
+from libero_env.tasks import get_task, make_task
 from libero_integrations.exports.demonstrations import export_demos
 from lifelong.data import demonstrations
 from tests.harness.demos import STEPS, generate, record_wander, wander
@@ -208,23 +207,23 @@ def test_recorded_models_have_the_joints_of_the_states(path):
 
 
 def test_a_task_that_the_expert_cannot_do_stops_no_other(tmp_path, monkeypatch):
-    class PartialExpert:
-        def __init__(self, task, *args, **kwargs):
-            if task.id == TASK:
-                raise UnsupportedGoalError("no skill for that")
+    def partial(env, experts, noise, max_steps):
+        return (run_experts if env.task is lift else wander)(env, experts, noise, max_steps=max_steps)
 
-    monkeypatch.setattr("libero_env.demos.record.Expert", PartialExpert)
-    monkeypatch.setattr("libero_env.demos.record.run_experts", wander)
+    monkeypatch.setattr("libero_env.demos.record.run_experts", partial)
+    place = {"butter_1": (0.1, 0.2)}
+    lift = make_task(scene="floor", objects=["butter"], place=place, goal="Up butter_1", language="lift it")
     jobs = [
-        RecordingJob(DemoConfig(t, (8, 8)), tmp_path / f"{t[-6:].replace('/', '')}.hdf5")
-        for t in (TASK, "libero_goal/4")
+        RecordingJob(DemoConfig(t, (8, 8)), tmp_path / f"{i}.hdf5")
+        for i, t in enumerate((lift, "libero_goal/4"))
     ]
     reports = list(make_demos(jobs, 2, workers=1, progress=False).values())
-    assert "no skill for that" in reports[0].error and reports[0].recorded == 0 and not jobs[0].path.exists()
+    assert "no skill reaches (Up butter_1)" in reports[0].error and not jobs[0].path.exists()
+    assert reports[0].recorded == 0 and reports[0].attempts == 20
     assert not reports[1].error and reports[1].recorded == reports[1].attempts == 2
     assert len(read_demos(jobs[1].path)) == 2
-    with pytest.raises(DemoError, match=r"1 of 1 files are not complete.*no skill for that"):
-        ensure_demos([get_task(TASK)], 1, root=tmp_path, camera_size=(8, 8), workers=1, progress=False)
+    with pytest.raises(DemoError, match=r"1 of 1 files are not complete.*no skill reaches"):
+        ensure_demos([lift], 1, root=tmp_path, camera_size=(8, 8), workers=1, progress=False)
 
 
 def test_recording_ends_if_the_expert_always_fails(tmp_path, monkeypatch):

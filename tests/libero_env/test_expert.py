@@ -544,6 +544,33 @@ def test_what_one_simulation_does_depends_on_no_other():
 
 
 @pytest.mark.sim
+def test_what_falls_into_place_after_the_expert_gave_up_is_no_success():
+    """One simulation goes on while its expert has given up, because that of the other has not."""
+
+    class Patient(Expert):
+        def __init__(self, task, rng, steps):
+            super().__init__(task, rng)
+            self.steps = steps
+
+        failure_reason = property(lambda self: "" if self.steps else "it gave up")
+
+        def act(self, view):
+            self.steps -= 1
+            return np.array([0.0] * 6 + [-1.0])
+
+    env = BatchEnv("libero_object/0", 2, cameras=())
+    env.reset(options={"init_state": 0})
+    state, model = env.simulations.physics_state(0), env.scene.model
+    soup = 1 + model.jnt_qposadr[model.body("alphabet_soup_1_main").jntadr[0]]
+    state[soup : soup + 3] = env.views[0].body_pos("basket_1") + [0.0, 0.0, 0.6]
+    env.simulations.set_physics_state(0, state)
+    attempt, _ = run_experts(env, [Patient(env.task, np.random.default_rng(0), n) for n in (2, 40)])
+    reached = env.check_goal(0)[0]
+    env.close()
+    assert reached and not attempt.success and attempt.reason == "it gave up"
+
+
+@pytest.mark.sim
 def test_an_object_that_slipped_is_picked_again(closing):
     task = get_task("libero_object/7")
     env = closing(LiberoEnv(task, cameras=()))
