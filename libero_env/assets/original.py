@@ -58,8 +58,9 @@ class OriginalPack:
         return check_folder(Path(self.root)).digest
 
     def categories(self) -> tuple[str, ...]:
-        """Return all categories, those that users registered included, sorted."""
-        return tuple(sorted({*user_defined_names(), *(c for group in FAMILIES.values() for c in group)}))
+        """Return all categories of the files that are there, those that users registered included, sorted."""
+        pro = (name for name in LIBERO_PRO if self.file(name).is_file())
+        return tuple(sorted({*user_defined_names(), *pro, *(c for group in FAMILIES.values() for c in group)}))
 
     def build(self, category: str) -> ObjectModel:
         """Return a new model of a category at each call; a category that users registered takes precedence.
@@ -76,6 +77,11 @@ class OriginalPack:
                 "libero_env.objects.register_object, or use the builtin pack where it has one (LIBERO_ASSETS=builtin)"
             )
         file = self.file(category)
+        if category in LIBERO_PRO and not file.is_file():
+            raise LiberoError(
+                f"{file} does not exist: LIBERO-PRO adds {category}, and only its distributions have it "
+                "(`libero assets install`, then --assets original)"
+            )
         spec = read_spec(object_xml(file, category, Path(self.root)), file)
         self._simplify(spec)
         base, scale = LIBERO_PRO.get(category, (category, 1.0))
@@ -96,13 +102,7 @@ class OriginalPack:
             raise UnknownNameError("object category", category, self.categories())
         stem = _STEMS.get(category, category)
         flat = Path(self.root) / folder / f"{stem}.xml"
-        file = flat if folder == "articulated_objects" else flat.with_suffix("") / flat.name
-        if category in LIBERO_PRO and not file.is_file():
-            raise LiberoError(
-                f"{file} does not exist: LIBERO-PRO adds {category}, and only its distributions have it "
-                "(`libero assets install`, then --assets original)"
-            )
-        return file
+        return flat if folder == "articulated_objects" else flat.with_suffix("") / flat.name
 
     def add_arena(
         self, spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mapping[str, str]

@@ -87,33 +87,37 @@ def list_objects(*, all: bool = False) -> None:
     Args:
         all: Also list those of the benchmark.
     """
-    from libero_env.objects import folder, object_names
+    from libero_env.assets.pack import select_pack
+    from libero_env.objects import folder
     from libero_env.paths import objects_dir
 
     own = folder.names()
-    for name in object_names() if all else own:
+    for name in select_pack().categories() if all else own:
         print(f"{name:28} {objects_dir() / name if name in own else ''}".rstrip())
     if not own and not all:
         print(f"no objects in {objects_dir()}; add one: libero objects add FILE")
 
 
 def show(names: Names) -> None:
-    """Print the properties and regions of objects: size, mass, regions, grasp.
+    """Print the properties of objects as they rest: size, mass, grasp, the joint range of each state, regions.
 
     Args:
         names: Names of objects.
     """
-    from libero_env.objects import folder, get_object
+    from libero_env.assets.pack import select_pack
+    from libero_env.design.objects.trial import try_object
+    from libero_env.objects import folder
     from libero_env.tasks.builder import model_regions
 
+    pack = select_pack()
     for name in names:
-        item, directory = get_object(name), folder.find(name)
-        print(f"{name}: {directory or 'builtin'}")
-        if directory:
-            lines = describe(folder.read_properties(directory))
-        else:
-            lines = [f"  height    {100 * (item.top_offset[2] - item.bottom_offset[2]):.1f} cm"]
-        print("\n".join([*lines, f"  radius    {100 * item.horizontal_radius:.1f} cm"]))
+        item, directory = pack.build(name), folder.find(name)
+        stored = folder.read_properties(directory) if directory else {}
+        lines = describe({**stored, **try_object(item, lambda _: None)})
+        print("\n".join([f"{name}: {directory or pack.name}", *lines]))
+        print(f"  placement keeps {100 * item.horizontal_radius:.1f} cm around its origin free")
+        for state, (low, high) in item.articulation.items():
+            print(f"  {state:9} from {low:g} to {high:g}, rad or m")
         print(f"  regions   {', '.join(model_regions(name)) or 'none'}")
 
 
@@ -124,11 +128,11 @@ def preview(name: Positional[str], *, out: FilePath | None = None) -> None:
         name: Name of an object.
         out: The picture (default: NAME.png here).
     """
+    from libero_env.assets.pack import select_pack
     from libero_env.design.objects.trial import draw_object
     from libero_env.design.preview import check_picture
-    from libero_env.objects import get_object
 
-    item, path = get_object(name), out or Path(f"{name}.png")
+    item, path = select_pack().build(name), out or Path(f"{name}.png")
     check_picture(path)
     print(draw_object(item, path))
 

@@ -1,5 +1,6 @@
 """Objects made of mesh and MJCF files: what becomes of them, where they are kept, and what is refused."""
 
+import re
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -435,6 +436,19 @@ def test_replacing_removes_objects_only(tmp_path):
     assert (tmp_path / "notes" / "thesis.txt").exists()
 
 
+def test_the_mass_of_an_mjcf_file_is_that_of_its_groups_with_mass(tmp_path):
+    (
+        tmp_path / "shell.xml"
+    ).write_text("""<mujoco><compiler inertiagrouprange="0 0"/><worldbody><body name="b">
+      <geom type="box" size="0.02 0.02 0.05" group="0" contype="0" conaffinity="0" density="500"/>
+      <geom type="box" size="0.02 0.02 0.05" group="3" density="2000"/></body></worldbody></mujoco>""")
+    added = add_object(tmp_path / "shell.xml", out=tmp_path / "objects")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "shell.xml"))
+    stored = folder.read_spec(added.folder / folder.MODEL).compile()
+    assert added.properties["mass"] == pytest.approx(model.body_mass.sum()) == pytest.approx(0.08)
+    np.testing.assert_allclose(stored.body_inertia[1], model.body_inertia[1])
+
+
 def test_the_command_adds_lists_shows_renders_and_removes(tmp_path, capsys):
     path = str(box(tmp_path / "block.stl"))
     assert main(["objects", "add", path, "--name", "red_block", "--mass", "0.1"]) == 0
@@ -456,6 +470,12 @@ def test_the_command_adds_lists_shows_renders_and_removes(tmp_path, capsys):
     assert main(["objects", "list"]) == 0 and capsys.readouterr().out.startswith("red_block ")
     assert main(["objects", "show", "red_block", "basket"]) == 0
     assert "contain_region" in capsys.readouterr().out
+    model = folder.find("red_block") / folder.MODEL
+    model.write_text(model.read_text().replace('mass="0.2"', 'mass="0.3"'))  # by hand
+    assert main(["objects", "show", "red_block", "alphabet_soup", "wooden_cabinet"]) == 0
+    own, can, cabinet = re.split(r"(?m)^\w+: .*$", capsys.readouterr().out)[1:]
+    assert "300 g" in own and "6.0 x 6.0 x 7.6 cm" in can and "stands    yes" in can
+    assert "21.8 cm" in cabinet and "open      from -0.16 to -0.14" in cabinet
     assert main(["objects", "preview", "basket", "--out", str(tmp_path / "basket.png")]) == 0
     with Image.open(tmp_path / "basket.png") as picture:
         assert picture.size == (4 * 224, 2 * 224)

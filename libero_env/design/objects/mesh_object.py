@@ -73,7 +73,7 @@ def store_mesh(path: Path, name: str, directory: Path, options: Options, notify:
         notify: Function that receives a message about each assumption and each problem.
 
     Returns:
-        `mass` [kg], `watertight` and `collision`, for `object.yaml`.
+        `watertight` and `collision`, for `object.yaml`.
 
     Raises:
         LiberoError: The file cannot be read, or its mesh is too large or has no volume.
@@ -123,7 +123,6 @@ def store_mesh(path: Path, name: str, directory: Path, options: Options, notify:
     ET.indent(root)
     (directory / MODEL).write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
     return {
-        "mass": round(kilograms, 5),
         "watertight": closed,
         "collision": {"method": pieces.method, "pieces": len(pieces)},
     }

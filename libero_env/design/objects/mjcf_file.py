@@ -28,7 +28,7 @@ _WIDEST = 25.0  # [m^2] sum of the squared radii of collision geoms, whose surfa
 
 
 def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notify: Notify) -> dict[str, Any]:
-    """Write the MJCF file of an object, with its meshes and textures; return its mass and collision geometry.
+    """Write the MJCF file of an object, with its meshes and textures; return `collision`, for `object.yaml`.
 
     The object is the one body of the file's world or, as in the original's files, the body `object` within it.
     Collision geoms become group 0, visual geoms group 1. Where there are no visual geoms, or some in the same group,
@@ -39,9 +39,6 @@ def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notif
         name: Category.
         container: Whether to add a region `contain_region` if the object has none.
         notify: Function that receives a message about omitted elements.
-
-    Returns:
-        `mass` [kg] and `collision`, for `object.yaml`.
 
     Raises:
         LiberoError: The file cannot be read, refers to a missing file, or does not contain exactly one object.
@@ -77,7 +74,7 @@ def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notif
         )
     (directory / MODEL).write_text(_with_names(spec.to_xml(), names), encoding="utf-8")
     solid = int(((model.geom_contype | model.geom_conaffinity) > 0).sum())
-    return {"mass": round(kilograms, 5), "collision": {"method": "mjcf", "pieces": solid}}
+    return {"collision": {"method": "mjcf", "pieces": solid}}
 
 
 def bounds_of(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
@@ -144,8 +141,16 @@ def _root(spec: mujoco.MjSpec, file: Mjcf, notify: Notify) -> mujoco.MjsBody:
 
 
 def _sort_geoms(spec: mujoco.MjSpec) -> None:
-    """Assign the groups of collision (0) and visual (1) geoms, and add copies of collision geoms that are seen."""
+    """Assign the groups of collision (0) and visual (1) geoms, and add copies of collision geoms that are seen.
+
+    What has no mass, because of the file's `inertiagrouprange`, has none in its new group.
+    """
     geoms = list(spec.geoms)
+    first, last = spec.compiler.inertiagrouprange
+    for geom in geoms:
+        if not first <= geom.group <= last:
+            geom.mass = 0.0
+    spec.compiler.inertiagrouprange = [0, mujoco.mjNGROUP - 1]
     solid = [geom for geom in geoms if geom.contype or geom.conaffinity]
     visuals = [geom for geom in geoms if not (geom.contype or geom.conaffinity) and geom.group < _HIDDEN]
     named = {geom.name for geom in geoms}

@@ -1,6 +1,5 @@
 """Test of a new object: whether it stays where it is put down, whether it can be grasped, and a picture of it."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +34,13 @@ def try_object(item: ObjectModel, notify: Notify, picture: Path | None = None) -
         picture: PNG file to write; None writes none.
 
     Returns:
-        `size` [m], the parameters of placement, `stands`, and `grasp`: the width of the narrowest grasp [m], or the
-        reason why there is none.
+        `mass` [kg], `size` [m] as it rests, the parameters of placement, `stands`, and `grasp`: the width of the
+        narrowest grasp [m], or the reason why there is none.
 
     Raises:
         LiberoError: The model cannot be compiled, or it has no collision geoms.
     """
-    model, data, found = _put_down(item, (1.0, 0.0, 0.0, 0.0))
+    model, data, found = _put_down(item)
     if picture is not None:
         turntable(model, data, found["size"], picture)
     found |= {"stands": _stands(model, data, notify), "grasp": _grasp(model, data, item.category, notify)}
@@ -61,7 +60,7 @@ def draw_object(item: ObjectModel, picture: Path) -> Path:
     Raises:
         LiberoError: The model cannot be compiled, or nothing can be rendered on this machine.
     """
-    model, data, found = _put_down(item, item.rest_quat())
+    model, data, found = _put_down(item)
     return turntable(model, data, found["size"], picture)
 
 
@@ -93,20 +92,21 @@ def turntable(model: mujoco.MjModel, data: mujoco.MjData, size: list[float], pic
     return picture
 
 
-def _put_down(
-    item: ObjectModel, quat: Sequence[float] | np.ndarray
-) -> tuple[mujoco.MjModel, mujoco.MjData, dict[str, Any]]:
-    """Return a scene with an object just above a floor, and its `size` and what placement needs, [m].
+def _put_down(item: ObjectModel) -> tuple[mujoco.MjModel, mujoco.MjData, dict[str, Any]]:
+    """Return a scene with an object just above a floor as it rests, its `mass` [kg], `size` and what placement needs, [m].
 
     Raises:
         LiberoError: The model cannot be compiled, or it has no collision geoms.
     """
     model = _scene(item)
-    points = surface_points(model, model.body(_BODY).id)
+    body, quat, mat = model.body(_BODY).id, item.rest_quat(), np.zeros(9)
+    mujoco.mju_quat2Mat(mat, quat)
+    points = surface_points(model, body) @ mat.reshape(3, 3).T
     if not len(points):
         raise LiberoError("it has no collision geoms; give it a geom with contype and conaffinity 1")
     low, high = points.min(axis=0), points.max(axis=0)
     found: dict[str, Any] = {
+        "mass": round(float(model.body_subtreemass[body]), 5),
         "size": [round(float(value), 5) for value in high - low],
         "bottom_offset": [0.0, 0.0, round(float(low[2]), 5)],
         "top_offset": [0.0, 0.0, round(float(high[2]), 5)],
@@ -150,6 +150,8 @@ def _aim(model: mujoco.MjModel, centre: np.ndarray, distance: float, yaw: float)
 
 def _stands(model: mujoco.MjModel, data: mujoco.MjData, notify: Notify) -> bool:
     """Return whether the object stays where it is put down; `data` ends in the state at rest."""
+    body = data.body(_BODY)
+    before = body.xmat.reshape(3, 3).copy()
     for _ in range(round(_SECONDS / model.opt.timestep)):
         mujoco.mj_step(model, data)
     if data.warning[mujoco.mjtWarning.mjWARN_BADQACC].number or not np.isfinite(data.qpos).all():
@@ -157,8 +159,7 @@ def _stands(model: mujoco.MjModel, data: mujoco.MjData, notify: Notify) -> bool:
         mujoco.mj_resetData(model, data)
         mujoco.mj_forward(model, data)
         return False
-    body = data.body(_BODY)
-    tilt = float(np.degrees(np.arccos(np.clip(body.xmat.reshape(3, 3)[2, 2], -1.0, 1.0))))
+    tilt = float(np.degrees(np.arccos(np.clip((body.xmat.reshape(3, 3) @ before.T)[2, 2], -1.0, 1.0))))
     slid = float(np.linalg.norm(body.xpos[:2]))
     stands = tilt < _MAX_TILT and slid < _MAX_SHIFT
     if not stands:
