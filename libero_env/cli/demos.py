@@ -128,8 +128,8 @@ def demo_configs(request: RecordingRequest) -> "list[DemoConfig]":
         tasks = (read_task(Path(str(request.bddl))),)
     shown = () if request.no_images else modalities(depth=request.depth, segmentation=request.segmentation)
     if request.no_images:
-        images = {"size": request.size, "depth": request.depth, "segmentation": request.segmentation}
-        refuse("with --no-images", cameras=request.cameras, **images)
+        given = ("cameras", "size", "drawing", "depth", "segmentation")
+        refuse("with --no-images", **{name: getattr(request, name) for name in given})
     size, drawing, robot = request.size or DemoConfig.camera_size, request.drawing, request.robot
     seed = request.seed
     if request.training:

@@ -257,6 +257,9 @@ class Reader:
         """Return the fields of the problem that the sections of a file have."""
         init = tuple(map(self.atom, items[":init"]))
         self.init, self.goal = self.goal, []
+        properties = [self.scene_property(node) for node in items.get(":scene_properties", ())]
+        if len(properties) > len(dict(properties)):
+            self.fail(self.sections[":scene_properties"], "two properties of one kind", "each once")
         return {
             "domain": " ".join(map(self.word, items.get(":domain", ()))) or "robosuite",
             "language": " ".join(map(self.word, items[":language"])),
@@ -264,7 +267,7 @@ class Reader:
             "fixtures": self.names(items[":fixtures"]),
             "objects": self.names(items[":objects"]),
             "obj_of_interest": tuple(map(self.word, items.get(":obj_of_interest", ()))),
-            "scene_properties": dict(map(self.scene_property, items.get(":scene_properties", ()))),
+            "scene_properties": dict(properties),
             "cameras": tuple(map(self.camera, items.get(":views", ()))),
             "zones": tuple(map(self.word, items.get(":zones", ()))),
             "init": init,

@@ -275,7 +275,7 @@ class Definition(TypedDict, total=False):
     cameras: dict[Name, View]
     zones: Annotated[list[Name], Field(max_length=MAX_PARTS), BeforeValidator(_listed)]
     obj_of_interest: Annotated[list[Name], Field(max_length=MAX_PARTS)]
-    scene_properties: dict[Name, Annotated[Words, AfterValidator(lambda text: " ".join(text.split()))]]
+    scene_properties: dict[Name, Words]
 
 
 KEYS = ("scene", "with", *Definition.__annotations__)

@@ -30,7 +30,7 @@ def _check_entity(name: str) -> str:
 def _check_writable(text: str) -> str:
     if _UNWRITABLE.search(text):
         raise ValueError(f"{text!r:.60} cannot be written; expected one line without ( ) and ;")
-    return text
+    return " ".join(text.split())  # as a reader of BDDL has them
 
 
 def check_corners(rectangle: Any) -> Any:

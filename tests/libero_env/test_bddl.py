@@ -61,6 +61,13 @@ def test_round_trip():
     assert_round_trip(bddl.parse(GOOD))
 
 
+def test_words_are_separated_by_one_blank():
+    words = {"language": " put  both pots\u2003on the stove", "scene_properties": {"wall": "red  brick"}}
+    problem = dataclasses.replace(bddl.parse(GOOD), **words)
+    assert problem.language == "put both pots on the stove"
+    assert_round_trip(problem)
+
+
 def test_round_trip_of_all_originals(shared):
     files = sorted((shared / "official" / "bddl_files").glob("*/*.bddl"))
     assert len(files) == 130
@@ -92,6 +99,7 @@ def test_a_problem_travels_between_processes():
     (("(Not (Turnon stove_1))", "(Not)"), 18, "(Not); expected (Not EXPRESSION)"),
     (("(:rgba (0 0 1 0.5))", "(:target table)"), 8, "a second :target in a region; expected one"),
     (("(cook_region (:target stove_1)", "(pot_region (:target table)"), 8, "table_pot_region is declared twice"),
+    (("(:floor wooden)", "(:floor wooden) (:floor dark)"), 15, "two properties of one kind; expected each once"),
     (("(turnon stove_1)", "(turn/on stove_1)"), 16, "turn/on is not a predicate; expected letters"),
     (("moka_pot\n", "moka_pot\0\n"), 11, "the character '\\x00'; expected text"),
     (("(Not ", "(" * 70), 18, "more than 64 nested brackets"),

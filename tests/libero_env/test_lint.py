@@ -60,6 +60,10 @@ FAULTS = [
      "instruction", "warning", "names a ketchup, but there is none"),
     ("Open the top layer of the drawer and put the bowl inside", "put the bowl in the bottom drawer",
      "instruction", "warning", "names bottom, but the goal top"),
+    (GOAL, "(And (Open wooden_cabinet_1_top_region) (Close wooden_cabinet_1_top_region))", "contradiction", "error",
+     "never hold together"),
+    (GOAL, "(And (Not (Up plate_1)) (In akita_black_bowl_1 wooden_cabinet_1_top_region) (Up plate_1))",
+     "contradiction", "error", r"\(Not \(Up plate_1\)\) and for \(Up plate_1\)"),
     ("main_table - table", "main_table - table\n    other_table - table", "workspace", "error", "2 workspaces"),
     ("(:init", "(:inti", "syntax", "error", "unknown section ':inti'"),
 ]  # fmt: skip

@@ -12,10 +12,11 @@ from libero_env.assets.pack import Pack, select_pack
 from libero_env.design.lint.report import Finding, Level, Report
 from libero_env.design.lint.scene import check_scene
 from libero_env.errors import BDDLError, UnknownNameError
+from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.predicates import PREDICATES
 from libero_env.tasks import Task, bddl
 from libero_env.tasks.builder import FILE, language_from_name
-from libero_env.tasks.problem import Problem, ProblemError
+from libero_env.tasks.problem import And, Atom, Expression, Not, Problem, ProblemError
 from libero_env.tasks.sexpr import parse_tree
 from libero_env.workspaces import WORKSPACES
 
@@ -86,6 +87,7 @@ def lint_text(
         report.add("warning", 1, "unknown-section", f"the section {section:.40} has no effect", "remove it")
     _check_categories(report, problem, pack)
     _check_atoms(report, problem)
+    _check_goal(report, problem)
     _check_regions(report, problem)
     _check_places(report, problem)
     _check_words(report, task, pack)
@@ -132,6 +134,18 @@ def _check_atoms(report: Report, problem: Problem) -> None:
         if atom.predicate not in PREDICATES:
             what = f"the predicate of {atom} does not exist"
             report.add("error", line, "unknown-predicate", what, report.suggest(atom.predicate, PREDICATES))
+
+
+def _check_goal(report: Report, problem: Problem) -> None:
+    """Check that a goal does not ask for a condition and its opposite."""
+    parts = problem.goal.parts if isinstance(problem.goal, And) else ()
+    for part in parts:
+        opposite: Expression | None = part.part if isinstance(part, Not) else None
+        if isinstance(part, Atom) and part.predicate in ("Open", "Turnon"):
+            opposite = Atom(OPPOSITE_STATES[part.predicate.lower()].capitalize(), part.args)
+        if opposite in parts:
+            what = f"the goal asks for {part} and for {opposite}, which never hold together"
+            report.add("error", report.lines.line(":goal"), "contradiction", what, "remove one of them")
 
 
 def _check_regions(report: Report, problem: Problem) -> None:
