@@ -103,6 +103,6 @@ def certify(
         solved = read_json(attempts_file())
         for certificate in certificates:
             solved |= certificate.attempts(named[certificate.perturbation])
-        write_json(attempts_file(), dict(sorted(solved.items())))
+        write_json(attempts_file(), {name: n for name, n in sorted(solved.items()) if n})
         lines.append(str(attempts_file()))
     return Answer("\n".join(lines), [asdict(one) for one in certificates])

@@ -114,7 +114,7 @@ def certify(
     Args:
         tasks: Tasks of suites, whose initial states are stored, or of files, whose initial state i is sampled with
             seed i.
-        states: Number of initial states of each task, at most the 50 that are stored.
+        states: Number of initial states of each task, at most those that are stored.
         jobs: Number of processes; the outcomes do not depend on it. 1 runs in this process, which knows the objects
             that are registered in it.
         out: Folder with a JSON file for each task; outcomes there of the same scene and expert are not run again.
@@ -137,8 +137,9 @@ def certify(
     paths = [out / "tasks" / task.suite / f"{task.name}{ending}.json" if out else None for task in tasks]
     if not again:
         found = [_stored(path, empty) if path else empty for path, empty in zip(paths, found, strict=True)]
-    chunks = [(k, chunk) for k, known in enumerate(found) for chunk in _missing(known, states)]
-    total, left = states * len(tasks), sum(len(chunk) for _, chunk in chunks)
+    counts = [min(states, task.num_starts) for task in tasks]
+    chunks = [(k, chunk) for k, known in enumerate(found) for chunk in _missing(known, counts[k])]
+    total, left = sum(counts), sum(len(chunk) for _, chunk in chunks)
     with progress_bar(
         total=total, initial=total - left, desc="certify", unit="start", progress=progress
     ) as bar:

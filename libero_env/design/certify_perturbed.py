@@ -66,9 +66,9 @@ class PerturbedCertificate:
         return self.drawn_again + sum(self.solved.values())
 
     def attempts(self, one: Perturbation) -> dict[str, int]:
-        """Return the numbers of the draws to use that are not the first, by their names."""
-        own = {one.sample_name(self.task, start): n for start, n in self.solved.items() if n}
-        return own | ({one.sample_name(self.task): self.drawn_again} if self.drawn_again else {})
+        """Return the numbers of the draws to use, by their names: 0, the first, where the expert solves none."""
+        own = {**dict.fromkeys(self.failures, 0), **self.solved, "": self.drawn_again}
+        return {one.sample_name(self.task, start): n for start, n in own.items()}
 
 
 def certify_perturbed(
@@ -85,7 +85,7 @@ def certify_perturbed(
 
     Args:
         perturbations: Perturbations, each by itself.
-        starts: Number of initial states of each task, at most 50.
+        starts: Number of initial states of each task, at most those that are stored.
         redraws: Number of further draws where the expert fails.
         jobs: Number of processes; the results do not depend on it.
         out: Folder of the results, a file for each task and perturbation.
@@ -99,12 +99,13 @@ def certify_perturbed(
     """
     units = [(task, one) for task in tasks for one in perturbations]
     found: dict[int, PerturbedCertificate] = {}
+    counts = [min(starts, task.num_starts) for task, _ in units]
     for k, (task, one) in enumerate(units):
-        if not again and (stored := _stored(_path(out, task, one), _digest(task, one, starts, redraws))):
+        if not again and (stored := _stored(_path(out, task, one), _digest(task, one, counts[k], redraws))):
             found[k] = stored
     left = [k for k in range(len(units)) if k not in found]
     with progress_bar(total=len(units), initial=len(found), desc="certify", unit="variant") as bar:
-        arguments = [(*units[k], range(starts), redraws) for k in left]
+        arguments = [(*units[k], range(counts[k]), redraws) for k in left]
         for index, certificate in run_each(attempt_perturbed, arguments, jobs):
             k = left[index]
             found[k] = certificate

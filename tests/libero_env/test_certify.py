@@ -1,7 +1,7 @@
 """Certificates: known outcomes are not run again, each initial state counts once, and the exit status is right."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 
 import mujoco
@@ -13,7 +13,7 @@ from libero_env.design import certify as module
 from libero_env.design.certify import Certificate, Outcome, certify, markdown_table, results
 from libero_env.errors import LiberoError
 from libero_env.objects import ObjectModel, register_object
-from libero_env.tasks import get_suite, get_task, make_task, read_task
+from libero_env.tasks import Task, get_suite, get_task, make_task, read_task
 
 TASKS = get_suite("libero_object").tasks[:2]
 
@@ -60,6 +60,15 @@ def test_what_was_done_before_a_stop_is_kept(tried, tmp_path, monkeypatch):
     found = certify(TASKS, 40, out=tmp_path, progress=False)
     assert len(tried) == len(set(tried)) == 80
     assert [len(c.outcomes) for c in found] == [40, 40]
+
+
+def test_a_task_with_fewer_stored_states_is_tried_from_those(tried, tmp_path):
+    class Short(Task):
+        num_starts = 2
+
+    short = Short(**{field.name: getattr(TASKS[0], field.name) for field in fields(Task)})
+    (found,) = certify([short], 20, out=tmp_path, progress=False)
+    assert [o.state for o in found.outcomes] == [0, 1] and found.rate == 1.0
 
 
 def test_another_scene_or_expert_is_run_again(tried, tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from libero_env.assets.arena import load_workspace
 from libero_env.cli import main as cli
 from libero_env.design.lint.checks import Finding, lint_file, lint_task, lint_text
 from libero_env.design.lint.scene import furthest_reach, reach
+from libero_env.init_states.store import load_init_states
 from libero_env.sim.predicates import PREDICATES
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, suite_names
@@ -189,6 +190,13 @@ def test_a_missing_place_is_reported_with_the_existing_ones():
 @pytest.mark.parametrize("key", ["libero_goal/3", "libero_object/0", "libero_90/86", "libero_spatial/5"])
 def test_tasks_of_the_benchmark_are_sound(key):
     assert [str(f) for f in lint_task(get_task(key), starts=2) if f.level != "info"] == []
+
+
+@pytest.mark.sim
+def test_more_starts_than_are_stored_are_all_that_are(monkeypatch):
+    one, load = get_task("libero_goal/3"), load_init_states
+    monkeypatch.setattr("libero_env.design.lint.scene.load_init_states", lambda *task: load(*task)[:1])
+    assert lint_task(one, starts=2) == lint_task(one, starts=1)
 
 
 @pytest.mark.sim

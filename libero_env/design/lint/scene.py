@@ -135,13 +135,16 @@ def _surfaces(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None:
     """Check initial states: they exist, are at rest, their atoms hold, and the goal does not."""
-    faults, checked = Counter[tuple[str, str]](), False
+    faults, checked, stored = Counter[tuple[str, str]](), False, None
+    if task.suite != FILE and scene.pack.name == BUILTIN:
+        stored = load_init_states(task, scene)[:starts]
+        starts = len(stored)
     with closing(LoopSimulations(scene.model, fixture_bodies=scene.fixture_bodies.tolist())) as simulations:
         view = StateView(scene, simulations)
         try:
             for i in range(starts):
                 try:
-                    _set_start(task, scene, simulations, i, faults)
+                    _set_start(scene, simulations, None if stored is None else stored[i], i, faults)
                 except PlacementError as error:
                     faults["placement", str(error)] += 1
                     continue
@@ -156,24 +159,28 @@ def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None
 
 
 def _set_start(
-    task: Task, scene: Scene, simulations: LoopSimulations, i: int, faults: Counter[tuple[str, str]]
+    scene: Scene,
+    simulations: LoopSimulations,
+    stored: np.ndarray | None,
+    i: int,
+    faults: Counter[tuple[str, str]],
 ) -> None:
-    """Set the simulation to initial state i: a stored one for a task of a suite, else a sampled one after settling.
+    """Set the simulation to a stored initial state, or else to that sampled with seed i after settling.
 
     Objects that move at first are counted in `faults`.
 
     Raises:
         PlacementError: No state can be sampled, or it does not come to rest.
     """
-    stored, still = task.suite != FILE and scene.pack.name == BUILTIN, np.zeros((1, scene.model.nv))
-    if stored:
-        qpos, _, (fixtures,) = scene.split_states(load_init_states(task, scene)[i : i + 1])
+    still = np.zeros((1, scene.model.nv))
+    if stored is not None:
+        qpos, _, (fixtures,) = scene.split_states(stored[None])
     else:
         start = sample_start(scene, np.random.default_rng(i))
         qpos, fixtures = start.qpos[None], start.fixtures
     simulations.reset([0], qpos, still, fixtures=fixtures[None])
     faults.update(("unstable-start", name) for name in _moving(scene, simulations))
-    if not stored:
+    if stored is None:
         qpos = settle(simulations, 0, qpos[0], scene.nq_robot, fixtures)[None]
     simulations.reset([0], qpos, still, fixtures=fixtures[None])
 
