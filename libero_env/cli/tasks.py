@@ -219,10 +219,11 @@ def new(
         goal: Atoms, such as 'On red_coffee_mug_1 plate_1' (default: first on last).
         language: The instruction (default: it describes the goal).
         out: Folder.
-        bddl: Also write the BDDL file.
+        bddl: Also write the BDDL file, whose instruction is its name.
     """
     from libero_env.design.template import task_template
     from libero_env.tasks import read_task
+    from libero_env.tasks.builder import language_from_name
     from libero_env.tasks.suites import write_task
     from libero_env.tasks.task import check_name
 
@@ -238,7 +239,7 @@ def new(
     task = read_task(path)
     print(f"{path}: {task.language}")
     if bddl:
-        print(write_task(task, path.with_suffix(".bddl")))
+        print(f"{write_task(task, path.with_suffix('.bddl'))}: {language_from_name(name)}")
     for command in (
         f"libero tasks preview {quote(str(path))} --video",
         f"libero tasks lint {quote(str(path))}",

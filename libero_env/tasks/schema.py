@@ -6,6 +6,7 @@ numbers are numbers (`pi/2` is 1.57), a single object is a list of one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import pi
 from pathlib import Path
 from typing import Annotated, Any, Required
 
@@ -149,6 +150,12 @@ def _number(value: Any) -> Any:
         ) from None
 
 
+def _few_turns(angle: float) -> float:
+    if abs(angle) > 4 * pi:
+        raise ValueError(f"{angle:g} rad is more than two turns; expected radians: 90 degrees are pi/2")
+    return angle
+
+
 def _pair(value: Any) -> Any:
     """Return a number as a pair of itself."""
     return value if isinstance(value, list) else [value, value]
@@ -197,7 +204,7 @@ _Number = Annotated[float, BeforeValidator(_number)]
 _Metres = Annotated[float, Field(ge=-10, le=10), BeforeValidator(_number)]
 _Point = Annotated[list[_Metres], _THREE]
 _Half = Annotated[float, Field(ge=0, le=10), BeforeValidator(_number)]
-_Radians = Annotated[float, Field(ge=-100, le=100), BeforeValidator(_number)]
+_Radians = Annotated[float, AfterValidator(_few_turns), BeforeValidator(_number)]
 _Row = Annotated[list[_Metres], _FOUR, AfterValidator(check_corners)]
 _Atom = Annotated[str, AfterValidator(_atom), BeforeValidator(_words)]
 _Atoms = Annotated[list[_Atom], Field(max_length=MAX_PARTS), BeforeValidator(_listed)]

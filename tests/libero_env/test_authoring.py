@@ -332,7 +332,9 @@ def test_a_task_runs_by_the_name_of_its_file_and_is_rendered(tmp_path, capsys):
     options = ["--scene", "floor", "--objects", "butter", "basket", "--bddl", "--out", str(tmp_path)]
     assert main(["tasks", "new", "first", *options]) == 0
     path = tmp_path / "first.yaml"
-    assert "put the butter in the basket" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "put the butter in the basket" in said
+    assert f"first.bddl: {read_task(tmp_path / 'first.bddl').language}\n" in said
     assert read_task(tmp_path / "first.bddl").problem == read_task(path).problem
     assert (
         main(["tasks", "new", "first", "--out", str(tmp_path)]) == 2

@@ -294,6 +294,16 @@ def test_registering_lasts_for_the_process_and_is_made_once(tmp_path):
     assert "block" in object_names() and folder.names() == ()
 
 
+def test_the_texture_of_a_gltf_file_is_multiplied_by_its_factor(tmp_path):
+    mesh = trimesh.creation.box((0.05, 0.05, 0.05))
+    white, uv = Image.new("RGB", (8, 8), (255, 255, 255)), np.zeros((len(mesh.vertices), 2))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=white, baseColorFactor=[255, 0, 0, 255])
+    mesh.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+    mesh.export(tmp_path / "red.glb")
+    (material,) = get_object(register_object_file(tmp_path / "red.glb")).spec.materials
+    assert material.rgba.tolist() == [1, 0, 0, 1] and any(material.textures)
+
+
 def test_registering_again_reads_what_the_file_names(tmp_path):
     defaults = '<mujoco><default><default class="c"><geom type="box" size=".02 .02 %s"/></default></default></mujoco>'
     body = '<include file="sizes.xml"/><worldbody><body name="b"><geom class="c"/></body></worldbody>'

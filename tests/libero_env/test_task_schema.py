@@ -49,6 +49,7 @@ BAD = [  # old, new, line, message
     ("[0, 0]", "'On On On'", 8, "'On On On' is not a place; expected such as plate_1"),
     ("[0, 0]", "akita_black_bowl_1", 8, "is of akita_black_bowl_1 and itself"),
     ("half: [0.01, 0.02]", "half: -1", 11, "plate_1.half"),
+    ("yaw: pi", "yaw: 90", 7, "90 rad is more than two turns; expected radians: 90 degrees are pi/2"),
     ("yaw: pi", "yaw: [pi, 0]", 7, "is not a range; expected (LOW HIGH)"),
     ("init: [Open", "init: [Opened", 12, "unknown predicate|Opened"),
     ("  - Up plate_1", "  - Up", 15, "not an atom"),

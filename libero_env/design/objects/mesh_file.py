@@ -3,7 +3,7 @@
 import json
 import os
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import log
@@ -41,7 +41,7 @@ class Surface:
         faces: Vertex indices, (f, 3).
         texcoords: Texture coordinates, (n, 2), v = 0 at the lower edge of the image; None for a plain colour.
         image: Texture; None for a plain colour.
-        rgba: Colour, in [0, 1]; white where there is a texture.
+        rgba: Colour, in [0, 1], by which a texture is multiplied.
     """
 
     vertices: np.ndarray
@@ -180,11 +180,16 @@ def _surface(part: Any, path: Path) -> Surface:
             raise InvalidInputError(
                 f"{path}: {len(vertices)} vertices have {len(points)} texture coordinates"
             )
-        return Surface(vertices, faces, points, _picture(image, str(path)), (1.0,) * 4)
+        factor = getattr(material, "baseColorFactor", None)  # of glTF, by which the texture is multiplied
+        rgba = (1.0,) * 4 if factor is None else _rgba(factor)
+        return Surface(vertices, faces, points, _picture(image, str(path)), rgba)
     known = getattr(part.visual, "defined", False) or material is not None
     colour = getattr(material if material is not None else part.visual, "main_color", None) if known else None
-    rgba = _GREY if colour is None else tuple(round(float(value) / 255, 4) for value in colour)
-    return Surface(vertices, faces, rgba=rgba)
+    return Surface(vertices, faces, rgba=_GREY if colour is None else _rgba(colour))
+
+
+def _rgba(colour: Sequence[int]) -> tuple[float, ...]:
+    return tuple(round(float(value) / 255, 4) for value in colour)
 
 
 def _check_finite(points: np.ndarray, path: Path) -> None:
