@@ -60,7 +60,9 @@ class OriginalPack:
     def categories(self) -> tuple[str, ...]:
         """Return all categories of the files that are there, those that users registered included, sorted."""
         pro = (name for name in LIBERO_PRO if self.file(name).is_file())
-        return tuple(sorted({*user_defined_names(), *pro, *(c for group in FAMILIES.values() for c in group)}))
+        return tuple(
+            sorted({*user_defined_names(), *pro, *(c for group in FAMILIES.values() for c in group)})
+        )
 
     def build(self, category: str) -> ObjectModel:
         """Return a new model of a category at each call; a category that users registered takes precedence.

@@ -93,7 +93,7 @@ def turntable(model: mujoco.MjModel, data: mujoco.MjData, size: list[float], pic
 
 
 def _put_down(item: ObjectModel) -> tuple[mujoco.MjModel, mujoco.MjData, dict[str, Any]]:
-    """Return a scene with an object just above a floor as it rests, its `mass` [kg], `size` and what placement needs, [m].
+    """Return a scene with an object just above a floor as it rests, its mass [kg], size [m], and what placement needs.
 
     Raises:
         LiberoError: The model cannot be compiled, or it has no collision geoms.
