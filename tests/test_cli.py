@@ -203,14 +203,14 @@ def test_runs_as_a_process():
 def test_doctor_reports_what_is_broken_and_how_to_fix_it(monkeypatch, capsys):
     broken = Finding("GL", "no picture", False, "install one")
     minor = Finding("demonstrations", "none", False, "make some", essential=False)
-    monkeypatch.setattr(doctor, "examine", lambda gl_only: [minor])
-    assert cli.main(["doctor", "--gl"]) == 0
+    monkeypatch.setattr(doctor, "examine_gpu", lambda: [minor])
+    assert cli.main(["doctor", "--gpu"]) == 0
     assert "note  demonstrations:" in capsys.readouterr().out
-    monkeypatch.setattr(doctor, "examine", lambda gl_only: [minor, broken])
-    assert cli.main(["doctor", "--gl"]) == 1
+    monkeypatch.setattr(doctor, "examine_gpu", lambda: [minor, broken])
+    assert cli.main(["doctor", "--gpu"]) == 1
     out = capsys.readouterr().out
     assert "FAIL  GL:" in out and "-> install one" in out
-    assert cli.main(["doctor", "--gl", "--json"]) == 1
+    assert cli.main(["doctor", "--gpu", "--json"]) == 1
     found = json.loads(capsys.readouterr().out)
     assert found["ok"] is False and [entry["essential"] for entry in found["findings"]] == [False, True]
     assert found["findings"][1] == {

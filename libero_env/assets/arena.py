@@ -170,15 +170,9 @@ def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
     for name, camera in workspace.parameters["cameras"].items():
         world.add_camera(name=name, pos=camera["pos"], quat=camera["quat"], fovy=camera["fovy_degrees"])
     for name, light in workspace.parameters["lights"].items():
-        add_light(
-            spec,
-            name,
-            pos=light["pos"],
-            dir=light["dir"],
-            diffuse=[0.8] * 3,
-            specular=[light.get("specular", 0.3)] * 3,
-            directional=light.get("directional", False),
-        )
+        values = {"pos": light["pos"], "dir": light["dir"], "diffuse": [0.8] * 3}
+        specular, directional = [light.get("specular", 0.3)] * 3, light.get("directional", False)
+        add_light(spec, name, directional=directional, specular=specular, **values)
 
 
 def surface_styles() -> dict[str, Mapping[str, Any]]:
@@ -196,19 +190,9 @@ def add_spare_materials(spec: mujoco.MjSpec) -> None:
         add_material(spec, SPARE + name, style)
 
 
-def add_light(
-    spec: mujoco.MjSpec,
-    name: str,
-    *,
-    pos: Sequence[float],
-    dir: Sequence[float],  # noqa: A002 - MuJoCo's name
-    diffuse: Sequence[float],
-    specular: Sequence[float],
-    directional: bool,
-) -> None:
-    """Add a light that casts no shadow to the world; arguments as in MJCF."""
-    light = spec.worldbody.add_light(name=name, pos=list(pos), dir=list(dir), castshadow=False)
-    light.diffuse, light.specular = list(diffuse), list(specular)
+def add_light(spec: mujoco.MjSpec, name: str, *, directional: bool, **values: Sequence[float]) -> None:
+    """Add a light that casts no shadow to the world; `values` are numbers of MJCF, such as `pos` and `diffuse`."""
+    light = spec.worldbody.add_light(name=name, castshadow=False, **values)
     if directional:
         make_directional(light)
 

@@ -17,9 +17,7 @@ from libero_env.mujoco_compat import delete, mujoco
 from libero_env.storage import read_yaml
 
 _NAMES = read_yaml("assets/original.yaml")
-SCENES: Mapping[str, str] = MappingProxyType(
-    _NAMES["scenes"]
-)  # workspace -> beginning of the names of its files
+SCENES: Mapping[str, str] = MappingProxyType(_NAMES["scenes"])  # workspace -> beginning of its files' names
 TEXTURES: Mapping[str, Mapping[str, str]] = MappingProxyType(_NAMES["textures"])  # name of a style -> file
 _TEXTURE_NAMES = {"floor": "texplane", "wall": "tex-wall"}
 _STIFF = 0.004  # [s] smallest time constant that the timestep allows
@@ -111,9 +109,8 @@ def restore_drawing(spec: mujoco.MjSpec, root: Path, workspace: Workspace, scene
     for mesh in spec.meshes:  # their vertices are rounded in the frame that MuJoCo gives them by default
         if mesh.name not in solid and mesh.file and Path(mesh.file).is_relative_to(root):
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_LEGACY
-    if hasattr(
-        mujoco, "mjtColorSpace"
-    ):  # after 3.3.2, which converts no colours of files that are tagged as sRGB
+    # after 3.3.2, which converts no colours of files that are tagged as sRGB
+    if hasattr(mujoco, "mjtColorSpace"):
         for texture in spec.textures:
             texture.colorspace = mujoco.mjtColorSpace.mjCOLORSPACE_LINEAR
 
@@ -129,15 +126,9 @@ def _restore_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace, world
     for name, pose in (cameras | read_yaml(_CAMERAS)[workspace.name]).items():
         parent.add_camera(name=name, pos=pose["pos"], quat=pose["quat"])
     for light in world.findall("light"):  # their order is that of a sum of floats
-        add_light(
-            spec,
-            light.get("name", ""),
-            pos=_numbers(light, "pos"),
-            dir=_numbers(light, "dir"),
-            diffuse=_numbers(light, "diffuse"),
-            specular=_numbers(light, "specular"),
-            directional=light.get("directional") == "true",
-        )
+        values = {key: _numbers(light, key) for key in ("pos", "dir", "diffuse", "specular")}
+        directional = light.get("directional") == "true"
+        add_light(spec, light.get("name", ""), directional=directional, **values)
 
 
 def _numbers(element: ET.Element, key: str) -> list[float]:

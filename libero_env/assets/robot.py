@@ -34,15 +34,8 @@ ROBOSUITE_VERSION = "1.4.1"
 ARM_JOINTS = tuple(f"robot0_joint{i}" for i in range(1, 8))
 FINGER_JOINTS = ("gripper0_finger_joint1", "gripper0_finger_joint2")
 GRIP_SITE = "gripper0_grip_site"
-REST_QPOS = (
-    0.0,
-    -0.161037389,
-    0.0,
-    -2.44459747,
-    0.0,
-    2.2267522,
-    np.pi / 4,
-)  # [rad] initial and null-space posture
+# [rad] initial and null-space posture
+REST_QPOS = (0.0, -0.161037389, 0.0, -2.44459747, 0.0, 2.2267522, np.pi / 4)
 OPEN_FINGERS = (0.020833, -0.020833)  # [m] initial finger positions
 ARMATURE = tuple(5.0 / (i + 1) for i in range(7))  # [kg m^2] robosuite adds it to joint i of the MJCF
 FRICTIONLOSS = 0.1  # [N m] robosuite adds it to every joint
@@ -225,13 +218,8 @@ def _replace_visuals(spec: mujoco.MjSpec, name: str) -> None:
         if len(faces):
             mesh = spec.add_mesh(name=f"visual{i}", uservert=vertices.ravel(), userface=faces.ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-            spec.body(body).add_geom(
-                name=f"visual{i}",
-                type=mujoco.mjtGeom.mjGEOM_MESH,
-                meshname=mesh.name,
-                rgba=rgba,
-                **VISUAL_GEOM,
-            )
+            look = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": mesh.name, "rgba": rgba}
+            spec.body(body).add_geom(name=f"visual{i}", **look, **VISUAL_GEOM)
     for geom in visuals:
         delete(spec, geom)
     used = {g.meshname for g in spec.geoms}

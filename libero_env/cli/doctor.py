@@ -9,10 +9,11 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from libero_env.assets.pack import BUILTIN, VARIABLE, chosen_assets, facade_assets, pack_of
 from libero_env.assets.published import find_distribution
@@ -102,14 +103,8 @@ class Finding:
     essential: bool = True
 
 
-def examine(gl_only: bool = False) -> list[Finding]:
-    """Return the findings about everything that the benchmark needs; this takes a few seconds.
-
-    Args:
-        gl_only: Whether to check rendering only.
-    """
-    if gl_only:
-        return [check_gl()]
+def examine() -> list[Finding]:
+    """Return the findings about everything that the benchmark needs; this takes a few seconds."""
     packages = [check_package(name) for name in ("mujoco", "numba", "numpy", "gymnasium", "h5py")]
     models = [check_facade(), check_robot_models(), check_models()]
     warp = check_package("mujoco-warp", WARP_REMEDY, essential=False)
@@ -233,15 +228,9 @@ def run_probe(words: Sequence[str], seconds: float = PROBE_SECONDS) -> tuple[boo
         Whether it ended well and in time, and the last line that it printed: of its errors where it did not.
     """
     path = os.pathsep.join(filter(None, (PACKAGE_ROOT, os.environ.get("PYTHONPATH"))))
+    how: dict[str, Any] = {"env": {**os.environ, "PYTHONPATH": path}, "timeout": seconds}
     try:
-        done = subprocess.run(
-            [sys.executable, *words],
-            env={**os.environ, "PYTHONPATH": path},
-            capture_output=True,
-            text=True,
-            timeout=seconds,
-            check=False,
-        )
+        done = subprocess.run([sys.executable, *words], capture_output=True, text=True, check=False, **how)
     except subprocess.TimeoutExpired:
         return False, f"no answer within {seconds:g} s"
     lines = [line for line in (done.stderr if done.returncode else done.stdout).splitlines() if line]
@@ -311,22 +300,6 @@ def folder_bytes(path: Path) -> int:
     return total
 
 
-def render_findings(findings: Iterable[Finding]) -> str:
-    """Return the findings as text, one line each and a second one with the remedy."""
-    rows = []
-    for finding in findings:
-        mark = "ok  " if finding.ok else ("FAIL" if finding.essential else "note")
-        rows.append(f"{mark}  {finding.title + ':':27} {finding.detail}")
-        if not finding.ok:
-            rows.append(f"      -> {finding.remedy}")
-    return "\n".join(rows)
-
-
-def is_broken(findings: Iterable[Finding]) -> bool:
-    """Return whether an essential check failed."""
-    return any(finding.essential and not finding.ok for finding in findings)
-
-
 def doctor(*, gl: bool = False, gpu: bool = False) -> Answer:
     """Say what this machine has and lacks, and how to fix it; return 1 where something essential is broken.
 
@@ -337,8 +310,14 @@ def doctor(*, gl: bool = False, gpu: bool = False) -> Answer:
     """
     if gl and gpu:
         raise InvalidInputError("--gl and --gpu each check one thing only; give one of them")
-    findings = examine_gpu() if gpu else examine(gl_only=gl)
+    findings = examine_gpu() if gpu else [check_gl()] if gl else examine()
     if not (gl or gpu) and importlib.util.find_spec("lifelong"):
         findings += importlib.import_module("lifelong.cli.runs").examine()
-    content = {"ok": not is_broken(findings), "findings": [asdict(finding) for finding in findings]}
-    return Answer(render_findings(findings), content, status=int(is_broken(findings)))
+    rows, broken = [], False
+    for finding in findings:
+        mark = "ok  " if finding.ok else ("FAIL" if finding.essential else "note")
+        rows.append(f"{mark}  {finding.title + ':':27} {finding.detail}")
+        rows += [] if finding.ok else [f"      -> {finding.remedy}"]
+        broken |= mark == "FAIL"
+    content = {"ok": not broken, "findings": [asdict(finding) for finding in findings]}
+    return Answer("\n".join(rows), content, status=int(broken))

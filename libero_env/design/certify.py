@@ -77,11 +77,6 @@ class Certificate:
         """Numbers of steps of the successful attempts."""
         return [o.steps for o in self.outcomes if o.success]
 
-    @property
-    def retries(self) -> int:
-        """Number of times that the expert started again, over all attempts."""
-        return sum(o.retries for o in self.outcomes)
-
     def summary(self) -> dict:
         """Return the results of the task as plain values, for JSON."""
         lengths = self.lengths
@@ -93,7 +88,7 @@ class Certificate:
             "median_length": median(lengths) if lengths else None,
             "mean_length": round(float(np.mean(lengths)), 1) if lengths else None,
             "max_length": max(lengths, default=None),
-            "retries": self.retries,
+            "retries": sum(o.retries for o in self.outcomes),
             "failures": {o.state: o.reason for o in self.outcomes if not o.success},
         }
 
@@ -282,15 +277,23 @@ def _environment(task: Task, pack: Pack, scene: str) -> tuple[BatchEnv, Shapes]:
     return env, Shapes(env.scene)
 
 
+def scene_digest(task: Task, pack: Pack) -> str:
+    """Return the digest of a task's scene, or why it cannot be built.
+
+    Raises:
+        MissingPackageError: A package is not installed, which concerns all tasks.
+    """
+    try:
+        return build_scene(task.problem, pack).digest
+    except MissingPackageError:
+        raise
+    except LiberoError as error:
+        return str(error)
+
+
 def _digest(task: Task, pack: Pack, disturb: bool) -> str:
     """Return a digest of the task, its scene, and the versions of expert and MuJoCo, 16 hexadecimal digits."""
-    try:
-        scene = build_scene(task.problem, pack).digest
-    except MissingPackageError:
-        raise  # it concerns all tasks
-    except LiberoError as error:
-        scene = str(error)
-    parts = (task.bddl_text, scene, pack.name, GENERATOR, mujoco.__version__, disturb)
+    parts = (task.bddl_text, scene_digest(task, pack), pack.name, GENERATOR, mujoco.__version__, disturb)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 

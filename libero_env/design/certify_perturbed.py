@@ -14,7 +14,7 @@ import numpy as np
 
 from libero_env.assets.pack import select_pack
 from libero_env.demos.config import GENERATOR
-from libero_env.design.certify import NO_HORIZON
+from libero_env.design.certify import NO_HORIZON, scene_digest
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, LiberoError, PlacementError
 from libero_env.expert import Expert, Shapes
@@ -23,7 +23,6 @@ from libero_env.mujoco_compat import mujoco
 from libero_env.parallel import progress_bar, run_each
 from libero_env.perturbations.kinds import trying
 from libero_env.perturbations.perturbation import Perturbation
-from libero_env.sim.scene import build_scene
 from libero_env.storage import read_json, write_json
 from libero_env.tasks import Task
 
@@ -199,11 +198,7 @@ def _path(folder: Path, task: Task, one: Perturbation) -> Path:
 
 def _digest(task: Task, one: Perturbation, starts: int, redraws: int) -> str:
     pack = select_pack()
-    try:
-        scene = build_scene(task.problem, pack).digest
-    except LiberoError as error:
-        scene = str(error)
-    what = (_FORMAT, task.bddl_text, scene, pack.name, str(one), one.definition.at_one)
+    what = (_FORMAT, task.bddl_text, scene_digest(task, pack), pack.name, str(one), one.definition.at_one)
     parts = (*what, starts, redraws, GENERATOR, mujoco.__version__)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 

@@ -131,32 +131,25 @@ def _one_list(text: str, file: str, line: int) -> List:
 
 def write(problem: Problem) -> str:
     """Return a problem as BDDL text in the original's layout; `parse(write(problem)) == problem`."""
-    sections = [
-        f"  (:domain {problem.domain})",
-        f"  (:language {problem.language})",
-        _block(":regions", [_region_text(region) for region in problem.regions]),
-        _block(":fixtures", _typed_names(problem.fixtures)),
-        _block(":objects", _typed_names(problem.objects)),
-        _block(":obj_of_interest", problem.obj_of_interest),
-    ]
-    if problem.scene_properties:
-        sections.append(
-            _block(":scene_properties", [f"(:{k} {v})" for k, v in problem.scene_properties.items()])
-        )
-    if problem.cameras:
-        sections.append(_block(":views", [f"({camera})" for camera in problem.cameras]))
-    if problem.zones:
-        sections.append(_block(":zones", problem.zones))
-    sections += [
-        _block(":init", map(str, problem.init)),
-        _block(":goal", [str(problem.goal)]),
-        *(f"  {text}" for text in problem.unknown_sections),
-    ]
-    return f"(define (problem {problem.name})\n" + "\n".join(sections) + "\n)\n"
-
-
-def _block(head: str, lines: Iterable[str]) -> str:
-    return "\n".join([f"  ({head}", *(f"    {line}" for line in lines), "  )"])
+    optional = {
+        ":scene_properties": [f"(:{kind} {style})" for kind, style in problem.scene_properties.items()],
+        ":views": [f"({camera})" for camera in problem.cameras],
+        ":zones": problem.zones,
+    }
+    blocks: dict[str, Iterable[str]] = {
+        ":regions": map(_region_text, problem.regions),
+        ":fixtures": _typed_names(problem.fixtures),
+        ":objects": _typed_names(problem.objects),
+        ":obj_of_interest": problem.obj_of_interest,
+        **{head: content for head, content in optional.items() if content},
+        ":init": map(str, problem.init),
+        ":goal": [str(problem.goal)],
+    }
+    lines = [f"(define (problem {problem.name})", f"  (:domain {problem.domain})"]
+    lines.append(f"  (:language {problem.language})")
+    for head, content in blocks.items():
+        lines += [f"  ({head}", *(f"    {line}" for line in content), "  )"]
+    return "\n".join([*lines, *(f"  {text}" for text in problem.unknown_sections), ")\n"])
 
 
 def _typed_names(names: Mapping[str, str]) -> list[str]:

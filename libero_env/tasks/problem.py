@@ -129,6 +129,7 @@ class Atom(Expression):
         return f"({' '.join((self.predicate, *self.args))})"
 
 
+@checked
 class _Several(Expression):
     """A node with any number of children."""
 
@@ -139,21 +140,17 @@ class _Several(Expression):
         return self.parts
 
     def map(self, function: Callable[[Expression], Expression]) -> Expression:
-        return type(self)(tuple(map(function, self.parts)))  # type: ignore[call-arg]
+        return type(self)(tuple(map(function, self.parts)))
 
 
 @checked
 class And(_Several):
     """Conjunction: holds if all parts hold."""
 
-    parts: tuple[Expression, ...]
-
 
 @checked
 class Or(_Several):
     """Disjunction: holds if any part holds."""
-
-    parts: tuple[Expression, ...]
 
 
 @checked
@@ -339,9 +336,8 @@ KINDS: dict[str, tuple[frozenset[str], ...]] = {
     "Incontact": (_SOLID, _SOLID),
     "Printjointstate": (_PLACE,),
 }
-OPERATORS = frozenset(
-    {"And", "Or", "Not", "Forall", "Then", "Never", "Count"}
-)  # no predicate has these names
+# no predicate has these names
+OPERATORS = frozenset({"And", "Or", "Not", "Forall", "Then", "Never", "Count"})
 BUILTIN_PREDICATES = frozenset(KINDS) | {"True", "False"}
 send_to_workers(__name__, "KINDS")
 

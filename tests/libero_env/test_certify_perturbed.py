@@ -103,8 +103,7 @@ def test_results_of_other_models_are_not_taken(monkeypatch):
     for category in ("milk", "ketchup"):
         register_object("milk", lambda category=category: replace(builtin.build(category), category="milk"))
         digests.append(certify_perturbed._digest(task, ROBOT, 2, REDRAWS))
-    scene = build_scene(task.problem)
-    monkeypatch.setattr(certify_perturbed, "build_scene", lambda *_: scene)
+    monkeypatch.setattr(certify_perturbed, "scene_digest", lambda *_: build_scene(task.problem).digest)
     monkeypatch.setattr(certify_perturbed, "select_pack", lambda: SimpleNamespace(name="another"))
     digests.append(certify_perturbed._digest(task, ROBOT, 2, REDRAWS))
     assert len(set(digests)) == 3

@@ -22,9 +22,8 @@ WALL_COST = 0.5  # for a grasp at a wall
 DEPTH_COST, COLLISION_COST = 20.0, 0.3  # for each [m] of a collision's depth, and for any collision
 _NUM_YAWS, _NUM_TILTED_YAWS = 18, 8  # yaws that are tried, from above and from another side
 _NUM_HEIGHTS = 4
-HAND = hand_points(
-    GRIPPER.max_opening + 0.012
-)  # points on the hand, with room beside the fingers, (N, 3), [m]
+# points on the hand, with room beside the fingers, (N, 3), [m]
+HAND = hand_points(GRIPPER.max_opening + 0.012)
 _FIRM_GRIP = 0.010  # [m] of a body between the pads, along and across them, that make a firm grip
 _FACE_TOLERANCE = 0.003  # [m] by which a face may vary over the width of a pad
 _APPROACH = (0.04, 0.08, 0.13)  # [m] before a grasp, where the hand must have room too

@@ -15,9 +15,7 @@ _TIP_BELOW, _TIP_THICKNESS, _TAPER = GRIPPER.tip_below, GRIPPER.tip_thickness, G
 _FINGER_THICKNESS, _HAND_LENGTH = GRIPPER.finger_thickness, GRIPPER.hand_length
 _PALM_ABOVE, _PALM_HALF_WIDTH = GRIPPER.palm_above - 0.01, GRIPPER.palm_half_width
 _PALM_HALF_LENGTH = GRIPPER.palm_half_length
-_OPEN_FINGER_HALF = (
-    GRIPPER.finger_half_width + 0.005
-)  # [m] half the width of a finger of the open hand, with room
+_OPEN_FINGER_HALF = GRIPPER.finger_half_width + 0.005  # [m] half the width of an open finger, with room
 _HAND_MARGIN = 0.002  # [m] around the hand
 _PAD_HALF_HEIGHT, _MIN_FACE_HEIGHT = GRIPPER.pad_above, 0.6 * GRIPPER.pad_above
 _FACE_TOLERANCE = 0.0025  # [m] by which a face may recede over the height of the pads

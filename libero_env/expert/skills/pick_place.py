@@ -87,9 +87,8 @@ class PickPlace(Skill):
         if self._plan is not None:
             return True
         previous, self._previous_pose = self._previous_pose, pose
-        moves = previous is not None and has_moved(
-            previous, pose, 0.001, 0.015
-        )  # as falling and rocking ones do
+        # as falling and rocking ones do
+        moves = previous is not None and has_moved(previous, pose, 0.001, 0.015)
         if moves and self._waiting_steps < MAX_WAITING_STEPS:
             self._waiting_steps += 1
             return False
