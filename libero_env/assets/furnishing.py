@@ -66,13 +66,8 @@ def add_material(
 
 def add_texture(spec: mujoco.MjSpec, material: mujoco.MjsMaterial, image: np.ndarray) -> None:
     """Set the texture of a material to an image, (height, width, 3) uint8."""
-    texture = spec.add_texture(
-        name=material.name,
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        height=image.shape[0],
-        width=image.shape[1],
-        nchannel=3,
-    )
+    flat, (height, width) = mujoco.mjtTexture.mjTEXTURE_2D, image.shape[:2]
+    texture = spec.add_texture(name=material.name, type=flat, height=height, width=width, nchannel=3)
     texture.data = image.tobytes()
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = material.name
 
@@ -155,14 +150,7 @@ def _smooth(size: int, widths: tuple[float, float], rng: np.random.Generator) ->
     return (field - field.mean()) / field.std()
 
 
-_PATTERNS = {
-    "tiles": _tiles,
-    "planks": _planks,
-    "plaster": _plaster,
-    "linen": _linen,
-    "marble": _marble,
-    "wood": _wood,
-}
+_PATTERNS = {f.__name__[1:]: f for f in (_tiles, _planks, _plaster, _linen, _marble, _wood)}
 
 
 def add_visual_mesh(
@@ -183,12 +171,8 @@ def add_visual_mesh(
         cells[: len(colours)] = colours
         palette = cells.reshape(_CELLS, _CELLS, 3).repeat(_CELL_PIXELS, 0).repeat(_CELL_PIXELS, 1)
         add_texture(spec, added, _as_pixels(palette))
-    added = spec.add_mesh(
-        name=name,
-        uservert=mesh.vertices.ravel(),
-        userface=mesh.faces.ravel(),
-        usertexcoord=mesh.texcoords.ravel(),
-    )
+    faces, points = mesh.faces.ravel(), mesh.texcoords.ravel()
+    added = spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), userface=faces, usertexcoord=points)
     added.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
     body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=material, **VISUAL_GEOM)
 

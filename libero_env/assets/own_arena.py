@@ -105,15 +105,8 @@ def _table(top: np.ndarray, size: list[float]) -> Mapping[str, Any]:
     x, y = np.array(size) / 2
     height = float(top[2]) / 2 - _HALF_THICKNESS
     down = -_HALF_THICKNESS - height
-    legs = [
-        {
-            "type": "cylinder",
-            "pos": [sx * (x - 0.1), sy * (y - 0.1), down],
-            "size": [_LEG_RADIUS, height, 0.0],
-        }
-        for sx in (1, -1)
-        for sy in (1, -1)
-    ]
+    feet = [[sx * (x - 0.1), sy * (y - 0.1), down] for sx in (1, -1) for sy in (1, -1)]
+    legs = [{"type": "cylinder", "pos": foot, "size": [_LEG_RADIUS, height, 0.0]} for foot in feet]
     half = [float(x), float(y), _HALF_THICKNESS]
     return {
         "bodies": {"table": [float(top[0]), float(top[1]), float(top[2]) - _HALF_THICKNESS]},

@@ -335,7 +335,7 @@ def replay_file(
         check_video_path(video)
     else:
         refuse("without --video", cameras=cameras, size=size)
-    demos = [f"demo_{number}" for number in demo] if demo else None
+    demos = [f"demo_{number}" for number in demo] or None
     results, lost = [], 0
     how: dict[str, Any] = {"by": by, "actions": actions, "demos": demos, "size": size or (256, 256)}
     shown = (cameras or ("agentview",)) if video else ()
@@ -374,7 +374,7 @@ def show_file(
         demo: Numbers of demonstrations (default: all).
         bddl: Task file of what was recorded (default: the task that the file states).
     """
-    demos = [f"demo_{number}" for number in demo] if demo else None
+    demos = [f"demo_{number}" for number in demo] or None
     write_rerun = import_module("libero_integrations.exports.rerun").write_rerun
     written = write_rerun(file, rerun, demos=demos, task=task_of(bddl))
     print(f"{rerun}: {written} demonstrations; open it with: rerun {rerun}")

@@ -121,16 +121,9 @@ def certify_tasks(
     from libero_env.tasks import find_tasks
 
     found = find_tasks(tasks)
-    certificates = certify(
-        found,
-        states,
-        jobs=jobs or cpu_count(),
-        out=out,
-        assets=assets,
-        disturb=disturb,
-        again=again,
-    )
-    write_results(certificates, out, assets=assets, disturb=disturb)
+    how: dict[str, Any] = {"assets": assets, "disturb": disturb}
+    certificates = certify(found, states, jobs=jobs or cpu_count(), out=out, again=again, **how)
+    write_results(certificates, out, **how)
     short = [certificate for certificate in certificates if certificate.rate < require]
     lines = []
     for one in short:

@@ -54,7 +54,15 @@ def task_template(
         places[name] = f"{{at: [{x}, {y}], yaw: {yaw}}}"
     for name, (x, y) in _assign_slots(names, _SLOTS, taken, "objects"):
         places[name] = f"{{at: [{x}, {y}], half: 0.025}}"
-    text = _text(scene, objects, furniture, places, goal, language)
+    lines = [f"language: {_scalar(language)}", f"scene: {_scalar(scene)}"]
+    for key, categories in (("furniture", furniture), ("objects", objects)):
+        lines += [f"{key}: [{', '.join(map(_scalar, categories))}]"] if categories else []
+    lines += [
+        "# centre (x away from the robot, y to its left) and distance around it, m; angle of furniture, rad"
+    ]
+    lines += ["place:", *(f"  {name}: {place}" for name, place in places.items())] if places else []
+    lines += ["# all of these must hold: On, In, Open, Close, Turnon, Turnoff, Up, Stack, ...", "goal:"]
+    text = "\n".join([*lines, *(f"  - {_scalar(atom)}" for atom in goal)]) + "\n"
     return text, make_task(**parse_yaml_text(text).data)
 
 
@@ -117,25 +125,6 @@ def _assign_slots(names: Iterable[str], slots: Sequence[tuple], taken: list[tupl
             )
         taken.append((free[0][0], free[0][1]))
         yield name, free[0]
-
-
-def _text(
-    scene: str,
-    objects: Sequence[str],
-    furniture: Sequence[str],
-    places: Mapping[str, object],
-    goal: Sequence[str],
-    language: str,
-) -> str:
-    lines = [f"language: {_scalar(language)}", f"scene: {_scalar(scene)}"]
-    lines += [f"furniture: [{', '.join(map(_scalar, furniture))}]"] if furniture else []
-    lines += [f"objects: [{', '.join(map(_scalar, objects))}]"] if objects else []
-    lines += [
-        "# centre (x away from the robot, y to its left) and distance around it, m; angle of furniture, rad"
-    ]
-    lines += ["place:", *(f"  {name}: {place}" for name, place in places.items())] if places else []
-    lines += ["# all of these must hold: On, In, Open, Close, Turnon, Turnoff, Up, Stack, ...", "goal:"]
-    return "\n".join([*lines, *(f"  - {_scalar(atom)}" for atom in goal)]) + "\n"
 
 
 def _scalar(text: str) -> str:

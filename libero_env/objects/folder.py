@@ -23,7 +23,7 @@ from libero_env.storage import read_yaml_file
 from libero_env.validation import validate
 
 MODEL, PROPERTIES, PREVIEW = "object.xml", "object.yaml", "preview.png"
-_OPTIONAL = ("joint_damping", "rotation", "rotation_axis", "articulation")
+_OF_MODEL = ("horizontal_radius", "joint_damping", "rotation", "rotation_axis", "articulation")
 _MAX_METRES = 10.0  # of an object
 _MAX_ANGLE = 100.0  # [rad], or [m] of a joint that slides
 
@@ -153,17 +153,9 @@ def load(directory: Path, category: str) -> ObjectModel:
         raise LiberoError(
             f"{directory / MODEL}: expected one body {ROOT_BODY!r} in the world, found {bodies}"
         )
-    optional: dict[str, Any] = {key: properties[key] for key in _OPTIONAL if key in properties}
-    bottom, top = properties["bottom_offset"], properties["top_offset"]
-    return ObjectModel(
-        category,
-        spec,
-        bottom_offset=(bottom[0], bottom[1], bottom[2]),
-        top_offset=(top[0], top[1], top[2]),
-        horizontal_radius=properties["horizontal_radius"],
-        digest=digest(directory),
-        **optional,
-    )
+    given: dict[str, Any] = {key: properties[key] for key in _OF_MODEL if key in properties}
+    given |= {key: tuple(properties[key]) for key in ("bottom_offset", "top_offset")}
+    return ObjectModel(category, spec, digest=digest(directory), **given)
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

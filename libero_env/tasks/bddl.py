@@ -204,6 +204,11 @@ class Reader:
         """Raise the error of a line in this file."""
         raise BDDLError(what, expected, self.file, line)
 
+    def refuse(self, line: int, error: InvalidInputError) -> NoReturn:
+        """Raise the error of a value on a line in this file."""
+        what, _, expected = str(error).removeprefix("Problem: ").partition("; expected ")
+        raise BDDLError(what, expected, self.file, line) from None
+
     def problem(self, root: List) -> Problem:
         """Return the problem of the tree of a text.
 
@@ -243,8 +248,7 @@ class Reader:
             raise
         except InvalidInputError as error:  # of one field
             field, place, *_ = (*error.path, None, None)
-            what, _, expected = str(error).removeprefix("Problem: ").partition("; expected ")
-            self.fail(self.line(_SECTIONS_OF.get(str(field), f":{field}"), place), what, expected)
+            self.refuse(self.line(_SECTIONS_OF.get(str(field), f":{field}"), place), error)
 
     def fields(self, items: Mapping[str, tuple[Word | List, ...]]) -> dict[str, Any]:
         """Return the fields of the problem that the sections of a file have."""
@@ -327,8 +331,7 @@ class Reader:
         try:
             region = Region(name=self.word(node.items[0]), **fields)
         except InvalidInputError as error:
-            what, _, expected = str(error).partition("; expected ")
-            raise BDDLError(what, expected, self.file, node.line) from None
+            self.refuse(node.line, error)
         self.regions[region.address] = node.line
         return region
 
@@ -357,8 +360,7 @@ class Reader:
         try:
             return Camera.read(" ".join(words))
         except InvalidInputError as error:
-            what, _, expected = str(error).partition("; expected ")
-            raise BDDLError(what, expected or "a camera", self.file, node.line) from None
+            self.refuse(node.line, error)
 
     def atom(self, node: Word | List) -> Atom:
         """Return the atom of a list."""

@@ -153,13 +153,8 @@ def _mass(volume: float, options: Options, notify: Notify) -> float:
 
 
 def _add_collision(category: str, pieces: Pieces, assets: ET.Element, main: ET.Element) -> None:
-    contact = {
-        "group": "0",
-        "condim": "3",
-        "rgba": "0.8 0.8 0.8 0.3",
-        **{key: _text(values) for key, values in CONTACT.items()},
-        "mass": "0",
-    }
+    contact = {"group": "0", "condim": "3", "rgba": "0.8 0.8 0.8 0.3", "mass": "0"}
+    contact |= {key: _text(values) for key, values in CONTACT.items()}
     for number, points in enumerate(pieces.meshes):
         name = f"{category}_collision{number}"
         # MuJoCo computes the hull of the points; no triangles are needed
@@ -195,20 +190,9 @@ def _add_visual(
         material["texture"] = f"{name}_texture"
     ET.SubElement(assets, "material", material)
     ET.SubElement(assets, "mesh", {"name": f"{name}_mesh", "file": f"{name}.obj", "inertia": "shell"})
-    ET.SubElement(
-        main,
-        "geom",
-        {
-            "name": f"visual{number or ''}",
-            "type": "mesh",
-            "mesh": f"{name}_mesh",
-            "material": f"{name}_material",
-            "group": "1",
-            "contype": "0",
-            "conaffinity": "0",
-            "mass": "0",
-        },
-    )
+    look = {"type": "mesh", "mesh": f"{name}_mesh", "material": f"{name}_material", "group": "1"}
+    unfelt = {"contype": "0", "conaffinity": "0", "mass": "0"}
+    ET.SubElement(main, "geom", {"name": f"visual{number or ''}", **look, **unfelt})
 
 
 def _simplified(surface: Surface, faces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -227,13 +211,9 @@ def _write_obj(
 ) -> None:
     lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in vertices]
     lines += [f"vt {u:.6g} {v:.6g}" for u, v in texcoords]
-    if len(texcoords):
-        pairs = zip(faces + 1, corners + 1, strict=True)
-        lines += [
-            "f " + " ".join(f"{v}/{t}" for v, t in zip(face, corner, strict=True)) for face, corner in pairs
-        ]
-    else:
-        lines += [f"f {a} {b} {c}" for a, b, c in faces + 1]
+    numbers = [faces + 1, corners + 1] if len(texcoords) else [faces + 1]
+    for corners_of in np.stack(numbers, axis=-1):  # of a triangle, (3, 1 or 2)
+        lines.append("f " + " ".join("/".join(map(str, corner)) for corner in corners_of))
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 

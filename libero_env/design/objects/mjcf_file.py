@@ -56,14 +56,9 @@ def store_mjcf(path: Path, name: str, directory: Path, *, container: bool, notif
     _check_extent(model, path)
     low, high = bounds_of(model)
     if container and all(site.name != "contain_region" for site in spec.sites):
-        root.add_site(
-            name="contain_region",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=(low + high) / 2,
-            size=INSIDE * (high - low) / 2,
-            rgba=(0, 0, 0, 0),
-            group=3,
-        )
+        place = {"pos": (low + high) / 2, "size": INSIDE * (high - low) / 2}
+        box = mujoco.mjtGeom.mjGEOM_BOX
+        root.add_site(name="contain_region", type=box, rgba=(0, 0, 0, 0), group=3, **place)
     model = _compiled(spec, path)
     kilograms = float(model.body_subtreemass[model.body(ROOT_BODY).id])
     if kilograms < 1e-6:
@@ -166,17 +161,8 @@ def _sort_geoms(spec: mujoco.MjSpec) -> None:
 
 
 def _add_visual(geom: mujoco.MjsGeom) -> None:
-    visual = geom.parent.add_geom(
-        type=geom.type,
-        size=geom.size,
-        pos=geom.pos,
-        quat=geom.quat,
-        fromto=geom.fromto,
-        rgba=geom.rgba,
-        material=geom.material,
-        meshname=geom.meshname,
-        **VISUAL_GEOM,
-    )
+    names = ("type", "size", "pos", "quat", "fromto", "rgba", "material", "meshname")
+    visual = geom.parent.add_geom(**{name: getattr(geom, name) for name in names}, **VISUAL_GEOM)
     visual.alt = geom.alt
 
 
