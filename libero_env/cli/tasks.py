@@ -24,8 +24,6 @@ from libero_env.parallel import cpu_count
 if TYPE_CHECKING:
     from libero_env.design.lint.report import Finding
 
-LEVELS = ("error", "warning", "info")
-
 
 def list_tasks(suite: Positional[str | None] = None, *, order: Natural = 0) -> None:
     """Print a line for each task; of the variants that others have published, one for each suite unless it is named.
@@ -155,6 +153,8 @@ def lint(
         level: Lowest level that is printed, or in the JSON.
         starts: Initial states to check; 0 simulates nothing.
     """
+    from libero_env.design.lint.report import LEVELS
+
     counts, shown, number = Counter[str](), list[dict[str, Any]](), 0
     for findings in _lint(tasks, assets, starts):
         number += 1

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from libero_env.assets.downloads import download_files
 from libero_env.paths import demos_dir
-from libero_env.tasks import get_suite, get_task
+from libero_env.tasks import find_tasks
 
 REPO = "yifengzhu-hf/LIBERO-datasets"  # a data set on the Hugging Face Hub; CC BY 4.0
 REVISION = "e329580e402fb5f07ae3b1f18475fc3b63783b91"
@@ -20,11 +20,7 @@ def remote_files(names: Sequence[str]) -> list[str]:
     Raises:
         UnknownNameError: A suite or task does not exist.
     """
-    files: dict[str, None] = {}
-    for name in names:
-        tasks = [get_task(name)] if "/" in name else get_suite(name).tasks
-        files |= {f"{task.suite}/{task.name}_demo.hdf5": None for task in tasks}
-    return list(files)
+    return [f"{task.suite}/{task.name}_demo.hdf5" for task in find_tasks(names)]
 
 
 def download_demos(

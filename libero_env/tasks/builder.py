@@ -58,7 +58,7 @@ from libero_env.paths import objects_dir
 from libero_env.storage import read_yaml
 from libero_env.tasks import bddl
 from libero_env.tasks.cameras import Camera
-from libero_env.tasks.problem import And, Expression, Problem, ProblemError, Region
+from libero_env.tasks.problem import PLACING, And, Expression, Problem, ProblemError, Region
 from libero_env.tasks.schema import Source, Trace, read_definition, scene_file
 from libero_env.tasks.task import FILE, Task, check_name
 from libero_env.text import shown, suggest
@@ -74,7 +74,6 @@ EMPTY: Mapping[str, str] = {
     "floor": "floor",
 }
 _HALF_EXTENT = {"object": 0.025, "fixture": 0.01}  # [m] default, as in the original's scenes
-_PLACING = ("On", "In")  # predicates of init atoms that give an entity its place
 _TABLE = "main_table"  # name of the fixture `table` in the original's task files
 # sites that tell the original's reader where an object ends
 _PLACEMENT_SITES = frozenset({"default_site", "bottom_site", "top_site", "horizontal_radius_site"})
@@ -513,7 +512,7 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
 def _placed_by(atom: str) -> str | None:
     """Return the object or fixture that an init atom gives its place; None where it places nothing."""
     words = atom.split()
-    return words[1] if len(words) == 3 and words[0].capitalize() in _PLACING else None
+    return words[1] if len(words) == 3 and words[0].capitalize() in PLACING else None
 
 
 def _rectangle(place: Values, kind: str) -> dict[str, Any]:

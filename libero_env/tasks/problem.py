@@ -38,7 +38,7 @@ _MAX_EVALUATIONS = 10_000  # atoms of a goal, counted for each object that its q
 
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?", re.IGNORECASE | re.ASCII)
 _VARIABLE = re.compile(r"\??\w[\w.-]*")
-_PLACING = ("On", "In")
+PLACING = ("On", "In")  # predicates of init atoms that give an entity its place
 _TOLERANCE = 1e-9  # largest difference of two equal numbers
 
 Value = TypeVar("Value")
@@ -473,7 +473,7 @@ def _names(count: int) -> str:
 def _places(problem: Problem) -> Iterator[Violation]:
     """Check that fixtures stand on the workspace, and nothing is placed twice or, by way of others, on itself."""
     placing = [
-        (i, atom) for i, atom in enumerate(problem.init) if atom.predicate in _PLACING and len(atom.args) == 2
+        (i, atom) for i, atom in enumerate(problem.init) if atom.predicate in PLACING and len(atom.args) == 2
     ]
     counts = Counter(atom.args[0] for _, atom in placing)
     carriers: dict[str, str] = {}

@@ -16,7 +16,7 @@ from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.predicates import PREDICATES
 from libero_env.tasks import Task, bddl
 from libero_env.tasks.builder import FILE, language_from_name
-from libero_env.tasks.problem import And, Atom, Expression, Not, Problem, ProblemError
+from libero_env.tasks.problem import PLACING, And, Atom, Expression, Not, Problem, ProblemError
 from libero_env.tasks.sexpr import parse_tree
 from libero_env.workspaces import WORKSPACES
 
@@ -172,7 +172,7 @@ def _check_regions(report: Report, problem: Problem) -> None:
 
 def _check_places(report: Report, problem: Problem) -> None:
     """Check that every object and fixture is placed."""
-    placed = {atom.args[0] for atom in problem.init if atom.predicate in ("On", "In") and len(atom.args) == 2}
+    placed = {atom.args[0] for atom in problem.init if atom.predicate in PLACING and len(atom.args) == 2}
     for name in (*problem.objects, *problem.fixtures):
         if name not in placed and problem.kind_of(name) != "workspace":
             is_object = name in problem.objects
