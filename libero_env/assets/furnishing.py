@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.errors import UnknownNameError
+from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.builtin.mesh import Mesh, Ring, box, loft, merge, quad
 from libero_env.objects.model import VISUAL_GEOM
@@ -37,8 +37,12 @@ def chosen_styles(defaults: Mapping[str, str], scene_properties: Mapping[str, st
 
     Raises:
         UnknownNameError: A property or a style does not exist; the message lists the valid ones.
+        InvalidInputError: Two properties are of one kind, such as `floor` and `floor_style`.
     """
     chosen = {key.removesuffix("_style"): name for key, name in scene_properties.items()}
+    if len(chosen) < len(scene_properties):
+        names = ", ".join(scene_properties)
+        raise InvalidInputError(f"scene properties {names}: two are of one kind; expected each once")
     valid = load_styles()
     for kind, name in chosen.items():
         if kind not in valid:

@@ -8,7 +8,7 @@ import pytest
 
 from libero_env.assets.arena import add_arena, add_mount, load_workspace, workspace_of_problem
 from libero_env.assets.furnishing import load_styles, make_texture
-from libero_env.errors import UnknownNameError
+from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.tasks import bddl
 from libero_env.workspaces import WORKSPACES
 
@@ -130,6 +130,11 @@ def test_every_style_compiles_and_changes_visuals_only(category):
         assert [model.geom(g).name for g in range(model.ngeom) if collides(model, g)] == solid
         seen.add(bytes(model.tex_data) + model.mat_rgba.tobytes())
     assert len(seen) >= len(styles["floor"]) + len(styles["wall"]) - 1
+
+
+def test_two_styles_of_one_kind_are_refused():
+    with pytest.raises(InvalidInputError, match="floor, floor_style: two are of one kind"):
+        compiled("floor", {"floor": "dark", "floor_style": "wood-plank"})
 
 
 def test_styles_differ_and_repeat_without_a_seam():
