@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import ConcatDataset, Dataset, Subset
@@ -68,13 +69,19 @@ class SequenceVLDataset(Dataset):
         return {**self.sequence_dataset[index], "task_emb": self.task_emb}
 
 
-class GroupedTaskDataset(ConcatDataset):
-    """Windows of several tasks that are learned together, each with its task's embedding."""
+class GroupedTaskDataset(Subset):
+    """Windows of several tasks that are learned together, each with its task's embedding.
+
+    The tasks take turns: the first window of each, the second of each, and so on, as long as a task has any.
+    """
 
     def __init__(self, sequence_datasets: Sequence[Dataset], task_embs: Sequence[Tensor]):
         parts = [SequenceVLDataset(*pair) for pair in zip(sequence_datasets, task_embs, strict=True)]
-        super().__init__(parts)
+        places = sorted((i, task) for task, part in enumerate(parts) for i in range(len(part)))
+        starts = np.cumsum([0, *map(len, parts)])
+        super().__init__(ConcatDataset(parts), [int(starts[task]) + i for i, task in places])
         self.sequence_datasets, self.task_embs = list(sequence_datasets), task_embs
+        self.group_size = self.task_group_size = len(parts)
         self.n_demos, self.total_num_sequences = sum(part.n_demos for part in parts), len(self)
 
 

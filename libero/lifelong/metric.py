@@ -19,6 +19,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from libero._adapters.batches import image_tensor, map_tensors
 from libero._adapters.files import generated_paths
+from libero._adapters.lookup import lookup
 from libero.lifelong.utils import available_device, safe_device
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import SimulationError
@@ -31,6 +32,10 @@ from lifelong.evaluation.rollout import Episode, run_episodes
 from lifelong.seeding import seeded
 
 CAMERAS = {"agentview_rgb": "agentview", "eye_in_hand_rgb": "robot0_eye_in_hand"}
+# entries of the demonstration files -> the original's observations
+OBSERVATIONS = {view: f"{camera}_image" for view, camera in CAMERAS.items()}
+OBSERVATIONS |= {"gripper_states": "robot0_gripper_qpos", "joint_states": "robot0_joint_pos"}
+OBSERVATIONS["ee_pos"] = "robot0_eef_pos"
 SETTLE_STEPS = 5
 
 
@@ -76,20 +81,23 @@ def evaluate_one_task_success(
         algo: Algorithm whose policy acts, with torch's global generator seeded by `cfg.seed`.
         task_emb: Embedding of the instruction, (L,).
         task_id: Position in the benchmark.
-        sim_states: `n_eval` lists to which the states [time, qpos, qvel] of each episode are appended.
+        sim_states: `n_eval` lists to which the states [time, qpos, qvel] of each episode are appended: that in which
+            the policy begins, and one after each of its actions.
         task_str: Name of the evaluation; it has no effect.
         selecting: Whether the result selects a checkpoint. With `eval.selection=apart` such episodes begin in other
             states than reported ones.
     """
-    total = int(cfg.eval.n_eval)
-    apart = selecting and cfg.eval.get("selection", "reporting") == "apart"
-    if apart and 2 * total > NUM_INIT_STATES:
-        raise ConfigError(
-            f"eval.n_eval is {total}: with eval.selection=apart at most half of the {NUM_INIT_STATES} states can be "
-            "those of selection"
-        )
-    first = max(NUM_INIT_STATES - total, 0) if apart else 0
-    rows = [(first + i) % NUM_INIT_STATES for i in range(total)]
+    total, first = int(cfg.eval.n_eval), 0
+    if selecting and cfg.eval.get("selection", "reporting") == "apart":
+        own = user_states(cfg, task)
+        count = NUM_INIT_STATES if own is None else len(own)
+        if 2 * total > count:
+            raise ConfigError(
+                f"eval.n_eval is {total}: with eval.selection=apart at most half of the {count} states can be "
+                "those of selection"
+            )
+        first = count - total
+    rows = range(first, first + total)
     episodes = rollouts(cfg, algo, task, task_emb, task_id, rows, sim_states=sim_states)
     return sum(episode.success for episode in episodes) / total
 
@@ -109,17 +117,21 @@ def rollouts(
 
     Args:
         cfg, algo, task, task_emb, task_id, sim_states: See `evaluate_one_task_success`.
-        init_states: Indices of the initial states.
+        init_states: Indices of the initial states; the first follows the last.
         on_step: Function called after each step with the position of the first of the episodes, their observations
             (B, ...), and which of them are over, (B,) bool.
     """
+    _check_observations(cfg)
+    own = user_states(cfg, task)
+    count = NUM_INIT_STATES if own is None else len(own)
     at_once = min(int(cfg.eval.num_procs), len(init_states)) if cfg.eval.use_mp else 1
     episodes: list[Episode] = []
     with seeded(int(cfg.seed), task_id, device=available_device(cfg.device)), acting(algo, task_id) as actor:
         for start in range(0, len(init_states), at_once):
-            rows = init_states[start : start + at_once]
+            rows = [i % count for i in init_states[start : start + at_once]]
             states = None if sim_states is None else sim_states[start : start + at_once]
-            with closing(_EvalEnv(cfg, task, len(rows), states, on_step and partial(on_step, start))) as env:
+            watch = on_step and partial(on_step, start)
+            with closing(_EvalEnv(cfg, task, len(rows), own, states, watch)) as env:
                 policy = _PolicyActor(actor, cfg, task_emb, tuple(cfg.data.obs.modality.rgb))
                 horizon = int(cfg.eval.max_steps)
                 part = run_episodes(policy, env, rows, horizon=horizon, settle_steps=SETTLE_STEPS)
@@ -150,9 +162,11 @@ def evaluate_success(
     """
     algo.eval()
     stored: Mapping[str, Any] = (result_summary or {}) if cfg.eval.save_sim_states else {}
-    rates = []
-    for i in task_ids:
-        states = stored.get(key or f"k{task_ids[-1]}_p{i}")
+    rates, count = [], cfg.eval.n_eval
+    for place, i in enumerate(task_ids):
+        states = stored.get(f"k{task_ids[-1]}_p{i}")
+        if key:  # the lists of each task after those of the last
+            states = stored.get(key) and stored[key][place * count : (place + 1) * count]
         arguments = benchmark.get_task(i), benchmark.get_task_emb(i), i, states
         rates.append(evaluate_one_task_success(cfg, algo, *arguments, selecting=selecting))
     return np.array(rates)
@@ -184,6 +198,25 @@ def mean_loss(algo: Any, dataset: Dataset, batch_size: int, num_workers: int) ->
 def acting(algo: Any, task_id: int) -> AbstractContextManager[Any]:
     """Return a context in which an algorithm has the weights that it acts with on a task."""
     return algo.acting_on(task_id) if hasattr(algo, "acting_on") else nullcontext(algo)
+
+
+def user_states(cfg: Any, task: Any) -> np.ndarray | None:
+    """Return the initial states of a task in the configured folder, (n, size); None where they are this package's."""
+    folder = cfg.get("init_states_folder")
+    path = Path(folder or "", task.problem_folder, task.init_states_file)
+    is_users = folder and folder != generated_paths()["init_states"] and path.is_file()
+    return read_states(path) if is_users else None
+
+
+def _check_observations(cfg: Any) -> None:
+    """Raise a ConfigError where rollouts would read other observations than the configuration names."""
+    used = {*cfg.data.obs.modality.rgb, *(cfg.data.obs.modality.get("low_dim") or ())}
+    for key, name in cfg.data.obs_key_mapping.items():
+        if key in used and OBSERVATIONS.get(key) != name:
+            raise ConfigError(
+                f"data.obs_key_mapping.{key} is {name}: rollouts read {OBSERVATIONS.get(key, key)}; "
+                "data.obs.modality chooses among the observations"
+            )
 
 
 def native_task(task: Any, bddl_folder: str | None) -> Task:
@@ -223,28 +256,33 @@ class _PolicyActor:
 class _EvalEnv(BatchEnv):
     """Simulations of a task that begin in the configured states; see `rollouts` for `sim_states` and `on_step`."""
 
-    def __init__(self, cfg: Any, task: Any, num_envs: int, sim_states: list | None, on_step: Any):
+    def __init__(
+        self,
+        cfg: Any,
+        task: Any,
+        num_envs: int,
+        rows: np.ndarray | None,
+        sim_states: list | None,
+        on_step: Any,
+    ):
         super().__init__(
             native_task(task, cfg.get("bddl_folder")),
             num_envs,
-            cameras=[CAMERAS[view] for view in cfg.data.obs.modality.rgb],
+            cameras=[lookup(CAMERAS, "view", view) for view in cfg.data.obs.modality.rgb],
             camera_size=(int(cfg.data.img_h), int(cfg.data.img_w)),
             horizon=int(cfg.eval.max_steps) + SETTLE_STEPS,
         )
-        folder = cfg.get("init_states_folder")
-        path = Path(folder or "", task.problem_folder, task.init_states_file)
-        is_users = folder and folder != generated_paths()["init_states"] and path.is_file()
-        self.rows = read_states(path) if is_users else None
-        if self.rows is not None:
-            self.scene.check_states(self.rows, path)
-        self.sim_states, self.on_step = sim_states, on_step
+        if rows is not None:
+            self.scene.check_states(rows, task.init_states_file)
+        self.rows, self.sim_states, self.on_step = rows, sim_states, on_step
+        self.settling = SETTLE_STEPS
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[dict, dict]:
         if self.rows is not None and options is not None:
             indices = np.asarray(options["init_state"])
-            rows = self.rows[indices % len(self.rows)]
+            rows = self.rows[indices]
             # poses of the fixtures, where the user's states have none
-            poses = self.init_states[indices, rows.shape[1] :]
+            poses = self.init_states[indices % len(self.init_states), rows.shape[1] :]
             options = {**options, "start": np.hstack([rows, poses])}
         return super().reset(seed=seed, options=options)
 
@@ -252,6 +290,9 @@ class _EvalEnv(BatchEnv):
         running = self.running
         result = super().step(actions)
         simulations, fields = self.simulations, self.simulations.fields
+        self.settling -= 1
+        if self.settling > 0:
+            return result
         if self.sim_states is not None:
             for i in np.flatnonzero(running).tolist():
                 self.sim_states[i].append(np.r_[simulations.time(i), fields["qpos"][i], fields["qvel"][i]])

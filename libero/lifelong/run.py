@@ -84,8 +84,10 @@ def run(config: Any) -> Path:
     mode: Any = os.environ.get("WANDB_MODE", "online") if cfg.use_wandb else "disabled"
     tracker = Tracker() if mode == "disabled" else WandB(mode=mode, project=cfg.wandb_project)
     tracker.start(cfg.experiment_name, cfg.experiment_dir, plain(cfg))
-    _Run(cfg, algo, benchmark, datasets, tracker).learn(done)
-    tracker.finish()
+    try:
+        _Run(cfg, algo, benchmark, datasets, tracker).learn(done)
+    finally:
+        tracker.finish()
     print(f"[info] finished: {cfg.experiment_dir}")
     return Path(cfg.experiment_dir)
 
@@ -223,9 +225,10 @@ class _Run:
         summary: dict[str, Any] = {name: np.zeros([count] * (2 if "mat" in name else 1)) for name in RESULTS}
         if cfg.eval.save_sim_states:
             tasks, points = range(self.benchmark.n_tasks), -(-cfg.train.n_epochs // cfg.eval.eval_every) + 1
-            keys = [f"k{k}_p{p}" for k in tasks for p in range(k + 1)]
-            keys += [f"k{k}_e{e}" for k in range(count) for e in range(points)]
-            summary.update({key: [[] for _ in range(cfg.eval.n_eval)] for key in keys})
+            lists = {f"k{k}_p{p}": 1 for k in tasks for p in range(k + 1)}
+            size = int(cfg.data.task_group_size)
+            lists |= {f"k{k}_e{e}": size for k in range(count) for e in range(points)}
+            summary.update({key: [[] for _ in range(n * cfg.eval.n_eval)] for key, n in lists.items()})
         return summary
 
     def _restore(self, task: int, summary: dict[str, Any]) -> None:

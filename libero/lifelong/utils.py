@@ -107,8 +107,8 @@ def compute_flops(algo: Any, dataset: Dataset, cfg: Any) -> tuple[float, float]:
 def create_experiment_dir(cfg: Any) -> str:
     """Create a folder `experiments/<benchmark>/<algorithm>/<policy>_seed<seed>/run_<number>` and return its path.
 
-    `cfg.experiment_dir` receives it, `cfg.experiment_name` its name on one line. Runs from given weights are in
-    `experiments_finetune`.
+    `cfg.experiment_dir` receives it, `cfg.experiment_name` its name on one line. Runs from given weights, of another
+    order of tasks, or with other embeddings are in folders such as `experiments_finetune_permute3_clip`.
     """
     root = experiment_root(cfg)
     root.mkdir(parents=True, exist_ok=True)
@@ -125,8 +125,15 @@ def create_experiment_dir(cfg: Any) -> str:
 
 def experiment_root(cfg: Any) -> Path:
     """Return the folder of all runs of a configuration."""
-    prefix = "experiments_finetune" if cfg.get("pretrain_model_path") else "experiments"
-    return Path(prefix, cfg.benchmark_name, cfg.lifelong.algo, f"{cfg.policy.policy_type}_seed{cfg.seed}")
+    embedding, order = cfg.task_embedding_format.replace("-", ""), cfg.data.task_order_index
+    marks = ["finetune"] * bool(cfg.get("pretrain_model_path")) + [f"permute{order}"] * bool(order)
+    marks += [embedding] * (embedding in ("onehot", "clip", "gpt2", "roberta"))
+    return Path(
+        "_".join(["experiments", *marks]),
+        cfg.benchmark_name,
+        cfg.lifelong.algo,
+        f"{cfg.policy.policy_type}_seed{cfg.seed}",
+    )
 
 
 def latest_run(root: Path) -> Path | None:

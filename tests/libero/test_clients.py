@@ -171,7 +171,7 @@ def test_video_of_an_episode(tmp_path):
         for k, obs in enumerate(frames):
             writer.append_vector_obs([obs, obs], [k > 2, False])
         writer.reset()
-    assert {path.stem for path in (tmp_path / "film").iterdir()} == {"video_0", "video_1"}
+    assert {path.stem for path in (tmp_path / "film").iterdir()} == {"0", "1"}
     with VideoWriter(tmp_path / "none") as writer:
         writer.append_obs(frames[0], False)
     assert not (tmp_path / "none").exists()

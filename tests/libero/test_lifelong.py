@@ -96,7 +96,10 @@ def test_datasets_with_instructions_grouped_and_truncated(file):
     assert "task_emb" not in dataset[1]
     group = GroupedTaskDataset([dataset, dataset], embs)
     assert (len(group), group.n_demos, group.total_num_sequences) == (18, 4, 18)
-    assert (group[10]["task_emb"] == embs[1]).all() and (group[10]["actions"] == dataset[1]["actions"]).all()
+    uneven = GroupedTaskDataset([instructed, TruncatedSequenceDataset(instructed, 2)], embs)
+    order = [0, 9, 1, 10, *range(2, 9)]  # the tasks take turns, as in the original
+    assert all((uneven[k]["actions"] == dataset[i % 9]["actions"]).all() for k, i in enumerate(order))
+    assert [int((uneven[k]["task_emb"] == embs[1]).all()) for k in range(5)] == [0, 1, 0, 1, 0]
     few = TruncatedSequenceDataset(instructed, 3)
     assert [tuple(b["actions"].shape) for b in DataLoader(few, batch_size=2)] == [(2, 2, 7), (1, 2, 7)]
     with pytest.raises(IndexError):
@@ -180,3 +183,5 @@ def test_experiment_folders_are_numbered(tmp_path, monkeypatch):
     utils.create_experiment_dir(cfg)
     assert cfg.experiment_dir.endswith("run_002")
     assert utils.latest_run(utils.experiment_root(cfg)).name == "run_002"
+    cfg.pretrain_model_path, cfg.data.task_order_index, cfg.task_embedding_format = "a.pth", 3, "one-hot"
+    assert utils.create_experiment_dir(cfg).startswith("experiments_finetune_permute3_onehot/LIBERO_SPATIAL/")

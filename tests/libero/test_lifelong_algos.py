@@ -1,6 +1,7 @@
 """The original's algorithms, and users' subclasses. Success rates are given, so nothing is simulated."""
 
 import copy
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -251,6 +252,24 @@ def test_multitask_learns_all_at_once(files, monkeypatch):
     best, _, _ = utils.torch_load_model(f"{cfg.experiment_dir}/multitask_model_ep1.pth")
     kept, _, _ = utils.torch_load_model(f"{cfg.experiment_dir}/multitask_model.pth")
     assert all(torch.equal(best[n], kept[n]) for n in best)
+    curve = torch.load(f"{cfg.experiment_dir}/multitask_auc.log")
+    assert curve["success"].tolist() == [0.0, 0.75, 0.25] and curve["loss"].shape == (3,)
+
+
+def test_checkpoints_of_multitask_runs_have_the_epoch_in_their_names(files):
+    algo, data, cfg = learner(files, "multitask", "train.n_epochs=3", "eval.eval_every=2")
+    algo.learn_all_tasks(data, Tasks(), {})
+    names = {path.name for path in Path(cfg.experiment_dir).glob("multitask_model_ep*")}
+    assert names == {f"multitask_model_ep{epoch}.pth" for epoch in (0, 2, 3)}
+
+
+@pytest.mark.parametrize("group", ["base", "multitask"])
+def test_pretraining_evaluates_nothing(files, group, succeed):
+    succeed()  # an evaluation would ask for a rate that is not given
+    more = ("lifelong.eval_in_train=true",) if group == "multitask" else ()
+    algo, data, _ = learner(files, group, "pretrain=true", "train.n_epochs=1", *more)
+    success, loss = algo.learn_all_tasks(data, Tasks(), {})
+    assert success == 0 and np.isfinite(loss)
 
 
 def test_schedulers_and_optimisers_are_torchs(files):

@@ -180,7 +180,8 @@ def test_extra_modalities():
     assert torch.equal(
         plain(obs), torch.cat([obs["joint_states"], obs["gripper_states"], obs["ee_states"][..., :3]], -1)
     )
-    assert bc_rnn_policy.ExtraModalities(use_joint=True, extra_num_layers=1)(obs).shape == (2, 3, 32)
+    sized = bc_rnn_policy.ExtraModalities(True, True, False, 3, 5)  # sizes that the original never reads
+    assert (sized.output_shape(), sized(obs).shape) == ((9,), (2, 3, 9))
     tokens = bc_transformer_policy.ExtraModalityTokens(True, True, True, extra_embedding_size=8)
     assert (tokens.num_extra, tokens(obs).shape) == (3, (2, 3, 3, 8))
     with pytest.raises(LiberoError, match="use_joint"):
@@ -228,10 +229,10 @@ def test_image_modules():
 def test_language_modules():
     emb = torch.randn(3, 5)
     assert torch.equal(language_modules.IdentityEncoder()({"task_emb": emb}), emb)
-    encoder = language_modules.MLPEncoder(5, 8, 2, 4)
+    encoder = language_modules.MLPEncoder(5, 8, 4, 2)  # as in the original: input, hidden, output, layers
     assert torch.equal(encoder({"task_emb": emb}), encoder(emb)) and encoder(emb).shape == (3, 4)
-    assert len(language_modules.MLPEncoder(5, 8, 1, 4).projection) == 1
-    assert language_modules.RNNEncoder(5, 8, 1, 4)(emb).shape == (3, 4)
+    assert len(language_modules.MLPEncoder(5, 8, 4, 1).projection) == 1
+    assert language_modules.RNNEncoder(5, 8, 4, 1)(emb).shape == (3, 4)
     assert language_modules.CLIPEncoder(output_size=4)(torch.randn(3, 512)).shape == (3, 4)
 
 
@@ -252,9 +253,16 @@ def test_transformer_modules():
     )
     attention = transformer_modules.Attention(8, num_heads=2, head_output_size=4).eval()
     tokens = x.flatten(1, 2)
-    alone = attention(tokens, torch.eye(12))
+    alone = attention(tokens, torch.eye(12)[None])
     values = tokens @ attention.qkv.weight[16:].T
     assert torch.allclose(alone, attention.output_layer(values), atol=1e-5), "a token that sees only itself"
+    seen = torch.ones(2, 12)
+    seen[1, 5:] = 0  # of the second sequence; a mask of tokens is (B, N), as in the original
+    assert torch.allclose(attention(tokens, seen)[0], attention(tokens)[0], atol=1e-6)
+    assert torch.allclose(attention(tokens, seen)[1, :5], attention(tokens[1:, :5])[0], atol=1e-6)
+    pairs = seen[:, None].expand(-1, 12, -1)  # (B, N, N)
+    assert torch.allclose(attention(tokens, pairs), attention(tokens, seen), atol=1e-6)
+    assert torch.allclose(decoder(tokens, pairs), decoder(tokens, seen), atol=1e-6)
     assert transformer_modules.TransformerFeedForwardNN(8, 16)(tokens).shape == tokens.shape
     assert torch.allclose(transformer_modules.Norm(8)(x).mean(-1), torch.zeros(2, 3, 4), atol=1e-5)
     drop, ones = transformer_modules.DropPath(0.5), torch.ones(64, 3)
@@ -274,6 +282,7 @@ def test_heads():
     assert torch.allclose(head.loss_fn(gmm, actions, "sum") / 12, head.loss_fn(gmm, actions))
     quiet = head.eval()(latent).component_distribution.stddev
     assert torch.allclose(quiet, torch.full_like(quiet, 1e-4), rtol=1e-3)
+    assert torch.equal(head.forward_fn(latent)[1], quiet)
     single = DeterministicHead(6, 7, hidden_size=8)
     assert single(latent).abs().max() <= 1
     assert torch.allclose(single.loss_fn(single(latent), actions), (single(latent) - actions).abs().mean())

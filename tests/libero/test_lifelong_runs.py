@@ -19,6 +19,7 @@ from libero_env.init_states.pickles import write_states
 from libero_env.tasks import get_task
 from lifelong import checkpoints
 from lifelong.errors import ConfigError
+from lifelong.evaluation.rollout import Rollouts
 from tests.harness.facade_learning import (
     LANGUAGE,
     SIZE,
@@ -69,8 +70,9 @@ def test_a_run_and_the_evaluation_of_its_checkpoint(folder, capsys):
     assert (result["S_conf_mat"] == 0).all(), "no policy succeeds in four steps"
     for key in ("k1_p0", "k0_e1"):
         ((*states,),) = result[key]
-        assert len(states) == metric.SETTLE_STEPS + 4 and states[0].shape == states[-1].shape
-        assert states[1][0] > states[0][0], "the first number is the time"
+        assert len(states) == 1 + 4 and states[0].shape == states[-1].shape
+        times = [state[0] for state in states]
+        assert np.allclose(times, 0.05 * (np.arange(5) + metric.SETTLE_STEPS)), "from where the policy begins"
 
     named = "--benchmark two_tasks --task_id 0 --algo packnet --policy bc_transformer_policy --seed 10000"
     arguments = [*named.split(), "--load_task", "1"]
@@ -202,6 +204,54 @@ def test_success_is_measured_from_the_first_states(acting, monkeypatch):
     monkeypatch.setitem(cfg.eval, "n_eval", 26)
     with pytest.raises(ConfigError, match=r"eval.n_eval is 26: .* at most half"):
         metric.evaluate_multitask_training_success(cfg, algo, suite, [0])
+
+
+def test_all_states_of_a_users_folder_count(acting, monkeypatch, tmp_path):
+    algo, cfg, suite = acting
+    begun = []
+    monkeypatch.setattr(
+        metric, "run_episodes", lambda a, e, rows, **k: begun.append(list(rows)) or Rollouts((), 0.0)
+    )
+    task, states = suite.get_task(0), suite.get_task_init_states(0)
+    monkeypatch.setitem(cfg, "init_states_folder", str(tmp_path))
+    monkeypatch.setitem(cfg.eval, "n_eval", 60)
+    monkeypatch.setitem(cfg.eval, "num_procs", 60)
+    file = tmp_path / task.problem_folder / task.init_states_file
+    write_states(file, np.concatenate([states, states[:8]]))
+    metric.evaluate_one_task_success(cfg, algo, task, suite.get_task_emb(0), 0)
+    assert begun == [[*range(58), 0, 1]]
+    write_states(file, states[:20])
+    monkeypatch.setitem(cfg.eval, "selection", "apart")
+    monkeypatch.setitem(cfg.eval, "n_eval", 10)
+    metric.evaluate_multitask_training_success(cfg, algo, suite, [0])
+    assert begun[1] == [*range(10, 20)], "none of those that are reported"
+    monkeypatch.setitem(cfg.eval, "n_eval", 11)
+    with pytest.raises(ConfigError, match=r"eval.n_eval is 11: .* at most half of the 20"):
+        metric.evaluate_multitask_training_success(cfg, algo, suite, [0])
+
+
+def test_rollouts_read_what_the_configuration_names_or_refuse(acting, monkeypatch):
+    algo, cfg, suite = acting
+    monkeypatch.setitem(cfg.data.obs_key_mapping, "joint_states", "robot0_joint_vel")
+    with pytest.raises(
+        ConfigError, match=r"obs_key_mapping.joint_states is robot0_joint_vel: rollouts read robot0_joint_pos"
+    ):
+        metric.evaluate_success(cfg, algo, suite, [0])
+    monkeypatch.setitem(cfg.data.obs_key_mapping, "joint_states", "robot0_joint_pos")
+    monkeypatch.setitem(cfg.data.obs_key_mapping, "unused", "robot0_joint_vel")
+    assert metric.evaluate_success(cfg, algo, suite, [0]).shape == (1,)
+
+
+def test_states_of_the_tasks_of_a_group_are_apart(acting, monkeypatch):
+    _, cfg, suite = acting
+    monkeypatch.setitem(cfg.eval, "save_sim_states", True)
+    monkeypatch.setattr(
+        metric, "evaluate_one_task_success", lambda c, a, t, e, i, states, **_: states[0].append(i) or 0.0
+    )
+    summary = {"k0_e0": [[] for _ in range(2 * cfg.eval.n_eval)]}
+    metric.evaluate_success(cfg, torch.nn.Identity(), suite, [0, 1], summary, key="k0_e0")
+    assert [lists for lists in summary["k0_e0"] if lists] == [[0], [1]]
+    assert summary["k0_e0"][cfg.eval.n_eval] == [1]
 
 
 def test_success_is_counted(acting, monkeypatch):

@@ -308,7 +308,12 @@ def test_videos(tmp_path, recwarn):
 
     dark = {"agentview_image": np.zeros((3, 4, 3), np.uint8)}
     writer = VideoWriter(tmp_path, save_video=True, fps=10)
-    writer.append_image(np.full((3, 4, 3), 200, np.uint8))
+    upright = np.full((3, 4, 3), 200, np.uint8)
+    upright[-1] = 90
+    writer.append_image(upright)
+    writer.append_obs({"agentview_image": upright[::-1]}, False)
+    assert [image[:, 0, 1].tolist() for image in writer.image_buffer.pop(0)] == [[200, 200, 90]] * 2
+    writer.append_image(upright)
     writer.append_obs(dark, False)
     writer.append_vector_obs([dark], [True])
     assert [int(image[0, 0, 1]) for image in writer.image_buffer[0]] == [200, 0, 51]

@@ -24,7 +24,7 @@ class VideoWriter:
         video_path: Folder of the files.
         save_video: Whether pictures are collected at all.
         fps: Pictures per second.
-        single_video: Whether all environments are in one video, one after the other, instead of `video_<i>`.
+        single_video: Whether all environments are in one file, `video`, one after the other; or in `0`, `1`, ...
     """
 
     def __init__(
@@ -46,18 +46,18 @@ class VideoWriter:
         self.last_images.clear()
 
     def append_image(self, img: np.ndarray, idx: int = 0) -> None:
-        """Add a picture (H, W, 3), lowest row first, of environment `idx`."""
+        """Add a picture (H, W, 3), upper row first, of environment `idx`."""
         if self.save_video:
-            self.image_buffer.setdefault(idx, []).append(np.asarray(img, np.uint8)[::-1])
+            self.image_buffer.setdefault(idx, []).append(np.asarray(img, np.uint8))
 
     def append_obs(self, obs: Obs, done: bool, idx: int = 0, camera_name: str = "agentview_image") -> None:
-        """Add the picture of an observation; after success the last picture, tinted green."""
+        """Add the picture of an observation, lowest row first; after success the last picture, tinted green."""
         image = np.asarray(obs[camera_name])
         if done:
             image = (1 - _TINT_WEIGHT) * self.last_images.get(idx, image) + _TINT_WEIGHT * _TINT
         else:
             self.last_images[idx] = image
-        self.append_image(image, idx)
+        self.append_image(image[::-1], idx)
 
     def append_vector_obs(
         self, obs: Sequence[Obs], dones: Sequence[bool], camera_name: str = "agentview_image"
@@ -71,7 +71,7 @@ class VideoWriter:
         if not self.save_video or not self.image_buffer:
             return []
         self.video_path.mkdir(parents=True, exist_ok=True)
-        videos = {f"video_{i}": images for i, images in self.image_buffer.items()}
+        videos = {str(i): images for i, images in self.image_buffer.items()}
         if self.single_video:
             videos = {"video": [image for images in self.image_buffer.values() for image in images]}
         return [_write(self.video_path / name, images, self.fps) for name, images in videos.items()]

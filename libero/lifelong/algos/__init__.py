@@ -137,8 +137,8 @@ class Multitask(Sequential):
     ) -> tuple[float, float]:
         """Train on all tasks; write `multitask_model.pth`, and `multitask_model_ep<n>.pth` at each evaluation.
 
-        With `lifelong.eval_in_train` the success on all tasks is measured at each evaluation and the best weights are
-        kept, else the last.
+        With `lifelong.eval_in_train`, and without `pretrain`, the success on all tasks is measured at each evaluation
+        and the best weights are kept, else the last.
 
         Returns:
             Success (0 if it is not measured) and loss, as `learn_one_task` returns them.
@@ -147,14 +147,16 @@ class Multitask(Sequential):
         tasks, every = list(range(benchmark.n_tasks)), self.cfg.eval.eval_every
 
         def measure(number: int) -> float | None:
-            self.save(os.path.join(self.experiment_dir, f"multitask_model_ep{number * every}.pth"))
-            if not self.cfg.lifelong.eval_in_train:
+            epoch = min(number * every, self.cfg.train.n_epochs)
+            self.save(os.path.join(self.experiment_dir, f"multitask_model_ep{epoch}.pth"))
+            if not self.cfg.lifelong.eval_in_train or self.cfg.pretrain:
                 return None
             return float(np.mean(evaluate_multitask_training_success(self.cfg, self, benchmark, tasks)))
 
         windows, path = ConcatDataset(datasets), os.path.join(self.experiment_dir, "multitask_model.pth")
         curve = self.train_policy(windows, self.cfg.train.n_epochs, every, path, measure)
         self.end_task(windows, 0, benchmark)
+        curve.write(os.path.join(self.experiment_dir, "multitask_auc.log"))
         return curve.means()
 
 

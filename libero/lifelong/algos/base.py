@@ -72,6 +72,11 @@ class LearningCurve:
         held = np.minimum(np.arange(len(self.losses)), self.best)
         return float(np.array(self.successes)[held].mean()), float(np.array(self.losses)[held].mean())
 
+    def write(self, path: str) -> None:
+        """Write success and loss, as tensors."""
+        points = {"success": self.successes, "loss": self.losses}
+        torch.save({name: torch.tensor(p, dtype=torch.float64) for name, p in points.items()}, path)
+
 
 class Sequential(nn.Module, metaclass=AlgoMeta):
     """Fine-tuning on one task after another, and the base class of all algorithms.
@@ -170,9 +175,7 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         curve = self.train_policy(dataset, self.cfg.train.n_epochs, every, path, measure)
         self.end_task(dataset, task_id, benchmark)
         self.save(path)
-        points = {"success": curve.successes, "loss": curve.losses}
-        log = os.path.join(self.experiment_dir, f"task{task_id}_auc.log")
-        torch.save({name: torch.tensor(p, dtype=torch.float64) for name, p in points.items()}, log)
+        curve.write(os.path.join(self.experiment_dir, f"task{task_id}_auc.log"))
         return curve.means()
 
     def learn_all_tasks(
@@ -206,7 +209,7 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         self, task_id: int, benchmark: Any, sim_states: Any = None, key: str = ""
     ) -> float | None:
         """Return the mean success on a task, or group of tasks, that is being learned; None without evaluation."""
-        if not self.cfg.eval.eval:
+        if not self.cfg.eval.eval or self.cfg.pretrain:
             return None
         size = int(self.cfg.data.task_group_size)
         tasks = range(task_id * size, (task_id + 1) * size)

@@ -54,16 +54,15 @@ class GMMHead(_Head):
     def forward_fn(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return means and standard deviations (..., K, A), and logits (..., K), given latents (..., E)."""
         params = self.head(x)
-        return params["means"], params["stds"], params["logits"]
-
-    def forward(self, x: Tensor) -> MixtureSameFamily:
-        """Return the distribution over actions (..., A) given latents (..., E)."""
-        params = self.head(x)
         stds = params["stds"]
         if self.head.low_eval_noise and not self.head.training:
             stds = stds.new_full(stds.shape, self.head.min_std)
-        parts = Independent(Normal(params["means"], stds), 1)
-        return MixtureSameFamily(Categorical(logits=params["logits"]), parts)
+        return params["means"], stds, params["logits"]
+
+    def forward(self, x: Tensor) -> MixtureSameFamily:
+        """Return the distribution over actions (..., A) given latents (..., E)."""
+        means, stds, logits = self.forward_fn(x)
+        return MixtureSameFamily(Categorical(logits=logits), Independent(Normal(means, stds), 1))
 
     def loss_fn(self, gmm: MixtureSameFamily, target: Tensor, reduction: str = "mean") -> Tensor:
         """Return the negative log-likelihood of actions (..., A); the reduction is `mean`, `sum` or `none`."""

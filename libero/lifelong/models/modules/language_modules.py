@@ -25,9 +25,9 @@ class IdentityEncoder(nn.Module):
 class MLPEncoder(nn.Module):
     """`num_layers` linear layers with ReLU between them."""
 
-    def __init__(self, input_size: int, hidden_size: int, num_layers: int, output_size: int):
+    def __init__(self, input_size: int, hidden_size: int, output_size: int, num_layers: int):
         super().__init__()
-        self.projection = mlp(input_size, hidden_size, num_layers, output_size)
+        self.projection = mlp(input_size, hidden_size, output_size, num_layers)
 
     def forward(self, data: Mapping[str, Tensor] | Tensor) -> Tensor:
         """Encode an embedding (B, L), alone or under `task_emb`, as (B, E)."""
@@ -38,15 +38,15 @@ class CLIPEncoder(MLPEncoder):
     """`MLPEncoder` with the sizes of CLIP's embeddings."""
 
     def __init__(
-        self, input_size: int = 512, hidden_size: int = 128, num_layers: int = 1, output_size: int = 128
+        self, input_size: int = 512, hidden_size: int = 128, output_size: int = 128, num_layers: int = 1
     ):
-        super().__init__(input_size, hidden_size, num_layers, output_size)
+        super().__init__(input_size, hidden_size, output_size, num_layers)
 
 
 class RNNEncoder(nn.Module):
     """GRU over the parts of an instruction, and a linear map of its last state."""
 
-    def __init__(self, input_size: int, hidden_size: int, num_layers: int, output_size: int):
+    def __init__(self, input_size: int, hidden_size: int, output_size: int, num_layers: int):
         super().__init__()
         self.rnn = nn.GRU(input_size, hidden_size, num_layers, batch_first=True)
         self.projection = nn.Linear(hidden_size, output_size)
@@ -65,7 +65,7 @@ def _embedding(data: Mapping[str, Tensor] | Tensor) -> Tensor:
     return data if isinstance(data, Tensor) else data["task_emb"]
 
 
-def mlp(input_size: int, hidden_size: int, num_layers: int, output_size: int) -> nn.Sequential:
+def mlp(input_size: int, hidden_size: int, output_size: int, num_layers: int) -> nn.Sequential:
     """Return `num_layers` linear layers, at least one, with ReLU between them."""
     if num_layers < 1:
         raise PolicyError(f"num_layers is {num_layers}; it must be at least 1")

@@ -3,10 +3,15 @@
 Shape legend: B batch, T time, M tokens per time step, N tokens, E token.
 """
 
-import torch
 from torch import Tensor, nn
 
-from lifelong.nn.transformer import TransformerLayer, attend, block_causal_mask, sinusoidal_positions
+from lifelong.nn.transformer import (
+    TransformerLayer,
+    attend,
+    block_causal_mask,
+    drop_samples,
+    sinusoidal_positions,
+)
 
 
 class SinusoidalPositionEncoding(nn.Module):
@@ -29,9 +34,9 @@ class SinusoidalPositionEncoding(nn.Module):
 class Norm(nn.Module):
     """Layer normalisation, (..., E) -> (..., E)."""
 
-    def __init__(self, size: int):
+    def __init__(self, dim: int):
         super().__init__()
-        self.norm = nn.LayerNorm(size)
+        self.norm = nn.LayerNorm(dim)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.norm(x)
@@ -47,10 +52,16 @@ class Attention(nn.Module):
         self.output_layer = nn.Sequential(nn.Linear(num_heads * head_output_size, dim), nn.Dropout(dropout))
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Map (B, N, E) to (B, N, E); the mask (N, N) is true where a token may attend."""
+        """Map (B, N, E) to (B, N, E); the mask, see `_of_heads`, is true where a token may attend."""
         dropout = self.dropout if self.training else 0.0
-        mask = None if mask is None else mask.bool()
-        return self.output_layer(attend(self.qkv(x), self.num_heads, mask, dropout))
+        return self.output_layer(attend(self.qkv(x), self.num_heads, _of_heads(mask), dropout))
+
+
+def _of_heads(mask: Tensor | None) -> Tensor | None:
+    """Return a mask of tokens (B, N), or of pairs (1, N, N) or (B, N, N), with an axis for the heads."""
+    if mask is None:
+        return None
+    return (mask[:, None, None] if mask.dim() == 2 else mask[:, None]).bool()
 
 
 class TransformerFeedForwardNN(nn.Module):
@@ -77,10 +88,7 @@ class DropPath(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Map (B, ...) to (B, ...)."""
-        if not self.training or self.drop_prob == 0.0:
-            return x
-        is_kept = torch.rand(len(x), *[1] * (x.dim() - 1), device=x.device) >= self.drop_prob
-        return x * is_kept / (1 - self.drop_prob)
+        return drop_samples(x, self.drop_prob, self.training)
 
 
 class TransformerDecoder(nn.Module):
@@ -105,11 +113,11 @@ class TransformerDecoder(nn.Module):
 
     def compute_mask(self, input_shape: tuple[int, ...]) -> None:
         """Make tokens attend to their own time step and earlier ones; input_shape is (B, T, M, E)."""
-        self.mask = block_causal_mask(input_shape[1], input_shape[2])
+        self.mask = block_causal_mask(input_shape[1], input_shape[2])[None]
 
     def forward(self, x: Tensor, mask: Tensor | None = None) -> Tensor:
         """Map (B, N, E) to (B, N, E), with the given mask, else that of `compute_mask`."""
-        mask = self.mask if mask is None else mask
+        mask = _of_heads(self.mask if mask is None else mask)
         for layer in self.layers:
-            x = layer(x, None if mask is None else mask.to(x.device).bool())
+            x = layer(x, None if mask is None else mask.to(x.device))
         return x
