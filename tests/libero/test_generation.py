@@ -303,9 +303,12 @@ def test_regions_of_objects(capsys):
     assert set(regions["wooden_cabinet"]) == {"top_side", "top_region", "middle_region", "bottom_region"}
     assert regions["flat_stove"] == ["cook_region"]
     assert "plate" not in regions
-    assert object_utils.update_exception_dict({"plate": ["rim_region"]}) == {"plate": ["rim_region"]}
-    assert object_utils.get_affordance_regions(["plate", "milk"], verbose=True) == {"plate": ["rim_region"]}
-    assert capsys.readouterr().out == "plate: rim_region\n"
+    assert object_utils.get_affordance_regions(["basket", "milk"], verbose=True) == {
+        "basket": ["contain_region"]
+    }
+    assert capsys.readouterr().out == "basket: contain_region\n"
+    object_utils.update_exception_dict("basket", "basket_contain_region")
+    assert object_utils.get_affordance_regions(["basket"]) == {}
     with pytest.raises(UnknownNameError, match="plate"):
         object_utils.get_affordance_regions(["plates"])
 

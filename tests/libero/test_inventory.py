@@ -323,11 +323,27 @@ def test_samplers():
     (a, quat, _), (b, _, _) = placed.values()
     assert np.hypot(a[0] - b[0], a[1] - b[1]) > sum(item.horizontal_radius for item in items)
     assert np.linalg.norm(quat) == pytest.approx(1.0)
+    plate = OBJECTS_DICT["plate"](name="plate_1")
+    ranges, turn = ([(0.3, 0.3)], [(0.3, 0.3)]), (plate.rotation, plate.rotation_axis)
+    # the original's order of arguments, and its reading of rotations, by which objects stand
+    table = regions.Libero100TableRegionSampler("t", plate, *ranges, *turn)
+    found = table.sample(fixtures=placed)
+    assert list(found) == ["milk_1", "butter_1", "plate_1"], "fixtures are among the placements"
+    assert np.allclose(found["plate_1"][1], plate.init_quat)
+    assert found["plate_1"][0][2] == pytest.approx(table.reference_pos[2] + 0.01 - plate.bottom_offset[2])
+    low = table.sample(on_top=False)["plate_1"][0]
+    assert low == pytest.approx((0.3, 0.3, table.reference_pos[2] + 0.01)) and not table.whole
+    both_axes = regions.TableRegionSampler("t", items[0], *ranges, items[0].rotation)
+    assert np.allclose(both_axes.sample()["milk_1"][1], items[0].init_quat)
+    assert np.allclose(
+        regions.MultiRegionRandomSampler("m", plate, rotation=0.2).sample()["plate_1"][1][3], np.sin(0.1)
+    )
     both = regions.SiteSequentialCompositeSampler("both")
     both.append_sampler(sampler)
     cup = OBJECTS_DICT["porcelain_mug"](name="mug_1")
     both.append_sampler(regions.ObjectBasedSampler("on", cup, rng=rng), {"reference": "milk_1"})
-    found = both.sample()
+    found = both.sample(fixtures={"plate_1": ((2, 2, 0), quat, plate)})
+    assert list(found) == ["plate_1", "milk_1", "butter_1", "mug_1"]
     assert found["mug_1"][0][2] > found["milk_1"][0][2]
     with pytest.raises(LiberoError, match="no free placement"):
         regions.TableRegionSampler("small", items, [(0, 0)], [(0, 0)], rng=rng).sample()
@@ -348,7 +364,13 @@ def test_small_functions(tmp_path):
     assert rectangle2xyrange([(0, 1, 2, 3)]) == ([[0, 2]], [[1, 3]])
     assert len(TEXTURE_MAPPING) == 35
     assert get_texture_filename("floor", "dark") in TEXTURE_MAPPING.values()
-    assert all(path.startswith(str(tmp_path)) for _, path in get_texture_file_list("wall", tmp_path))
+    assert TEXTURE_MAPPING["Gray_Floor_1"] == "gray_floor.png"
+    walls = dict(get_texture_file_list("wall", tmp_path))
+    assert walls["White_Wall_1"] == str(tmp_path / "textures" / "white_wall.png")
+    assert "Gray_Plaster_1" in walls and not any("Floor" in name or "Table" in name for name in walls)
+    with pytest.raises(LiberoError, match="table_full_size: not supported; the kitchen_table is"):
+        KitchenTableArena(table_full_size=(1.0, 1.0, 0.05))
+    assert OBJECTS_DICT["milk"](name="milk_1", joints=None).joints == []
     assert (MountedPanda().default_mount, OnTheGroundPanda().default_mount) == ("RethinkMount", None)
     assert KitchenTableArena(wall_style="white").spec.compile().ncam >= 3
     assert (reconstruct_image_output(process_image_input(np.arange(3))) == np.arange(3)).all()

@@ -336,8 +336,8 @@ def test_small_functions():
     assert kwargs == {"a": 1, "b": 2}
     xml = (
         '<mujoco><asset><mesh file="/elsewhere/robosuite/models/assets/robots/panda/meshes/link0.stl"/></asset>'
-        '<worldbody><camera name="agentview" pos="0 0 0"/></worldbody></mujoco>'
+        '<worldbody><camera name="agentview" mode="track" pos="0 0 0"/></worldbody></mujoco>'
     )
     processed = postprocess_model_xml(xml, {"agentview": {"pos": (1, 2, 3)}})
-    assert 'pos="1 2 3"' in processed
+    assert 'pos="1 2 3"' in processed and 'mode="fixed"' in processed
     assert Path(processed.partition('file="')[2].partition('"')[0]).parent.parent.is_dir()

@@ -175,7 +175,7 @@ class BuiltinObject(BaseObject):
         **_: Any,
     ):
         self.category_name = category_of(type(self).__name__)
-        self.name = name or self.category_name
+        self.name, self._fixed = name or self.category_name, joints is None
         if model is not None:
             self.__dict__["model"] = model
         names = [obj_name] if obj_name else [category_of(cls.__name__) for cls in type(self).__mro__]
@@ -196,7 +196,7 @@ class BuiltinObject(BaseObject):
         stem = Path(obj_name)
         if stem.suffix != ".xml":
             stem = folder / (stem if self.in_folders else "") / f"{stem.name}.xml"
-        self.file, self.joint_specs, self._fixed = str(stem), joints, joints is None
+        self.file, self.joint_specs = str(stem), joints
         self.object_properties = _properties({})
 
     @cached_property

@@ -16,7 +16,7 @@ _ROBOSUITE, _ASSETS = "robosuite/models/assets/", "/assets/"
 
 
 def postprocess_model_xml(xml_str: str, cameras_dict: Mapping[str, Mapping[str, Any]] | None = None) -> str:
-    """Return a stored model with the paths of this machine, and with new attributes of cameras by name."""
+    """Return a stored model with the paths of this machine, and with new attributes of cameras by name, then fixed."""
     root = parse_xml_text(xml_str.encode(), "the stored model")
     for element in root.iterfind("asset/*[@file]"):
         file = element.get("file", "")
@@ -25,7 +25,8 @@ def postprocess_model_xml(xml_str: str, cameras_dict: Mapping[str, Mapping[str, 
         elif _ASSETS in file and (folder := assets_folder()):
             element.set("file", str(folder / file.split(_ASSETS)[-1]))
     for camera in root.iter("camera"):
-        for key, value in (cameras_dict or {}).get(camera.get("name", ""), {}).items():
+        given = (cameras_dict or {}).get(camera.get("name", ""))
+        for key, value in {"mode": "fixed", **given}.items() if given else ():
             camera.set(key, value if isinstance(value, str) else " ".join(map(str, np.atleast_1d(value))))
     return ElementTree.tostring(root, encoding="unicode")
 

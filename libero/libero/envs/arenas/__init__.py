@@ -9,7 +9,7 @@ from libero._adapters.lookup import alias_modules, lookup
 from libero._adapters.models import facade_pack
 from libero_env.assets.arena import load_workspace
 from libero_env.assets.original_arena import TEXTURES
-from libero_env.errors import LiberoError
+from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.mujoco_compat import mujoco
 
 STYLE_KINDS = ("floor", "wall")
@@ -68,7 +68,9 @@ class WorkspaceArena(Arena):
     Args:
         floor_style, wall_style: Names in `FLOOR_STYLE` and `WALL_STYLE`.
         scene: Style of the whole scene, such as `warm`.
-        kwargs: Other arguments of the original's classes, such as `table_full_size`, have no effect.
+
+    Raises:
+        InvalidInputError: Another argument of the original's classes is given, such as `table_full_size`.
     """
 
     category: ClassVar[str]
@@ -80,6 +82,10 @@ class WorkspaceArena(Arena):
         scene: str | None = None,
         **kwargs: Any,
     ):
+        if kwargs:
+            raise InvalidInputError(
+                f"{', '.join(kwargs)}: not supported; the {self.category} is that of the benchmark"
+            )
         spec = mujoco.MjSpec()
         styles = {"floor": floor_style, "wall": wall_style, "scene": scene}
         self.workspace = load_workspace(self.category)

@@ -11,6 +11,7 @@ import numpy as np
 from libero._adapters.lookup import alias_modules, lookup
 from libero_env.assets.arena import load_workspace
 from libero_env.errors import PlacementError, UnknownNameError
+from libero_env.objects.model import rest_quat
 from libero_env.parallel import send_to_workers
 
 Placements = dict[str, tuple[tuple[float, float, float], np.ndarray, Any]]
@@ -60,22 +61,22 @@ class MultiRegionRandomSampler:
         self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
 
     def sample(self, fixtures: Any = None, reference: Any = None, on_top: bool = True) -> Placements:
-        """Return placements of all objects.
+        """Return placements of all objects, and those of the fixtures.
 
         Args:
             fixtures: Placements that exist already.
             reference: Name of one of them, or a position (3,), m, as the origin instead of `reference_pos`.
-            on_top: Whether objects stand on the reference rather than at its height.
+            on_top: Whether objects stand on the reference, or have their origin at its height.
 
         Raises:
             PlacementError: There was no free placement in 5000 tries.
         """
         placed: Placements = dict(fixtures or {})
         origin = self._origin(placed, reference, on_top)
-        placements: Placements = {}
         for item in self.mujoco_objects:
-            placements[item.name] = placed[item.name] = self._place(item, origin, placed)
-        return placements
+            height = self.z_offset - on_top * item.bottom_offset[-1]
+            placed[item.name] = self._place(item, origin, height, placed)
+        return placed
 
     def _origin(self, placed: Placements, reference: Any, on_top: bool) -> np.ndarray:
         if reference is None:
@@ -87,12 +88,12 @@ class MultiRegionRandomSampler:
         pos, _, item = placed[reference]
         return np.asarray(pos) + (np.array([0.0, 0.0, item.top_offset[-1]]) if on_top else 0.0)
 
-    def _place(self, item: Any, origin: np.ndarray, placed: Placements) -> Any:
+    def _place(self, item: Any, origin: np.ndarray, height: float, placed: Placements) -> Any:
         margin = item.horizontal_radius if self.whole else 0.0
         for _ in range(_TRIES):
             self.idx = int(self.rng.integers(len(self.x_ranges)))
             xy = self._sample_x(margin), self._sample_y(margin)
-            pos = origin + (*xy, self.z_offset - item.bottom_offset[-1])
+            pos = origin + (*xy, height)
             if not self.apart or all(self._clear(item, pos, other) for other in placed.values()):
                 return tuple(pos), self._sample_quat(), item
         raise PlacementError(
@@ -119,44 +120,74 @@ class MultiRegionRandomSampler:
         return bool(apart or pos[2] + item.bottom_offset[-1] >= other_pos[2] + other_item.top_offset[-1])
 
     def _sample_quat(self) -> np.ndarray:
-        if self.rotation is None:
-            angle = self.rng.uniform(0.0, 2 * np.pi)
-        else:
-            angle = self.rng.uniform(*self.rotation) if np.ndim(self.rotation) else float(self.rotation)
-        quat = np.zeros(4)
-        quat[0], quat[1 + "xyz".index(self.rotation_axis)] = np.cos(angle / 2), np.sin(angle / 2)
-        return quat
+        return np.roll(rest_quat(self._ranges(), self.rng), 1)
 
-
-class TableRegionSampler(MultiRegionRandomSampler):
-    """Samples placements on the table."""
-
-    category = "table"
-
-    def __init__(self, name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
-        kwargs.setdefault("reference_pos", load_workspace(self.category).offset)
-        super().__init__(name, mujoco_objects, *args, **{"rotation": (0.0, 0.0), **kwargs})
-
-
-class Libero100TableRegionSampler(TableRegionSampler):
-    """Samples placements on the tables of LIBERO-100."""
-
-    category = "kitchen_table"
+    def _ranges(self) -> dict[str, tuple[float, float]]:
+        """Return the range of the rotation about each axis, rad."""
+        if isinstance(self.rotation, Mapping):
+            return dict(self.rotation)
+        rotation = (0.0, 2 * np.pi) if self.rotation is None else np.broadcast_to(self.rotation, 2).tolist()
+        return {self.rotation_axis: (min(rotation), max(rotation))}
 
 
 class ObjectBasedSampler(MultiRegionRandomSampler):
-    """Samples placements on another object: pass its name to `sample` as `reference`."""
+    """Samples placements on another object: pass its name to `sample` as `reference`.
+
+    `rotation` is as objects have it, also axis -> range; see `libero_env.objects.model.rest_quat`.
+    """
+
+    def __init__(
+        self,
+        object_name: str,
+        mujoco_objects: Any = None,
+        x_ranges: Sequence[Sequence[float]] | None = None,
+        y_ranges: Sequence[Sequence[float]] | None = None,
+        rotation: Any = (np.pi / 2, np.pi / 2),
+        rotation_axis: str = "z",
+        ensure_object_boundary_in_range: bool = True,
+        ensure_valid_placement: bool = True,
+        reference_pos: Sequence[float] = (0.0, 0.0, 0.0),
+        z_offset: float = 0.01,
+        rng: np.random.Generator | None = None,
+    ):
+        ranges, turn = (x_ranges, y_ranges), (rotation, rotation_axis)
+        checks = ensure_object_boundary_in_range, ensure_valid_placement
+        super().__init__(object_name, mujoco_objects, *ranges, *turn, *checks, reference_pos, z_offset, rng)
+
+    def _sample_quat(self) -> np.ndarray:
+        return rest_quat(self._ranges(), self.rng)
+
+
+class TableRegionSampler(ObjectBasedSampler):
+    """Samples placements on the table; `rotation` as in `ObjectBasedSampler`."""
+
+    category = "table"
+
+    def __init__(self, object_name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
+        if len(args) < 7:  # the position of reference_pos
+            kwargs.setdefault("reference_pos", load_workspace(self.category).offset)
+        super().__init__(object_name, mujoco_objects, *args, **kwargs)
+
+
+class Libero100TableRegionSampler(TableRegionSampler):
+    """Samples placements on the tables of LIBERO-100; objects may extend beyond the rectangles."""
+
+    category = "kitchen_table"
+
+    def __init__(self, object_name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
+        if len(args) < 5:  # the position of ensure_object_boundary_in_range
+            kwargs.setdefault("ensure_object_boundary_in_range", False)
+        super().__init__(object_name, mujoco_objects, *args, **kwargs)
 
 
 class SiteRegionRandomSampler(MultiRegionRandomSampler):
     """Samples placements around a site: pass its position to `sample` as `reference`."""
 
+    _sample_quat = ObjectBasedSampler._sample_quat
+
 
 class InSiteRegionRandomSampler(SiteRegionRandomSampler):
-    """Samples placements in the box of a site; objects may extend beyond it."""
-
-    def __init__(self, name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
-        super().__init__(name, mujoco_objects, *args, **{"ensure_object_boundary_in_range": False, **kwargs})
+    """Samples placements in the box of a site."""
 
 
 class SiteSequentialCompositeSampler:
@@ -172,12 +203,10 @@ class SiteSequentialCompositeSampler:
 
     def sample(self, fixtures: Mapping[str, Any] | None = None, **_: Any) -> Placements:
         """Return all placements."""
-        placed, placements = dict(fixtures or {}), {}
+        placed: Placements = dict(fixtures or {})
         for sampler, arguments in self.samplers.values():
-            new = sampler.sample(fixtures=placed, **arguments)
-            placed.update(new)
-            placements.update(new)
-        return placements
+            placed = sampler.sample(fixtures=placed, **arguments)
+        return placed
 
 
 class ObjectPropertySampler:
@@ -240,7 +269,7 @@ _TABLES = {
     "libero_kitchen_tabletop_manipulation": ("kitchen_table", Libero100TableRegionSampler),
     "libero_living_room_tabletop_manipulation": ("living_room_table", Libero100TableRegionSampler),
     "libero_study_tabletop_manipulation": ("study_table", Libero100TableRegionSampler),
-    "libero_coffee_table_manipulation": ("coffee_table", Libero100TableRegionSampler),
+    "libero_coffee_table_manipulation": ("coffee_table", TableRegionSampler),
     "libero_floor_manipulation": ("floor", TableRegionSampler),
 }
 REGION_SAMPLERS: dict[str, dict[str, type]] = {
