@@ -65,6 +65,9 @@ def run(config: Any) -> Path:
         LiberoError: The configuration or the data is invalid.
     """
     cfg = Config(plain(config))
+    for key in ("bddl_folder", "init_states_folder"):
+        if cfg[key] and not Path(cfg[key]).is_dir():
+            raise ConfigError(f"{key}={cfg[key]}: no such folder; null is that of get_libero_path")
     for note in notes(cfg):
         print(f"[note] {note}")
     control_seed(cfg.seed)

@@ -144,6 +144,7 @@ def test_configured_variants(file):
         "policy/language_encoder=rnn_encoder",
         "policy/policy_head=deterministic_head",
         "policy.policy_head.network_kwargs.hidden_size=8",
+        "+policy.policy_head.network_kwargs.action_squash=false",
         "policy.image_encoder.network_kwargs.freeze=true",
         "policy.image_encoder.network_kwargs.language_fusion=none",
         "policy/data_augmentation@policy.color_aug=img_color_jitter_group_aug",
@@ -153,6 +154,10 @@ def test_configured_variants(file):
     )
     policy.compute_loss(batch).backward()
     assert policy(batch).shape == (4, 3, 7)
+    latent = torch.full((1, 1, 8), 30.0)
+    policy.policy_head.head.means.weight.data.fill_(1.0)
+    policy.policy_head.head.trunk = nn.Identity()
+    assert policy.policy_head(latent).min() > 1, "no tanh"
     names = {n.split(".")[1] for n, p in policy.named_parameters() if p.requires_grad and p.grad is not None}
     assert names == {"language", "proprio", "transformer", "head"}, "the image encoders are frozen"
     assert len(policy.network.proprio.linears) == 3
@@ -164,6 +169,11 @@ def test_configured_variants(file):
     (["policy.transformer_input_size=5"], "transformer_input_size"),
     (["policy/language_encoder=identity_encoder"], "IdentityEncoder"),
     (["policy.color_aug.network=Blur"], "BatchWiseImgColorJitterAug"),
+    (["+policy.image_encoder.network_kwargs.frozen=true"], "key of policy.image_encoder 'frozen'"),
+    (["+policy.policy_head.network_kwargs.modes=3"], "key of policy.policy_head 'modes'"),
+    (["+policy.policy_head.loss_kwargs.weight=3"], "key of policy.policy_head 'weight'"),
+    (["+policy.temporal_position_encoding.network_kwargs.base=3"], "key of policy.temporal_position_encoding 'base'"),
+    (["policy.temporal_position_encoding.network=Learned"], "SinusoidalPositionEncoding"),
 ])  # fmt: skip
 def test_unsupported_configurations_raise(overrides, message, file):
     with pytest.raises(LiberoError, match=message):

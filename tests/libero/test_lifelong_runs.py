@@ -168,6 +168,8 @@ def test_errors_are_printed_on_one_line(folder, monkeypatch, capsys):
         ("lifelong=hat", "lifelong 'hat'.*packnet"),
         ("benchmark_name=LIBERO_1", "libero_spatial"),
         ("data.task_group_size=3", "task_group_size=3"),
+        ("init_states_folder=/no/such", "init_states_folder=/no/such: no such folder"),
+        ("bddl_folder=/no/such", "bddl_folder=/no/such: no such folder"),
     ):
         monkeypatch.setattr(
             sys, "argv", ["main", f"folder={folder}", "device=cpu", "benchmark_name=LIBERO_OBJECT", override]

@@ -5,6 +5,7 @@ Shape legend: B batch, T time, M tokens per time step, E token, A action, D sum 
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -17,8 +18,16 @@ from libero._adapters.config import plain
 from libero._adapters.lookup import lookup
 from libero.lifelong.models.base_policy import BasePolicy
 from libero.lifelong.models.modules.language_modules import ENCODERS, mlp
-from libero.lifelong.models.modules.rgb_modules import configure_resnet, resnet_arguments, square
+from libero.lifelong.models.modules.rgb_modules import (
+    PatchEncoder,
+    ResnetEncoder,
+    configure_resnet,
+    resnet_arguments,
+    square,
+)
+from libero.lifelong.models.modules.transformer_modules import SinusoidalPositionEncoding
 from libero.lifelong.models.policy_head import HEADS, GMMHead, check_activation, wrap_head
+from libero_env.errors import require_known
 from lifelong.errors import PolicyError
 from lifelong.nn.transformer import sinusoidal_positions
 from lifelong.policies import BCRNN, BCTransformer, BCViLT
@@ -26,6 +35,11 @@ from lifelong.policies.history import HistoryPolicy
 from lifelong.settings import build
 
 State = tuple[Tensor, Tensor]  # of an LSTM
+_PARTS: Mapping[str, Mapping[str, type]] = {  # of the configuration -> classes by name
+    "image_encoder": {kind.__name__: kind for kind in (PatchEncoder, ResnetEncoder)},
+    "policy_head": HEADS,
+    "temporal_position_encoding": {"SinusoidalPositionEncoding": SinusoidalPositionEncoding},
+}
 
 
 class NativePolicy(BasePolicy):
@@ -45,6 +59,7 @@ class NativePolicy(BasePolicy):
         policy = cfg.policy
         self.max_seq_len = int(policy.get("transformer_max_seq_len") or cfg.data.seq_len)
         self.spec = policy_spec(cfg, shape_meta, self.max_seq_len)
+        _check_keys(policy)
         arguments = {**self._arguments(policy), "head": _head(policy)}
         node = {"_target_": f"{self.kind.__module__}.{self.kind.__name__}", **arguments}
         whole: Any = OmegaConf.merge(node, plain(policy.get("native") or {}))
@@ -52,6 +67,7 @@ class NativePolicy(BasePolicy):
         self._configure(policy)
         loss = policy.policy_head.get("loss_kwargs") or {}
         head = wrap_head(self.network.head, float(loss.get("loss_coef", 1.0)))
+        head.action_squash = bool(policy.policy_head.network_kwargs.get("action_squash", True))
         object.__setattr__(self, "policy_head", head)  # not a submodule: its weights are the network's
         self.latent_queue: list[Tensor] = []
 
@@ -236,6 +252,15 @@ class ExtraModalityTokens(nn.Module):
         """Encode inputs (B, T, ...) as (B, T, M, E)."""
         tokens = [encoder(proprio_input(obs_dict, name)) for name, encoder in self.encoders.items()]
         return torch.stack(tokens, dim=-2)
+
+
+def _check_keys(policy: Any) -> None:
+    """Raise an UnknownNameError for a network, or a key of its arguments, that would have no effect."""
+    for part, kinds in _PARTS.items():
+        if node := policy.get(part):
+            known = signature(lookup(kinds, part, node.network)).parameters
+            for key in (*node.network_kwargs, *(node.get("loss_kwargs") or ())):
+                require_known(f"key of policy.{part}", key, known)
 
 
 def _part(name: str, **arguments: Any) -> dict[str, Any]:
