@@ -49,7 +49,7 @@ def evaluate(request: Evaluation) -> dict[str, Any]:
     algo.policy.load_state_dict(weights)
     if isinstance(algo, PackNet):
         algo.load_masks(masks, request.task_id if request.load_task is None else request.load_task)
-        algo = algo.get_eval_algo(request.task_id // int(cfg.data.task_group_size))
+        algo = algo.get_eval_algo(request.task_id)
     algo = safe_device(algo, cfg.device)
     emb, view = benchmark.get_task_emb(request.task_id), cfg.data.obs.modality.rgb[0]
     loss = _loss(cfg, algo, benchmark, request.task_id)

@@ -201,6 +201,8 @@ def test_ewc_penalises_and_agem_projects(files, succeed):
         next(algo.policy.network.head.means.parameters()).add_(0.1)
     assert algo.hooks.penalty(algo.policy).item() > 0
     assert torch.isclose(7 * algo.penalty(), algo.hooks.penalty(algo.policy))
+    before, algo.hooks.strength, algo.cfg.lifelong.e_lambda = algo.penalty(), 0.0, 0.0
+    assert torch.equal(algo.penalty(), before) and before > 0
     assert algo.get_params().shape == algo.get_grads().shape
     algo, data, _ = learner(files, "agem")
     algo.learn_one_task(data[0], 0, Tasks(), {})

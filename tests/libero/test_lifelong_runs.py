@@ -12,14 +12,14 @@ import torch
 
 from libero.libero.benchmark import BENCHMARK_MAPPING, get_benchmark
 from libero.libero.envs import OffScreenRenderEnv
-from libero.lifelong import algos, evaluate, main, metric, utils
+from libero.lifelong import algos, evaluate, main, metric, run_evaluation, utils
 from libero.lifelong import run as run_module
 from libero.lifelong.run import run
 from libero_env.init_states.pickles import write_states
 from libero_env.tasks import get_task
 from lifelong import checkpoints
 from lifelong.errors import ConfigError
-from lifelong.evaluation.rollout import Rollouts
+from lifelong.evaluation.rollout import Episode, Rollouts
 from tests.harness.facade_learning import (
     LANGUAGE,
     SIZE,
@@ -88,6 +88,34 @@ def test_a_run_and_the_evaluation_of_its_checkpoint(folder, capsys):
     assert "--ep: a checkpoint of packnet is named by the last task before it" in capsys.readouterr().err
     assert evaluate.main([*arguments[:-1], "7"]) == 2
     assert "task0_model.pth, task1_model.pth" in capsys.readouterr().err
+
+
+def test_evaluation_of_a_group_of_tasks_acts_with_the_weights_of_the_group(folder, monkeypatch):
+    class FourTasks(TwoTasks):
+        def __init__(self, task_order_index: int = 0):
+            super().__init__(task_order_index)
+            self.tasks, self.n_tasks = get_benchmark("libero_object")().tasks[:4], 4
+
+    monkeypatch.setitem(BENCHMARK_MAPPING, "two_tasks", FourTasks)
+    grouped = (
+        "data.task_group_size=2",
+        "lifelong=packnet",
+        "lifelong.post_prune_epochs=0",
+        "eval.eval=false",
+    )
+    path, acted = run(config(folder, *grouped)), []
+
+    def rollouts(cfg, algo, *args, **kwargs):
+        acted.append(algo.policy.state_dict())
+        return [Episode(0, False, 1)]
+
+    monkeypatch.setattr(run_evaluation, "rollouts", rollouts)
+    named = "--benchmark two_tasks --algo packnet --policy bc_transformer_policy --seed 10000 --load_task 1 --task_id"
+    for task in ("2", "0"):
+        assert evaluate.main([*named.split(), task]) == 0
+    stored = utils.torch_load_model(path / "task1_model.pth")[0]
+    of_group, of_first = ([n for n, p in stored.items() if not torch.equal(p, found[n])] for found in acted)
+    assert not of_group and of_first
 
 
 def test_an_interrupted_run_resumes_to_the_same_weights(folder):

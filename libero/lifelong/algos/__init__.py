@@ -77,8 +77,10 @@ class EWC(Sequential):
 
     def penalty(self) -> Tensor:
         """Return the penalty on the present weights, without the factor `lifelong.e_lambda`."""
-        penalty = self.hooks.penalty(self.policy)
-        return torch.zeros(()) if penalty is None else penalty / self.cfg.lifelong.e_lambda
+        hooks = copy.copy(self.hooks)
+        hooks.strength = 1.0
+        penalty = hooks.penalty(self.policy)
+        return torch.zeros(()) if penalty is None else penalty
 
 
 class PackNet(Sequential):
@@ -109,7 +111,7 @@ class PackNet(Sequential):
         self.hooks.load_state_dict({"task_index": task_id, "pruned": True, "owner": masks}, {})
 
     def get_eval_algo(self, task_id: int) -> "PackNet":
-        """Return a copy whose policy has only the weights of the tasks up to this one."""
+        """Return a copy whose policy has only the weights of the tasks, or groups, up to that of this task."""
         other = copy.copy(self)
         other._modules = dict(self._modules)
         with self.acting_on(task_id):
