@@ -236,8 +236,11 @@ class Stage:
         self.frames, self.truths, self.is_reached = [], [], []
 
     def _add(self, state: np.ndarray) -> None:
-        assert self.env is not None
-        self.env.set_state(0, state)
+        assert self.env is not None and self.choice is not None
+        if self.frames and self.choice.source != POLICY:  # conditions over time remember the frames before
+            self.env.simulations.set_physics_state(0, state)
+        else:
+            self.env.set_state(0, state)
         reached, truth = self.env.check_goal(0)
         self.frames.append(state)
         self.truths.append(truth)

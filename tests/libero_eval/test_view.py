@@ -18,6 +18,7 @@ from libero_env.cli.main import main
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.perturbations import Perturbation
+from libero_env.tasks import Atom, Not, Then, bddl, get_task
 from libero_eval.requests import ViewRequest
 from libero_integrations.viewer import POLICY, Stage, Viewer
 from tests.harness.demos import STEPS, record_wander
@@ -86,6 +87,15 @@ def test_predicates_turn_true_in_the_frames_of_a_recording(stage, recording):
     shown.show(7)
     np.testing.assert_array_equal(shown.env.simulations.physics_state(0), states[7])
     np.testing.assert_array_equal(shown.env.simulations.fixtures[0].ravel(), np.ravel(fixtures))
+
+
+def test_goals_over_time_remember_the_frames_of_a_recording(stage, recording, tmp_path):
+    on = Atom("Turnon", ("flat_stove_1",))
+    goal = Then((Not(on), on))
+    (tmp_path / "then.bddl").write_text(bddl.write(replace(get_task(TASK).problem, goal=goal)))
+    shown = stage(recording, bddl=tmp_path / "then.bddl")
+    shown.open(replace(shown.initial, source="demo_1"))
+    assert shown.is_reached == [False] * ON_FROM + [True] * (STEPS - ON_FROM)
 
 
 def test_perturbations_change_pictures_and_those_of_physics_are_refused_in_recordings(stage, recording):
