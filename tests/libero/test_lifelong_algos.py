@@ -131,7 +131,17 @@ def test_without_evaluation_the_last_weights_are_kept(files):
     algo, data, cfg = learner(files, "base", "eval.eval=false", "train.n_epochs=2", "eval.eval_every=5")
     success, loss = algo.learn_one_task(data[0], 0, Tasks(), {})
     assert success == 0 and np.isfinite(loss)
-    assert len(torch.load(f"{cfg.experiment_dir}/task0_auc.log")["loss"]) == 2  # before, and at the end
+    assert len(torch.load(f"{cfg.experiment_dir}/task0_auc.log")["loss"]) == 1  # 2 // 5 + 1
+
+
+def test_the_curve_has_the_epochs_of_the_original(files, succeed):
+    """The original's notebook takes forward transfer from n_epochs // eval_every + 1 points, and zeros otherwise."""
+    succeed(0.0, 0.25, 0.5)
+    algo, data, cfg = learner(files, "base", "train.n_epochs=3", "eval.eval_every=2")
+    assert algo.learn_one_task(data[0], 0, Tasks(), {})[0] == pytest.approx(0.125)
+    assert torch.load(f"{cfg.experiment_dir}/task0_auc.log")["success"].tolist() == [0.0, 0.25]
+    kept, last = utils.torch_load_model(algo.checkpoint(0))[0], algo.policy.state_dict()
+    assert all(torch.equal(kept[name], p) for name, p in last.items()), "the last epoch is the best"
 
 
 def test_the_same_seed_gives_the_same_weights(files, succeed):

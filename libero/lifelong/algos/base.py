@@ -53,18 +53,24 @@ class AlgoMeta(type):
 
 @dataclass
 class LearningCurve:
-    """Loss and success (0 where not measured) at epoch 0 and each evaluated epoch; the weights of `best` are kept."""
+    """Loss and success (0 where not measured) of every `eval_every`-th epoch; the weights of the `best` are kept."""
 
     losses: list[float] = field(default_factory=list)
     successes: list[float] = field(default_factory=list)
     best: int = 0
+    highest: float = -1.0
 
-    def add(self, loss: float, success: float | None) -> bool:
-        """Append an epoch; return whether it is the best: the first with the highest success, without any the last."""
-        is_best = success is None or success > max(self.successes, default=-1.0)
-        self.best = len(self.losses) if is_best else self.best
-        self.losses.append(loss)
-        self.successes.append(success or 0.0)
+    def add(self, loss: float, success: float | None, is_point: bool) -> bool:
+        """Compare an epoch, and append it if it is a point of the curve; return whether it is the best so far.
+
+        The best is the first with the highest success, or the last where success is not measured.
+        """
+        is_best = success is None or success > self.highest
+        if is_best:
+            self.best, self.highest = len(self.losses), success or 0.0
+        if is_point:
+            self.losses.append(loss)
+            self.successes.append(success or 0.0)
         return is_best
 
     def means(self) -> tuple[float, float]:
@@ -221,9 +227,10 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
     ) -> LearningCurve:
         """Train with `lifelong.training.fit`; load the weights of the best evaluation, or the last if none measures.
 
-        Epoch 0, every `every` epochs and the last are evaluated; the best weights so far are written to `path`. `phase`
-        is the number of the training phase within the task, a part of the seed. Unlike the original's loader, `fit`
-        fills up the last batch of an epoch with further windows.
+        Epoch 0, every `every` epochs and the last are evaluated; the best weights so far are written to `path`. The
+        last is a point of the curve only where its turn has come, as scripts of the original expect. `phase` is the
+        number of the training phase within the task, a part of the seed. Unlike the original's loader, `fit` fills up
+        the last batch of an epoch with further windows.
         """
         curve, train = LearningCurve(), self.cfg.train
 
@@ -231,7 +238,7 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
             if epoch % every and epoch != epochs:
                 return
             success = measure(len(curve.losses))
-            if curve.add(loss, success):
+            if curve.add(loss, success, epoch % every == 0):
                 self.save(path)
             text = "" if success is None else f" | success {success:4.2f}"
             print(f"[info] epoch {epoch:3d} | loss {loss:7.3f}{text}", flush=True)
