@@ -5,7 +5,7 @@ Shape legend: T time, C H W image, D dimension of a proprioceptive input, A acti
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -102,11 +102,8 @@ def get_dataset(
     frame_stack: int = 1,
     filter_key: str | None = None,
     hdf5_cache_mode: str | None = "low_dim",
-    *,
-    pairing: Literal["stored", "aligned"] = "stored",
-    labels: Literal["expert", "executed"] = "expert",
 ) -> tuple[SequenceDataset, dict[str, Any]]:
-    """Read the windows of a demonstration file.
+    """Read the windows of a demonstration file; actions are paired with observations as they are stored.
 
     Args:
         dataset_path: HDF5 file in the original's layout.
@@ -116,9 +113,6 @@ def get_dataset(
         frame_stack: Number of frames at the first step: observations begin `frame_stack - 1` frames before the window.
         filter_key: Subset of the demonstrations in the file's group `mask`.
         hdf5_cache_mode: Without effect: images are in memory as uint8.
-        pairing: `stored` takes the file as it is, which in the original's files pairs an action with the
-            observation after it; `aligned` pairs it with the one before it.
-        labels: See `libero_env.demos.read.read_demos`.
 
     Returns:
         The windows, and the shapes that a policy is built from: `ac_dim`, `all_shapes` (key -> shape),
@@ -141,13 +135,12 @@ def get_dataset(
         language_dim=1,
         seq_len=seq_len,
     )
-    reading: Any = {"pairing": pairing, "labels": labels}
     if filter_key is None:
-        windows = Windows.from_file(path, spec=spec, language=torch.zeros(1), **reading)
+        windows = Windows.from_file(path, spec=spec, language=torch.zeros(1), pairing="stored")
     else:
         with open_demo_file(path) as handle:
             names = set(subset_names(handle, path, filter_key))
-        demos = read_demos(path, [*views, *proprio], **reading)
+        demos = read_demos(path, [*views, *proprio])
         chosen = [demo for demo in demos if demo.name in names]
         windows = Windows.from_demos(chosen, spec=spec, language=torch.zeros(1), source=str(path))
     all_shapes = dict.fromkeys(views, (3, *spec.image_size)) | {name: shapes[name] for name in proprio}

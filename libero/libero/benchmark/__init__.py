@@ -77,12 +77,14 @@ def grab_language_from_filename(x: str) -> str:
 
 @cache
 def _task_maps() -> dict[str, dict[str, Task]]:
-    return {suite: {task.name: _entry(task) for task in get_suite(suite).tasks} for suite in suite_names()}
+    return {
+        suite: {task.name: _entry(task.suite, task.name, task.language) for task in get_suite(suite).tasks}
+        for suite in suite_names()
+    }
 
 
-def _entry(task: Any) -> Task:
-    files = f"{task.name}.bddl", f"{task.name}.pruned_init"
-    return Task(task.name, task.language, "Libero", task.suite, *files)
+def _entry(suite: str, name: str, language: str) -> Task:
+    return Task(name, language, "Libero", suite, f"{name}.bddl", f"{name}.pruned_init")
 
 
 class Benchmark:
@@ -101,14 +103,9 @@ class Benchmark:
 
     def _make_benchmark(self) -> None:
         tasks = self._entries()
-        if self.name in suite_names():
-            self.tasks = [_entry(task) for task in get_suite(self.name).order(self.task_order_index)]
-        else:
-            orders = (
-                read_yaml("tasks/data/task_orders.yaml") if len(tasks) == 10 else [list(range(len(tasks)))]
-            )
-            require_known(f"task order of {self.name}", self.task_order_index, range(len(orders)))
-            self.tasks = [tasks[i] for i in orders[self.task_order_index]]
+        orders = read_yaml("tasks/data/task_orders.yaml") if len(tasks) == 10 else [list(range(len(tasks)))]
+        require_known(f"task order of {self.name}", self.task_order_index, range(len(orders)))
+        self.tasks = [tasks[i] for i in orders[self.task_order_index]]
         self.n_tasks = len(self.tasks)
 
     def _entries(self) -> list[Task]:
@@ -120,11 +117,7 @@ class Benchmark:
         if self.name not in libero_task_map:
             raise UnknownNameError("suite", self.name, [*_task_maps(), *libero_task_map])
         names = libero_task_map[self.name]
-        files = [(f"{name}.bddl", f"{name}.pruned_init") for name in names]
-        return [
-            Task(name, grab_language_from_filename(name), "Libero", self.name, *pair)
-            for name, pair in zip(names, files, strict=True)
-        ]
+        return [_entry(self.name, name, grab_language_from_filename(name)) for name in names]
 
     def get_num_tasks(self) -> int:
         """Return the number of tasks."""

@@ -8,7 +8,6 @@ import numpy as np
 from libero_env.demos.contents import check_demo, demo_names, file_attributes, read_values, subset_names
 from libero_env.demos.hdf5 import open_demo_file
 from libero_env.errors import DemoError
-from libero_env.memory import require_memory
 
 
 def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, verbose: bool = True) -> dict:
@@ -32,12 +31,13 @@ def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, ve
             names = subset_names(file, path, filter_key)
         if not names:
             raise DemoError(f"{path}: no demonstrations; expected at least data/demo_0")
-        size = sum(check_demo(data[name], f"{path}: {name}", ()) for name in names)
-        require_memory(size, str(path), "choose a subset", DemoError)
-        rows = [
-            np.asarray(read_values(data[name], "actions", f"{path}: {name}", check=False)) for name in names
-        ]
-        lengths, actions = np.array([len(row) for row in rows]), np.concatenate(rows)
+        counts, ends = [], []
+        for name in names:
+            check_demo(data[name], f"{path}: {name}", ())
+            actions = np.asarray(read_values(data[name], "actions", f"{path}: {name}", check=False))
+            counts.append(len(actions))
+            ends.append((actions.min(), actions.max()))
+        lengths, (low, high) = np.array(counts), np.transpose(ends)
         structure = {name: _shapes(data[name]) for name in names}
         attributes, first = file_attributes(file, path), structure[names[0]]
     info = {
@@ -47,8 +47,8 @@ def get_dataset_info(dataset_path: str | Path, filter_key: str | None = None, ve
         "length_std": float(lengths.std()),
         "length_min": int(lengths.min()),
         "length_max": int(lengths.max()),
-        "action_min": float(actions.min()),
-        "action_max": float(actions.max()),
+        "action_min": float(low.min()),
+        "action_max": float(high.max()),
         "observations": {key[4:]: shape[1:] for key, shape in first.items() if key.startswith("obs/")},
         "attributes": {key: value for key, value in attributes.items() if key != "bddl_file_content"},
         "structure": structure,

@@ -4,7 +4,7 @@ They are for clients that place objects themselves; the environments sample with
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -18,7 +18,24 @@ Placements = dict[str, tuple[tuple[float, float, float], np.ndarray, Any]]
 _TRIES = 5000
 
 
-class MultiRegionRandomSampler:
+class _Sampler:
+    """Base of the samplers: a name in messages, objects, and a generator."""
+
+    def __init__(self, name: str, mujoco_objects: Any, rng: np.random.Generator | None):
+        self.name, self.rng = name, np.random.default_rng() if rng is None else rng
+        self.mujoco_objects: list[Any] = []
+        self.add_objects(() if mujoco_objects is None else mujoco_objects)
+
+    def add_objects(self, mujoco_objects: Any) -> None:
+        """Add objects."""
+        self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
+
+    def reset(self) -> None:
+        """Remove all objects."""
+        self.mujoco_objects = []
+
+
+class MultiRegionRandomSampler(_Sampler):
     """Samples placements in rectangles, of the x and y ranges of the same index, without overlap.
 
     Args:
@@ -47,18 +64,12 @@ class MultiRegionRandomSampler:
         z_offset: float = 0.0,
         rng: np.random.Generator | None = None,
     ):
-        self.name, self.rotation, self.rotation_axis = name, rotation, rotation_axis
+        super().__init__(name, mujoco_objects, rng)
+        self.rotation, self.rotation_axis = rotation, rotation_axis
         self.x_ranges, self.y_ranges = x_ranges or [(0.0, 0.0)], y_ranges or [(0.0, 0.0)]
         self.whole, self.apart = ensure_object_boundary_in_range, ensure_valid_placement
         self.reference_pos, self.z_offset = np.asarray(reference_pos, np.float64), z_offset
-        self.rng = np.random.default_rng() if rng is None else rng
         self.idx = 0  # of the rectangle that is sampled
-        self.mujoco_objects: list[Any] = []
-        self.add_objects(mujoco_objects if mujoco_objects is not None else ())
-
-    def add_objects(self, mujoco_objects: Any) -> None:
-        """Add objects to place."""
-        self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
 
     def sample(self, fixtures: Any = None, reference: Any = None, on_top: bool = True) -> Placements:
         """Return placements of all objects, and those of the fixtures.
@@ -133,8 +144,12 @@ class MultiRegionRandomSampler:
 class ObjectBasedSampler(MultiRegionRandomSampler):
     """Samples placements on another object: pass its name to `sample` as `reference`.
 
-    `rotation` is as objects have it, also axis -> range; see `libero_env.objects.model.rest_quat`.
+    `rotation` is as objects have it, also axis -> range; see `libero_env.objects.model.rest_quat`. Of a sampler of a
+    workspace, the default of `reference_pos` is the origin of the workspace.
     """
+
+    category: ClassVar[str | None] = None  # of the workspace
+    whole_object: ClassVar[bool] = True  # default of ensure_object_boundary_in_range
 
     def __init__(
         self,
@@ -144,15 +159,21 @@ class ObjectBasedSampler(MultiRegionRandomSampler):
         y_ranges: Sequence[Sequence[float]] | None = None,
         rotation: Any = (np.pi / 2, np.pi / 2),
         rotation_axis: str = "z",
-        ensure_object_boundary_in_range: bool = True,
+        ensure_object_boundary_in_range: bool | None = None,
         ensure_valid_placement: bool = True,
-        reference_pos: Sequence[float] = (0.0, 0.0, 0.0),
+        reference_pos: Sequence[float] | None = None,
         z_offset: float = 0.01,
         rng: np.random.Generator | None = None,
     ):
-        ranges, turn = (x_ranges, y_ranges), (rotation, rotation_axis)
-        checks = ensure_object_boundary_in_range, ensure_valid_placement
-        super().__init__(object_name, mujoco_objects, *ranges, *turn, *checks, reference_pos, z_offset, rng)
+        whole = ensure_object_boundary_in_range
+        super().__init__(
+            object_name, mujoco_objects, x_ranges, y_ranges, rotation, rotation_axis,
+            self.whole_object if whole is None else whole, ensure_valid_placement, z_offset=z_offset, rng=rng,
+        )  # fmt: skip
+        if reference_pos is None and self.category is not None:
+            reference_pos = load_workspace(self.category).offset
+        if reference_pos is not None:
+            self.reference_pos = np.asarray(reference_pos, np.float64)
 
     def _sample_quat(self) -> np.ndarray:
         return rest_quat(self._ranges(), self.rng)
@@ -163,21 +184,11 @@ class TableRegionSampler(ObjectBasedSampler):
 
     category = "table"
 
-    def __init__(self, object_name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
-        if len(args) < 7:  # the position of reference_pos
-            kwargs.setdefault("reference_pos", load_workspace(self.category).offset)
-        super().__init__(object_name, mujoco_objects, *args, **kwargs)
-
 
 class Libero100TableRegionSampler(TableRegionSampler):
     """Samples placements on the tables of LIBERO-100; objects may extend beyond the rectangles."""
 
-    category = "kitchen_table"
-
-    def __init__(self, object_name: str, mujoco_objects: Any = None, *args: Any, **kwargs: Any):
-        if len(args) < 5:  # the position of ensure_object_boundary_in_range
-            kwargs.setdefault("ensure_object_boundary_in_range", False)
-        super().__init__(object_name, mujoco_objects, *args, **kwargs)
+    category, whole_object = "kitchen_table", False
 
 
 class SiteRegionRandomSampler(MultiRegionRandomSampler):
@@ -209,7 +220,7 @@ class SiteSequentialCompositeSampler:
         return placed
 
 
-class ObjectPropertySampler:
+class ObjectPropertySampler(_Sampler):
     """Samples a joint position from a range.
 
     Args:
@@ -233,19 +244,8 @@ class ObjectPropertySampler:
     ):
         if self.states and state_type not in self.states:
             raise UnknownNameError(f"state of {name}", state_type, self.states)
-        self.name, self.state_type = name, state_type
-        self.mujoco_objects: list[Any] = []
-        self.add_objects(() if mujoco_objects is None else mujoco_objects)
-        self.joint_ranges = tuple(joint_ranges)
-        self.rng = np.random.default_rng() if rng is None else rng
-
-    def add_objects(self, mujoco_objects: Any) -> None:
-        """Add objects with the joint."""
-        self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
-
-    def reset(self) -> None:
-        """Remove all objects."""
-        self.mujoco_objects = []
+        super().__init__(name, mujoco_objects, rng)
+        self.state_type, self.joint_ranges = state_type, tuple(joint_ranges)
 
     def sample(self) -> float:
         """Return a position in the range."""
