@@ -226,11 +226,11 @@ def test_functions_of_bddl_generation_utils(tmp_path, capsys):
     assert names == {"table": ["main_table"], "flat_stove": ["flat_stove_1"], "plate": ["plate_1", "plate_2"]}
     assert pieces.get_fixtures(names)["plate_2"] == pieces.get_objects(names)["plate_1"] == "plate"
     assert isinstance(names, pieces.ObjectDict)
-    assert [pieces.object_naming_mapping(n) for n in ("main_table", "plate_2", "floor")] == [
-        "table",
-        "plate",
-        "floor",
-    ]
+    assert pieces.get_object_dict({"table": 1}) == {"table": ["main_table"]}
+    given = (("table", 1), ("plate", 2), ("floor", 1))
+    assert [pieces.object_naming_mapping(*one) for one in given] == ["main_table", "plate_2", "floor"]
+    with pytest.raises(LiberoError, match="floor: 2 of them; a scene has one workspace"):
+        pieces.object_naming_mapping("floor", 2)
     assert pieces.get_objects_of_interest(["a", "b", "a"]) == ("a", "b")
     zones = pieces.get_xy_region("zone", "main_table", [[0.0, 0.1], [0.2, 0.3]], (0.01, 0.02))
     assert np.allclose(zones.ranges, [(-0.01, 0.08, 0.01, 0.12), (0.19, 0.28, 0.21, 0.32)])

@@ -86,19 +86,20 @@ class PDDLDefinition:
         return write
 
 
-def object_naming_mapping(object_name: str) -> str:
-    """Return the category of a name: `table` for `main_table`, `plate` for `plate_2`."""
-    return WORKSPACE_CATEGORIES.get(object_name, re.sub(r"_\d+$", "", object_name))
+def object_naming_mapping(category_name: str, object_id: int) -> str:
+    """Return the name of an object, `plate_2`; a workspace, of which there is one, has its own, `main_table`."""
+    name = {category: name for name, category in WORKSPACE_CATEGORIES.items()}.get(category_name)
+    if name and object_id > 1:
+        raise InvalidInputError(f"{category_name}: {object_id} of them; a scene has one workspace")
+    return name or f"{category_name}_{object_id}"
 
 
 def get_object_dict(object_num_info: Mapping[str, int]) -> ObjectDict:
-    """Return category -> names, from category -> number; a workspace keeps its own name."""
+    """Return category -> names, from category, or name of a workspace, -> number."""
     objects = ObjectDict()
     for category, count in object_num_info.items():
-        if category in WORKSPACE_CATEGORIES:
-            objects[WORKSPACE_CATEGORIES[category]] = [category]
-        else:
-            objects.setdefault(category, []).extend(f"{category}_{i}" for i in range(1, count + 1))
+        category = WORKSPACE_CATEGORIES.get(category, category)
+        objects[category] = [object_naming_mapping(category, i) for i in range(1, count + 1)]
     return objects
 
 
@@ -135,12 +136,12 @@ def get_object_affordance_region(region_name: str, target_name: str) -> Region:
 
 
 def region_module(
-    xy_region_kwargs_list: Iterable[Mapping[str, Any]],
-    affordance_region_kwargs_list: Iterable[Mapping[str, Any]],
+    xy_region_kwargs_list: Iterable[Mapping[str, Any]] | None = None,
+    affordance_region_kwargs_list: Iterable[Mapping[str, Any]] | None = None,
 ) -> tuple[Region, ...]:
     """Return all regions, from arguments of `get_xy_region` and of `get_object_affordance_region`."""
-    regions = [get_xy_region(**kwargs) for kwargs in xy_region_kwargs_list]
-    regions += [get_object_affordance_region(**kwargs) for kwargs in affordance_region_kwargs_list]
+    regions = [get_xy_region(**kwargs) for kwargs in xy_region_kwargs_list or ()]
+    regions += [get_object_affordance_region(**kwargs) for kwargs in affordance_region_kwargs_list or ()]
     return tuple(RegionWrapper(regions).regions.values())
 
 

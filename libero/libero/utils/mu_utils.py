@@ -7,6 +7,7 @@ that of `libero_env.tasks`.
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
 from libero._adapters.lookup import lookup
@@ -34,7 +35,7 @@ def scene_key(name: str) -> str:
     return name.lower()
 
 
-def register_mu(scene_type: str) -> Callable[[Template], Template]:
+def register_mu(scene_type: str = "general") -> Callable[[Template], Template]:
     """Return a decorator that registers a scene of any type by its name; a scene of the same name is replaced."""
 
     def register(target_class: Template) -> Template:
@@ -77,12 +78,15 @@ class InitialSceneTemplates:
         UnknownNameError: The workspace or a category does not exist.
     """
 
-    def __init__(self, workspace_name: str, fixture_num_info: Counts, object_num_info: Counts):
+    def __init__(
+        self,
+        workspace_name: str = "main_table",
+        fixture_num_info: Counts = MappingProxyType({}),
+        object_num_info: Counts = MappingProxyType({}),
+    ):
         require_known("workspace", workspace_name, WORKSPACE_CATEGORIES)
         self.workspace_name = workspace_name
-        self.fixture_num_info = dict(fixture_num_info)
-        if workspace_name not in self.fixture_num_info:
-            self.fixture_num_info = {workspace_name: 1, **fixture_num_info}
+        self.fixture_num_info = {workspace_name: 1, **fixture_num_info}
         self.object_num_info = dict(object_num_info)
         self.fixture_object_dict = get_object_dict(self.fixture_num_info)
         self.movable_object_dict = get_object_dict(self.object_num_info)
@@ -107,15 +111,18 @@ class InitialSceneTemplates:
         self,
         region_centroid_xy: Sequence[float],
         region_name: str,
-        target_name: str,
+        target_name: str | None = None,
         region_half_len: float | Sequence[float] = 0.02,
         yaw_rotation: Sequence[float] = (0.0, 0.0),
     ) -> dict[str, dict[str, Any]]:
-        """Return a rectangle for `regions.update`, see `bddl_generation_utils.get_xy_region`; each name once."""
+        """Return a rectangle, by default on the workspace, for `regions.update`; each name once.
+
+        See `bddl_generation_utils.get_xy_region`.
+        """
         if region_name in self.regions:
             raise LiberoError(f"{type(self).__name__}: region {region_name} is defined twice; rename one")
         facts = {
-            "target_name": target_name,
+            "target_name": target_name or self.workspace_name,
             "region_centroid_xy": region_centroid_xy,
             "region_half_len": region_half_len,
             "yaw_rotation": yaw_rotation,

@@ -133,11 +133,12 @@ class TargetZone(BuiltinObject):
         zone_height: float = 0.007,
         z_offset: float = 0.02,
         rgba: Any = (1, 0, 0, 1),
+        joints: Any = None,
         zone_size: Any = (0.15, 0.05),
         zone_centroid_xy: Any = (0.0, 0.0),
         **kwargs: Any,
     ):
-        super().__init__(name, **kwargs)
+        super().__init__(name, joints=joints, **kwargs)
         self.zone_height, self.rgba, self.quat = zone_height, rgba, np.array([1.0, 0.0, 0.0, 0.0])
         self.size = np.array([*zone_size[:2], zone_height], np.float64)
         self.pos = np.array([*zone_centroid_xy[:2], z_offset], np.float64)
