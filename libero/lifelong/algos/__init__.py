@@ -96,7 +96,7 @@ class PackNet(Sequential):
         self.hooks.begin_phase(retrain, self.policy)
         if epochs := settings.post_prune_epochs:
             self.make_optimizer(epochs)
-            path, measure = self.checkpoint(task_id), lambda _: self.measure_success(task_id, benchmark)
+            path, measure = self.checkpoint_path(task_id), lambda _: self.measure_success(task_id, benchmark)
             self.train_policy(dataset, epochs, settings.post_eval_every, path, measure, phase=1)
         self.hooks.end_phase(retrain, self.policy)
         self.hooks.end_task(task_id, DictWindows(dataset, task_id), self.policy, self.draws)

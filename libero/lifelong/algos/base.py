@@ -177,7 +177,7 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         def measure(number: int) -> float | None:
             return self.measure_success(task_id, benchmark, result_summary, f"k{task_id}_e{number}")
 
-        every, path = self.cfg.eval.eval_every, self.checkpoint(task_id)
+        every, path = self.cfg.eval.eval_every, self.checkpoint_path(task_id)
         curve = self.train_policy(dataset, self.cfg.train.n_epochs, every, path, measure)
         self.end_task(dataset, task_id, benchmark)
         self.save(path)
@@ -203,7 +203,7 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         with self.hooks.policy_for(group, self.policy):
             yield self
 
-    def checkpoint(self, task_id: int) -> str:
+    def checkpoint_path(self, task_id: int) -> str:
         """Return the path of a task's checkpoint."""
         return os.path.join(self.experiment_dir, f"task{task_id}_model.pth")
 
