@@ -4,7 +4,6 @@ Images are (B, T, C, H, W) in [0, 1]; all frames of a window change alike. In ev
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -80,35 +79,29 @@ class ImgColorJitterAug(BatchWiseImgColorJitterAug):
     epsilon, whole_batch = 0.05, True
 
 
-class _AllViews(nn.Module):
-    """Changes the images of several cameras alike: forward maps a tuple of (B, T, C, H, W) to another."""
-
-    def forward(self, x: Any) -> Any:
-        return torch.split(super().forward(torch.cat(list(x), dim=1)), [part.shape[1] for part in x], dim=1)
-
-
-class ImgColorJitterGroupAug(_AllViews, BatchWiseImgColorJitterAug):
-    """`BatchWiseImgColorJitterAug` with the same change for all cameras."""
+class ImgColorJitterGroupAug(BatchWiseImgColorJitterAug):
+    """`BatchWiseImgColorJitterAug` with another `epsilon`."""
 
     epsilon = 0.05
 
 
-class TranslationAugGroup(_AllViews, TranslationAug):
-    """`TranslationAug` with the same shift for all cameras."""
+class TranslationAugGroup(TranslationAug):
+    """`TranslationAug`, as a configuration of the original calls it."""
 
 
 class DataAugGroup(nn.Module):
-    """Several augmentations in order, of the images of several cameras."""
+    """Several augmentations in order; the images of all cameras change alike."""
 
     def __init__(self, aug_list: Sequence[nn.Module]):
         super().__init__()
-        self.aug_layers = nn.ModuleList(aug_list)
+        self.aug_layer = nn.Sequential(*aug_list)
 
     def forward(self, x_groups: Sequence[Tensor]) -> tuple[Tensor, ...]:
         """Map a tuple of (B, T, C, H, W), one for each camera, to another."""
-        for aug in self.aug_layers:
-            x_groups = aug(x_groups) if isinstance(aug, _AllViews) else [aug(x) for x in x_groups]
-        return tuple(x_groups)
+        if not self.training:
+            return tuple(x_groups)
+        changed = self.aug_layer(torch.cat(list(x_groups), dim=1))
+        return torch.split(changed, [x.shape[1] for x in x_groups], dim=1)
 
 
 _EACH_VIEW = (BatchWiseImgColorJitterAug, IdentityAug, ImgColorJitterAug, TranslationAug)
