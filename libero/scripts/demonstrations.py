@@ -34,29 +34,23 @@ class Recording(InputOptions):
     Attributes:
         directory: Folder of the files.
         robots: Panda is the only robot.
-        config: No effect: the benchmark has one arm.
-        arm: No effect: the benchmark has one arm.
+        config: The benchmark has one arm.
+        arm: The benchmark has one arm.
         controller: OSC_POSE is the only controller.
         num_demonstration: Demonstrations in the file.
         size: Size of the recorded pictures, pixels.
     """
 
     directory: Path = Path("demonstration_data")
-    robots: tuple[str, ...] = ("Panda",)
-    config: str = "single-arm-opposed"
-    arm: str = "right"
-    controller: str = "OSC_POSE"
+    robots: tuple[Literal["Panda"]] = ("Panda",)
+    config: Literal["single-arm-opposed"] = "single-arm-opposed"
+    arm: Literal["right"] = "right"
+    controller: Literal["OSC_POSE"] = "OSC_POSE"
     num_demonstration: Positive = 50
     size: Side = 128
 
     def collect(self, bddl: Path) -> int:
         """Record into `<directory>/<problem>_<task>/demo.hdf5`; return 1 where the user stopped early."""
-        for flag, value, valid in (
-            ("--robots", " ".join(self.robots), "Panda"),
-            ("--controller", self.controller, "OSC_POSE"),
-        ):
-            if value != valid:
-                raise LiberoError(f"{flag} {value}: demonstrations are recorded with {valid} only")
         task = read_task(bddl)
         out = self.directory / f"{task.problem.name.lower()}_{task.name}" / "demo.hdf5"
         out.parent.mkdir(parents=True, exist_ok=True)

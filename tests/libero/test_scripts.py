@@ -286,11 +286,16 @@ def test_collecting_scripts(tmp_path, monkeypatch, capsys):
     assert "space: open or close the gripper" in out
     target = tmp_path / "data" / "libero_tabletop_manipulation_mine" / "demo.hdf5"
     assert f"{target}: 0 of 3 demonstrations" in out
-    assert demonstrations.collect_demonstration([*argv, "--controller", "IK_POSE"]) == 2
-    assert "OSC_POSE only" in capsys.readouterr().err
-    assert demonstrations.collect_demonstration([*argv, "--robots", "Sawyer"]) == 2
-    with pytest.raises(SystemExit):
-        demonstrations.collect_demonstration([*argv, "--num-demonstration", "0"])
+    for option, value, valid in (
+        ("--controller", "IK_POSE", "OSC_POSE"),
+        ("--robots", "Sawyer", "Panda"),
+        ("--arm", "left", "right"),
+        ("--config", "bimanual", "single-arm-opposed"),
+        ("--num-demonstration", "0", "1"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            demonstrations.collect_demonstration([*argv, option, value])
+        assert ended.value.code == 2 and valid in capsys.readouterr().err
     assert (
         demonstrations.libero_100_collect_demonstrations(
             ["--task-id", "99", "--directory", str(tmp_path / "data")]
