@@ -1,6 +1,7 @@
 """Every public name of the original exists, and those of its environment half work."""
 
 import importlib
+import inspect
 import json
 import re
 from pathlib import Path
@@ -103,6 +104,42 @@ NAMES = {
     "libero.lifelong.algos.er": "cycle merge_datas",
     "libero.libero.envs.textures": "TEXTURE_MAPPING get_texture_file_list",
 }
+# Parameters in the order in which the original takes them; ours may have more after these.
+PARAMETERS = {
+    "libero.lifelong.models.modules.language_modules.MLPEncoder": "input_size hidden_size output_size num_layers",
+    "libero.lifelong.models.modules.transformer_modules.Attention": "dim num_heads head_output_size dropout",
+    "libero.lifelong.models.modules.transformer_modules.Norm": "dim",
+    "libero.lifelong.models.modules.transformer_modules.TransformerDecoder": """input_size num_layers num_heads
+        head_output_size mlp_hidden_size dropout""",
+    "libero.lifelong.models.modules.data_augmentation.TranslationAug": "input_shape translation",
+    "libero.lifelong.models.modules.rgb_modules.ResnetEncoder": """input_shape output_size pretrained freeze
+        remove_layer_num no_stride language_dim language_fusion""",
+    "libero.lifelong.models.bc_rnn_policy.ExtraModalities": """use_joint use_gripper use_ee extra_hidden_size
+        extra_embedding_size""",
+    "libero.lifelong.models.bc_transformer_policy.ExtraModalityTokens": """use_joint use_gripper use_ee
+        extra_num_layers extra_hidden_size extra_embedding_size""",
+    "libero.lifelong.models.policy_head.GMMHead": """input_size output_size hidden_size num_layers min_std num_modes
+        activation low_eval_noise loss_coef""",
+    "libero.lifelong.datasets.get_dataset": """dataset_path obs_modality initialize_obs_utils seq_len frame_stack
+        filter_key hdf5_cache_mode""",
+    "libero.lifelong.metric.evaluate_one_task_success": "cfg algo task task_emb task_id sim_states task_str",
+    "libero.lifelong.metric.evaluate_success": "cfg algo benchmark task_ids result_summary",
+    "libero.lifelong.utils.get_train_test_loader": """dataset train_ratio train_batch_size test_batch_size
+        num_workers""",
+    "libero.libero.envs.ControlEnv": """bddl_file_name robots controller gripper_types initialization_noise
+        use_camera_obs has_renderer has_offscreen_renderer render_camera render_collision_mesh render_visual_mesh
+        render_gpu_device_id control_freq horizon ignore_done hard_reset camera_names camera_heights camera_widths
+        camera_depths camera_segmentations renderer renderer_config""",
+    "libero.libero.envs.regions.TableRegionSampler": """object_name mujoco_objects x_ranges y_ranges rotation
+        rotation_axis ensure_object_boundary_in_range ensure_valid_placement reference_pos z_offset""",
+    "libero.libero.envs.regions.OpenCloseSampler": "name state_type mujoco_objects joint_ranges",
+    "libero.libero.envs.objects.SiteObject": "name parent_name joints size rgba site_type site_pos site_quat",
+    "libero.libero.envs.objects.TargetZone": "name zone_height z_offset rgba joints zone_size zone_centroid_xy",
+    "libero.libero.utils.bddl_generation_utils.object_naming_mapping": "category_name object_id",
+    "libero.libero.utils.mu_utils.InitialSceneTemplates": "workspace_name fixture_num_info object_num_info",
+    "libero.libero.utils.object_utils.update_exception_dict": "object_name site_name",
+    "libero.libero.utils.video_utils.VideoWriter": "video_path save_video fps single_video",
+}
 CONTROL_ENV = """step reset check_success get_sim_state set_state set_init_state regenerate_obs_from_state
     reset_from_xml_string seed close _post_process _update_observables obj_of_interest robots sim _visualizations env
     problem_name domain_name language_instruction"""
@@ -171,6 +208,14 @@ PREDICATES = "true false in on up printjointstate open close turnon turnoff"
 def test_names(module):
     found = importlib.import_module(module)
     assert [name for name in NAMES[module].split() if not hasattr(found, name)] == []
+
+
+@pytest.mark.parametrize("path", PARAMETERS)
+def test_parameters_have_the_order_of_the_original(path):
+    module, _, name = path.rpartition(".")
+    parameters = list(inspect.signature(getattr(importlib.import_module(module), name)).parameters)
+    expected = PARAMETERS[path].split()
+    assert parameters[: len(expected)] == expected
 
 
 @pytest.fixture(scope="module")
