@@ -149,13 +149,11 @@ class BCRNNPolicy(NativePolicy):
             ),
         }
 
-    def forward(
-        self, data: Mapping[str, Any], init_state: State | None = None, return_state: bool = False
-    ) -> Any:
-        """Return the distribution of actions (B, T, A) from a state, by default empty; and the state after it."""
-        latent, state = self.network.rnn(self.spatial_encode(data), init_state)
-        dist = self.policy_head(latent)
-        return (dist, state) if return_state else dist
+    def forward(self, data: Mapping[str, Any], train_mode: bool = True) -> Any:
+        """Return the distribution of actions (B, T, A), from an empty state in training, else from that of the last."""
+        latent, state = self.network.rnn(self.spatial_encode(data), None if train_mode else self._state)
+        self._state = self._state if train_mode else state
+        return self.policy_head(latent)
 
     def reset(self) -> None:
         super().reset()
