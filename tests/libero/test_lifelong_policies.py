@@ -174,6 +174,7 @@ def test_configured_variants(file):
     (["+policy.policy_head.loss_kwargs.weight=3"], "key of policy.policy_head 'weight'"),
     (["+policy.temporal_position_encoding.network_kwargs.base=3"], "key of policy.temporal_position_encoding 'base'"),
     (["policy.temporal_position_encoding.network=Learned"], "SinusoidalPositionEncoding"),
+    (["policy.image_encoder.network=PatchEncoder"], "image_encoder 'PatchEncoder'.*ResnetEncoder"),
 ])  # fmt: skip
 def test_unsupported_configurations_raise(overrides, message, file):
     with pytest.raises(LiberoError, match=message):

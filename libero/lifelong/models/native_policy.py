@@ -35,11 +35,6 @@ from lifelong.policies.history import HistoryPolicy
 from lifelong.settings import build
 
 State = tuple[Tensor, Tensor]  # of an LSTM
-_PARTS: Mapping[str, Mapping[str, type]] = {  # of the configuration -> classes by name
-    "image_encoder": {kind.__name__: kind for kind in (PatchEncoder, ResnetEncoder)},
-    "policy_head": HEADS,
-    "temporal_position_encoding": {"SinusoidalPositionEncoding": SinusoidalPositionEncoding},
-}
 
 
 class NativePolicy(BasePolicy):
@@ -53,13 +48,14 @@ class NativePolicy(BasePolicy):
     """
 
     kind: type[HistoryPolicy]
+    image_encoder: type = ResnetEncoder
 
     def __init__(self, cfg: Any, shape_meta: Mapping[str, Any]):
         super().__init__(cfg, shape_meta)
         policy = cfg.policy
         self.max_seq_len = int(policy.get("transformer_max_seq_len") or cfg.data.seq_len)
         self.spec = policy_spec(cfg, shape_meta, self.max_seq_len)
-        _check_keys(policy)
+        self._check_keys(policy)
         arguments = {**self._arguments(policy), "head": _head(policy)}
         node = {"_target_": f"{self.kind.__module__}.{self.kind.__name__}", **arguments}
         whole: Any = OmegaConf.merge(node, plain(policy.get("native") or {}))
@@ -71,13 +67,26 @@ class NativePolicy(BasePolicy):
         object.__setattr__(self, "policy_head", head)  # not a submodule: its weights are the network's
         self.latent_queue: list[Tensor] = []
 
+    def _check_keys(self, policy: Any) -> None:
+        """Raise an UnknownNameError for a network, or a key of its arguments, that would have no effect."""
+        parts = {
+            "image_encoder": {self.image_encoder.__name__: self.image_encoder},
+            "policy_head": HEADS,
+            "temporal_position_encoding": {"SinusoidalPositionEncoding": SinusoidalPositionEncoding},
+        }
+        for part, kinds in parts.items():
+            if node := policy.get(part):
+                known = signature(lookup(kinds, part, node.network)).parameters
+                for key in (*node.network_kwargs, *(node.get("loss_kwargs") or ())):
+                    require_known(f"key of policy.{part}", key, known)
+
     @abstractmethod
     def _arguments(self, policy: Any) -> dict[str, Any]:
         """Return the network's arguments except the head."""
 
     def _configure(self, policy: Any) -> None:
         """Replace the parts of the network that the configuration changes."""
-        if policy.image_encoder.network == "ResnetEncoder":
+        if self.image_encoder is ResnetEncoder:
             for encoder in self.network.encoders.values():
                 configure_resnet(encoder, **policy.image_encoder.network_kwargs)
         if hasattr(self.network, "transformer"):
@@ -180,17 +189,15 @@ class BCTransformerPolicy(NativePolicy):
 class BCViLTPolicy(NativePolicy):
     """A transformer over the patches of a frame, and one over time."""
 
-    kind = BCViLT
+    kind, image_encoder = BCViLT, PatchEncoder
 
     def _arguments(self, policy: Any) -> dict[str, Any]:
-        patches, size = policy.image_encoder, policy.embed_size
-        if patches.network != "PatchEncoder":
-            raise PolicyError(f"image_encoder is {patches.network}; this policy needs a PatchEncoder")
+        size, patch = policy.embed_size, policy.image_encoder.network_kwargs.patch_size
         token = policy.spatial_down_sample_embed_size if policy.spatial_down_sample else size
         return {
             "patch_embed": size,
             "embed_dim": token,
-            "encoder": _part("PatchEncoder", patch=square(patches.network_kwargs.patch_size)),
+            "encoder": _part("PatchEncoder", patch=square(patch)),
             "spatial": _transformer("SpatialTransformer", policy, "spatial_transformer"),
             "temporal": _temporal(policy, token),
         }
@@ -252,25 +259,13 @@ class ExtraModalityTokens(nn.Module):
         return torch.stack(tokens, dim=-2)
 
 
-def _check_keys(policy: Any) -> None:
-    """Raise an UnknownNameError for a network, or a key of its arguments, that would have no effect."""
-    for part, kinds in _PARTS.items():
-        if node := policy.get(part):
-            known = signature(lookup(kinds, part, node.network)).parameters
-            for key in (*node.network_kwargs, *(node.get("loss_kwargs") or ())):
-                require_known(f"key of policy.{part}", key, known)
-
-
 def _part(name: str, **arguments: Any) -> dict[str, Any]:
     """Return the configuration of a part of a network, which the network completes."""
     return {"_target_": f"lifelong.nn.{name}", "_partial_": True, **arguments}
 
 
 def _resnet(policy: Any) -> dict[str, Any]:
-    node = policy.image_encoder
-    if node.network != "ResnetEncoder":
-        raise PolicyError(f"image_encoder is {node.network}; this policy needs a ResnetEncoder")
-    return _part("ResNetFiLMEncoder", **resnet_arguments(**node.network_kwargs))
+    return _part("ResNetFiLMEncoder", **resnet_arguments(**policy.image_encoder.network_kwargs))
 
 
 def _temporal(policy: Any, embed_size: int) -> dict[str, Any]:
