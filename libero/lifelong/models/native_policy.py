@@ -69,7 +69,7 @@ class NativePolicy(BasePolicy):
 
     def _check_keys(self, policy: Any) -> None:
         """Raise an UnknownNameError for a network, or a key of its arguments, that would have no effect."""
-        parts = {
+        parts: dict[str, Mapping[str, type]] = {
             "image_encoder": {self.image_encoder.__name__: self.image_encoder},
             "policy_head": HEADS,
             "temporal_position_encoding": {"SinusoidalPositionEncoding": SinusoidalPositionEncoding},
