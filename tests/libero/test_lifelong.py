@@ -155,10 +155,10 @@ def test_loaders_split_a_dataset(file):
     assert [len(p) for p in parts] == [6, 3] and not parts[0] & parts[1]
 
 
-def test_confidence_intervals_are_wider_than_zero():
-    assert utils.confidence_interval(0.5, 100) == pytest.approx(1.96 * 0.05, abs=0.002)
-    assert utils.confidence_interval(0.0, 20) == pytest.approx(utils.confidence_interval(1.0, 20))
-    assert utils.confidence_interval(0.0, 20) > 0.05
+def test_confidence_intervals_are_the_originals():
+    assert utils.confidence_interval(0.5, 100) == pytest.approx(1.96 * 0.05)
+    assert utils.confidence_interval(0.1, 20) == pytest.approx(1.96 * 0.3 / 20**0.5)
+    assert utils.confidence_interval(1.0, 20) == 0.0
 
 
 def test_task_embeddings():
