@@ -78,10 +78,10 @@ def get_train_test_loader(
     test_batch_size: int,
     num_workers: tuple[int, int] = (0, 0),
 ) -> tuple[DataLoader, DataLoader]:
-    """Split a dataset at random, with a fixed seed, into a shuffled training part and a test part."""
+    """Split a dataset at random, as `control_seed` seeds it, into a shuffled training part and a test part."""
     size = len(dataset)  # type: ignore[arg-type]
     first = int(size * train_ratio)
-    parts = random_split(dataset, [first, size - first], torch.Generator().manual_seed(0))
+    parts = random_split(dataset, [first, size - first])
     train = DataLoader(parts[0], train_batch_size, shuffle=True, num_workers=num_workers[0])
     return train, DataLoader(parts[1], test_batch_size, num_workers=num_workers[1])
 

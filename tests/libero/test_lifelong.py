@@ -153,6 +153,11 @@ def test_loaders_split_a_dataset(file):
         {tuple(a) for batch in loader for a in batch["actions"][:, 0].tolist()} for loader in (train, test)
     ]
     assert [len(p) for p in parts] == [6, 3] and not parts[0] & parts[1]
+    splits = []
+    for seed in (1, 1, 2):
+        utils.control_seed(seed)
+        splits.append(utils.get_train_test_loader(range(9), 0.7, 2, 3)[1].dataset.indices)
+    assert splits[0] == splits[1] != splits[2]
 
 
 def test_confidence_intervals_are_the_originals():
