@@ -383,6 +383,11 @@ def test_samplers():
     assert np.allclose(
         regions.MultiRegionRandomSampler("m", plate, rotation=0.2).sample()["plate_1"][1][3], np.sin(0.1)
     )
+    drawn = []
+    for seed in (1, 1, 2):
+        np.random.seed(seed)  # noqa: NPY002 - the original's generator
+        drawn.append(regions.MultiRegionRandomSampler("m", plate).sample()["plate_1"][1].tolist())
+    assert drawn[0] == drawn[1] != drawn[2]
     both = regions.SiteSequentialCompositeSampler("both")
     both.append_sampler(sampler)
     cup = OBJECTS_DICT["porcelain_mug"](name="mug_1")

@@ -174,6 +174,7 @@ def test_configured_variants(file):
     (["+policy.policy_head.loss_kwargs.weight=3"], "key of policy.policy_head 'weight'"),
     (["+policy.temporal_position_encoding.network_kwargs.base=3"], "key of policy.temporal_position_encoding 'base'"),
     (["policy.temporal_position_encoding.network=Learned"], "SinusoidalPositionEncoding"),
+    (["policy.temporal_position_encoding.network_kwargs.factor_ratio=2"], "factor_ratio is not learned here"),
     (["policy.image_encoder.network=PatchEncoder"], "image_encoder 'PatchEncoder'.*ResnetEncoder"),
 ])  # fmt: skip
 def test_unsupported_configurations_raise(overrides, message, file):
@@ -253,6 +254,8 @@ def test_transformer_modules():
     assert codes.shape == (3, 8) and torch.allclose(
         codes[1, :2], torch.tensor([np.sin(1.0), np.cos(1.0)]).float()
     )
+    scaled = transformer_modules.SinusoidalPositionEncoding(8, factor_ratio=2.0)
+    assert torch.equal(scaled(x), 2 * codes) and [tuple(p.shape) for p in scaled.parameters()] == [(1,)]
     decoder = transformer_modules.TransformerDecoder(8, 2, 2, 4, 16, 0.0).eval()
     decoder.compute_mask(x.shape)
     out = decoder(x.flatten(1, 2)).view_as(x)

@@ -91,9 +91,12 @@ class NativePolicy(BasePolicy):
                 configure_resnet(encoder, **policy.image_encoder.network_kwargs)
         if hasattr(self.network, "transformer"):
             kwargs = policy.temporal_position_encoding.network_kwargs
-            codes, scale = self.network.transformer.positions, kwargs.get("factor_ratio")
-            new = sinusoidal_positions(codes.shape[0], codes.shape[1], kwargs.inv_freq_factor)
-            codes.copy_(new * (1.0 if scale is None else scale))
+            if kwargs.get("factor_ratio") is not None:
+                raise PolicyError(
+                    "temporal_position_encoding: factor_ratio is not learned here; set it to null"
+                )
+            codes = self.network.transformer.positions
+            codes.copy_(sinusoidal_positions(codes.shape[0], codes.shape[1], kwargs.inv_freq_factor))
         for name in ("language", "spatial_language"):
             if hasattr(self.network, name):
                 token = getattr(self.network, name)

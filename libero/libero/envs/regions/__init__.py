@@ -19,10 +19,10 @@ _TRIES = 5000
 
 
 class _Sampler:
-    """Base of the samplers: a name in messages, objects, and a generator."""
+    """Base of the samplers: a name in messages, objects, and a generator, by default of NumPy's global seed."""
 
     def __init__(self, name: str, mujoco_objects: Any, rng: np.random.Generator | None):
-        self.name, self.rng = name, np.random.default_rng() if rng is None else rng
+        self.name, self.rng = name, rng or np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
         self.mujoco_objects: list[Any] = []
         self.add_objects(() if mujoco_objects is None else mujoco_objects)
 

@@ -3,6 +3,7 @@
 Shape legend: B batch, T time, M tokens per time step, N tokens, E token.
 """
 
+import torch
 from torch import Tensor, nn
 
 from lifelong.nn.transformer import (
@@ -15,16 +16,21 @@ from lifelong.nn.transformer import (
 
 
 class SinusoidalPositionEncoding(nn.Module):
-    """Codes of time steps, times `factor_ratio`; see `lifelong.nn.transformer.sinusoidal_positions`."""
+    """Codes of time steps, times a learned factor that begins as `factor_ratio`, if that is given.
+
+    See `lifelong.nn.transformer.sinusoidal_positions`.
+    """
 
     def __init__(self, input_size: int, inv_freq_factor: float = 10, factor_ratio: float | None = None):
         super().__init__()
-        self.input_size, self.inv_freq_factor, self.factor_ratio = input_size, inv_freq_factor, factor_ratio
+        self.input_size, self.inv_freq_factor = input_size, inv_freq_factor
+        self.factor = 1.0 if factor_ratio is None else nn.Parameter(torch.tensor([float(factor_ratio)]))
 
     def forward(self, x: Tensor) -> Tensor:
         """Return the codes (T, E) of the time steps of x, (B, T, ...)."""
-        codes = sinusoidal_positions(x.shape[1], self.input_size, self.inv_freq_factor).to(x.device)
-        return codes if self.factor_ratio is None else codes * self.factor_ratio
+        return (
+            sinusoidal_positions(x.shape[1], self.input_size, self.inv_freq_factor).to(x.device) * self.factor
+        )
 
     def output_shape(self, input_shape: tuple[int, ...]) -> tuple[int, ...]:
         """Return the given shape."""
