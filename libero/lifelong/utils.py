@@ -22,10 +22,11 @@ from lifelong.training.costs import count_flops
 
 
 def control_seed(seed: int) -> None:
-    """Seed the global generators of Python, NumPy and PyTorch."""
+    """Seed the global generators of Python, NumPy and PyTorch, and let cuDNN choose algorithms that repeat."""
     random.seed(seed)
     np.random.seed(seed)  # noqa: NPY002 - what the name promises
     torch.manual_seed(seed)
+    torch.backends.cudnn.deterministic = True
 
 
 def available_device(device: Any) -> torch.device:

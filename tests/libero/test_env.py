@@ -132,6 +132,16 @@ def test_only_the_seed_determines_the_placement(make_env):
     assert (env.get_sim_state() != states[0]).any()
 
 
+def test_without_a_seed_of_its_own_numpys_determines_the_placement(make_env):
+    states = []
+    for seed in (5, 5, 6):
+        np.random.seed(seed)  # noqa: NPY002 - as scripts of the original do
+        env = make_env(**BLIND)
+        env.reset()
+        states.append(env.get_sim_state())
+    assert (states[0] == states[1]).all() and (states[0] != states[2]).any()
+
+
 def test_states_are_restored(make_env, suite):
     env = make_env(**BLIND)
     row = suite.get_task_init_states(0)[1]

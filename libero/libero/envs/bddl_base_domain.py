@@ -198,7 +198,7 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         sizes = camera_heights, camera_widths
         self.camera_list = cameras(camera_names, *sizes, camera_depths, camera_segmentations)
         self.camera_names = [camera.name for camera in self.camera_list]
-        self.rng = np.random.default_rng()
+        self.rng = np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002 - until `seed`, that of scripts
         self._resets: OriginalResets | None = None
         self._restart_clock()
         self._is_sampled = self._closed = False
