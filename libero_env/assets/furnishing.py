@@ -154,7 +154,10 @@ def _smooth(size: int, widths: tuple[float, float], rng: np.random.Generator) ->
     return (field - field.mean()) / field.std()
 
 
-_PATTERNS = {f.__name__[1:]: f for f in (_tiles, _planks, _plaster, _linen, _marble, _wood)}
+_PATTERNS = {
+    **{"tiles": _tiles, "planks": _planks, "plaster": _plaster},
+    **{"linen": _linen, "marble": _marble, "wood": _wood},
+}
 
 
 def add_visual_mesh(

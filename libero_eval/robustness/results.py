@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.integrate import trapezoid
 
 from libero_env.text import flatten, plain, shorten
 from libero_eval.evaluation_file import EvaluationResult, by_start
@@ -188,9 +189,7 @@ class Outcomes:
         columns = [self.conditions.index(c) for c in conditions]
         severities = tuple(c[0][1] if c else 0.0 for c in conditions)
         rates, draws = self.rates[columns], self.draws[:, columns]
-        weights = np.asarray(
-            np.trapezoid(np.eye(len(severities)), severities) / severities[-1]
-        )  # of the area
+        weights = trapezoid(np.eye(len(severities)), severities) / severities[-1]  # of the area
         mean, drawn = float(rates @ weights), draws @ weights
         area = _estimate(mean, drawn, self._least, 0.0, 1.0)
         shares = _share(mean, float(rates[0])), _shares(drawn, draws[:, 0])
