@@ -25,6 +25,7 @@ Count = Annotated[int, Field(ge=1, le=1_000_000_000)]
 Natural = Annotated[int, Field(ge=0, le=1_000_000_000)]
 Width = Annotated[int, Field(ge=1, le=1_000_000)]  # of a layer or an image
 Depth = Annotated[int, Field(ge=0, le=1000)]  # number of layers
+Layers = Annotated[int, Field(ge=1, le=1000)]  # the same, at least one
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]

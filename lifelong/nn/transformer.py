@@ -5,14 +5,13 @@ frame.
 """
 
 import math
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from lifelong.types import Depth, Share, Width
+from lifelong.types import Depth, Layers, Share, Width
 
 
 def sinusoidal_positions(length: int, dim: int, factor: float = 10.0) -> Tensor:
@@ -184,7 +183,7 @@ class SpatialTransformer(nn.Module):
         patches: int,
         dim: Width = 128,
         out_dim: Width = 64,
-        layers: Depth = 7,
+        layers: Layers = 7,
         heads: Width = 8,
         head_dim: Width = 120,
         mlp_dim: Width = 256,
@@ -236,7 +235,7 @@ class TemporalLSTM(nn.LSTM):
         *,
         in_dim: int,
         hidden: Width = 1024,
-        layers: Annotated[int, Field(ge=1, le=1000)] = 2,
+        layers: Layers = 2,
         dropout: Share = 0.0,
     ) -> None:
         super().__init__(

@@ -248,6 +248,11 @@ class TokenPolicy(HistoryPolicy):
             proprio=spec.proprio, dim=dim, normalise=normalise, dropout=dropout, measured=spec.measured
         )
         self.transformer = temporal(dim=dim, max_length=spec.seq_len)
+        if readout == "instruction" and len(getattr(self.transformer, "layers", (None,))) == 0:
+            raise PolicyError(
+                "policy.temporal.layers=0 with policy.readout=instruction: actions would follow the instruction alone; "
+                "give at least one layer, or policy.readout=all"
+            )
         self._sizes = {"language": 1, "proprio": len(spec.proprio)} | dict.fromkeys(cameras, 1)
         tokens = 1 + (sum(self._sizes.values()) if readout == "all" else 0)
         self.head = self.build_head(head, in_dim=dim * tokens)

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from torch import nn
 
 from lifelong.data import fake_batch
-from lifelong.errors import PolicyError
+from lifelong.errors import ConfigError, PolicyError
 from lifelong.nn import (
     DeterministicHead,
     FlowHead,
@@ -25,6 +25,7 @@ from lifelong.policies.history import HistoryPolicy
 from lifelong.settings import build
 from lifelong.training.precision import bf16_runs_on_cpu
 from lifelong.types import Batch, Observation, PolicySpec
+from tests.harness.configs import chosen
 from tests.harness.policies import small_transformer
 
 SPEC = PolicySpec(image_size=(32, 32), language_dim=6, seq_len=4)
@@ -321,6 +322,15 @@ def test_a_head_that_reads_all_tokens_sees_the_camera_past_the_transformer(reado
     assert latents[0].shape == (2, SPEC.seq_len, width * (1 + (readout == "all") * tokens.shape[2]))
     assert torch.equal(latents[0][..., :width], latents[1][..., :width])  # it passes on nothing of a camera
     assert torch.equal(*latents) == (readout == "instruction")
+
+
+def test_a_policy_whose_actions_follow_the_instruction_alone_is_refused() -> None:
+    none = partial(TemporalTransformer, layers=0, heads=2, head_dim=4, mlp_dim=8)
+    small_transformer(SPEC, temporal=none, readout="all")
+    with pytest.raises(PolicyError, match="temporal.layers=0 with policy.readout=instruction"):
+        small_transformer(SPEC, temporal=none, readout="instruction")
+    with pytest.raises(ConfigError, match="spatial.layers"):
+        build(chosen("policy", "bc_vilt", "policy.spatial.layers=0"), spec=SPEC)
 
 
 @every_policy
