@@ -86,7 +86,8 @@ def test_a_run_acts_as_in_process(tmp_path, capsys, data, perturb):
     assert found["errors"] == [0]
     assert found["steps"] == tasks[0]["lengths"] and found["success"] == tasks[0]["successes"]
     assert found["actions"] == tasks[0]["actions"]
-    card.write_text("extends: libero\nworld: {perturb: 'goal=1@step2'}\n")
+    # after the five settling steps
+    card.write_text("extends: libero\nworld: {perturb: 'goal=1@step7'}\n")
     found = vla_eval().run("vla_eval_served_run.py", tmp_path / "run", json.dumps([entry]), cwd=tmp_path)
     assert found["errors"] == [2], "the benchmark tells the other goal, and a run cannot be told it"
 
