@@ -95,7 +95,11 @@ def _check_compat(config: DictConfig, words: Sequence[str], folders: Sequence[Pa
     ]
     if compat == "none" or not inner:
         return
-    plain = _compose([*(word for word in words if not word.startswith("compat=")), "compat=none"], folders)
+    # files alone: a single key may exist with compat only
+    files = [
+        word for word, (key, _, _) in zip(words, pairs, strict=True) if "." not in key and key != "compat"
+    ]
+    plain = _compose([*files, "compat=none"], folders)
     for key in inner:
         target = f"{key.replace('/', '.')}._target_"
         if (found := OmegaConf.select(config, target)) != OmegaConf.select(plain, target):
