@@ -89,9 +89,7 @@ def _check_compat(config: DictConfig, words: Sequence[str], folders: Sequence[Pa
     """
     compat, pairs = config.hydra.runtime.choices.compat, [word.partition("=") for word in words]
     inner = [
-        key
-        for key, _, name in pairs
-        if any((f / key / f"{name}.yaml").is_file() for f in folders) and "/" in key
+        k for k, _, name in pairs if "/" in k and any((f / k / f"{name}.yaml").is_file() for f in folders)
     ]
     if compat == "none" or not inner:
         return

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import linregress
 from table import finished, table
 
 from libero_env.text import duration, quantity
@@ -29,6 +30,13 @@ def plasticity(results: Results) -> Iterator[tuple[str, float]]:
     learned = np.diag(results.success_matrix()[0])
     for part in np.array_split(np.arange(len(learned)), 5):
         yield f"tasks {part[0] + 1} to {part[-1] + 1}", float(np.nanmean(learned[part]))
+
+
+def trend(results: Results) -> Iterator[tuple[str, float]]:
+    """Yield by how much a line through the success just after learning rises from the first task to the last."""
+    learned = np.diag(results.success_matrix()[0])
+    line = linregress(np.linspace(0, 1, len(learned)), learned)
+    yield from {"from the first to the last": line.slope, "standard error, of a run": line.stderr}.items()
 
 
 def cells(results: Results) -> Iterator[tuple[int, int, tuple[float, float]]]:
@@ -57,6 +65,15 @@ def by_distance(results: Results) -> Iterator[tuple[str, list[tuple[float, float
     """Yield the measured cells by the number of tasks learned since."""
     values = [(float(i - k), pair) for i, k, pair in cells(results)]
     yield from binned(values, DISTANCES, lambda low, high: f"{low} to {high - 1} tasks since")
+
+
+def by_row(results: Results) -> Iterator[tuple[str, list[tuple[float, float]]]]:
+    """Yield the measured cells after the last task, of all rows before, and of the 25 before."""
+    found = list(cells(results))
+    last = max(i for i, _, _ in found)
+    yield "after the last task", [pair for i, _, pair in found if i == last]
+    yield "after those before it", [pair for i, _, pair in found if i < last]
+    yield "after the 25 before it", [pair for i, _, pair in found if last - 25 <= i < last]
 
 
 def by_similarity(results: Results) -> Iterator[tuple[str, list[tuple[float, float]]]]:
@@ -98,8 +115,9 @@ def main() -> None:
         results = ResultLog(Path(folder) / "results.jsonl").read()
         if not np.isnan(results.success_matrix()[0][0, 0]):  # all tasks at once are no stream
             runs.setdefault(run.method, []).append(results)
-    show("just learned", {method: [dict(plasticity(r)) for r in found] for method, found in runs.items()})
-    for measure in (by_distance, by_similarity):
+    for title, curve in (("just learned", plasticity), ("a line through it", trend)):
+        show(title, {method: [dict(curve(r)) for r in found] for method, found in runs.items()})
+    for measure in (by_distance, by_row, by_similarity):
         cut = {method: [dict(measure(results)) for results in found] for method, found in runs.items()}
         lost = {
             method: [{name: forgotten(pairs) for name, pairs in seed.items()} for seed in seeds]

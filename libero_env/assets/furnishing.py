@@ -155,8 +155,12 @@ def _smooth(size: int, widths: tuple[float, float], rng: np.random.Generator) ->
 
 
 _PATTERNS = {
-    **{"tiles": _tiles, "planks": _planks, "plaster": _plaster},
-    **{"linen": _linen, "marble": _marble, "wood": _wood},
+    "tiles": _tiles,
+    "planks": _planks,
+    "plaster": _plaster,
+    "linen": _linen,
+    "marble": _marble,
+    "wood": _wood,
 }
 
 

@@ -52,8 +52,7 @@ def evaluate(options: EvalOptions) -> Answer:
 
     early = evaluation.until is not None  # rows are known at the end only
     on_task = (lambda _: None) if early else print_row
-    tell = lambda progress: tell_progress(str(progress))  # noqa: E731
-    result = run(options, evaluation, on_task=on_task, on_progress=tell)
+    result = run(options, evaluation, on_task=on_task, on_progress=lambda now: tell_progress(str(now)))
     for task in result.tasks if early else ():
         print_row(task)
     for name in ("renderer", "instruction_set"):
