@@ -1,4 +1,4 @@
-"""What the documentation takes from the code while it is built: the references, and three tables.
+"""What the documentation takes from elsewhere while it is built: the first page, the references, and three tables.
 
 MkDocs calls the functions `on_...` (`hooks` in mkdocs.yml). The references have a page for each group of commands and
 of keys. A page asks for a part with a line such as `<!-- generated: commands -->`. Links to files outside this folder
@@ -58,7 +58,10 @@ def on_config(config: MkDocsConfig) -> None:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
-    """Add the pages of the references, which no file holds."""
+    """Add the pages that no file in this folder holds: the first one, which is README.md, and the references."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    first = re.sub(r"\]\((?!https?:|#)(docs/)?", lambda link: "](" if link[1] else "](../", readme)
+    files.append(File.generated(config, "index.md", content=first))
     for reference in REFERENCES:
         for name, content in pages(reference).items():
             files.append(File.generated(config, name, content=content))
