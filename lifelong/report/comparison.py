@@ -94,7 +94,10 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
 
 def runs_of(runs: Sequence[Run]) -> list[MethodRun]:
     """Return runs as what the statistics take."""
-    return [MethodRun(r.results.scores(), r.record.seed, r.record.tasks, r.record.data_seed) for r in runs]
+    return [
+        MethodRun(r.results.scores(), r.record.seed, r.record.tasks, r.record.demonstrations_seed)
+        for r in runs
+    ]
 
 
 def findings(found: Mapping[str, Any], names: Mapping[str, str], most: int = 12) -> list[str]:
@@ -157,9 +160,8 @@ def _reference(measured: Mapping[str, Sequence[Run]]) -> _References:
 def _success_alone(run: Run, reference: _References) -> dict[str, float]:
     """Return the mean success by task of the reference with a run's settings: of its own seeds, else of all."""
     fitting = reference.get(_besides_algorithm(run), ())
-    own = [
-        r for r in fitting if (r.record.seed, r.record.data_seed) == (run.record.seed, run.record.data_seed)
-    ]
+    seeds = [(r.record.seed, r.record.demonstrations_seed) for r in (run, *fitting)]
+    own = [r for r, drawn in zip(fitting, seeds[1:], strict=True) if drawn == seeds[0]]
     found: dict[str, list[float]] = {}
     for one in own or fitting:
         for name, rate in zip(one.record.tasks, _just_learned(one), strict=True):

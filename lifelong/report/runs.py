@@ -173,7 +173,7 @@ def _one_of_each(label: str, members: Sequence[Run]) -> Group:
 
 def _factors(run: Run) -> tuple[Any, ...]:
     """Return what runs of one method are samples of: order of tasks, demonstrations, and all else that is drawn."""
-    return run.record.tasks, run.record.data_seed, run.record.seed
+    return run.record.tasks, run.record.demonstrations_seed, run.record.seed
 
 
 def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]], *, whole: bool = False) -> str:
@@ -260,7 +260,7 @@ def _unlike_draws(groups: Sequence[Group]) -> list[str]:
     draws: dict[str, Callable[[RunRecord], Any]] = {
         "seeds": lambda record: record.seed,
         "tasks or their orders": lambda record: record.tasks,
-        "seeds of the demonstrations (data.seed)": lambda record: record.data_seed,
+        "seeds of the demonstrations (data.seed)": lambda record: record.demonstrations_seed,
     }
     lines = []
     for name, drawn in draws.items():
@@ -293,7 +293,7 @@ def _unlike_demonstrations(groups: Sequence[Group]) -> list[str]:
             counts = tuple(sorted(zip(run.record.tasks, found.counts, strict=True)))
             digests = tuple(sorted(zip(run.record.tasks, found.digests, strict=True)))
             data = tuple(item for item in settings_of(run).items() if item[0].startswith("data."))
-            alike = sets.setdefault((run.record.benchmark, run.record.data_seed, counts, data), {})
+            alike = sets.setdefault((run.record.benchmark, run.record.demonstrations_seed, counts, data), {})
             alike.setdefault(digests, []).append(name)
     lines = (
         [f"No record tells which demonstrations these learned from: {few_of(unknown)}."] if unknown else []
@@ -350,7 +350,8 @@ def settings_of(run: Run) -> dict[str, Any]:
             continue
         if name == "_target_":  # a component goes by the name of its class
             key, value = f"{section}.", str(value).rpartition(".")[2]
-        settings[key] = value if isinstance(value, str | int | float | bool | None) else str(value)
+        if value is not None:  # an older run may not have the key
+            settings[key] = value if isinstance(value, str | int | float | bool) else str(value)
     if "eval.backend" in settings:  # device and memory aside
         settings["eval.backend"] = record.backend
     if not run.config:

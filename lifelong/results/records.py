@@ -93,6 +93,11 @@ class RunRecord:
         return tuple(range(end - size, end) for size, end in zip(sizes, accumulate(sizes), strict=True))
 
     @property
+    def demonstrations_seed(self) -> int:
+        """Seed of the demonstrations: 0 where the configuration names none, as the expert then records with."""
+        return self.data_seed or 0
+
+    @property
     def has_base_stage(self) -> bool:
         """Whether more tasks were learned together first than in any later group."""
         return len(self.groups) > 1 and len(self.groups[0]) > max(map(len, self.groups[1:]))

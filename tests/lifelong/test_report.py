@@ -704,6 +704,15 @@ def test_keys_that_change_no_result_make_no_method(key: str, tmp_path: Path):
     assert len(group_runs([load_run(run) for run in runs])) == 1
 
 
+def test_a_setting_that_is_not_named_is_as_one_that_is_null(tmp_path: Path):
+    """Older runs lack the keys of newer ones, and without a seed the expert records with seed 0."""
+    runs = [make_run(tmp_path / str(seed), "er", seed, tasks=1, epochs=(0, 1)) for seed in (1, 2)]
+    runs.append(make_run(tmp_path / "named", "er", 2, tasks=1, epochs=(0, 1), data_seed=0))
+    configure(runs[2], data__statistics=None, algo__share=None)
+    (group,) = group_runs([load_run(run) for run in runs])
+    assert (len(group.runs), len(group.repeats)) == (2, 1)
+
+
 @undrawn
 def test_runs_of_one_seed_from_two_starts_are_two_in_the_table_of_episodes(tmp_path: Path):
     runs = [make_run(tmp_path / str(n), "er", 1, tasks=1, epochs=(0, 1)) for n in (1, 2)]
