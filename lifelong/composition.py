@@ -1,7 +1,7 @@
 """From the words of a command line to a configuration; for a key or file that does not exist, the nearest is named."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -77,33 +77,39 @@ def compose_first(words: Sequence[str], folders: Sequence[Path]) -> DictConfig:
         config = _compose(first, folders)
     except REFUSALS as error:
         raise explained(error, words, folders) from error
-    _check_compat(config, first, folders)
+    check_obeyed(config, config.hydra.runtime.choices, first, folders)
     return config
 
 
-def _check_compat(config: DictConfig, words: Sequence[str], folders: Sequence[Path]) -> None:
-    """Check that a file that is chosen within a group, as by algo/estimator=sample, is not replaced by `compat`.
+def check_obeyed(
+    config: DictConfig, choices: Mapping[str, str], words: Sequence[str], folders: Sequence[Path]
+) -> None:
+    """Check that what the words of a single run choose is not replaced or unused.
+
+    Args:
+        config: Configuration that they compose, with its interpolations.
+        choices: Name of the file chosen in each group.
+        words: Overrides.
+        folders: Folders of configuration files, from `config_folders`.
 
     Raises:
-        ConfigError: It is.
+        ConfigError: `compat` replaces a file within a group, as of algo/estimator=sample, or no one reads a key.
     """
-    compat, pairs = config.hydra.runtime.choices.compat, [word.partition("=") for word in words]
-    inner = [
-        k for k, _, name in pairs if "/" in k and any((f / k / f"{name}.yaml").is_file() for f in folders)
-    ]
-    if compat == "none" or not inner:
-        return
-    # files alone: a single key may exist with compat only
-    files = [
-        word for word, (key, _, _) in zip(words, pairs, strict=True) if "." not in key and key != "compat"
-    ]
-    plain = _compose([*files, "compat=none"], folders)
-    for key in inner:
-        target = f"{key.replace('/', '.')}._target_"
-        if (found := OmegaConf.select(config, target)) != OmegaConf.select(plain, target):
+    for key, _, name in (word.partition("=") for word in words):
+        if key == "benchmark.horizon" and not OmegaConf.is_interpolation(config.eval, "horizon"):
             raise ConfigError(
-                f"{key} has no effect with compat={compat}, which has {found} there; leave one of them out"
+                f"{key} has no effect with preset={choices['preset']}, where eval.horizon is {config.eval.horizon}; "
+                "set eval.horizon"
             )
+        files = [folder / key / f"{name}.yaml" for folder in folders if "/" in key]
+        for file in filter(Path.is_file, files if choices["compat"] != "none" else ()):
+            asked = OmegaConf.select(OmegaConf.load(file), "_target_")
+            found = OmegaConf.select(config, f"{key.replace('/', '.')}._target_")
+            if asked not in (None, found):
+                raise ConfigError(
+                    f"{key} has no effect with compat={choices['compat']}, which has {found} there; leave one of them "
+                    "out"
+                )
 
 
 def _first(words: Sequence[str], folders: Sequence[Path]) -> list[str]:

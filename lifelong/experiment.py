@@ -70,7 +70,7 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
     Raises:
         LiberoError: The configuration, the data or the directory is invalid.
     """
-    plain = _with_drawing(plain_data(config))
+    plain = with_drawing(plain_data(config))
     configuration = Configuration(plain)
     settings = configuration.settings()
     directory = RunDirectory(Path(settings.runs_dir) / _run_name(names, settings))
@@ -106,7 +106,7 @@ def check(config: DictConfig) -> None:
     Raises:
         LiberoError: A run would refuse the configuration, or this machine lacks what it needs.
     """
-    configuration = Configuration(_with_drawing(plain_data(config)))
+    configuration = Configuration(with_drawing(plain_data(config)))
     settings = configuration.settings()
     _, parts = _checked_parts(configuration, Ranks().device(settings.device))
     configuration.build("language")
@@ -114,7 +114,7 @@ def check(config: DictConfig) -> None:
         configuration.build("policy", spec=parts["data"].spec(EXAMPLE_DIM))
 
 
-def _with_drawing(config: dict[str, Any]) -> dict[str, Any]:
+def with_drawing(config: dict[str, Any]) -> dict[str, Any]:
     """Return a configuration that names how images are drawn, so that the saved one does."""
     data = config.get("data")
     if not isinstance(data, dict) or data.get("drawing") is not None:

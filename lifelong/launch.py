@@ -8,7 +8,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from copy import copy
-from functools import partial
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -24,7 +23,7 @@ from libero_env.errors import LiberoError
 from libero_env.parallel import end_with_parent, limit_first_picture
 from libero_env.text import printable, suggest
 from lifelong import experiment
-from lifelong.composition import REFUSALS, compose_first, config_folders, explained, swept
+from lifelong.composition import REFUSALS, check_obeyed, compose_first, config_folders, explained, swept
 from lifelong.errors import ConfigError
 from lifelong.report.comparison import Plan
 from lifelong.report.page import comparison_text, write_report
@@ -105,10 +104,9 @@ def _launch(options: argparse.Namespace, ranks: Ranks) -> int:
     folders = config_folders(None if options.config_dir is None else Path(options.config_dir))
     words, sweep = list(options.overrides), None
     lists = swept(words, folders)
-    # a plain run's configuration is composed by Hydra alone, unless a file within a group is to be checked
-    needed = options.multirun or options.cfg or any("/" in word.partition("=")[0] for word in words)
-    config = compose_first(words, folders) if needed else DictConfig({})
-    job = Job(ranks, [word for word in words if not word.startswith("hydra")])
+    # a plain run's configuration is composed by Hydra alone
+    config = compose_first(words, folders) if options.multirun or options.cfg else DictConfig({})
+    job = Job(ranks, [word for word in words if not word.startswith("hydra")], folders)
     if options.multirun:
         folder = config.hydra.sweep.dir
         if not any(word.startswith("hydra.sweep.dir=") for word in words):
@@ -149,11 +147,12 @@ class Job:
     Args:
         ranks: Ranks of this process.
         words: Overrides of the whole command.
+        folders: Folders of configuration files.
     """
 
-    def __init__(self, ranks: Ranks, words: list[str]):
+    def __init__(self, ranks: Ranks, words: list[str], folders: list[Path]):
         self.ranks: Ranks | None = ranks
-        self.words, self.status = words, 0
+        self.words, self.folders, self.status = words, folders, 0
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "ranks": None}  # a launcher's process joins those it trains with by itself
@@ -184,7 +183,12 @@ class Job:
         return self._learn(config, hydra_config, ranks)
 
     def _learn(self, config: DictConfig, hydra_config: Any, ranks: Ranks) -> Path | None:
-        learn = partial(experiment.run, config, hydra_config.runtime.choices, ranks)
+        choices, words = hydra_config.runtime.choices, hydra_config.overrides.task
+
+        def learn() -> Path:
+            check_obeyed(config, choices, words, self.folders)
+            return experiment.run(config, choices, ranks)
+
         if hydra_config.mode != RunMode.MULTIRUN or not ranks.first:
             try:
                 return learn()
@@ -195,8 +199,9 @@ class Job:
                 return None
         file = Path(hydra_config.runtime.output_dir) / JOB_FILE
         # a run of another name is another one
-        key = config_digest({**plain_data(config), "run": [config.runs_dir, config.run_id]})
-        record = JobRecord(int(hydra_config.job.num), key, tuple(hydra_config.overrides.task), "running")
+        plain = experiment.with_drawing(plain_data(config))
+        key = config_digest({**plain, "run": [config.runs_dir, config.run_id]})
+        record = JobRecord(int(hydra_config.job.num), key, tuple(words), "running")
         # a finished run returns at once, or is evaluated under another shift
         again = ranks.size > 1 or not config.resume or config.eval.shift is not None
         done = run_job(file, record, learn, _report_line, again=again)

@@ -148,14 +148,17 @@ def _last(key: str) -> str:
 
 
 def begin_sweep(folder: Path, words: Sequence[str], planned: int | None) -> None:
-    """Write what is asked.
+    """Write what is asked; where another command had the folder, the records of its jobs are removed.
 
     Raises:
-        ResultsError: The folder cannot be written.
+        ResultsError: The folder cannot be written, or a file is broken.
     """
-    content = {"words": list(words), "planned": planned, "started": utc_now()}
+    file, content = folder / SWEEP_FILE, {"words": list(words), "planned": planned}
     with writing(folder, "the sweep"):
-        write_json(folder / SWEEP_FILE, content)
+        if file.is_file() and not content.items() <= _read_json(file).items():
+            for job in (folder / "jobs").glob(f"*/{JOB_FILE}"):
+                job.unlink()
+        write_json(file, {**content, "started": utc_now()})
 
 
 def read_sweep(folder: Path) -> Sweep:
@@ -170,8 +173,6 @@ def read_sweep(folder: Path) -> Sweep:
     content = _read_json(file)
     words, planned = content.get("words", []), content.get("planned")
     jobs = [job for path in (folder / "jobs").glob(f"*/{JOB_FILE}") if (job := read_job(path))]
-    if planned is not None:  # others are of an earlier command in the same folder
-        jobs = [job for job in jobs if job.number < planned]
     return Sweep(folder, tuple(words), planned, tuple(sorted(jobs, key=lambda job: job.number)))
 
 

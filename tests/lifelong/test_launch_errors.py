@@ -72,6 +72,7 @@ MISTAKES = {
     "foo/bar=x": ("foo/bar", "Valid: algo"),
     "algo=er algo/estimator=batch": ("algo/estimator", "algo=NAME"),
     "compat=libero algo=ewc algo/estimator=sample": ("algo/estimator has no effect with compat=libero", "BatchFisher"),
+    "benchmark.horizon=100": ("benchmark.horizon has no effect with preset=smoke", "set eval.horizon"),
     "policy.head_hidden=5": ("policy.head_hidden", "Did you mean 'policy.head.hidden'?"),
     "policy.encoder.width=17": ("17 channels", "a multiple of 8"),
     "train.lr=${nothing}": ("train.lr", "'nothing' not found"),
@@ -216,7 +217,22 @@ def test_jobs_of_one_folder_with_other_names_of_their_runs_are_others(here, monk
     monkeypatch.setattr("lifelong.launch.run_job", run)
     for word in ("run_id=a", "run_id=b", "runs_dir=other"):
         main(["train", "-m", "seed=1,2", "hydra.sweep.dir=sweep", word])
-    assert len(set(keys)) == 6
+    monkeypatch.setattr(experiment, "default_drawing", lambda pack: "faithful")  # as of other models
+    main(["train", "-m", "seed=1,2", "hydra.sweep.dir=sweep", "run_id=a"])
+    assert len(set(keys)) == 8
+
+
+def test_every_job_of_a_sweep_is_checked_for_what_has_no_effect(here, monkeypatch, capsys):
+    ran = []
+
+    def run(config, names, ranks):
+        ran.append(config.algo.estimator._target_)
+        raise ConfigError("a run begins")
+
+    monkeypatch.setattr(experiment, "run", run)
+    assert main(["train", "-m", "compat=libero", "algo=ewc", "algo/estimator=batch,sample"]) == 2
+    assert ran == ["lifelong.algorithms.importance.BatchFisher"]
+    assert "algo/estimator has no effect with compat=libero" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("words", "noted"), [

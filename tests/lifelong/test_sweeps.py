@@ -106,7 +106,10 @@ def test_a_run_that_another_process_writes_is_waited_for(tmp_path, monkeypatch, 
 
 
 def test_a_sweep_is_done_when_all_that_was_asked_for_is(tmp_path) -> None:
-    begin_sweep(tmp_path, ["algo=er", "seed=0,1,2"], 3)
+    begin_sweep(tmp_path, ["algo=er", "seed=1,2,3"], 3)
+    run_job(file_of(tmp_path, 2), job(2), lambda: learned(tmp_path / "other"), told)
+    for _ in range(2):  # another command in the same folder, and the same again
+        begin_sweep(tmp_path, ["algo=er", "seed=0,1,2"], 3)
     for number in (0, 1):
         run_job(
             file_of(tmp_path, number),
@@ -117,11 +120,12 @@ def test_a_sweep_is_done_when_all_that_was_asked_for_is(tmp_path) -> None:
     sweep = read_sweep(tmp_path)
     assert (sweep.missing, sweep.exit_status, len(sweep.runs)) == (1, 1, 2)
     run_job(file_of(tmp_path, 2), job(2), lambda: learned(tmp_path / "r2"), told)
-    run_job(file_of(tmp_path, 7), job(7), lambda: learned(tmp_path / "r7"), told)  # of an earlier, larger one
+    begin_sweep(tmp_path, ["algo=er", "seed=0,1,2"], 3)
     sweep = read_sweep(tmp_path)
     assert (sweep.missing, sweep.exit_status, [j.number for j in sweep.jobs]) == (0, 0, [0, 1, 2])
     begin_sweep(tmp_path, ["hydra/sweeper=optuna"], None)
-    assert len(read_sweep(tmp_path).jobs) == 4, "a sweeper that chooses as it goes has no plan"
+    run_job(file_of(tmp_path, 7), job(7), lambda: learned(tmp_path / "r7"), told)
+    assert len(read_sweep(tmp_path).jobs) == 1, "a sweeper that chooses as it goes has no plan"
 
 
 def test_the_status_names_what_runs_failed_was_lost_and_is_left(tmp_path, capsys) -> None:
