@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from lifelong.errors import PolicyError
 from lifelong.types import Depth, Layers, Share, Width
 
 
@@ -227,7 +228,10 @@ class TemporalLSTM(nn.LSTM):
         in_dim: F.
         hidden: Size of the state.
         layers: Number of layers.
-        dropout: Dropout between the layers; without effect where there is one.
+        dropout: Dropout between the layers.
+
+    Raises:
+        PolicyError: There is dropout between layers, and there is one layer.
     """
 
     def __init__(
@@ -238,13 +242,12 @@ class TemporalLSTM(nn.LSTM):
         layers: Layers = 2,
         dropout: Share = 0.0,
     ) -> None:
-        super().__init__(
-            input_size=in_dim,
-            hidden_size=hidden,
-            num_layers=layers,
-            dropout=dropout if layers > 1 else 0.0,
-            batch_first=True,
-        )
+        if dropout and layers == 1:
+            raise PolicyError(
+                f"policy.temporal.dropout={dropout} acts between layers, and there is one: use 0, or "
+                "policy.temporal.layers=2"
+            )
+        super().__init__(in_dim, hidden, layers, dropout=dropout, batch_first=True)
 
     def forward(self, x: Tensor, state: tuple[Tensor, Tensor] | None = None) -> Any:
         """Return the outputs and the last state; with gradients in evaluation mode too, which cuDNN has not."""

@@ -73,6 +73,7 @@ MISTAKES = {
     "algo=er algo/estimator=batch": ("algo/estimator", "algo=NAME"),
     "compat=libero algo=ewc algo/estimator=sample": ("algo/estimator has no effect with compat=libero", "BatchFisher"),
     "benchmark.horizon=100": ("benchmark.horizon has no effect with preset=smoke", "set eval.horizon"),
+    "policy=bc_rnn_small policy.temporal.dropout=0.1": ("dropout=0.1 acts between layers, and there is one",),
     "policy.head_hidden=5": ("policy.head_hidden", "Did you mean 'policy.head.hidden'?"),
     "policy.encoder.width=17": ("17 channels", "a multiple of 8"),
     "train.lr=${nothing}": ("train.lr", "'nothing' not found"),

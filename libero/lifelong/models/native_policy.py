@@ -157,7 +157,7 @@ class BCRNNPolicy(NativePolicy):
                 "TemporalLSTM",
                 hidden=policy.rnn_hidden_size,
                 layers=policy.rnn_num_layers,
-                dropout=policy.rnn_dropout,
+                dropout=policy.rnn_dropout if policy.rnn_num_layers > 1 else 0.0,
             ),
         }
 
