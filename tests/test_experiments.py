@@ -107,4 +107,6 @@ def test_records_of_the_study_are_of_todays_configuration(monkeypatch):
     kept = [run for run in study.planned() if run.record.exists()]
     for one in {run.study.name: run for run in kept}.values():
         assert one.is_done()
+        monkeypatch.setitem(one.config["data"], "demos", None)  # which the record names
+        assert not one.is_done()
     assert kept

@@ -171,11 +171,11 @@ class Planned:
         """Return whether there are records, of today's configuration."""
         if not self.record.exists():
             return False
-        saved = yaml.safe_load(_read(self.record)["config"])
-        known = set(result_relevant(self.config))  # a saved configuration also names how pictures were drawn
-        was = {k: v for k, v in result_relevant(saved).items() if k in known}
-        now = {k: v for k, v in result_relevant(self.config).items() if v is not None}
-        return {k: v for k, v in was.items() if k in now} == now
+        was, now = (  # a saved configuration also names how pictures were drawn
+            {k: v for k, v in result_relevant(config).items() if v is not None and k != "data.drawing"}
+            for config in (yaml.safe_load(_read(self.record)["config"]), self.config)
+        )
+        return was == now
 
     def missing(self) -> list[str]:
         """Return the shifts that it was not evaluated under; before them "" if the run itself is missing."""
