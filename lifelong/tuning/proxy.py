@@ -139,7 +139,16 @@ class Trial:
         groups = {group: self.config[group] for group in _GROUPS} | {"algo": algo}
         stream = [task.id for task in self.stream]
         rest = [FORMAT, stream, self.seed, self.steps, self.held_out, source_digest(), installed_versions()]
+        rest += _stamps(self.config["data"])
         return hashlib.sha256(json.dumps([groups, rest], sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _stamps(data: Mapping[str, Any]) -> list[tuple[str, int, int]]:
+    """Return name, size and time of the demonstration files that are the user's, which he may replace."""
+    files = [Path(name).expanduser() for name in data["files"]]
+    if data["folder"]:
+        files += sorted(Path(data["folder"]).expanduser().rglob("*.hdf5"))
+    return [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files if file.is_file()]
 
 
 def open_stream(config: Mapping[str, Any], tasks: Sequence[Task], held_out: float) -> StreamData:

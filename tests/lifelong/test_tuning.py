@@ -265,6 +265,15 @@ def test_trials_of_another_source_or_expert_and_of_other_models_are_measured_aga
     assert trial.key() != before[0] and trial.start_key(algorithm) != before[1]
 
 
+@pytest.mark.parametrize("words", ["data.files=[FOLDER/own.hdf5]", "data.folder=FOLDER"])
+def test_trials_of_demonstrations_that_were_replaced_are_measured_again(words, tmp_path) -> None:
+    config, keys = plain_data(composed("algo=ewc", words.replace("FOLDER", str(tmp_path)))), set()
+    for content in ("", "recorded", "recorded again"):
+        (tmp_path / "own.hdf5").write_text(content)
+        keys.add(Trial(config, (), 1, 10, 0.25).key())
+    assert len(keys) == 3
+
+
 def test_values_that_change_nothing_are_named(capsys, tmp_path, fake_streams) -> None:
     assert tune(*WORDS, "train.last_batch=short,filled", *FAST, "--out", str(tmp_path)) == 0
     assert "all values have the same errors: train.last_batch has no effect" in capsys.readouterr().err
