@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,14 @@ from libero_env.sim.scene import default_drawing
 from libero_env.tasks import Task
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
-from lifelong.data.demonstrations import DemoDatasets, check_folder, demo_copies, find_demos, perturb_demos
+from lifelong.data.demonstrations import (
+    DemoDatasets,
+    check_folder,
+    check_pairing,
+    demo_copies,
+    find_demos,
+    perturb_demos,
+)
 from lifelong.data.settings import DataSettings
 from lifelong.errors import ConfigError, DataError
 from lifelong.evaluation.environments import EnvPool, held_out_shift, renderer_name_or_none, run_environment
@@ -346,6 +354,7 @@ def _find_demos(
     recorded = find_demos(context.tasks, context.demos, context.data, context.progress, others)
     own = (context.tasks, context.demos, context.perturbed, context.data, context.progress)
     paths, copies = perturb_demos(recorded, *own), demo_copies(recorded, *own)
+    check_pairing([*paths, *chain(*copies)], context.data)
     _record_demonstrations(context, recorded, learned)
     context.directory.log.append(PhaseRecord(phase="demos", seconds=time.perf_counter() - began))
     return paths, copies

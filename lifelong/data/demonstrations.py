@@ -1,7 +1,7 @@
 """Demonstrations of a run's tasks: recorded if there are none, read when they are needed."""
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from weakref import WeakValueDictionary
@@ -60,6 +60,11 @@ def find_demos(
     files = _named_files(tasks, required, data, others)
     if folder is not None:
         files = _files_in(folder, [t for t in by_id.values() if t.id not in files], required, data) | files
+    recorded = others or by_id.keys() - files.keys()
+    if data.seed is not None and not recorded and not any("seed" in read_header(f) for f in files.values()):
+        raise DataError(
+            f"data.seed={data.seed} has no effect: no file of this run states a seed; leave it out"
+        )
     for count in sorted(set(counts), reverse=True):
         missing = [t for t in by_id.values() if required[t.id] == count and t.id not in files]
         if not missing:
@@ -223,6 +228,27 @@ def _misfit(file: Path, required: int, data: DataSettings) -> str:
             use = f"data.image_size={height}" if height == width else "`libero demos rerender`"
             return f"has images of {height}x{width} pixels and data.image_size is {size}; use {use}"
     return ""
+
+
+def check_pairing(files: Iterable[Path], data: DataSettings) -> None:
+    """Check that `data.pairing=stored` pairs all actions of a run with observations in the same way.
+
+    Args:
+        files: All files that the run learns from.
+
+    Raises:
+        DataError: Some hold the observation before an action, others the one after it.
+    """
+    found = (
+        {read_header(file).get("pairing", "libero"): file for file in files}
+        if data.pairing == "stored"
+        else {}
+    )
+    if len(found) > 1:
+        raise DataError(
+            f"data.pairing=stored: {found['libero']} holds the observation after an action, {found['aligned']} the one "
+            "before it; use data.pairing=aligned, which pairs all with the one before"
+        )
 
 
 def check_folder(data: DataSettings) -> Path | None:

@@ -71,6 +71,28 @@ def test_named_files_and_files_of_a_folder_are_found_by_the_task_that_they_state
     assert demonstrations.find_demos(TASKS[:1], [2], seeded, False)[0].parent.name == "seed5"
 
 
+def test_a_seed_that_no_file_states_is_refused(tmp_path, recorded):
+    """Runs with several would count as several samples."""
+    write_demos(tmp_path, TASKS[0], 2)
+    data = replace(settings(str(tmp_path)), seed=5)
+    with pytest.raises(DataError, match="data.seed=5 has no effect"):
+        demonstrations.find_demos(TASKS[:1], [2], data, False)
+    demonstrations.find_demos(TASKS[:1], [2], data, False, others=TASKS[1:])
+    demonstrations.find_demos(TASKS[:2], [2, 2], data, False)
+    assert recorded == [TASKS[1].name]
+
+
+def test_files_as_they_are_pair_all_actions_in_the_same_way(tmp_path):
+    human, expert = write_demos(tmp_path, TASKS[0], 2), own(tmp_path / "own.hdf5")
+    stored = replace(settings(None), pairing="stored")
+    for files, data in (([human], stored), ([expert], stored), ([human, expert], settings(None))):
+        demonstrations.check_pairing(files, data)
+    with pytest.raises(
+        DataError, match=f"{human} holds the observation after an action, {expert} the one before"
+    ):
+        demonstrations.check_pairing([expert, human], stored)
+
+
 def test_a_repeated_task_has_one_file_with_the_most_demonstrations_that_are_required(tmp_path, recorded):
     first, second = demonstrations.find_demos([TASKS[0]] * 2, [3, 1], settings(str(tmp_path)), False)
     assert first == second and first.name == f"{TASKS[0].name}_3.hdf5" and recorded == [TASKS[0].name]
