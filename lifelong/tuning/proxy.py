@@ -19,7 +19,7 @@ from libero_env.storage import read_record, write_record
 from libero_env.tasks import Task
 from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.demonstrations import DemoDatasets, find_demos
+from lifelong.data.demonstrations import DemoDatasets, check_pairing, find_demos
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import ConfigError
@@ -173,6 +173,7 @@ def open_stream(config: Mapping[str, Any], tasks: Sequence[Task], held_out: floa
     languages = checked.build("language").embed([task.language for task in tasks])
     spec = data.spec(languages.shape[1])
     paths = find_demos(tasks, [data.demos] * len(tasks), data, None)
+    check_pairing(paths, data)
     device = torch.device("cpu")
     training, everything = (
         DemoDatasets(paths, [count] * len(tasks), spec, languages, data, device)
