@@ -48,7 +48,7 @@ def load_runs(*patterns: str | Path) -> "pd.DataFrame":
 def find_runs(patterns: Sequence[str | Path]) -> list[Run]:
     """Return the runs that patterns name, in the order of their paths; see `load_runs`.
 
-    Those that `resume=false` moved aside (`.old1`) are left out, unless one is named itself.
+    Pretrainings and those that `resume=false` moved aside (`.old1`) are left out, unless one is named itself.
     """
     found: dict[Path, None] = {}
     for pattern in map(str, patterns):
@@ -57,7 +57,8 @@ def find_runs(patterns: Sequence[str | Path]) -> list[Run]:
         inside = [
             run
             for log in logs
-            if (run := log.parent) == Path(pattern) or not re.search(r"\.old\d+$", run.name)
+            if (run := log.parent) == Path(pattern)
+            or not (re.search(r"\.old\d+$", run.name) or run.parent.parent.name == "pretrain")
         ]
         if not inside:
             raise LifelongError(f"{pattern}: no run directory is there (with a file results.jsonl)")

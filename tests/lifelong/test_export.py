@@ -50,12 +50,13 @@ def test_latex_has_a_row_for_each_method(tmp_path, capsys):
     assert len({line.count(" & ") for line in lines if " & " in line}) == 1
 
 
-def test_runs_moved_aside_are_left_out(tmp_path):
-    for name in ("seed1", "seed1.old1"):
+def test_runs_moved_aside_and_pretrainings_are_left_out(tmp_path):
+    for name in ("seed1", "seed1.old1", "pretrain/libero_90/0123"):
         shutil.copytree(RUNS / "er", tmp_path / name)
     for pattern in (tmp_path, f"{tmp_path}/*", tmp_path / "seed1"):
         assert list(lifelong.load_runs(pattern).path) == [str(tmp_path / "seed1")]
-    assert list(lifelong.load_runs(tmp_path / "seed1.old1").path) == [str(tmp_path / "seed1.old1")]
+    for name in ("seed1.old1", "pretrain/libero_90/0123"):
+        assert list(lifelong.load_runs(tmp_path / name).path) == [str(tmp_path / name)]
 
 
 def test_text_of_a_label_is_never_markup():
