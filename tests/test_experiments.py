@@ -85,6 +85,15 @@ def test_a_script_explains_itself_and_does_not_start_when_asked_for_help(script)
     )
 
 
+def test_what_is_held_out_is_not_learned():
+    spec = importlib.util.spec_from_file_location("learn", EXPERIMENTS / "laptop" / "learn.py")
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    script.find_demos = None  # nothing is read or recorded
+    with pytest.raises(SystemExit, match="data.demos=80 and 30 held out are more than --demos 109"):
+        script.learn([], "libero_object", 0, 1, 109)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.parent.name)
 def test_a_page_of_the_study_is_of_all_its_records(page):
     groups = json.loads(page.read_text(encoding="utf-8"))["groups"].values()

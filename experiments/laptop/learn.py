@@ -69,8 +69,10 @@ def learn(words: Sequence[str], suite: str, task: int, seed: int, demos: int) ->
     words = [f"benchmark={suite}", f"benchmark.tasks=[{task}]", f"seed={seed}", "threads=1", *words]
     with initialize_config_dir(str(config_folder().resolve()), version_base="1.3"):
         config = Configuration(plain_data(compose("config", words)))
-    torch.set_num_threads(1)
     data, settings = config.build("data"), config.build("train")
+    if data.demos > demos - HELD_OUT:
+        raise SystemExit(f"error: data.demos={data.demos} and {HELD_OUT} held out are more than --demos {demos}")
+    torch.set_num_threads(1)
     found = config.build("benchmark").sequence()[0]
     path = find_demos([found], [demos], data, False)[0]
     language = config.build("language").embed([found.language])[0]

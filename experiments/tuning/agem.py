@@ -27,10 +27,10 @@ class Watched(AGEM):
         self.projected, self._before, self._references = projected, [], None
 
     def after_backward(self, policy):
-        if self._reference is None:
+        if self.reference is None:
             return
         params = [p for p in policy.parameters() if p.requires_grad]
-        loss = policy.loss(self._reference)
+        loss = policy.loss(self.reference)
         grads = torch.autograd.grad(loss, params, allow_unused=True)
         pairs = [(p, r) for p, r in zip(params, grads, strict=True) if r is not None and p.grad is not None]
         mine = torch.cat([p.grad.flatten() for p, _ in pairs])
@@ -39,7 +39,7 @@ class Watched(AGEM):
         if self.projected == "gradient":
             super().after_backward(policy)
             return
-        self._reference, self._references = None, pairs
+        self.reference, self._references = None, pairs
         self._before = [p.detach().clone() for p, _ in pairs]
 
     @torch.no_grad()
