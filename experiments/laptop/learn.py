@@ -71,7 +71,9 @@ def learn(words: Sequence[str], suite: str, task: int, seed: int, demos: int) ->
         config = Configuration(plain_data(compose("config", words)))
     data, settings = config.build("data"), config.build("train")
     if data.demos > demos - HELD_OUT:
-        raise SystemExit(f"error: data.demos={data.demos} and {HELD_OUT} held out are more than --demos {demos}")
+        raise SystemExit(
+            f"error: data.demos={data.demos} and {HELD_OUT} held out are more than --demos {demos}"
+        )
     torch.set_num_threads(1)
     found = config.build("benchmark").sequence()[0]
     path = find_demos([found], [demos], data, False)[0]
