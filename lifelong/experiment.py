@@ -132,7 +132,8 @@ def with_drawing(config: dict[str, Any]) -> dict[str, Any]:
 
 def _run_name(names: Mapping[str, str], settings: RunSettings) -> str:
     """Return the run's directory below `runs_dir`, which is also its name in W&B."""
-    words = [names["policy"], f"seed{settings.seed}", *([str(settings.run_id)] if settings.run_id else [])]
+    own = [] if settings.run_id is None else [str(settings.run_id)]
+    words = [names["policy"], f"seed{settings.seed}", *own]
     return f"{names['benchmark']}/{names['algo']}/{'_'.join(words)}"
 
 

@@ -253,6 +253,17 @@ def test_a_policy_with_a_history_that_is_given_single_frames_says_so(words, note
     assert found.endswith("error: the first task begins\n") and (note in found) == noted
 
 
+def test_a_run_is_named_by_its_run_id_also_where_that_is_zero(here, monkeypatch):
+    def learn(*args):
+        raise ConfigError("the first task begins")
+
+    monkeypatch.setattr(experiment, "_run_sequence", learn)
+    tiny = ("benchmark.tasks=1", "language=onehot", "device=cpu", "threads=1", "eval.episodes=1")
+    assert main(["train", *tiny, "run_id=0"]) == 2
+    (config,) = here.rglob("config.yaml")
+    assert config.parent.name == "bc_transformer_small_seed1_0"
+
+
 def test_missing_commands_print_the_help(capsys):
     for words, shown in (([], "compare"), (["tasks"], "certify"), (["results"], "export")):
         assert main(words) == 2
