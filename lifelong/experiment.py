@@ -48,7 +48,7 @@ from lifelong.results.provenance import (
     utc_now,
 )
 from lifelong.results.records import DemonstrationsRecord, PhaseRecord, RunEndRecord, RunRecord
-from lifelong.results.run_directory import RunDirectory, config_digest
+from lifelong.results.run_directory import RunDirectory, config_digest, read_saved_config
 from lifelong.results.summary import write_summary
 from lifelong.sequence import TaskSequence, is_measured
 from lifelong.settings import Configuration, RunSettings, plain_data
@@ -100,6 +100,7 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
                     if ranks.first:
                         context.tracker.finish()
             elif ranks.first:
+                _check_learned_from(context, pretraining, plain)
                 print(
                     f"{directory.path} is finished; its report is written again (resume=false repeats the run)"
                 )
@@ -278,6 +279,21 @@ def _is_finished(context: RunContext) -> bool:
     return results.finished and (complete or is_measured(context, results))
 
 
+def _check_learned_from(
+    context: RunContext, pretraining: RunContext | None, plain: Mapping[str, Any]
+) -> None:
+    """Check that another `data.folder` than before has the demonstrations that a finished run learned from.
+
+    Raises:
+        DataError: It has others.
+    """
+    was = read_saved_config(context.directory.path / "config.yaml").get("data", {}).get("folder")
+    if was != plain["data"].get("folder") and context.directory.log.read().demonstrations is not None:
+        others = pretraining.tasks if pretraining else ()
+        found = find_demos(context.tasks, context.demos, context.data, context.progress, others)
+        _record_demonstrations(context, found, learned=True)
+
+
 def _note_single_frames(policy: Policy, name: str) -> None:
     """Say where a policy that uses its history is given windows of one frame, as by the preset `laptop`."""
     if policy.uses_history and policy.spec.seq_len == 1:
@@ -375,8 +391,8 @@ def _record_demonstrations(context: RunContext, paths: Sequence[Path], learned: 
     changes = changed_demonstrations(before[-1], record, names) if before else ""
     if changes and learned:
         raise DataError(
-            f"the pretraining in {context.directory.path} cannot be shared by a run {changes.partition(':')[0]}; "
-            "use another runs_dir, or move that folder away"
+            f"what {context.directory.path} has learned cannot be shared by a run {changes.partition(':')[0]}; "
+            "use another runs_dir (for a run that is finished, run_id=NAME as well), or move that folder away"
         )
     if not before or before[-1] != record:
         log.append(record)

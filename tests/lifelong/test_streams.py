@@ -1,7 +1,9 @@
 """Streams: groups of tasks, fewer demonstrations, blurred boundaries, pretraining and initial weights."""
 
 import math
+from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -457,3 +459,29 @@ def test_a_pretraining_is_not_shared_by_runs_with_other_demonstrations(tmp_path,
     with pytest.raises(DataError, match="cannot be shared by a run with other demonstrations than before of"):
         experiment._record_demonstrations(context, other, True)
     assert len(context.directory.log.read().of(DemonstrationsRecord)) == 1
+
+
+def test_a_finished_run_is_not_that_of_another_folder_with_other_demonstrations(
+    tmp_path, monkeypatch
+) -> None:
+    context, found = run_context(tmp_path, "sequential"), iter("ab")
+    origin = partial(SimpleNamespace, generator="")
+    monkeypatch.setattr(experiment, "find_demos", lambda tasks, *_: [Path(next(found))] * len(tasks))
+    monkeypatch.setattr(experiment, "demo_origin", lambda path, count: origin(count=count, digest=path.name))
+    monkeypatch.setattr(experiment, "_build_contexts", lambda *_: (context, None))
+    monkeypatch.setattr(experiment, "_held", lambda *_: nullcontext())
+    monkeypatch.setattr(experiment, "_is_finished", lambda context: True)
+    monkeypatch.setattr(experiment, "_write_results", lambda *_: None)
+    (tmp_path / "config.yaml").write_text("data: {folder: null}")
+    experiment._record_demonstrations(context, [Path("a")] * len(context.tasks), False)
+
+    def again(folder: str) -> None:
+        config = composed(*TINY, f"data.folder={folder}", f"runs_dir={tmp_path}")
+        experiment.run(config, {"policy": "bc", "benchmark": "libero_goal", "algo": "sequential"})
+
+    again("null")
+    again("copied")
+    with pytest.raises(
+        DataError, match=f"{context.directory.path} has learned cannot be shared by a run with other"
+    ):
+        again("human_demos")
