@@ -148,9 +148,17 @@ def short_labels(instructions: Sequence[str]) -> list[str]:
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:
     """Group runs that differ only in seed and order of tasks; the labels name what differs between groups."""
-    groups: dict[tuple[tuple[str, Any], ...], list[Run]] = {}
+    alike: dict[tuple[tuple[str, Any], ...], list[Run]] = {}
     for run in runs:
-        groups.setdefault(tuple(settings_of(run).items()), []).append(run)
+        alike.setdefault(tuple(settings_of(run).items()), []).append(run)
+    groups: dict[tuple[tuple[str, Any], ...], list[Run]] = {}
+    for settings, members in alike.items():
+        learned = {(_factors(r), d.digests if (d := r.results.demonstrations) else ()) for r in members}
+        several = len(learned) > len({_factors(r) for r in members})  # with one seed, from several folders
+        for run in members:
+            folder = (run.config.get("data") or {}).get("folder") if several else None
+            key = (*settings, ("data.folder", str(folder))) if folder else settings
+            groups.setdefault(key, []).append(run)
     identities = [dict(key) for key in groups]
     short = [_label(identity, identities) for identity in identities]
     whole = [_label(identity, identities, whole=True) for identity in identities]

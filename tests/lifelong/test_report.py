@@ -704,6 +704,21 @@ def test_keys_that_change_no_result_make_no_method(key: str, tmp_path: Path):
     assert len(group_runs([load_run(run) for run in runs])) == 1
 
 
+def test_runs_of_one_seed_that_learned_from_two_folders_are_two_methods(tmp_path: Path):
+    runs = []
+    for folder, digest in (("moved", "aa"), ("human", "bb"), (None, "aa")):
+        for seed in (1, 2):
+            run = make_run(tmp_path / f"{folder}{seed}", "er", seed, tasks=1, epochs=(0, 1))
+            runs.append(configure(run, data__folder=folder))
+            ResultLog(run / "results.jsonl").append(
+                DemonstrationsRecord(counts=(50,), generators=("",), digests=(digest,))
+            )
+    assert [group.label for group in group_runs([*map(load_run, runs[2:])])] == ["er (folder human)", "er"]
+    assert [len(group.runs) for group in group_runs([*map(load_run, runs[2:])])] == [2, 2]
+    (group,) = group_runs([*map(load_run, runs[:2]), *map(load_run, runs[4:])])
+    assert (len(group.runs), len(group.repeats)) == (2, 2)
+
+
 def test_a_setting_that_is_not_named_is_as_one_that_is_null(tmp_path: Path):
     """Older runs lack the keys of newer ones, and without a seed the expert records with seed 0."""
     runs = [make_run(tmp_path / str(seed), "er", seed, tasks=1, epochs=(0, 1)) for seed in (1, 2)]
