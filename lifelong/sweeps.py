@@ -30,7 +30,8 @@ from lifelong.results.provenance import utc_now
 
 SWEEP_FILE, JOB_FILE, FOLDER = "sweep.json", "job.json", "sweep"
 Status = Literal["running", "done", "failed", "interrupted"]
-IN_NAME = ("seed", "algo", "policy", "benchmark", "run_id")  # values that the name of every run has
+# values that the name of every run has; and one run is evaluated under several shifts
+IN_NAME = ("seed", "algo", "policy", "benchmark", "run_id", "eval.shift")
 _LONGEST = 60  # characters of what a sweep adds to a run's name
 _POLL = 5.0  # s between two looks at a run that another process writes
 

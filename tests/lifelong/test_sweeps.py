@@ -172,6 +172,7 @@ def test_the_same_command_has_the_same_folder() -> None:
     ({"a.x": "1", "b.x": "2"}, "a.x1_b.x2"),
     ({"benchmark.tasks": "[0,4,7]", "hydra.launcher.n_jobs": "2"}, "tasks-0-4-7"),
     ({"+algo.note": "a/b\\c d"}, "note-a-b-c-d"),
+    ({"eval.shift": "{light:0.5}", "train.lr": "0.001"}, "lr0.001"),
 ])  # fmt: skip
 def test_runs_of_a_sweep_are_named_by_what_tells_them_apart(own, suffix) -> None:
     assert job_suffix(own) == suffix
