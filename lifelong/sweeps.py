@@ -24,6 +24,7 @@ from pydantic import Field
 
 from libero_env.parallel import is_running, process_start, this_machine
 from libero_env.storage import read_json, write_json
+from libero_env.text import duration
 from libero_env.validation import validate
 from lifelong.errors import ResultsError, RunLockedError, writing
 from lifelong.results.provenance import utc_now
@@ -255,7 +256,8 @@ def status_lines(sweep: Sweep) -> Iterator[str]:
     for job in sweep.jobs:
         state = _state(job)
         own = " ".join(word for word in job.words if word not in common)
-        line = f"{job.number:>4}  {state:<11}  {_time(job):>9}  {own}"
+        took = "" if job.status == "running" else duration(job.seconds)
+        line = f"{job.number:>4}  {state:<11}  {took:>11}  {own}"
         if state == "done" and (auc := job.metrics.get("auc")) is not None:
             line += f"  AUC {auc:.3f}"
         if state in ("running", "lost"):
@@ -268,13 +270,6 @@ _STATES = ("done", "running", "failed", "interrupted", "lost")
 
 def _state(job: JobRecord) -> str:
     return "lost" if job.is_lost else job.status
-
-
-def _time(job: JobRecord) -> str:
-    if job.status == "running":
-        return ""
-    minutes, seconds = divmod(round(job.seconds), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"
 
 
 def _when_free(learn: Callable[[], Path]) -> Path:

@@ -320,13 +320,12 @@ def demo_copies(
     Raises:
         DemoError: A file is broken, or cannot be written.
     """
-    copies_of_each: list[tuple[Path, ...]] = [()] * len(paths)
+    of_each: list[list[Path]] = []
     for number in range(data.copies):
         draws = [replace(one, seed=one.seed + number) for one in data.perturbations()]
         of_copy = [replace_perturbations(own, draws) for own in perturb]
-        files = perturb_demos(paths, tasks, counts, of_copy, data, progress)
-        copies_of_each = [(*copies, file) for copies, file in zip(copies_of_each, files, strict=True)]
-    return copies_of_each
+        of_each.append(perturb_demos(paths, tasks, counts, of_copy, data, progress))
+    return list(zip(*of_each, strict=True)) or [()] * len(paths)
 
 
 @dataclass(frozen=True)
