@@ -234,7 +234,7 @@ def _build_contexts(
     pretrain = config.build("pretrain")
     # equal ones are shared by runs; the size of one-hot embeddings depends on the run's tasks, too
     keys = {key: config.values[key] for key in PRETRAIN_KEYS} | {"language_dim": languages.shape[1]}
-    digest = config_digest(keys)
+    digest = config_digest(keys | ({"deterministic": True} if settings.deterministic else {}))
     folder = Path(settings.runs_dir) / "pretrain" / str(pretrain.suite) / digest
     return context, pretraining_context(
         context, plan.before, languages[:first], pretrain, RunDirectory(folder)
