@@ -15,7 +15,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.cli import ending
@@ -168,9 +168,9 @@ class Job:
 
     def _run(self, config: DictConfig, ranks: Ranks) -> Path | None:
         hydra_config = HydraConfig.get()
-        is_sweep = hydra_config.mode == RunMode.MULTIRUN
-        if is_sweep:
-            words = hydra_config.overrides.task
+        # as they were typed, with their interpolations
+        words: Any = OmegaConf.to_container(hydra_config.overrides.task)
+        if hydra_config.mode == RunMode.MULTIRUN:
             config = self._named(config, words)
             own = [word for word in words if word.partition("=")[0] in swept(self.words)]
             planned = read_sweep(Path(hydra_config.sweep.dir)).planned
@@ -179,11 +179,11 @@ class Job:
                 redirect_stdout(_Named(sys.stdout, f"[{name}] ")),
                 redirect_stderr(_Named(sys.stderr, f"[{name}] ")),
             ):
-                return self._learn(config, hydra_config, ranks)
-        return self._learn(config, hydra_config, ranks)
+                return self._learn(config, hydra_config, words, ranks)
+        return self._learn(config, hydra_config, words, ranks)
 
-    def _learn(self, config: DictConfig, hydra_config: Any, ranks: Ranks) -> Path | None:
-        choices, words = hydra_config.runtime.choices, hydra_config.overrides.task
+    def _learn(self, config: DictConfig, hydra_config: Any, words: list[str], ranks: Ranks) -> Path | None:
+        choices = hydra_config.runtime.choices
 
         def learn() -> Path:
             check_obeyed(config, choices, words, self.folders)
