@@ -21,6 +21,7 @@ from libero_env.sim.backend import Backend
 from libero_env.tasks import Task
 from libero_env.tasks.published import require_available
 from libero_env.tasks.task import FILE
+from libero_env.text import json_safe
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, permission_names
@@ -174,8 +175,9 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
     else:
         init_states = earlier.init_states
         tasks_here = {f"task {task.id}": task.digest for task in tasks}
-        here = {**identity, **versions, **tasks_here, "protocol": protocol.digest}
-        check_same(earlier, here, request.despite)
+        check_same(
+            earlier, identity, {**versions, **tasks_here, "protocol": protocol.digest}, request.despite
+        )
     tasks = tuple(dict.fromkeys(tasks))
     ids = [task.id for task in tasks]
     if twice := [task.name for task in tasks if ids.count(task.id) > 1]:
@@ -438,22 +440,30 @@ def _check_allowed(policy: str, request: EvalRequest) -> None:
         )
 
 
-def check_same(result: EvaluationResult, now: Mapping[str, Any], despite: Sequence[str]) -> None:
+def check_same(
+    result: EvaluationResult, identity: Mapping[str, Any], now: Mapping[str, Any], despite: Sequence[str]
+) -> None:
     """Check that an evaluation is the one of a result.
 
     Args:
-        now: What identifies the policy now, versions, and digests of the protocol and of each task.
+        identity: What identifies the policy now.
+        now: Versions, and digests of the protocol and of each task; those that the result does not have are not
+            compared.
         despite: Names of differences that the user accepts.
 
     Raises:
         ConfigError: Something differs; the message names both values of each.
     """
-    then = {**result.evaluated, **result.versions, "protocol": result.protocol.get("digest")}
+    then, identity = {**result.versions, "protocol": result.protocol.get("digest")}, json_safe(identity)
     then |= {f"task {task.task}": task.digest for task in result.tasks if task.digest}
+    both = {
+        name: (result.evaluated.get(name), identity.get(name)) for name in {**result.evaluated, **identity}
+    }
+    both |= {name: (value, now[name]) for name, value in then.items() if name in now}
     wrong = [
-        f"{name}: {then[name]} in the result, {now[name]} here"
-        for name in then
-        if name in now and then[name] != now[name] and name not in despite
+        f"{name}: {old} in the result, {new} here"
+        for name, (old, new) in both.items()
+        if old != new and name not in despite
     ]
     if wrong:
         names = " ".join(text.partition(":")[0] for text in wrong)

@@ -257,6 +257,30 @@ def test_a_result_that_was_stopped_stays_one_when_it_is_run_again(tmp_path):
     assert evaluate(tmp_path, stopped=stopped).stopped == stopped == EvaluationResult.read(tmp_path).stopped
 
 
+@pytest.mark.parametrize("had", [True, False])
+def test_a_result_is_not_run_again_without_its_weights_nor_with_weights_that_it_had_not(
+    had, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path("weighed.py").write_text(
+        "from pathlib import Path\nclass make:\n    def __init__(self):\n"
+        "        self.identity = {'weights': 'step 3'} if Path('weights').exists() else {}\n"
+        "    def predict(self, observations): ...\n"
+    )
+    Path("weights").write_text("") if had else None
+    first = plan_evaluation(EvalRequest(policy="weighed:make", suite=("libero_goal/0",)))
+    values = {"evaluated": dict(first.identity), "versions": dict(first.versions)}
+    task = task_result("libero_goal/0", [True], digest=first.tasks[0].digest)
+    result_of(task, protocol=first.protocol.resolved(), **values).write("eval.json")
+    again = EvalRequest(policy="eval.json", allow=("weighed",))
+    assert plan_evaluation(again).identity == first.identity
+    Path("weights").unlink() if had else Path("weights").write_text("")
+    then, now = ("step 3", "None") if had else ("None", "step 3")
+    with pytest.raises(ConfigError, match=f"weights: {then} in the result, {now} here"):
+        plan_evaluation(again)
+    assert plan_evaluation(replace(again, despite=("weights",)))
+
+
 def test_episodes_that_were_not_filmed_are_told(tmp_path, capsys):
     request = EvalRequest(policy="expert")
     evaluate_request(request, evaluation(tmp_path))
