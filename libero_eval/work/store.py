@@ -185,7 +185,7 @@ class WorkStore:
         return {unit.name for unit in units} == read_plan(self.path)["units"].keys()
 
     def clear(self) -> None:
-        """Remove the evaluation; videos and files of others stay.
+        """Remove the evaluation with its videos; files of others stay.
 
         Raises:
             ConfigError: Another process works on it, or a folder in it is a link that leads out of it.
@@ -198,6 +198,8 @@ class WorkStore:
         for name in PARTS:
             path = self.path / name
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        for video in (self.path / "videos").glob("*[0-9]_start_[0-9][0-9]_*.webp"):
+            video.unlink()
         self._results = {}
 
     def done(self, units: Iterable[Unit]) -> dict[str, UnitResult]:

@@ -557,8 +557,11 @@ def test_repeating_is_refused_while_others_work(tmp_path):
         folder.clear()
     (tmp_path / "claims" / "libero_goal_00_starts_03_04.json").unlink()
     (tmp_path / "videos").mkdir()
+    (tmp_path / "videos" / "libero_goal_00_start_03_failure.webp").write_bytes(b"of what is removed")
+    (tmp_path / "videos" / "mine.webp").write_bytes(b"")
     folder.clear()
     assert [path.name for path in tmp_path.iterdir()] == ["videos"]
+    assert [path.name for path in (tmp_path / "videos").iterdir()] == ["mine.webp"]
 
 
 def test_the_status_says_who_holds_what_and_what_is_left(tmp_path):
