@@ -110,7 +110,8 @@ class Stage:
         self.tasks = self.tasks or self.policy.tasks
         base = self.policy.protocol(load_protocol(request.protocol))
         self._protocol = resolve_protocol(evaluation, base, self.tasks)
-        perturbations = parse_perturbations(request.perturb, request.perturb_seed)
+        perturb = request.perturb or self._protocol.world.perturb
+        perturbations = parse_perturbations(perturb, request.perturb_seed)
         self.initial = Choice(
             self.tasks[0], self.sources[0], request.start, tuple(one for one in perturbations if one.severity)
         )

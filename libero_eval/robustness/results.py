@@ -327,9 +327,14 @@ def _compared(policy: Robustness) -> dict[str, Any]:
     }
 
 
+def shared_settings(result: EvaluationResult) -> dict[str, Any]:
+    """Return what all conditions have in common, flat, by dotted name: that of a comparison, and MuJoCo's version."""
+    return settings(result) | {"versions.mujoco": result.versions.get("mujoco")}
+
+
 def _odd_settings(base: EvaluationResult, result: EvaluationResult, condition: Condition) -> list[str]:
     """Return where a condition's policy and settings are not the base's, apart from what the condition changes."""
-    a, b = (settings(one) | flatten(plain({"evaluated": one.evaluated})) for one in (base, result))
+    a, b = (shared_settings(one) | flatten(plain({"evaluated": one.evaluated})) for one in (base, result))
     changed, clock = ("tasks.", "protocol.sources.", "protocol.world.perturb"), "protocol.action.clock"
     if LATENCY in dict(condition):
         for values in (a, b):

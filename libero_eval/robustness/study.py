@@ -10,9 +10,9 @@ from pathlib import Path
 from libero_env.perturbations import format_perturbations, parse_perturbations
 from libero_env.storage import require_own_folders
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
-from libero_eval.judging.comparability import settings
 from libero_eval.plan import further_process, load_policy, plan_evaluation, policy_threads
 from libero_eval.policies import PolicyUnderTest
+from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import (
     CLOCK,
     EVENT_SEVERITIES,
@@ -22,7 +22,15 @@ from libero_eval.requests import (
     SEVERITIES,
     RobustnessRequest,
 )
-from libero_eval.robustness.results import LATENCY, Condition, Outcomes, Robustness, events_of, name_of
+from libero_eval.robustness.results import (
+    LATENCY,
+    Condition,
+    Outcomes,
+    Robustness,
+    events_of,
+    name_of,
+    shared_settings,
+)
 from libero_eval.work.evaluation import Evaluation
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError
@@ -42,6 +50,11 @@ def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_:
         A name of the policy, and the folder of the results.
     """
     conditions = conditions_of(request)
+    if perturb := load_protocol(request.protocol).world.perturb:
+        raise ConfigError(
+            f"protocol {request.protocol} has the perturbations {perturb}, and each condition has its own: name a "
+            "protocol without world.perturb"
+        )
     policy = load_policy(request)
     if request.out is None:
         require_own_folders(policy.out, "robustness", error=ConfigError)
@@ -204,7 +217,7 @@ def read_study(folder: Path, name: str = "", conditions: Sequence[str] | None = 
         )
     outcomes, base = Outcomes.of(results), results[()]
     words = ("protocol.sources.", "protocol.title")
-    common = {k: v for k, v in settings(base).items() if not k.startswith(words)}
+    common = {k: v for k, v in shared_settings(base).items() if not k.startswith(words)}
     common["seeds of perturbations"] = ", ".join(map(str, sorted(seeds)))
     horizon = base.protocol["episode"]["horizon"]
     return Robustness(name or folder.name, outcomes, (str(folder),), redrawn, events, horizon, common)

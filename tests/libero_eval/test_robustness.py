@@ -131,6 +131,13 @@ def test_conditions_are_of_one_policy() -> None:
         Outcomes.of({(): result(8), B: replace(result(2), evaluated={"run": "other"})})
 
 
+def test_conditions_are_of_one_mujoco() -> None:
+    old, new = (replace(result(8), versions={"mujoco": version, "torch": version}) for version in "34")
+    assert Outcomes.of({(): old, B: old}).conditions == ((), B)
+    with pytest.raises(ResultsError, match=r"camera=1 .* \(versions.mujoco: 4 instead of 3\)"):
+        Outcomes.of({(): old, B: new})
+
+
 def test_only_the_conditions_that_are_asked_for_are_read(tmp_path) -> None:
     def write(name: str, perturb: str, wins: int, horizon: int = 5) -> None:
         (tmp_path / "conditions" / name).mkdir(parents=True)

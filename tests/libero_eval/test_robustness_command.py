@@ -39,6 +39,7 @@ def still(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "still_policy.py").write_text(POLICY)
     (tmp_path / "late.yaml").write_text(LATE)
+    (tmp_path / "dim.yaml").write_text("{extends: libero, world: {perturb: light=0.5}}")
     return tmp_path
 
 
@@ -143,6 +144,7 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
     (["--kinds", "noise", "noise@3"], "differ in their seeds alone"),
     (["--kinds"], "name no condition"),
     (["--kinds", "clock", "--pairs", "--protocol", "late.yaml"], "has the clock latency=50ms,wait=hold"),
+    (["--kinds", "noise", "--protocol", "dim.yaml"], "protocol dim.yaml has the perturbations light=0.5"),
     (["--beside", "other=nowhere"], "nowhere holds no finished conditions"),
 ])  # fmt: skip
 def test_mistakes_take_one_line_before_anything_is_run(still, words, told, capsys) -> None:

@@ -190,6 +190,14 @@ def test_the_page_and_its_socket_are_served_and_a_client_may_come_back(viewer, c
     assert f"--port {view.port} cannot be listened on: Address already in use" in line
 
 
+def test_perturbations_of_the_protocol_are_shown_unless_others_are_named(stage, tmp_path):
+    own = tmp_path / "dim.yaml"
+    own.write_text("{extends: libero, world: {perturb: light=0.5@2}}")
+    assert stage(TASK, protocol=str(own)).initial.perturbations == (Perturbation("light", 0.5, 2),)
+    named = stage(TASK, protocol=str(own), perturb="camera=0.3")
+    assert named.initial.perturbations == (Perturbation("camera", 0.3),)
+
+
 def test_options_that_mean_nothing_are_refused(tmp_path):
     with pytest.raises(InvalidInputError, match="--bddl is of demonstration files"):
         Stage(ViewRequest(what=TASK, bddl=tmp_path / "mine.bddl"))
