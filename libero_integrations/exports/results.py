@@ -114,7 +114,10 @@ def export_eval_results(result: EvaluationResult, folder: Path, dataset: str, so
 
 
 def _aggregate(result: EvaluationResult, suite: str, tasks: Sequence[TaskResult]) -> dict[str, Any]:
-    rows = [_vla_eval_task(task) for task in tasks]
+    words = [
+        task.instruction for task in tasks
+    ]  # by which vla-eval knows tasks; some of libero_90 share them
+    rows = [_vla_eval_task(task, words.count(task.instruction) == 1) for task in tasks]
     wins = [won for task in tasks for won in task.successes]
     seed = {"seed": result.evaluated["seed"]} if "seed" in result.evaluated else {}
     return {
@@ -140,7 +143,7 @@ def _aggregate(result: EvaluationResult, suite: str, tasks: Sequence[TaskResult]
     }
 
 
-def _vla_eval_task(task: TaskResult) -> dict[str, Any]:
+def _vla_eval_task(task: TaskResult, is_known: bool) -> dict[str, Any]:
     errors = task.errors or (None,) * len(task.successes)
     rows = zip(task.init_states, task.successes, task.lengths, errors, strict=True)
     episodes = [
@@ -150,7 +153,7 @@ def _vla_eval_task(task: TaskResult) -> dict[str, Any]:
     ]
     failed = sum(error is not None for error in errors)
     return {
-        "task": task.instruction,
+        "task": task.instruction if is_known else f"{task.instruction} ({task.task})",
         "episodes": episodes,
         "num_episodes": len(episodes),
         "avg_steps": float(np.mean(task.lengths)),

@@ -244,6 +244,15 @@ def test_too_few_results_and_equal_names_are_refused():
         compare_groups([one, side("a", drawn_result(0.8, 2, policy="b:b"))])
 
 
+def test_a_run_counts_once_in_its_group():
+    """A copy of a result, as of a copied run, would make the intervals over runs narrower."""
+    one, other = (drawn_result(0.9, d, evaluated={"run": f"er{d}", "weights": f"{d}"}) for d in (1, 2))
+    copied = replace(one, evaluated={"run": "copy", "weights": "1"})
+    assert compare_groups([side("er", one, other), side("ewc", drawn_result(0.7, 3))])
+    with pytest.raises(ConfigError, match="results 1 and 3 of er are one run"):
+        compare_groups([side("er", one, other, copied), side("ewc", drawn_result(0.7, 3))])
+
+
 def test_runs_of_methods_are_aggregated_by_rliable():
     metrics = pytest.importorskip("rliable.metrics")
     groups = [
@@ -324,6 +333,13 @@ def test_exports_to_vla_eval(tmp_path):
         expected.record(values["tasks"][0]["task"], dict(episode))
     theirs = expected.get_benchmark_result(values["config"])
     assert values["tasks"] == theirs["tasks"] and theirs.keys() - {"created_at"} <= values.keys()
+
+
+def test_tasks_of_one_instruction_keep_rows_of_their_own_in_vla_eval(tmp_path):
+    tasks = [task_result(f"libero_90/{n}", [1], instruction="turn on the stove") for n in (0, 7)]
+    (path,) = export_vla_eval(result_of(*tasks), tmp_path)
+    names = [row["task"] for row in json.loads(path.read_text())["tasks"]]
+    assert names == ["turn on the stove (libero_90/0)", "turn on the stove (libero_90/7)"]
 
 
 def test_exports_to_lerobot(tmp_path):
