@@ -154,7 +154,7 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
         raise ConfigError("no tasks are given; name a suite, such as --suite libero_object")
     require_available(tasks)
     protocol = resolve_protocol(request, policy.protocol(base), tasks)
-    if not protocol.world.delta and _kind(request.policy_name) in ("expert", "run"):
+    if policy.relative and not protocol.world.delta:
         raise ConfigError(
             f"{request.policy_name} moves relative to the present pose; protocol {protocol.name} has absolute actions "
             "(world.delta: false)"

@@ -46,6 +46,7 @@ class PolicyUnderTest(ABC):
         chunk: Number of actions of its answers; None where only they say it.
         inpaints: Whether it can continue a chunk of actions that is being executed.
         hears: Whether it can be told another instruction during an episode.
+        relative: Whether it moves relative to the present pose only.
         cameras: Cameras that are rendered for it; None for the protocol's.
         observations: Names of its observations, see `libero_env.sim.observations`.
     """
@@ -58,6 +59,7 @@ class PolicyUnderTest(ABC):
     chunk: int | None = None
     inpaints: bool = False
     hears: bool = False
+    relative: bool = False
     cameras: tuple[str, ...] | None = None
     observations: tuple[str, ...] = OBSERVATIONS
 
@@ -114,7 +116,7 @@ class PolicyUnderTest(ABC):
 class RunPolicy(PolicyUnderTest):
     """The policy of a run, evaluated with the images it was trained on: their size and drawing."""
 
-    hears = True
+    hears = relative = True
 
     def __init__(self, request: Request):
         super().__init__(request)
@@ -160,7 +162,7 @@ EXPERT, AVOIDING = "expert", "expert-avoid"
 class ExpertPolicy(PolicyUnderTest):
     """The scripted expert, which sees the whole state: how much of a task can be done at all, or done safely."""
 
-    chunk, hears = 1, True
+    chunk, hears, relative = 1, True, True
 
     def __init__(self, request: Request):
         from libero_env.demos.config import GENERATOR

@@ -19,7 +19,6 @@ from pydantic import Field
 from libero_env.envs.checks import checked_numbers
 from libero_env.envs.config import Cameras
 from libero_env.errors import code_of
-from libero_env.sim.observations import DEFAULT_CAMERAS
 from libero_env.tasks import Task
 from libero_env.validation import validate
 from libero_eval.policies import PolicyUnderTest
@@ -62,7 +61,7 @@ class UserPolicy(PolicyUnderTest):
             raise ConfigError(
                 f"--seed {request.seed}: {name} draws by itself; its reset would get seeds with an argument `seeds`"
             )
-        self.cameras = self._attribute("cameras", Cameras, DEFAULT_CAMERAS)
+        self.cameras = self._attribute("cameras", Cameras | None, None)
         self.observations = self._attribute("observations", tuple[str, ...], OBSERVATIONS)
         named = self._attribute("identity", dict[str, Any], {})
         if "weights" not in named and (weights := weights_digest(self.policy)):
@@ -95,7 +94,7 @@ class UserPolicy(PolicyUnderTest):
     @contextmanager
     def planner(self, task: Task, states: Sequence[int], protocol: EvalProtocol) -> Iterator[Planner]:
         """Yield what gives the policy its observations under the names it takes."""
-        views = tuple(map(view_of, self.cameras or ()))
+        views = tuple(map(view_of, protocol.pixels.cameras if self.cameras is None else self.cameras))
         names, words = self._names(protocol), self.seeds(task, states)
         seeds = tuple(int(np.random.SeedSequence(one).generate_state(1)[0]) for one in words)
         if names == "protocol":

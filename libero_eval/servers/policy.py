@@ -74,7 +74,7 @@ class ServerPolicy(PolicyUnderTest):
         with self._client() as client:
             self.announced, self._kind = client.announced, type(client)
         about = self.announced
-        self.is_run = about.get("server") == SERVER  # a policy of this package
+        self.is_run = self.relative = about.get("server") == SERVER  # a policy of this package
         self.identity = {"server": given, "announced": about}
         self.out = Path("eval") / re.sub(r"\W+", "_", given).strip("_")
         self._answer: np.ndarray | None = None
@@ -108,6 +108,12 @@ class ServerPolicy(PolicyUnderTest):
                 about["robot"],
                 drawing=about["drawing"],
                 assets=self.request.assets,
+            )
+        clock = base.action.clock if self.request.clock is None else self.request.clock
+        if self.request.seed and not clock:  # whose latencies it draws
+            raise ConfigError(
+                f"--seed {self.request.seed}: {self.given} draws by itself, and is sent no seed; leave it out, and "
+                "evaluate again with another --out"
             )
         base.check(self._kind.stated(about))
         if base.action.replan is None and self._kind.needs_replan:

@@ -384,6 +384,9 @@ def test_what_openpi_announces_identifies_the_policy_and_is_compared_with_the_pr
     assert found.protocol(base) is base
     with pytest.raises(ProtocolMismatchError, match=rf"action.replan.*{replan + 1}"):
         policy({**about, "action.replan": replan + 1}).protocol(base)
+    with pytest.raises(ConfigError, match=r"--seed 3: ws://.* is sent no seed; leave it out.*--out"):
+        policy(about, seed=3).protocol(base)
+    assert policy(about, seed=3, clock="latency=uniform:50/150ms").protocol(base) is base
     with pytest.raises(ConfigError, match="does not say which policy it serves.*--name"):
         policy({"action.replan": replan})
     assert policy({"action.replan": replan}, name="pi0_1").protocol(base) is base

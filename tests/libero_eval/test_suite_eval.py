@@ -22,6 +22,7 @@ from libero_eval.plan import choose_init_states, plan_evaluation, repeated
 from libero_eval.plan import evaluate as evaluate_request
 from libero_eval.protocols.files import load_protocol
 from libero_eval.requests import EvalRequest
+from libero_eval.servers.serving import ServedPolicy
 from libero_eval.user_policy import (
     ORIGINAL_NAMES,
     CallableActor,
@@ -31,8 +32,10 @@ from libero_eval.user_policy import (
     weights_digest,
 )
 from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
+from lifelong.evaluation.restore import restore
 from lifelong.results.run_directory import CheckpointFolder
 from lifelong.stats.intervals import wilson_interval
+from tests.harness import policy_servers
 from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate, evaluation
 from tests.harness.results import result_of, task_result
 from tests.harness.runs import make_run
@@ -182,11 +185,12 @@ def test_an_option_that_a_policy_does_not_obey_is_refused_by_name(learned, polic
 
 def test_what_moves_relative_to_its_pose_is_refused_absolute_actions(learned, tmp_path):
     (tmp_path / "own.yaml").write_text("extends: libero\nworld: {delta: false}\n")
-    for policy in ("expert", str(learned)):
-        with pytest.raises(ConfigError, match="own has absolute actions"):
-            plan_evaluation(
-                EvalRequest(policy=policy, suite=("libero_goal/0",), protocol=str(tmp_path / "own.yaml"))
-            )
+    with policy_servers.served(ServedPolicy(restore(learned, device="cpu"))) as address:
+        for policy in ("expert", str(learned), address):
+            with pytest.raises(ConfigError, match="own has absolute actions"):
+                plan_evaluation(
+                    EvalRequest(policy=policy, suite=("libero_goal/0",), protocol=str(tmp_path / "own.yaml"))
+                )
 
 
 @pytest.mark.parametrize("changes", [
@@ -422,6 +426,21 @@ def test_what_a_policy_would_misread_is_refused(more, options, message, tmp_path
     with pytest.raises(ConfigError, match=message):
         plan_evaluation(EvalRequest(**words, **options))
     assert plan_evaluation(EvalRequest(**words, names="native"))
+
+
+@pytest.mark.sim
+def test_a_policy_sees_the_protocol_s_cameras_unless_it_names_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "one.yaml").write_text("{extends: libero, pixels: {cameras: [agentview]}}")
+    for name, own in (("all_seeing", ""), ("one_eyed", "cameras = ('robot0_eye_in_hand',)")):
+        (tmp_path / f"{name}.py").write_text(
+            f"class make:\n    {own}\n    def predict(self, observations): ...\n"
+        )
+        plan = plan_evaluation(
+            EvalRequest(policy=f"{name}:make", suite=("libero_goal/0",), protocol="one.yaml")
+        )
+        with closing(plan.env(plan.tasks[0], 1)) as env:
+            assert env.config.cameras == (("robot0_eye_in_hand",) if own else ("agentview",))
 
 
 @pytest.mark.parametrize(
