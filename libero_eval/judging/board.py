@@ -126,7 +126,8 @@ def _joined(entries: Sequence[Group]) -> list[Group]:
             (first,) = group.results
             alike = first.evaluated == result.evaluated and first.protocol == result.protocol
             if alike and names.isdisjoint(task.task for task in first.tasks):
-                whole = replace(first, tasks=(*first.tasks, *result.tasks))
+                stopped = first.stopped or result.stopped
+                whole = replace(first, tasks=(*first.tasks, *result.tasks), stopped=stopped)
                 groups[place] = Group(group.label, (whole,), (*group.paths, *entry.paths))
                 break
         else:

@@ -57,6 +57,18 @@ def test_results_of_one_policy_on_other_suites_are_a_row():
     assert board.shared == 100 and row.success.value == pytest.approx(1.0), "the first 50 starts of each"
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_parts_of_which_one_was_stopped_have_intervals_that_are_always_valid(order):
+    stopped = Stopped("width=0.2", "known", 100)
+    parts = [
+        won("a", first(50), "libero_goal/0"),
+        entry("a2", result_of(task_result("libero_object/0", first(50)), policy="a:make", stopped=stopped)),
+    ]
+    (row,) = make_board(parts[::order], ["starts", "tasks"]).rows
+    own = parts[1].results[0].success
+    assert row.suites == {"libero_goal": own, "libero_object": own}
+
+
 def test_a_suite_that_not_all_ran_is_left_empty(tmp_path):
     both = (task_result(f"{suite}/0", first(50)) for suite in ("libero_goal", "libero_object"))
     entries = [won("a", first(50)), entry("b", result_of(*both, policy="b:make"))]
