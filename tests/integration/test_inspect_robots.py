@@ -111,6 +111,8 @@ def test_mistakes_are_its_own_errors(tmp_path):
     found = inspect_robots().run("inspect_robots_mistakes.py", cwd=tmp_path, LIBERO_ASSETS="builtin")
     assert found == [
         "unknown robot 'panda'. Valid: libero, robosuite-1.4.1",
+        "perturb=camera=0.5@25% begins at a share of an episode's length, which Inspect Robots alone knows: name "
+        "a step, such as @step40",
         "task_ids [77] do not exist: libero_goal has 0 to 9",
         "num_starts is 51; valid: 1 to 50",
         "nowhere does not exist; give the directory of a run, such as runs/libero_object/er/NAME, or one of its "

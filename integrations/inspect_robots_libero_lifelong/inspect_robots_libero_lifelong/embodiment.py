@@ -92,6 +92,11 @@ class LiberoEmbodiment(EmbodimentBase):
             robot=robot,
             perturb=perturb or (),
         )
+        if shares := [str(p) for p in self.config.perturb if getattr(p, "trigger", "").endswith("%")]:
+            raise LiberoError(
+                f"perturb={shares[0]} begins at a share of an episode's length, which Inspect Robots alone knows: name "
+                "a step, such as @step40"
+            )
         self._env: LiberoEnv | None = None
         self._words: dict[str, str] = {}  # of the task -> of the scene
         self._images = [image_name(camera, "rgb") for camera in self.config.cameras]

@@ -8,6 +8,7 @@ from inspect_robots.registry import resolve
 said = []
 for kind, name, options in (
     ("embodiment", "libero", {"robot": "panda"}),
+    ("embodiment", "libero", {"perturb": "camera=0.5@25%"}),
     ("task", "libero", {"suite": "libero_goal", "task_ids": [77]}),
     ("task", "libero", {"num_starts": 51}),
     ("policy", "libero_run", {"run": "nowhere"}),
