@@ -48,7 +48,7 @@ def export_lerobot(result: EvaluationResult, folder: Path) -> list[Path]:
     Raises:
         ResultsError: The file cannot be written.
     """
-    suites, seconds = _by_suite(result), result.times.get("seconds")
+    suites, seconds = _by_suite(result), result.times.get("busy_seconds")
     seconds = float(seconds) if isinstance(seconds, int | float) else float("nan")
     overall = _lerobot_rates(result.tasks)
     per_task = []

@@ -35,7 +35,7 @@ def result_of(*tasks: TaskResult, policy: str = "mine:make", seed: int = 0, **ch
         "versions": {"mujoco": "4.0.0", "libero-lifelong": "0.1.0"},
         "tasks": tasks,
         "environment": ENVIRONMENT,
-        "times": {"finished": "2026-01-01T00:00:00+00:00", "seconds": 60.0},
+        "times": {"finished": "2026-01-01T00:00:00+00:00", "busy_seconds": 60.0},
     }
     return EvaluationResult(**(values | changes))
 

@@ -18,6 +18,7 @@ from libero_eval.judging.page import forest_figure, gate_text, render  # noqa: E
 from libero_integrations.exports.results import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
 from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
 from lifelong.stats.power import Question, paired_power, shown_difference  # noqa: E402
+from tests.harness.evaluations import evaluate  # noqa: E402
 from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
 
 
@@ -353,6 +354,8 @@ def test_exports_to_lerobot(tmp_path):
     assert values["per_task"][0]["metrics"]["successes"] == [True, False, True]
     assert values["per_group"]["libero_goal"]["pc_success"] == pytest.approx(200 / 3)
     assert values["overall"]["pc_success"] == pytest.approx(100 / 3) and values["overall"]["eval_ep_s"] == 10
+    of_an_evaluation = json.loads(export_lerobot(evaluate(tmp_path), tmp_path)[0].read_text())
+    assert of_an_evaluation["overall"]["eval_s"] >= 0
 
 
 def test_exports_to_model_cards_are_entries_as_the_hub_documents_them(tmp_path):
