@@ -7,10 +7,11 @@ import inspect
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from types import ModuleType
+from types import BuiltinMethodType, MethodType, ModuleType
 from typing import Annotated, Any
 
 import numpy as np
@@ -359,7 +360,7 @@ def _imports(source: bytes, name: str, path: Path) -> Iterator[str]:
 def weights_digest(policy: Any) -> str | None:
     """Return the digest of the arrays and networks that an object, its class and its module hold; None for none.
 
-    Attributes are followed a few steps.
+    Attributes, and what functions were made with, are followed a few steps.
     """
     digest = hashlib.sha256()
     seen: dict[int, Any] = {}
@@ -388,6 +389,23 @@ def _add_arrays(value: Any, digest: Any, seen: dict[int, Any], left: int = 8) ->
         except (TypeError, ValueError, RuntimeError):  # of objects, or sparse
             return 0
         return 1
-    inside = value if isinstance(value, Mapping) else getattr(value, "__dict__", {})
-    parts = value if isinstance(value, list | tuple) else list(inside.values())
-    return sum([_add_arrays(part, digest, seen, left - 1) for part in parts])
+    return sum([_add_arrays(part, digest, seen, left - 1) for part in _held(value)])
+
+
+def _held(value: Any) -> list[Any]:
+    """Return what an object holds: its entries, attributes, and, as a function, what it was made with."""
+    if isinstance(value, list | tuple):
+        return list(value)
+    if isinstance(value, Mapping):
+        return list(value.values())
+    if isinstance(value, partial):
+        return [value.func, *value.args, *value.keywords.values()]
+    slots = [getattr(kind, "__slots__", ()) for kind in type(value).__mro__]  # each one name, or several
+    names = [name for part in slots for name in ([part] if isinstance(part, str) else part)]
+    held = [*getattr(value, "__dict__", {}).values(), *(getattr(value, name, None) for name in names)]
+    if isinstance(value, MethodType | BuiltinMethodType):
+        held.append(value.__self__)
+    for cell in getattr(value, "__closure__", None) or ():
+        with suppress(ValueError):  # it is empty
+            held.append(cell.cell_contents)
+    return held

@@ -6,7 +6,8 @@ import shutil
 import signal
 import sys
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -706,6 +707,33 @@ def test_statistics_that_a_policys_processors_hold_are_part_of_its_identity():
         return weights_digest(SimpleNamespace(net=np.ones(3), processors=(SimpleNamespace(steps=[step]),)))
 
     assert digest(0.0) == digest(0.0) != digest(1.0)
+
+
+def _of_closure(weights):
+    class Policy:
+        def predict(self, observations):
+            return weights
+
+    return Policy()
+
+
+@dataclass(slots=True)
+class _Slotted:
+    weights: np.ndarray
+
+    def act(self, observations):
+        return self.weights
+
+
+@pytest.mark.parametrize("make", [
+    _of_closure,
+    _Slotted,
+    lambda weights: SimpleNamespace(predict=partial(np.add, weights)),
+    lambda weights: SimpleNamespace(predict=_Slotted(weights).act),
+], ids=["closure", "slots", "partial", "method"])  # fmt: skip
+def test_weights_that_no_attribute_has_are_part_of_the_digest(make):
+    digests = [weights_digest(make(np.full(3, value))) for value in (0.0, 0.0, 1.0)]
+    assert digests[0] == digests[1] != digests[2] is not None
 
 
 def test_errors_are_reported_in_one_line(module, tmp_path, capsys):
