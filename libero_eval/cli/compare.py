@@ -207,12 +207,15 @@ def export(
 
 def _observed(words: Sequence[str]) -> tuple[float, float | None, float | None]:
     """Return the success of the first of two results, the second's minus it, and their discordance."""
-    from libero_eval.judging.comparability import match
+    from libero_eval.judging.comparability import check_comparable, match
     from lifelong.stats.episodes import count
 
     if len(words) != 2:
         raise ConfigError(f"libero power takes two results, not {len(words)}")
-    pairs = match(*_single_groups(words)).pairs
+    groups = _single_groups(words)
+    for note in check_comparable(groups, allow=("protocol", "environment", "tasks")):
+        print(f"note: {note}")
+    pairs = match(*groups).pairs
     counts = count(pairs)
     first, second = float(pairs.first.mean()), float(pairs.second.mean())
     print(

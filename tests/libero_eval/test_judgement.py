@@ -413,6 +413,9 @@ def test_commands(tmp_path, monkeypatch, capsys):
     assert "pi0 is better than b" in out and "control arm: a − c" in out
     assert sorted(p.name for p in Path("report").iterdir()) == ["compare.html", "compare.json"]
     assert main(["power", "a", "b"]) == 0 and "observed in 500 pairs" in capsys.readouterr().out
+    written(tmp_path, short=drawn_result(0.8, 2, policy="b:b", protocol=PROTOCOL | {"settle_steps": 5}))
+    assert main(["power", "a", "short"]) == 0
+    assert "note: protocol.settle_steps: 10 in a, 5 in short; allowed" in capsys.readouterr().out
     assert main(["power", "--difference", "0.03", "--correlation", "0.3", "--tests", "4"]) == 0
     assert "over 4 comparisons" in capsys.readouterr().out
     assert main(["power", "--base", "0.9", "--episodes", "114", "--correlation", "0.5"]) == 0
