@@ -34,6 +34,8 @@ from lifelong.settings.configuration import require_same_module
 
 _WRITE = "write module:function, such as my_policy:make"
 _PROJECT = ("libero", "libero_env", "libero_eval", "lifelong")  # whose version is in the result
+# Keys of a result's `evaluated` that are not the user's
+_STATED = ("policy", "source", "names", "name", "seed", "run", "after", "server", "announced")
 _Side = Annotated[int, Field(ge=1, le=4096)]  # pixels
 ORIGINAL_NAMES = {
     "agentview_rgb": "agentview_image",
@@ -65,6 +67,10 @@ class UserPolicy(PolicyUnderTest):
         self.cameras = self._attribute("cameras", Cameras | None, None)
         self.observations = self._attribute("observations", tuple[str, ...], OBSERVATIONS)
         named = self._attribute("identity", dict[str, Any], {})
+        if taken := [key for key in _STATED if key in named]:
+            raise PolicyError(
+                f"the policy's identity names {taken[0]}, which a result states itself; call it own_{taken[0]}"
+            )
         if "weights" not in named and (weights := weights_digest(self.policy)):
             named = {"weights": weights, **named}
         names = {} if request.names is None else {"names": request.names}

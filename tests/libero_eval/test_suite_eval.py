@@ -413,6 +413,17 @@ def test_objects_and_the_robot_are_those_of_the_facade_under_the_original_s_name
             np.testing.assert_allclose(found[name][0], wanted[name], atol=1e-5, err_msg=name)
 
 
+@pytest.mark.parametrize("key", ["seed", "run", "policy"])
+def test_an_identity_does_not_name_what_a_result_states_itself(key, tmp_path, monkeypatch):
+    """The training seed was replaced by `--seed`, and a result with `run` was of that run."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / f"named_{key}.py").write_text(
+        f"class make:\n    identity = {{'{key}': 5}}\n    def predict(self, observations): ...\n"
+    )
+    with pytest.raises(PolicyError, match=f"identity names {key}, .* call it own_{key}"):
+        UserPolicy(EvalRequest(policy=f"named_{key}:make"))
+
+
 @pytest.mark.parametrize(("more", "options", "message"), [
     ('observations = ("rgb", "depth")', {}, "the original's depth are in other units.*--names native"),
     ("camera_size = (32, 48)", {"size": 64}, "--size 64: .* has a size of its own, camera_size 32 x 48"),
