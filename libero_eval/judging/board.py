@@ -77,7 +77,7 @@ class Board:
 
 
 def make_board(entries: Sequence[Group], allow: Iterable[str] = (), alpha: float = ALPHA) -> Board:
-    """Rank policies. Results of one policy on other tasks make one row.
+    """Rank policies. Results of one policy on other tasks make one row, and so does a copy of a result.
 
     Args:
         entries: Results, each a group of its own.
@@ -117,17 +117,17 @@ def make_board(entries: Sequence[Group], allow: Iterable[str] = (), alpha: float
 
 
 def _joined(entries: Sequence[Group]) -> list[Group]:
-    """Return a group for each policy: results of the same one on other tasks are one."""
+    """Return a group for each policy: results of the same one on other tasks are one, and so are copies."""
     groups: list[Group] = []
     for entry in entries:
         (result,) = entry.results
-        names = {task.task for task in result.tasks}
         for place, group in enumerate(groups):
             (first,) = group.results
+            new = [task for task in result.tasks if task not in first.tasks]
             alike = first.evaluated == result.evaluated and first.protocol == result.protocol
-            if alike and names.isdisjoint(task.task for task in first.tasks):
+            if alike and not {task.task for task in new} & {task.task for task in first.tasks}:
                 stopped = first.stopped or result.stopped
-                whole = replace(first, tasks=(*first.tasks, *result.tasks), stopped=stopped)
+                whole = replace(first, tasks=(*first.tasks, *new), stopped=stopped)
                 groups[place] = Group(group.label, (whole,), (*group.paths, *entry.paths))
                 break
         else:

@@ -1,6 +1,7 @@
 """A leaderboard of evaluations, and the page of one."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,6 +56,22 @@ def test_results_of_one_policy_on_other_suites_are_a_row():
     assert row.episodes == 200 and row.paths == ("a/eval.json", "a2/eval.json")
     assert {name: e.value for name, e in row.suites.items()} == {"libero_goal": 0.5, "libero_object": 1.0}
     assert board.shared == 100 and row.success.value == pytest.approx(1.0), "the first 50 starts of each"
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_copy_of_a_result_or_of_a_part_is_no_row_of_its_own(order):
+    """Each further row is tested against all others, so that fewer differences remain."""
+    both = drawn_result(0.5, 1, suites=("libero_goal", "libero_object"), tasks=1, policy="a:make")
+    part = replace(both, tasks=both.tasks[1:])
+    entries = [
+        entry("a", both),
+        entry("again", both),
+        entry("part", part),
+        won("b", first(50), "libero_goal/0"),
+    ]
+    board = make_board(entries[::order], ["starts", "tasks"])
+    assert len(board.rows) == 2 and len(board.pairs) == 1
+    assert {len(row.paths) for row in board.rows} == {1, 3}
 
 
 @pytest.mark.parametrize("order", [1, -1])
