@@ -248,8 +248,13 @@ class EvaluationResult:
     @property
     def suites(self) -> dict[str, Estimate]:
         """Mean success over the tasks of each suite, with intervals as of `success`."""
+        return {name: self.success_of(tasks) for name, tasks in self.by_suite.items()}
+
+    @property
+    def by_suite(self) -> dict[str, list[TaskResult]]:
+        """The tasks of each suite."""
         names = dict.fromkeys(task.suite for task in self.tasks)
-        return {name: self.success_of([task for task in self.tasks if task.suite == name]) for name in names}
+        return {name: [task for task in self.tasks if task.suite == name] for name in names}
 
     @property
     def world(self) -> dict[str, Any]:

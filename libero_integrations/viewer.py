@@ -12,6 +12,7 @@ from contextlib import redirect_stdout
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from libero_eval.protocols.environment import ProtocolEnv
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import EvalRequest, ViewRequest
-from lifelong.evaluation.actors import Actor, TakesNote, WatchesWorld
+from lifelong.evaluation.actors import Actor, WatchesWorld
 from lifelong.evaluation.environments import Obs
 from lifelong.evaluation.rollout import run_episodes
 
@@ -255,23 +256,19 @@ class Stage:
 class _WatchedActor:
     """An actor before whose every step a function is called."""
 
+    action_dim: int
+    views: tuple[str, ...]
+    reset: Callable[[int], None]
+
     def __init__(self, actor: Actor, look: Callable[[], None]):
         self._actor, self._look = actor, look
-        self.action_dim, self.views = actor.action_dim, actor.views
-        self.sees_next = getattr(actor, "sees_next", True)
 
-    def reset(self, num_envs: int) -> None:
-        self._actor.reset(num_envs)
-
-    def note(self, over: np.ndarray, success: np.ndarray) -> None:
-        if isinstance(self._actor, TakesNote):
-            self._actor.note(over, success)
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._actor, name)
 
     def act(self, obs: Obs) -> np.ndarray:
         self._look()
-        actions = self._actor.act(obs)
-        self.sees_next = getattr(self._actor, "sees_next", True)
-        return actions
+        return self._actor.act(obs)
 
 
 class _Restarted(Exception):

@@ -20,7 +20,7 @@ def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
     Raises:
         ResultsError: The page cannot be written.
     """
-    suites = {name: [task for task in result.tasks if task.suite == name] for name in result.suites}
+    suites = result.by_suite
     means = {"mean over tasks": result.tasks, **(suites if len(suites) > 1 else {})}
     return save_page(
         folder / PAGE_NAME,

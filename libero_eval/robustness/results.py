@@ -327,14 +327,10 @@ def _compared(policy: Robustness) -> dict[str, Any]:
     }
 
 
-def shared_settings(result: EvaluationResult) -> dict[str, Any]:
-    """Return what all conditions have in common, flat, by dotted name: that of a comparison, and MuJoCo's version."""
-    return settings(result) | {"versions.mujoco": result.versions.get("mujoco")}
-
-
 def _odd_settings(base: EvaluationResult, result: EvaluationResult, condition: Condition) -> list[str]:
     """Return where a condition's policy and settings are not the base's, apart from what the condition changes."""
-    a, b = (shared_settings(one) | flatten(plain({"evaluated": one.evaluated})) for one in (base, result))
+    more = ({"evaluated": r.evaluated, "versions.mujoco": r.versions.get("mujoco")} for r in (base, result))
+    a, b = (settings(one) | flatten(plain(its)) for one, its in zip((base, result), more, strict=True))
     changed, clock = ("tasks.", "protocol.sources.", "protocol.world.perturb"), "protocol.action.clock"
     if LATENCY in dict(condition):
         for values in (a, b):

@@ -10,6 +10,7 @@ from pathlib import Path
 from libero_env.perturbations import format_perturbations, parse_perturbations
 from libero_env.storage import require_own_folders
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
+from libero_eval.judging.comparability import settings
 from libero_eval.plan import further_process, load_policy, plan_evaluation, policy_threads
 from libero_eval.policies import PolicyUnderTest
 from libero_eval.protocols.files import load_protocol
@@ -22,15 +23,7 @@ from libero_eval.requests import (
     SEVERITIES,
     RobustnessRequest,
 )
-from libero_eval.robustness.results import (
-    LATENCY,
-    Condition,
-    Outcomes,
-    Robustness,
-    events_of,
-    name_of,
-    shared_settings,
-)
+from libero_eval.robustness.results import LATENCY, Condition, Outcomes, Robustness, events_of, name_of
 from libero_eval.work.evaluation import Evaluation
 from libero_eval.work.worker import Worker, Workers
 from lifelong.errors import ConfigError
@@ -217,7 +210,8 @@ def read_study(folder: Path, name: str = "", conditions: Sequence[str] | None = 
         )
     outcomes, base = Outcomes.of(results), results[()]
     words = ("protocol.sources.", "protocol.title")
-    common = {k: v for k, v in shared_settings(base).items() if not k.startswith(words)}
+    common = {k: v for k, v in settings(base).items() if not k.startswith(words)}
+    common["versions.mujoco"] = base.versions.get("mujoco")
     common["seeds of perturbations"] = ", ".join(map(str, sorted(seeds)))
     horizon = base.protocol["episode"]["horizon"]
     return Robustness(name or folder.name, outcomes, (str(folder),), redrawn, events, horizon, common)

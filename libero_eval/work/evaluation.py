@@ -271,10 +271,8 @@ class Evaluation:
     def _unit_result(
         self, unit: Unit, done: Rollouts, env: VectorEnv, started: float, errors: tuple[str | None, ...] = ()
     ) -> UnitResult:
-        attempts, began, solved = (
-            tuple(getattr(e, name) for e in done.counted) for name in ("attempts", "began", "solved")
-        )
-        timing = tuple(e.timing for e in done.counted)
+        names = ("attempts", "began", "solved", "timing")  # of what not every protocol has
+        rows = {name: tuple(getattr(e, name) for e in done.counted) for name in names}
         kept = tuple(e for e, ran in zip(errors, done.episodes, strict=False) if not ran.simulation_error)
         result = TaskResult(
             task=unit.task.id,
@@ -283,11 +281,8 @@ class Evaluation:
             digest=unit.task.digest,
             errors=kept if any(kept) else (),
             actions=tuple(e.actions for e in done.counted),
-            attempts=attempts if any(attempts) else (),
-            began=began if any(began) else (),
-            solved=solved if any(solved) else (),
             atoms_at_start=tuple(e.at_start for e in done.counted),
-            timing=timing if any(timing) else (),
+            **{name: column if any(column) else () for name, column in rows.items()},
             **done.columns(),
         )
         environment, versions = describe_environment(env), dict(self.versions)

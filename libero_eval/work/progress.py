@@ -131,12 +131,11 @@ def table_row(result: TaskResult) -> str:
 def total_rows(result: EvaluationResult) -> list[str]:
     """Format the rows of each suite and of each kind of LIBERO-Plus, where there are several, and of all together."""
     results = result.tasks
-    suites: dict[str, list[TaskResult]] = {}
     kinds: dict[str, list[TaskResult]] = {}
     for task in results:
-        suites.setdefault(suite := task.suite, []).append(task)
-        if suite.startswith(PLUS):
+        if task.suite.startswith(PLUS):
             kinds.setdefault(f"  {parse_plus_id(task.name).kind}", []).append(task)
+    suites = result.by_suite
     rows = {**(suites if len(suites) > 1 else {}), **(kinds if len(kinds) > 1 else {})}
     lines = []
     for name, tasks in {**rows, "mean over tasks": results}.items():

@@ -35,7 +35,7 @@ def export_vla_eval(result: EvaluationResult, folder: Path) -> list[Path]:
     """
     return [
         _write(folder / f"{suite}_aggregate.json", _aggregate(result, suite, tasks))
-        for suite, tasks in _by_suite(result).items()
+        for suite, tasks in result.by_suite.items()
     ]
 
 
@@ -48,7 +48,7 @@ def export_lerobot(result: EvaluationResult, folder: Path) -> list[Path]:
     Raises:
         ResultsError: The file cannot be written.
     """
-    suites, seconds = _by_suite(result), result.times.get("busy_seconds")
+    suites, seconds = result.by_suite, result.times.get("busy_seconds")
     seconds = float(seconds) if isinstance(seconds, int | float) else float("nan")
     overall = _lerobot_rates(result.tasks)
     per_task = []
@@ -90,7 +90,7 @@ def export_eval_results(result: EvaluationResult, folder: Path, dataset: str, so
     if not re.fullmatch(r"(https?://\S+)?", source):
         raise ConfigError(f"the source is {source!r}; expected an address that begins with https://")
     paths, names = [], ("protocol", "models", "robot", "perturbed by", "clock")
-    for suite, tasks in _by_suite(result).items():
+    for suite, tasks in result.by_suite.items():
         success, described = replace(result, tasks=tuple(tasks)).success, dict(facts(result))
         about = [
             f"success in percent over {sum(len(task.successes) for task in tasks)} episodes of {len(tasks)} tasks",
@@ -167,13 +167,6 @@ def _lerobot_rates(tasks: Sequence[TaskResult]) -> dict[str, Any]:
     rate = float(np.mean(wins))
     means = {"avg_sum_reward": rate, "avg_max_reward": rate, "pc_success": 100 * rate}
     return {**means, "n_episodes": len(wins), "video_paths": []}
-
-
-def _by_suite(result: EvaluationResult) -> dict[str, list[TaskResult]]:
-    suites: dict[str, list[TaskResult]] = {}
-    for task in result.tasks:
-        suites.setdefault(task.suite, []).append(task)
-    return suites
 
 
 def _write(path: Path, values: Mapping[str, Any]) -> Path:
