@@ -332,9 +332,10 @@ def _check_options(request: EvalRequest, earlier: EvaluationResult | None) -> No
         ConfigError: One is; the message says what it is of.
     """
     kind = _kind(request.policy_name)
-    for of, (text, options) in _KINDS.items():
-        if of != kind and (given := _given(request, options)):
-            raise ConfigError(f"{given[0]} is of {text}, and {request.policy} is {_KINDS[kind][0]}")
+    for name, kinds in _OF.items():
+        if kind not in kinds and (given := _given(request, [name])):
+            of = " and ".join(_KINDS[one] for one in kinds)
+            raise ConfigError(f"{given[0]} is of {of}, and {request.policy} is {_KINDS[kind]}")
     if request.allow and kind != "run" and earlier is None:
         raise ConfigError("--allow is of runs, and of results that are run again")
     if request.perturb_seed and request.perturb is None and not request.event and earlier is None:
@@ -351,11 +352,17 @@ def _given(request: EvalRequest, names: Iterable[str]) -> list[str]:
     return [f"--{name.replace('_', '-')}" for name in names if getattr(request, name) != getattr(plain, name)]
 
 
-_KINDS: dict[str, tuple[str, tuple[str, ...]]] = {  # with the options that are of it alone
-    "run": ("a run", ("after", "device")),
-    "module": ("a policy of your own", ("names", "size")),
-    "server": ("a policy server", ("timeout", "in_flight")),
-    "expert": ("the expert", ()),
+_KINDS = {
+    "run": "a run",
+    "module": "a policy of your own",
+    "server": "a policy server",
+    "expert": "the expert",
+}
+_OF: dict[str, tuple[str, ...]] = {  # option -> the kinds that obey it
+    **dict.fromkeys(("after", "device"), ("run",)),
+    **dict.fromkeys(("names", "size"), ("module",)),
+    **dict.fromkeys(("timeout", "in_flight"), ("server",)),
+    "policy_threads": ("run", "module"),
 }
 # What a result states, so that it is run again with this
 _STATED = (

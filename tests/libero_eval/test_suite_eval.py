@@ -168,12 +168,13 @@ def test_a_protocol_says_how_many_episodes_and_tasks_it_counts(tmp_path):
 
 OPTIONS = {
     "names": "original", "size": 64, "timeout": 3.0, "in_flight": 2, "device": "cuda:9", "after": 0, "allow": ("foo",),
-    "perturb_seed": 3, "seed": 4
+    "perturb_seed": 3, "policy_threads": 2
 }  # fmt: skip
 
 
 @pytest.mark.parametrize(("policy", "options"), [
-    ("expert", ("names", "size", "timeout", "in_flight", "device", "after", "allow", "perturb_seed")),
+    ("expert", ("names", "size", "timeout", "in_flight", "device", "after", "allow", "perturb_seed", "policy_threads")),
+    ("ws://localhost:1", ("names", "size", "device", "after", "allow", "perturb_seed", "policy_threads")),
     ("run", ("names", "size", "timeout", "in_flight", "perturb_seed")),
     ("os:getcwd", ("timeout", "in_flight", "device", "after", "allow", "perturb_seed")),
 ])  # fmt: skip
