@@ -95,6 +95,9 @@ def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
     )
     exec(compile(reading, "evaluating.md", "exec"), {})  # noqa: S102
     assert "libero_object/0 Estimate(value=0.0" in capsys.readouterr().out
+    (again,) = (line for line in lines(DOCS / "evaluating.md") if "my_policy.make/eval.json" in line)
+    assert main(shlex.split(again)[1:]) == 0
+    assert "eval/my_policy.make/again/eval.json" in capsys.readouterr().out
     assert main(["eval", "--status", "eval/my_policy.make"]) == 0
     assert "1 of 1 units, 2 of 2 episodes" in capsys.readouterr().out
 
