@@ -52,6 +52,13 @@ def envs(plugin):
         env.close()
 
 
+def test_starts_follow_from_two_options_that_do_not_contradict_each_other(plugin):
+    chosen = plugin.settings.chosen_starts
+    assert [chosen(True, False), chosen(True, True), chosen(False, False)] == ["stored", "original", "new"]
+    with pytest.raises(LiberoError, match="init_states is false"):
+        chosen(False, True)
+
+
 def test_observations_are_those_of_our_environment_as_lerobot_lays_them_out(envs):
     env = envs(2)
     observed, info = env.reset(seed=[1000, 1001])

@@ -7,7 +7,13 @@ from lerobot.envs.configs import EnvConfig, HubEnvConfig
 from lerobot.processor import LiberoProcessorStep, PolicyProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 
-from lerobot_env_libero_lifelong.settings import OBS_TYPES, ROBOT_STATE, Settings, selected_tasks
+from lerobot_env_libero_lifelong.settings import (
+    OBS_TYPES,
+    ROBOT_STATE,
+    Settings,
+    chosen_starts,
+    selected_tasks,
+)
 from lerobot_env_libero_lifelong.vector import TaskEnvs
 
 DEFAULT_NAMES = {"agentview_image": "image", "robot0_eye_in_hand_image": "image2"}
@@ -86,7 +92,7 @@ class LiberoLifelongEnv(HubEnvConfig):
             with_state=self.obs_type == "pixels_agent_pos",
             max_steps=self.episode_length,
             wait_steps=self.num_steps_wait,
-            starts=("original" if self.original_starts else "stored") if self.init_states else "new",
+            starts=chosen_starts(self.init_states, self.original_starts),
             control_mode=self.control_mode,
             fps=self.fps,
             drawing=self.drawing,

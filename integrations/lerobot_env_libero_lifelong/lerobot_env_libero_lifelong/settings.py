@@ -119,6 +119,17 @@ class Settings:
         )
 
 
+def chosen_starts(init_states: bool, original: bool) -> str:
+    """Return the `starts` of the options `init_states` and `original_starts`.
+
+    Raises:
+        LiberoError: They contradict each other.
+    """
+    if original and not init_states:
+        raise LiberoError("original_starts are init_states, and init_states is false: leave one of them out")
+    return ("original" if original else "stored") if init_states else "new"
+
+
 def selected_tasks(suites: str, indices: Sequence[int] | None = None) -> dict[str, list[Task]]:
     """Return tasks by suite.
 
