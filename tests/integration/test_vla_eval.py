@@ -95,8 +95,10 @@ def test_a_run_acts_as_in_process(tmp_path):
     ({"card": "simplevla-rl", "send_state": False}, "the policy needs robot0_eye_in_hand"),
     ({"camera_size": [64, 64]}, "camera_size: protocol vla-eval has its own"),
     ({"observations": ["agentview_rgb"], "absolute_action": True}, "absolute_action cannot be used with observations"),
+    ({"observations": ["agentview_rgb"], "card": "goals.yaml"}, "absolute_action cannot be used with observations"),
 ])  # fmt: skip
 def test_a_server_for_another_protocol_is_refused(recorded, tmp_path, params, message):
+    (tmp_path / "goals.yaml").write_text("{extends: libero, world: {delta: false}}")
     entry = {"benchmark": OURS, "params": {"suite": "libero_object", **params}}
     with pytest.raises(AssertionError) as refused:
         evaluate(recorded, tmp_path, entry)

@@ -125,7 +125,7 @@ class LiberoBenchmark(StepBenchmark):
         else:
             height, width = camera_size or chosen.pixels.render_size or (128, 128)
             settling = chosen.settle_steps if num_steps_wait is None else num_steps_wait
-            if absolute_action:
+            if absolute_action or not chosen.world.delta:
                 raise ProtocolError(
                     "absolute_action cannot be used with observations: runs move relative to the pose"
                 )
