@@ -91,6 +91,7 @@ def test_a_run_acts_as_in_process(tmp_path):
 
 @pytest.mark.parametrize(("params", "message"), [
     ({"card": "openpi", "env_seed": 0}, "world.env_seed: protocol openpi has 7, the policy 0"),
+    ({"card": "openpi", "env_seed": 0, "observations": ["agentview_rgb"]}, "world.env_seed: protocol openpi has 7"),
     ({"card": "starvla"}, "proprioception.source: protocol starvla has 'none', the policy 'observation'"),
     ({"card": "simplevla-rl", "send_state": False}, "the policy needs robot0_eye_in_hand"),
     ({"camera_size": [64, 64]}, "camera_size: protocol vla-eval has its own"),

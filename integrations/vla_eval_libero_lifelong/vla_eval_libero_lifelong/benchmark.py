@@ -129,6 +129,8 @@ class LiberoBenchmark(StepBenchmark):
                 raise ProtocolError(
                     "absolute_action cannot be used with observations: runs move relative to the pose"
                 )
+            if (env_seed := asked["world.env_seed"]) is not None:
+                chosen = _agreed(chosen, {"world.env_seed": env_seed})
             steps = 600 if max_steps is None else max_steps
             arm = robot or DEFAULT_ROBOT
             chosen = run_protocol(
