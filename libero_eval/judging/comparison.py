@@ -187,8 +187,8 @@ def compare_groups(
     if twice := sorted({name for name in labels if labels.count(name) > 1}):
         raise ConfigError(f"two policies are called {', '.join(twice)}; write NAME=RESULT to name them")
     for group in groups:
-        for (i, a), (k, b) in combinations(enumerate(group.results, 1), 2):
-            if same_policy(a, b) and a.outcomes == b.outcomes:
+        for (i, one), (k, other) in combinations(enumerate(group.results, 1), 2):
+            if same_policy(one, other) and one.outcomes == other.outcomes:
                 raise ConfigError(
                     f"results {i} and {k} of {group.label} are one run, which counts once; leave one out"
                 )
