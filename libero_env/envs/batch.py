@@ -248,7 +248,7 @@ class BatchEnv(LiberoVectorEnv):
             self._start(ids, states, None if request.init_states is None else request.init_states[ids])
             if request.outdated_controller:
                 self.simulations.outdate_controller(ids)
-            self._steps[ids], self._running[ids] = 0, True
+            self._steps[ids], self._running[ids], self._moved[ids] = 0, True, False
             self._forget(ids)
             for i in map(int, ids) if self._watched else ():
                 self.event_states = {key: state for key, state in self.event_states.items() if key[0] != i}
@@ -321,7 +321,7 @@ class BatchEnv(LiberoVectorEnv):
         """
         self.require_open()
         i, state = checked_index(i, self.num_envs), self._checked_state(state)
-        self._running[i] = False
+        self._running[i] = self._moved[i] = False
         self._errors.pop(i, None)
         self._forget(np.array([i]))
         kept, is_whole = self._kept(i), state.size > self.simulations.state_size
@@ -531,7 +531,8 @@ class BatchEnv(LiberoVectorEnv):
     def _step_and_observe(self, ids: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
         """Advance simulations by one control period, and observe them when `config.observed` says."""
         if self.perturbed is not None:
-            actions = self.perturbed.act(ids, actions)
+            controller = self.simulations.controller_state.controller
+            actions = self.perturbed.act(ids, np.clip(actions, controller.low, controller.high))
         is_after, (first, second) = self.config.observed == AFTER, self.simulations.watched
         seen = {} if is_after else self.proprioception()
 

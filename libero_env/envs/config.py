@@ -14,7 +14,7 @@ from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
 from libero_env.errors import InvalidInputError, require_known
 from libero_env.perturbations.appearance import CAMERA
 from libero_env.perturbations.episodes import checked_perturbations
-from libero_env.perturbations.filters import ActionDelay, ActionGain, ActionNoise
+from libero_env.perturbations.filters import ActionDelay, ActionGain, ActionNoise, StateBias
 from libero_env.perturbations.perturbation import Perturbation
 from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS, IMAGES
@@ -135,12 +135,19 @@ class EnvConfig:
             )
         is_seen = not self.cameras or CAMERA in map(camera_name, self.cameras)
         images = {*self.observations} & {*IMAGES} if self.cameras else set()
+        unfelt = {*self.observations}.isdisjoint(("proprioception", *StateBias.entries))
         for one in self.perturb:
             kind = one.definition if isinstance(one, Perturbation) else one
             if images and "rgb" not in images and getattr(kind, "only_rgb", False):
                 raise InvalidInputError(
                     f"perturb={one} changes colours only, and observations={', '.join(self.observations)} have none: "
                     "add rgb, or leave the perturbation out"
+                )
+            is_bias = isinstance(one, StateBias) or getattr(one, "kind", "") == "proprio_bias"
+            if is_bias and self.observations and unfelt:
+                raise InvalidInputError(
+                    f"perturb={one} changes what the robot feels, which is not in observations="
+                    f"{', '.join(self.observations)}; add proprioception, or leave the perturbation out"
                 )
             if getattr(one, "kind", "") in ("camera", "fov") and not is_seen:
                 raise InvalidInputError(

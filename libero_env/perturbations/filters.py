@@ -119,8 +119,10 @@ class StateBias(ObservationFilter):
 
     Attributes:
         amount: Distance in joint space and angle of the hand, [rad]; distance of the hand, [m]. Fingers: a tenth.
+        entries: Entries of observations that it changes.
     """
 
+    entries = ("joint_states", "gripper_states", "ee_pos", "ee_ori", "ee_quat")
     amount: float
 
     def state(self, entries: Mapping[str, np.ndarray], episode: Episode) -> Mapping[str, np.ndarray]:

@@ -36,11 +36,11 @@ class SampleKey:
     """
 
     def __init__(self, *words: object):
-        self._words = words
+        self.words = words
 
     def generator(self, *words: object) -> np.random.Generator:
         """Return the generator of a part of the sample; the same words give the same numbers."""
-        text = "\0".join(map(str, (*self._words, *words)))
+        text = "\0".join(map(str, (*self.words, *words)))
         digest = hashlib.sha256(text.encode()).digest()
         return np.random.Generator(np.random.PCG64(int.from_bytes(digest[:16], "little")))
 
@@ -171,7 +171,8 @@ class ActionFilter(ABC):
         """Return the action (A,) that the robot executes.
 
         Args:
-            action: Action that was chosen, (A,); it is not changed. The last number is the gripper's.
+            action: Action that was chosen, clipped to the action space, (A,); it is not changed. The last number is
+                the gripper's.
             episode: Episode that it belongs to; its step is the number of those before.
         """
 

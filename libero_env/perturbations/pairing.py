@@ -39,7 +39,7 @@ class Pairing:
         self._shifts = dict(moved(base.problem, scene.problem))
         self._is_same = old == new and not self._shifts
         self._simulations: LoopSimulations | None = None
-        self._known: dict[tuple[bytes, int], tuple[np.ndarray, int]] = {}
+        self._known: dict[tuple[object, ...], tuple[np.ndarray, int]] = {}
 
     def row(self, row: np.ndarray, key: SampleKey, first: int = 0) -> tuple[np.ndarray, int]:
         """Return the start that belongs to a start of the scene without perturbations, and the number of its sample.
@@ -54,17 +54,17 @@ class Pairing:
         """
         if self._is_same:
             return row, 0
-        name = row.tobytes(), first
+        name = row.tobytes(), key.words, first
         if name not in self._known:
             self._known[name] = self._first_valid(row, key, first)
         paired, attempt = self._known[name]
         return paired.copy(), attempt
 
     def _first_valid(self, row: np.ndarray, key: SampleKey, first: int) -> tuple[np.ndarray, int]:
-        paired, before = self._paired(row), contacts(self.base, row)
+        paired = self._paired(row)
+        if self._shifts and self._contacts(self.scene, paired) > self._contacts(self.base, row):
+            raise PlacementError(f"{self.scene.problem.language!r}: a moved object touches another")
         if not (self.added or self.exchanged):
-            if self._shifts and len(contacts(self.scene, paired)) > len(before):
-                raise PlacementError(f"{self.scene.problem.language!r}: a moved object touches another")
             return paired, 0
         for attempt in range(first, first + _ATTEMPTS):
             try:
@@ -72,6 +72,11 @@ class Pairing:
             except PlacementError as error:
                 reason = error
         raise reason
+
+    def _contacts(self, scene: Scene, row: np.ndarray) -> int:
+        """Return how many pairs of bodies touch in a state, without what is new."""
+        new = {int(b) for n in (*self.added, *self.exchanged) for b in scene.bodies.get(n, ())}
+        return sum(new.isdisjoint(pair) for pair in contacts(scene, row))
 
     def _paired(self, row: np.ndarray) -> np.ndarray:
         """Return the start with everything that both scenes have; what is new is at its model's origin."""

@@ -8,7 +8,7 @@ import pytest
 from libero_env.envs import BatchEnv, EnvConfig, LiberoEnv, SubprocEnv
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.perturbations.corruptions import Corruption
-from libero_env.perturbations.filters import ActionDelay, ActionGain
+from libero_env.perturbations.filters import ActionDelay, ActionGain, StateBias
 
 TASK = "libero_object/0"
 FIELDS = [field.name for field in dataclasses.fields(EnvConfig)]
@@ -71,6 +71,14 @@ def test_what_changes_colours_only_is_refused_where_pictures_have_none(perturb):
     ):
         assert EnvConfig(perturb=perturb, **options)
     assert EnvConfig(perturb="camera=1,latency=1,dropped_frames=1", **seen)
+
+
+@pytest.mark.parametrize("perturb", ["proprio_bias=1", "noise=1,proprio_bias=1@step3", [StateBias(0.1)]])
+def test_sensors_that_are_off_are_observed(perturb):
+    with pytest.raises(InvalidInputError, match="not in observations=rgb, joint_velocities; add proprioception"):
+        EnvConfig(perturb=perturb, observations=("rgb", "joint_velocities"))
+    for names in ((), ("rgb", "proprioception"), ("rgb", "ee_quat")):
+        assert EnvConfig(perturb=perturb, observations=names)
 
 
 def test_an_event_at_a_step_that_no_episode_has_is_refused(closing):

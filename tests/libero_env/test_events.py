@@ -106,6 +106,14 @@ def act(env, experts, done=lambda info: False):
     return info
 
 
+def test_what_has_just_moved_belongs_to_its_step():
+    with BatchEnv(TASK, 2, cameras=(), perturb="object=1@step0") as env:
+        env.reset(options={"init_state": [0, 1]})
+        assert env.step(np.zeros((2, 7)))[-1]["moved"].tolist() == [True, True]
+        info = env.reset(options={"init_state": 0, "reset_mask": np.array([True, False])})[1]
+        assert info["moved"].tolist() == [False, True]
+
+
 def test_another_goal_of_the_scene_is_judged_from_the_event_on():
     with BatchEnv(TASK, 2, cameras=(), horizon=400, perturb="goal=1@lifted") as env:
         env.reset(options={"init_state": [0, 1]})

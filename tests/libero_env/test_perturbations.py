@@ -7,7 +7,7 @@ import pytest
 
 from libero_env import BatchEnv, LiberoEnv, make_task
 from libero_env.envs import EnvConfig
-from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, PlacementError, UnknownNameError
 from libero_env.geometry import quat_to_axis_angle
 from libero_env.perturbations import (
     KINDS,
@@ -22,6 +22,7 @@ from libero_env.perturbations.appearance import CAMERA, pivot_of
 from libero_env.perturbations.filters import PixelNoise
 from libero_env.perturbations.instructions import edit_distance, reword, split_clauses
 from libero_env.perturbations.kinds import Episode
+from libero_env.perturbations.pairing import moved
 from libero_env.sim.appearance import Appearance, CameraView, Light
 from libero_env.tasks import get_suite
 
@@ -282,6 +283,25 @@ def test_an_episode_from_a_seed_is_paired_with_the_same_placement(closing):
     assert same([first], [perturbed.reset(seed=5)[0]])
 
 
+def test_places_of_what_is_new_are_named_by_the_start_whatever_was_reset_before(closing):
+    first, second = (closing(BatchEnv(TASK, 1, cameras=(), perturb="distractors=0.2")) for _ in range(2))
+    second.reset(options={"start": second.init_states[:1]})  # named by its numbers
+    for env in (first, second):
+        env.reset(options={"init_state": 0})
+    assert np.array_equal(*(env.simulations.physics_state(0) for env in (first, second)))
+
+
+@pytest.mark.parametrize("perturb", ["layout=1", "layout=1,distractors=0.2"])
+def test_a_start_whose_moved_objects_collide_is_refused(closing, perturb):
+    env = closing(BatchEnv("libero_object/3", 1, cameras=(), perturb=perturb))
+    shifts = dict(moved(env.base_task.problem, env.task.problem))
+    (one, by), (other, away) = list(shifts.items())[:2]
+    start, (at, there) = env.init_states[:1].copy(), (1 + env.base_scene.pose_address(n) for n in (one, other))
+    start[0, there : there + 2] = start[0, at : at + 2] + by - away  # where both come to the same place
+    with pytest.raises(PlacementError, match="a moved object touches another"):
+        env.reset(options={"start": start})
+
+
 def test_another_goal_of_the_scene_comes_with_its_instruction(world_of):
     goals = {task.language: task.problem.goal for task in get_suite("libero_goal").tasks}
     env, _, info = world_of("goal=1", cameras=())
@@ -415,6 +435,13 @@ def test_actions_are_scaled_and_noisy_but_not_the_gripper():
     acted = np.array([noise.act(action, Episode(episode.key, step)) for step in range(500)])
     assert (acted[:, 6] == 0.5).all() and acted[:, :6].std() == pytest.approx(0.2, rel=0.05)
     assert np.array_equal(acted[3], noise.act(action, Episode(episode.key, 3)))
+
+
+@pytest.mark.parametrize("perturb", ["gain=1@1", "action_noise=1"])  # half as far
+def test_actions_are_clipped_before_they_are_perturbed(perturb, world_of):
+    within, beyond = (world_of(perturb, cameras=())[0] for _ in range(2))
+    direction = np.array([1.0, -1.0, 1.0, 0.0, 0.0, 0.0, -1.0])
+    assert same([within.step(direction)[0]], [beyond.step(4 * direction)[0]])
 
 
 def test_a_configuration_with_perturbations_goes_to_other_processes():
