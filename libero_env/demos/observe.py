@@ -29,6 +29,7 @@ from libero_env.text import shown
 from libero_env.timing import CONTROL_HZ, FREQUENCIES
 
 _OPEN_FILE = "<_io."  # begins what `str(open(file))` returns
+_NO_HORIZON = 10**9  # [steps] a recording ends where it ended
 
 
 def recorded_robot(file: Path) -> str:
@@ -158,6 +159,7 @@ class StateRenderer:
             task,
             cameras=config.cameras,
             camera_size=config.size,
+            horizon=_NO_HORIZON,
             assets=assets,
             drawing=config.drawing,
             robot=robot,

@@ -233,9 +233,10 @@ def recorded_language(file: Path, task: Task | None = None) -> str:
     Args:
         task: Task that was recorded; None for the one that the file states.
     """
-    if task is not None:
+    header = read_header(file)
+    if task is not None and "instruction" not in str(header.get("perturb", "")):
         return task.language
-    stated = json_attribute(read_header(file), "problem_info", file).get("language_instruction")
+    stated = json_attribute(header, "problem_info", file).get("language_instruction")
     return stated if isinstance(stated, str) else recorded_task(file).language
 
 

@@ -19,6 +19,7 @@ from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError, InvalidInputError
 from libero_env.perturbations import parse_perturbations
 from libero_env.tasks import get_task
+from libero_integrations.exports.demonstrations import recorded_language
 from tests.harness.demos import STEPS, record_wander
 
 TASK, SIZE = "libero_goal/3", (24, 32)
@@ -97,6 +98,7 @@ def test_what_happened_stays_and_what_is_seen_and_said_changes(path, other):
         said = [json.loads(f["data"].attrs["problem_info"])["language_instruction"] for f in (old, new)]
     env = LiberoEnv(TASK, cameras=(), perturb="instruction=0.6")
     assert said == [get_task(TASK).language, env.task.language] and said[0] != said[1]
+    assert [recorded_language(file, get_task(TASK)) for file in (path, target)] == said
     assert f"rendered under {text}" in describe(target) and f"rendered under {text}" in str(examine(target))
     assert "rendered under" not in describe(path) and not examine(target).faults
     assert len(read_demos(target)) == 2

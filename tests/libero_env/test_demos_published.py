@@ -239,12 +239,12 @@ def test_a_recording_that_ends_too_early_is_continued(file, episode, tmp_path):
     assert continued.success and expected_frames - 3 < len(continued.actions) <= expected_frames + 7
     (stopped,) = regenerate(short, replace(small, extra_steps=0))
     assert not stopped.success and len(stopped.actions) == expected_frames - 3
-    human = DemoWriter(
-        tmp_path / "human.hdf5", {k: v for k, v in read_header(short).items() if k != "generator"}
-    )
-    human.write(0, next(read_episodes(short)))
-    (left,) = regenerate(human.finish(), small)
-    assert not left.success and len(left.actions) == expected_frames - 3
+    original = {k: v for k, v in read_header(short).items() if k != "generator"}
+    for name, header in {"original": original, "by_hand": original | {"generator": "teleoperation"}}.items():
+        human = DemoWriter(tmp_path / f"{name}.hdf5", header)
+        human.write(0, next(read_episodes(short)))
+        (left,) = regenerate(human.finish(), small)
+        assert not left.success and len(left.actions) == expected_frames - 3
 
 
 def test_a_task_that_the_states_do_not_fit_is_refused(file, tmp_path):

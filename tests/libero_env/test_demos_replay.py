@@ -16,6 +16,8 @@ from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
 from libero_env.demos.read import Episode, read_demos, read_episodes
 from libero_env.demos.rendering import rerender
 from libero_env.demos.replay import replay
+from libero_env.demos.write import DemoWriter
+from libero_env.envs import EnvConfig
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
 from libero_env.expert.expert import Attempt, run_experts
@@ -59,6 +61,14 @@ def test_actions_replay_to_the_same_states(path):
         assert result.steps == STEPS and result.drift.shape == (STEPS,)
         assert result.drift.max() < 1e-9 and result.arm_drift.max() < 1e-9
         assert result.recorded and not result.success  # a random walk reaches nothing
+
+
+def test_a_recording_longer_than_an_episode_is_replayed_to_its_end(path, tmp_path):
+    writer, one = DemoWriter(tmp_path / "long.hdf5", read_header(path)), next(read_episodes(path))
+    steps = np.zeros(EnvConfig.horizon + 2, int)
+    writer.write(0, replace(one.select(steps), actions=np.zeros((len(steps), 7)), obs={}, expert_actions=None))
+    (result,) = replay(writer.finish())
+    assert result.steps == len(steps) and not result.success
 
 
 def test_a_recording_of_another_frequency_is_replayed_at_it_and_not_exported(path, tmp_path):
