@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 
 from libero._adapters.models import assets_folder
-from libero_env.errors import LiberoError
+from libero_env.demos.config import DemoConfig
+from libero_env.demos.contents import json_attribute, read_header
+from libero_env.demos.generate import demo_path
+from libero_env.errors import DemoError, LiberoError
 from libero_env.init_states.pickles import states_content
 from libero_env.init_states.store import packaged_states, shipped_path
 from libero_env.paths import cache_dir, demos_dir
@@ -100,13 +103,17 @@ def _digest(path: Path) -> str | None:
 def _link_demos(root: Path) -> None:
     """Link recorded demonstrations to where the original has them, `<suite>/<task>_demo.hdf5`.
 
-    A recording is in a folder that is named by what it depends on. Of several, the latest with images of 128 pixels
-    and the default seed is linked; of others, the latest.
+    A recording is in a folder that is named by what it depends on. Of several, that with the default configuration is
+    linked; else the latest with images of 128 pixels and the default seed; else the latest. None is linked that starts
+    in the stored states, from which policies are evaluated.
     """
     usual = "128x128-seed0-"
-    for suite in (root / name for name in suite_tasks() if (root / name).is_dir()):
-        folders = [folder for folder in suite.iterdir() if folder.is_dir() and "-seed" in folder.name]
-        folders.sort(key=lambda f: (f.name.startswith(usual), f.stat().st_mtime))
+    for suite_name, tasks in suite_tasks().items():
+        if not (suite := root / suite_name).is_dir():
+            continue
+        default = demo_path(root, DemoConfig(tasks[0])).parent
+        folders = [f for f in suite.iterdir() if f.is_dir() and "-seed" in f.name and not _is_reserved(f)]
+        folders.sort(key=lambda f: (f == default, f.name.startswith(usual), f.stat().st_mtime))
         files = {file.name: file for folder in folders for file in folder.glob("*_demo.hdf5")}
         for name, file in files.items():
             link, target = suite / name, Path(file.parent.name, name)
@@ -117,6 +124,14 @@ def _link_demos(root: Path) -> None:
                 atomic_path(link) as temporary,
             ):  # a folder that cannot be written has no links
                 temporary.symlink_to(target)
+
+
+def _is_reserved(folder: Path) -> bool:
+    """Return whether the recordings in a folder start in the stored initial states."""
+    with suppress(DemoError, StopIteration):
+        file = next(folder.glob("*_demo.hdf5"))
+        return bool(json_attribute(read_header(file), "variation", file).get("reserved"))
+    return False
 
 
 def suite_tasks() -> dict[str, tuple[Task, ...]]:

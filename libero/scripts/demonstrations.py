@@ -24,7 +24,8 @@ from libero_env.demos.rendering import rerender
 from libero_env.demos.replay import rerun_actions
 from libero_env.errors import LiberoError
 from libero_env.storage import atomic_path
-from libero_env.tasks import read_task
+from libero_env.tasks import get_suite, read_task, suite_names
+from libero_env.tasks.problem import same_meaning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,13 +51,19 @@ class Recording(InputOptions):
     size: Side = 128
 
     def collect(self, bddl: Path) -> int:
-        """Record into `<directory>/<problem>_<task>/demo.hdf5`; return 1 where the user stopped early."""
-        task = read_task(bddl)
+        """Record into `<directory>/<problem>_<task>/demo.hdf5`; return 1 where the user stopped early.
+
+        A file of the benchmark, in a folder of its suite's name, is recorded as the benchmark's task.
+        """
+        task, suite = read_task(bddl), bddl.absolute().parent.name
+        tasks = get_suite(suite).tasks if suite in suite_names() else ()
+        same = (t.id for t in tasks if t.name == task.name and same_meaning(t.problem, task.problem))
+        named = next(same, None)
+        which = {"bddl": bddl} if named is None else {"task": named}
         out = self.directory / f"{task.problem.name.lower()}_{task.name}" / "demo.hdf5"
         out.parent.mkdir(parents=True, exist_ok=True)
-        options = {one.name: getattr(self, one.name) for one in fields(InputOptions)}
-        size = (self.size, self.size)
-        return teleop(TeleopRequest(bddl=bddl, out=out, n=self.num_demonstration, size=size, **options))
+        options = {one.name: getattr(self, one.name) for one in fields(InputOptions)} | which
+        return teleop(TeleopRequest(out=out, n=self.num_demonstration, size=(self.size, self.size), **options))
 
 
 @dataclass(frozen=True, kw_only=True)

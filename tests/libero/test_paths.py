@@ -1,9 +1,12 @@
 """Paths: importing neither writes nor prompts; files are written when their path is requested."""
 
+import json
+import os
 import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -11,10 +14,12 @@ from libero._adapters import files
 from libero.libero import benchmark, get_default_path_dict, get_libero_path, set_libero_default_path
 from libero.libero.benchmark.libero_suite_task_map import libero_task_map
 from libero_env.assets.pack import chosen_assets, pack_of
+from libero_env.demos.config import DemoConfig, Variation
 from libero_env.demos.curate import find_demo_files
+from libero_env.demos.generate import demo_path
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states.pickles import read_states, write_states
-from libero_env.tasks import bddl
+from libero_env.tasks import bddl, get_suite
 
 
 def test_importing_neither_writes_nor_prompts(tmp_path):
@@ -98,7 +103,21 @@ def test_recordings_are_linked_where_the_original_has_them(tmp_path, monkeypatch
     (newer / Path(name).name).write_text("newer")
     get_libero_path("datasets")
     assert found.read_text() == "newer"
-    files = sorted(f / Path(name).name for f in (*folders, newer))
+    task = get_suite("libero_object").tasks[0]
+    default, reserved = (
+        demo_path(tmp_path, DemoConfig(task, variation=Variation(reserved=yes))) for yes in (False, True)
+    )
+    reserved.parent.mkdir()
+    with h5py.File(reserved, "w") as file:
+        file.create_group("data").attrs["variation"] = json.dumps({"reserved": True})
+    get_libero_path("datasets")
+    assert found.read_text() == "newer", "policies are evaluated from those states"
+    default.parent.mkdir()
+    default.write_text("as scripts expect them")
+    os.utime(default.parent, (0, 0))
+    get_libero_path("datasets")
+    assert found.read_text() == "as scripts expect them"
+    files = sorted((*(f / Path(name).name for f in (*folders, newer)), default, reserved))
     assert sorted(find_demo_files([tmp_path])) == sorted(find_demo_files([files[0], tmp_path])) == files
     found.unlink()
     found.write_text("a file of the user's")

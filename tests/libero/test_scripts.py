@@ -307,6 +307,21 @@ def test_collecting_scripts(tmp_path, monkeypatch, capsys):
     assert "LIBERO-100 has 0 to 99" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("folder", "named"), [("libero_goal", TASK), ("libero_10", None), ("mine", None)])
+def test_a_file_of_the_benchmark_is_recorded_as_its_task(folder, named, tmp_path, monkeypatch):
+    """Its data set is then where `get_task_demonstration` says, `<suite>/<task>_demo.hdf5`."""
+    asked, task = [], get_task(TASK)
+    monkeypatch.setattr(demonstrations, "teleop", asked.append)
+    file = tmp_path / folder / f"{task.name}.bddl"
+    file.parent.mkdir()
+    file.write_text(task.bddl_text)
+    demonstrations.collect_demonstration(["--bddl-file", str(file), "--directory", str(tmp_path)])
+    assert [(request.task, request.bddl) for request in asked] == [(named, None if named else file)]
+    file.write_text(get_task("libero_goal/2").bddl_text)  # another goal under its name
+    demonstrations.collect_demonstration(["--bddl-file", str(file), "--directory", str(tmp_path)])
+    assert asked[1].task is None
+
+
 def test_videos(tmp_path, recwarn):
     """Success tints the last picture green; odd sizes, which MP4 has no room for, become a GIF."""
     from libero.libero.utils.video_utils import VideoWriter
