@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 from libero_env.cli.options import Answer, Field, FilePath, Positional, ProcessesOrAll, Seed, Side, arg
+from libero_env.errors import InvalidInputError
 from libero_env.parallel import cpu_count
 
 Perturb = Annotated[str, arg(metavar="KIND=SEVERITY,...")]
@@ -84,12 +85,19 @@ def certify(
     from libero_env.perturbations.kinds import attempts_file
     from libero_env.storage import read_json, write_json
     from libero_env.tasks import find_tasks
+    from libero_env.tasks.task import FILE
 
+    found = find_tasks(tasks)
+    if keep and (own := [task.name for task in found if task.suite == FILE]):
+        raise InvalidInputError(
+            f"--keep cannot be used with task files, such as that of {own[0]}: samples are kept by the id of a task, "
+            "which all files share; leave it out"
+        )
     names = kinds or [name for name, kind in KINDS.items() if kind.physical]
     amounts = dict.fromkeys(severities)
     perturbations = [Perturbation(kind, s, seed) for kind in dict.fromkeys(names) for s in amounts]
     certificates = certify_perturbed(
-        find_tasks(tasks),
+        found,
         perturbations,
         starts,
         redraws=redraws,

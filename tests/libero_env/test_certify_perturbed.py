@@ -114,6 +114,14 @@ def test_results_of_tasks_of_files_are_kept_apart(tmp_path):
     assert len({certify_perturbed._path(tmp_path, task, ROBOT) for task in tasks}) == 2
 
 
+def test_samples_of_task_files_are_not_kept_for_all_files(expert, tmp_path, capsys):
+    file = tmp_path / "mine.bddl"
+    file.write_text(TASK.bddl_text)
+    words = ["perturb", "certify", str(file), "--kinds", "gain", "--starts", "1", "--jobs", "1", "--keep"]
+    assert main([*words, "--out", str(tmp_path)]) == 2
+    assert "--keep cannot be used with task files, such as that of mine" in capsys.readouterr().err
+
+
 def test_a_severity_counts_once_and_is_above_0(expert, tmp_path, capsys):
     words = ["perturb", "certify", "libero_goal/3", "--kinds", "gain", "--starts", "1", "--jobs", "1"]
     words += ["--out", str(tmp_path), "--severities"]
