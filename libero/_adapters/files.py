@@ -117,13 +117,19 @@ def _link_demos(root: Path) -> None:
         files = {file.name: file for folder in folders for file in folder.glob("*_demo.hdf5")}
         for name, file in files.items():
             link, target = suite / name, Path(file.parent.name, name)
-            if (link.exists() and not link.is_symlink()) or (link.is_symlink() and link.readlink() == target):
+            ours = is_recording(link)
+            if (link.exists() and not ours) or (ours and link.readlink() == target):
                 continue
             with (
                 suppress(OSError),
                 atomic_path(link) as temporary,
             ):  # a folder that cannot be written has no links
                 temporary.symlink_to(target)
+
+
+def is_recording(path: Path) -> bool:
+    """Return whether a path is a link to what was recorded here, and not a file, or link, of the user's."""
+    return path.is_symlink() and "-seed" in path.readlink().parent.name
 
 
 def _is_reserved(folder: Path) -> bool:

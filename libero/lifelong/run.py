@@ -20,6 +20,7 @@ import torch
 
 from libero._adapters.batches import DictWindows
 from libero._adapters.config import NO_EFFECT, Config, notes, plain
+from libero._adapters.files import is_recording
 from libero.libero import get_libero_path
 from libero.libero.benchmark import get_benchmark
 from libero.lifelong.algos import Multitask, Sequential, get_algo_class
@@ -135,7 +136,7 @@ def load_datasets(cfg: Any, benchmark: Any) -> tuple[list[Any], dict[str, Any]]:
 def demonstrations(cfg: Any, benchmark: Any, i: int) -> Path:
     """Return the file of a task's demonstrations; generate them if there is none."""
     path = Path(cfg.folder, benchmark.get_task_demonstration(i))
-    if path.exists() and not path.is_symlink():  # a link is to a recording, which may have too few
+    if path.exists() and not is_recording(path):  # which may have too few
         return path
     size = int(cfg.data.img_h), int(cfg.data.img_w)
     task = native_task(benchmark.get_task(i), cfg.bddl_folder)

@@ -1,6 +1,7 @@
 """Downloads from a local server that closes connections, sends wrong bytes, or does not support ranges."""
 
 import io
+import os
 import threading
 import urllib.request
 import zipfile
@@ -207,6 +208,18 @@ def test_the_facade_downloads_archives(server, tmp_path, monkeypatch, capsys):
     download_utils.libero_dataset_download("libero_100", tmp_path)
     assert len(server.requests) == requests
     assert "libero_100: complete" in capsys.readouterr().out
+    (first, second) = remote_files(["libero_goal"])[:2]
+    recorded, mine = tmp_path / "libero_goal" / "128x128-seed0-expert9" / "a.hdf5", tmp_path / "mine.hdf5"
+    recorded.parent.mkdir()
+    for name, target in {first: recorded, second: mine}.items():
+        target.write_text("other demonstrations")
+        (tmp_path / name).unlink()
+        (tmp_path / name).symlink_to(os.path.relpath(target, (tmp_path / name).parent))
+    assert not download_utils.check_libero_dataset(tmp_path)
+    assert f"9 of 10 files, no {first}" in capsys.readouterr().out, "what was recorded here is not the original's"
+    download_utils.libero_dataset_download("libero_goal", tmp_path)
+    assert (tmp_path / first).read_bytes() == b"demonstrations"
+    assert recorded.read_text() == (tmp_path / second).read_text() == "other demonstrations"
 
 
 def test_download_functions(server, tmp_path):

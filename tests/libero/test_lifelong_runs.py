@@ -57,6 +57,15 @@ def config(folder: Path, *overrides: str):
     return tiny(*SMALL, f"folder={folder}", "benchmark_name=two_tasks", *overrides)
 
 
+def test_demonstrations_may_be_links_as_in_the_cache_of_hugging_face(tmp_path):
+    suite = get_benchmark("libero_object")()
+    file = tmp_path / suite.get_task_demonstration(0)
+    file.parent.mkdir()
+    (tmp_path / "blob").write_bytes(b"")
+    file.symlink_to("../blob")
+    assert run_module.demonstrations(tiny(f"folder={tmp_path}"), suite, 0) == file
+
+
 def test_a_run_and_the_evaluation_of_its_checkpoint(folder, capsys):
     path = run(
         config(folder, "lifelong=packnet", "lifelong.post_prune_epochs=1", "eval.save_sim_states=true")

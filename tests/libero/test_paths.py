@@ -123,6 +123,10 @@ def test_recordings_are_linked_where_the_original_has_them(tmp_path, monkeypatch
     found.write_text("a file of the user's")
     get_libero_path("datasets")
     assert found.read_text() == "a file of the user's"
+    (tmp_path / "blob").write_text("a link of the user's, as Hugging Face's cache has them")
+    found.unlink()
+    found.symlink_to("../blob")
+    assert Path(get_libero_path("datasets"), name).read_text().startswith("a link of the user's")
 
 
 def test_a_warning_names_the_configuration_only_where_it_exists(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from libero._adapters.downloads import check_url, fetch, open_url, unpack
+from libero._adapters.files import is_recording
 from libero.libero import get_path_dict
 from libero.libero.benchmark import get_benchmark
 from libero_env.assets.downloads import REPO as HF_ASSETS_REPO_ID  # noqa: F401 - name of the original
@@ -120,6 +121,8 @@ def libero_dataset_download(
             print(f"{name}: complete in {folder}")
             continue
         print(f"{name}: to {folder}")
+        for file in filter(is_recording, (folder / missing for missing in _missing(folder, name))):
+            file.unlink()  # or it would be kept
         if use_huggingface:
             download_from_huggingface(name, folder, check_overwrite)
         else:
@@ -142,7 +145,7 @@ def datasets_folder() -> Path:
 
 
 def _missing(folder: Path, suite: str) -> list[str]:
-    """Return the demonstration files of a suite that do not exist."""
+    """Return the demonstration files of a suite that do not exist, or are links to what was recorded here."""
     benchmark = get_benchmark(suite)()
     names = [benchmark.get_task_demonstration(i) for i in range(benchmark.n_tasks)]
-    return [name for name in names if not (folder / name).is_file()]
+    return [name for name in names if not (folder / name).is_file() or is_recording(folder / name)]
