@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from libero._adapters.models import assets_folder
+from libero._adapters.models import assets_folder, facade_robot
 from libero_env.demos.config import DemoConfig
 from libero_env.demos.contents import json_attribute, read_header
 from libero_env.demos.generate import demo_path
@@ -111,7 +111,7 @@ def _link_demos(root: Path) -> None:
     for suite_name, tasks in suite_tasks().items():
         if not (suite := root / suite_name).is_dir():
             continue
-        default = demo_path(root, DemoConfig(tasks[0])).parent
+        default = demo_path(root, DemoConfig(tasks[0], robot=facade_robot())).parent
         folders = [f for f in suite.iterdir() if f.is_dir() and "-seed" in f.name and not _is_reserved(f)]
         folders.sort(key=lambda f: (f == default, f.name.startswith(usual), f.stat().st_mtime))
         files = {file.name: file for folder in folders for file in folder.glob("*_demo.hdf5")}

@@ -16,9 +16,11 @@ import numpy as np
 
 from libero_env.assets.original_mjcf import attachable_xml, read_file, read_spec
 from libero_env.assets.pack import ORIGINAL, Pack, facade_assets, original_folder, pack_of
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects import ObjectModel
+from libero_env.paths import read_config
 
 OFFSETS = ("bottom", "top", "horizontal_radius")  # sites, without their suffix
 Offsets = Mapping[str, tuple[float, ...]]
@@ -29,6 +31,11 @@ _DAMPING = 0.0005  # [N s/m and N m s/rad] damping of a free joint, as in robosu
 def facade_pack() -> Pack:
     """Return the pack of the facade; see `libero_env.assets.pack.facade_assets`."""
     return pack_of(facade_assets())
+
+
+def facade_robot() -> str:
+    """Return the model of the arm that the configuration file names; by default `DEFAULT_ROBOT`."""
+    return str(read_config().get("robot") or DEFAULT_ROBOT)
 
 
 def assets_folder() -> Path | None:

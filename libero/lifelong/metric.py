@@ -20,6 +20,7 @@ from torch.utils.data import DataLoader, Dataset
 from libero._adapters.batches import image_tensor, map_tensors
 from libero._adapters.files import generated_paths
 from libero._adapters.lookup import lookup
+from libero._adapters.models import facade_robot
 from libero.lifelong.utils import available_device, safe_device
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import SimulationError
@@ -271,6 +272,7 @@ class _EvalEnv(BatchEnv):
             cameras=[lookup(CAMERAS, "view", view) for view in cfg.data.obs.modality.rgb],
             camera_size=(int(cfg.data.img_h), int(cfg.data.img_w)),
             horizon=int(cfg.eval.max_steps) + SETTLE_STEPS,
+            robot=cfg.get("robot") or facade_robot(),
         )
         if rows is not None:
             self.scene.check_states(rows, task.init_states_file)

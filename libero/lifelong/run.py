@@ -21,6 +21,7 @@ import torch
 from libero._adapters.batches import DictWindows
 from libero._adapters.config import NO_EFFECT, Config, notes, plain
 from libero._adapters.files import is_recording
+from libero._adapters.models import facade_robot
 from libero.libero import get_libero_path
 from libero.libero.benchmark import get_benchmark
 from libero.lifelong.algos import Multitask, Sequential, get_algo_class
@@ -36,6 +37,7 @@ from libero.lifelong.utils import (
     safe_device,
     torch_load_model,
 )
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.generate import ensure_demos
 from libero_env.storage import atomic_path, read_json
 from libero_env.text import flatten
@@ -97,7 +99,7 @@ def run(config: Any) -> Path:
 
 
 def fill_in(cfg: Any) -> None:
-    """Set folders and device where the configuration leaves them open."""
+    """Set folders and device where the configuration leaves them open, and an arm that is not the default one."""
     cfg.folder = cfg.folder or get_libero_path("datasets")
     cfg.bddl_folder = cfg.bddl_folder or get_libero_path("bddl_files")
     cfg.init_states_folder = cfg.init_states_folder or get_libero_path("init_states")
@@ -105,6 +107,8 @@ def fill_in(cfg: Any) -> None:
     if device != str(cfg.device) and not isinstance(cfg.device, int):
         print(f"[note] device={cfg.device}: no GPU is available; the CPU is used")
     cfg.device = device
+    if facade_robot() != DEFAULT_ROBOT:
+        cfg.robot = facade_robot()
 
 
 def load_datasets(cfg: Any, benchmark: Any) -> tuple[list[Any], dict[str, Any]]:
@@ -141,7 +145,7 @@ def demonstrations(cfg: Any, benchmark: Any, i: int) -> Path:
     size = int(cfg.data.img_h), int(cfg.data.img_w)
     task = native_task(benchmark.get_task(i), cfg.bddl_folder)
     print(f"[info] no {path}: demonstrations of the scripted expert are used", flush=True)
-    return ensure_demos([task], DEMOS, camera_size=size)[0]
+    return ensure_demos([task], DEMOS, camera_size=size, robot=cfg.get("robot") or facade_robot())[0]
 
 
 def _open_folder(cfg: Any) -> int:

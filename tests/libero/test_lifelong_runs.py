@@ -4,6 +4,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -163,21 +164,27 @@ def test_results_of_a_user_defined_algorithm_are_written_too(folder):
     assert (notes["task"], notes["norms"].tolist(), notes["name"]) == (1, [0.0, 1.0, 2.0], "noting")
 
 
-def test_missing_demonstrations_are_generated(folder, monkeypatch, capsys):
+@pytest.mark.parametrize("robot", ["libero", "robosuite-1.4.1"])
+def test_missing_demonstrations_are_generated(folder, robot, tmp_path, monkeypatch, capsys):
     """The expert is asked for the demonstrations that the configuration needs; here it returns noise."""
     asked = []
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    (tmp_path / "config.yaml").write_text(f"robot: {robot}\n")
 
-    def record(tasks, count, *, camera_size):
-        asked.append((*tasks, count, camera_size))
+    def record(tasks, count, *, camera_size, robot):
+        asked.append((*tasks, count, camera_size, robot))
         return [folder / get_benchmark("libero_object")().get_task_demonstration(0)]
 
     monkeypatch.setattr(run_module, "ensure_demos", record)
     cfg = config(folder / "elsewhere", "eval.eval=false", "train.n_epochs=0")
     path = run(cfg)
-    assert asked == [(get_task(f"libero_object/{i}"), 50, (SIZE, SIZE)) for i in range(2)]
+    assert asked == [(get_task(f"libero_object/{i}"), 50, (SIZE, SIZE), robot) for i in range(2)]
     assert "scripted expert" in capsys.readouterr().out
     _, stored, _ = utils.torch_load_model(path / "task0_model.pth")
     assert len(stored.demonstrations) == 2
+    (tmp_path / "config.yaml").unlink()  # a run is evaluated with the arm that it has learned with
+    with closing(metric._EvalEnv(stored, get_benchmark("libero_object")().tasks[0], 1, None, None, None)) as env:
+        assert env.config.robot == env.scene.robot == robot
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from libero._adapters.arguments import (
 )
 from libero._adapters.controllers import controller_of
 from libero._adapters.lookup import lookup
-from libero._adapters.models import facade_pack
+from libero._adapters.models import facade_pack, facade_robot
 from libero._adapters.observations import Observer, RobosuiteMethods, cameras, quat_xyzw
 from libero._adapters.sim import ClientSimulations, MjSim, MjSimState, Window
 from libero.libero import get_assets_path
@@ -34,7 +34,7 @@ from libero.libero.envs.predicates import eval_predicate_fn
 from libero.libero.envs.robots import SingleArm
 from libero.libero.envs.scene_objects import TaskModel, scene_fixtures, scene_objects, scene_sites
 from libero.libero.utils.utils import postprocess_model_xml
-from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, ROBOTS
+from libero_env.assets.robot import OPEN_FINGERS, REST_QPOS, ROBOTS
 from libero_env.demos.stored_model import compile_stored, model_xml, read_fixture_poses, spec_without_textures
 from libero_env.envs.checks import checked_numbers
 from libero_env.errors import (
@@ -48,7 +48,6 @@ from libero_env.init_states.original_resets import OriginalResets
 from libero_env.init_states.placement import Start, sample_settled
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP
-from libero_env.paths import read_config
 from libero_env.sim.controller import ControllerState
 from libero_env.sim.predicates import evaluate, glowing_sites
 from libero_env.sim.scene import DRAWINGS, FAITHFUL, build_scene, scene_spec
@@ -179,7 +178,7 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         check_horizon(horizon)
         self._substeps = substeps_of(control_freq)
         require_known("drawing", drawing, DRAWINGS)
-        self.robot = robot or str(read_config().get("robot") or DEFAULT_ROBOT)
+        self.robot = robot or facade_robot()
         require_known("robot", self.robot, ROBOTS)
         self.drawing = drawing
         self.bddl_file_name, self.control_freq = task_file(bddl_file_name), control_freq
