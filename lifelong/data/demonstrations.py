@@ -8,7 +8,7 @@ from weakref import WeakValueDictionary
 
 import torch
 
-from libero_env.assets.pack import select_pack
+from libero_env.assets.pack import BUILTIN, select_pack
 from libero_env.demos.config import DemoConfig, RenderConfig
 from libero_env.demos.contents import demo_names, json_attribute, read_header
 from libero_env.demos.generate import demo_path, ensure_demos
@@ -60,10 +60,18 @@ def find_demos(
     files = _named_files(tasks, required, data, others)
     if folder is not None:
         files = _files_in(folder, [t for t in by_id.values() if t.id not in files], required, data) | files
+    headers = {file: read_header(file) for file in files.values()}
     recorded = others or by_id.keys() - files.keys()
-    if data.seed is not None and not recorded and not any("seed" in read_header(f) for f in files.values()):
+    if data.seed is not None and not recorded and not any("seed" in header for header in headers.values()):
         raise DataError(
             f"data.seed={data.seed} has no effect: no file of this run states a seed; leave it out"
+        )
+    unstated = [file for file, header in headers.items() if {"generator", "models"}.isdisjoint(header)]
+    if unstated and (pack := select_pack().name) == BUILTIN:
+        print(
+            f"{unstated[0]} does not state whose models it shows; policies are evaluated on {pack} ones. For the "
+            "original's demonstrations set LIBERO_ASSETS=original",
+            file=sys.stderr,
         )
     for count in sorted(set(counts), reverse=True):
         missing = [t for t in by_id.values() if required[t.id] == count and t.id not in files]

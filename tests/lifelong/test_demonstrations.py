@@ -46,13 +46,20 @@ def write_demos(folder, task, demos):
     return path
 
 
-def test_files_in_the_originals_layout_are_used(tmp_path, recorded):
+def test_files_in_the_originals_layout_are_used(tmp_path, recorded, monkeypatch, capsys):
+    monkeypatch.setenv("LIBERO_ASSETS", "builtin")
     human = write_demos(tmp_path, TASKS[1], 2)
     data = replace(settings(str(tmp_path)), seed=7, robot="robosuite-1.4.1", drawing="faithful")
     found = demonstrations.find_demos(TASKS, [2, 2, 1], data, False)
     assert found[1] == human  # which says nothing of these
     assert recorded == [TASKS[0].name, TASKS[2].name]
     assert [path.name for path in found[::2]] == [f"{TASKS[0].name}_2.hdf5", f"{TASKS[2].name}_1.hdf5"]
+    said = f"{human} does not state whose models it shows; policies are evaluated on builtin ones"
+    assert said in capsys.readouterr().err
+    with h5py.File(human, "a") as file:
+        file["data"].attrs["models"] = '{"pack": "builtin"}'
+    demonstrations.find_demos(TASKS, [2, 2, 1], data, False)
+    assert "whose models" not in capsys.readouterr().err
 
 
 def own(path, task=TASKS[1], demos=2, size=8, **more):
