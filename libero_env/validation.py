@@ -198,11 +198,7 @@ def is_plain(kind: Any) -> bool:
     no_schema = (PydanticInvalidForJsonSchema, PydanticSchemaGenerationError, PydanticUserError, SchemaError)
     try:
         _adapter(kind).json_schema()
-    except (
-        *no_schema,
-        NameError,
-        TypeError,
-    ):  # names that exist for type checkers only; annotations with lists
+    except (*no_schema, NameError, TypeError):  # names of type checkers only; annotations with lists
         return False
     return True
 

@@ -34,10 +34,8 @@ CHUNKS = {
     "pi05": "chunk_size",
     "xvla": "chunk_size",
 }
-WITH_EMBEDDING = (
-    "act",
-    "diffusion",
-)  # they read the instruction's embedding as observation.environment_state
+# they read the instruction's embedding as observation.environment_state
+WITH_EMBEDDING = ("act", "diffusion")
 WITH_TEXT = ("smolvla", "pi0", "pi0_fast", "pi05", "xvla")  # they read the instruction as text
 DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     "act": {"pretrained_backbone_weights": None},

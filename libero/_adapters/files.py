@@ -120,10 +120,7 @@ def _link_demos(root: Path) -> None:
             ours = is_recording(link)
             if (link.exists() and not ours) or (ours and link.readlink() == target):
                 continue
-            with (
-                suppress(OSError),
-                atomic_path(link) as temporary,
-            ):  # a folder that cannot be written has no links
+            with suppress(OSError), atomic_path(link) as temporary:  # what cannot be written has no links
                 temporary.symlink_to(target)
 
 

@@ -75,9 +75,8 @@ class VectorHost(Host):
 
     def call(self, method: str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         """Call a method; None stands for arrays of an observation that are in shared memory."""
-        if method == "seed" and not hasattr(
-            self.env, "seed"
-        ):  # Gymnasium's environments are seeded by a reset
+        # Gymnasium's environments are seeded by a reset
+        if method == "seed" and not hasattr(self.env, "seed"):
             self.env.reset(seed=args[0])
             return [args[0]]
         result = super().call(method, args, kwargs)

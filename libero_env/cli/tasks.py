@@ -223,16 +223,16 @@ def new(
     if name.startswith(".") or Path(name).name != name:
         raise LiberoError(f"{name!r} is not the name of a task, such as my_task; --out is the folder")
     check_name(name)
-    path = out / f"{name}.yaml"
-    if path.exists():
-        raise LiberoError(f"{path} exists already; choose another name, or remove it")
+    path, text_file = out / f"{name}.yaml", out / f"{name}.bddl"
+    if present := [file for file in (path, *[text_file] * bddl) if file.exists()]:
+        raise LiberoError(f"{present[0]} exists already; choose another name, or remove it")
     text, _ = task_template(scene, objects, furniture, goal, language)
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")
     task = read_task(path)
     print(f"{path}: {task.language}")
     if bddl:
-        print(f"{write_task(task, path.with_suffix('.bddl'))}: {language_from_name(name)}")
+        print(f"{write_task(task, text_file)}: {language_from_name(name)}")
     for command in (
         f"libero tasks preview {quote(str(path))} --video",
         f"libero tasks lint {quote(str(path))}",

@@ -22,9 +22,8 @@ from libero_env.workspaces import WORKSPACES
 _DIRECTIONS = 60  # tries for each object
 _BESIDE = 0.12  # [m] between the middles of two objects that stand beside each other
 _FULL_STEP, _FULL_TURN = 0.05, np.deg2rad(30.0)  # [m], [rad] at severity 1
-_STILL = (
-    0.01  # [m, rad, or quaternion units] largest change of a start that is at rest, and of what is not moved
-)
+# [m, rad, or quaternion units] largest change of a start that is at rest, and of what is not moved
+_STILL = 0.01
 _LIMIT_MARGIN = 0.02  # [rad] between a sampled joint and the end of its range
 
 

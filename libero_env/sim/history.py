@@ -15,10 +15,8 @@ import numpy as np
 
 from libero_env.tasks.problem import Atom, Count, Expression, Never, Not, Or, Then
 
-_LATE, _IN_ORDER = (
-    1,
-    2,
-)  # of the second part of a Then that holds: whether the first had held before it began to
+# of the second part of a Then that holds: whether the first had held before it began to
+_LATE, _IN_ORDER = 1, 2
 
 
 class History:

@@ -327,6 +327,15 @@ def test_the_video_does_not_replace_the_pictures(tmp_path, capsys):
     assert "would be both the pictures and the video" in capsys.readouterr().err and not path.exists()
 
 
+def test_a_new_task_replaces_no_file_of_the_user(tmp_path, capsys):
+    mine = tmp_path / "mine.bddl"
+    mine.write_text("by hand")
+    assert main(["tasks", "new", "mine", "--bddl", "--out", str(tmp_path)]) == 2
+    assert f"{mine} exists already" in capsys.readouterr().err
+    assert [*tmp_path.iterdir()] == [mine] and mine.read_text() == "by hand"
+    assert main(["tasks", "new", "mine", "--out", str(tmp_path)]) == 0
+
+
 @pytest.mark.sim
 def test_a_task_runs_by_the_name_of_its_file_and_is_rendered(tmp_path, capsys):
     options = ["--scene", "floor", "--objects", "butter", "basket", "--bddl", "--out", str(tmp_path)]

@@ -270,9 +270,8 @@ class BDDLBaseDomain(RobosuiteMethods, names=_NAMES):
         self.model = TaskModel(scene, self.sim.model._model, self.get_xml, parts, self.robots[0].robot_model)
         self.visualize(dict.fromkeys(self._visualizations, False))
         drawn = self.camera_list if self.use_camera_obs else ()
-        self.sim.draws_sites = not any(
-            camera.segmentations for camera in drawn
-        )  # robosuite shrinks them to nothing
+        # robosuite shrinks sites to nothing
+        self.sim.draws_sites = not any(camera.segmentations for camera in drawn)
         observed = list(scene.objects) if self.use_object_obs else []
         self.observer = Observer(self.sim, observed, drawn, self.model.segments)
         self._observables = self._observables or self._setup_observables()
