@@ -9,10 +9,12 @@ from typing import Literal
 import h5py
 from pydantic.dataclasses import dataclass
 
+from libero._adapters.models import facade_robot
 from libero.libero.benchmark import get_benchmark
 from libero.libero.utils.dataset_utils import get_dataset_info as dataset_info
 from libero.libero.utils.download_utils import check_libero_dataset, datasets_folder, libero_dataset_download
 from libero.scripts.command import script
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.cli.demos import check_files
 from libero_env.cli.options import Positional, Positive, Side
 from libero_env.cli.teleop import InputOptions, TeleopRequest, teleop
@@ -23,6 +25,7 @@ from libero_env.demos.observe import recorded_task
 from libero_env.demos.rendering import rerender
 from libero_env.demos.replay import rerun_actions
 from libero_env.errors import LiberoError
+from libero_env.paths import config_file
 from libero_env.storage import atomic_path
 from libero_env.tasks import get_suite, read_task, suite_names
 from libero_env.tasks.problem import same_meaning
@@ -55,6 +58,8 @@ class Recording(InputOptions):
 
         A file of the benchmark, in a folder of its suite's name, is recorded as the benchmark's task.
         """
+        if (robot := facade_robot()) != DEFAULT_ROBOT:
+            raise LiberoError(f"{config_file()} names the robot {robot}; by hand only {DEFAULT_ROBOT} is recorded")
         task, suite = read_task(bddl), bddl.absolute().parent.name
         tasks = get_suite(suite).tasks if suite in suite_names() else ()
         same = (t.id for t in tasks if t.name == task.name and same_meaning(t.problem, task.problem))

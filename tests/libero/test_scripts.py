@@ -322,6 +322,13 @@ def test_a_file_of_the_benchmark_is_recorded_as_its_task(folder, named, tmp_path
     assert asked[1].task is None
 
 
+def test_an_arm_that_is_not_recorded_by_hand_is_refused(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    (tmp_path / "config.yaml").write_text("robot: robosuite-1.4.1\n")
+    assert demonstrations.libero_100_collect_demonstrations(["--task-id", "0"]) == 2
+    assert "config.yaml names the robot robosuite-1.4.1; by hand only libero" in capsys.readouterr().err
+
+
 def test_videos(tmp_path, recwarn):
     """Success tints the last picture green; odd sizes, which MP4 has no room for, become a GIF."""
     from libero.libero.utils.video_utils import VideoWriter
