@@ -139,10 +139,11 @@ class PerturbedEpisodes:
             PlacementError: There is none.
         """
         problem = self._of("problem")
-        seeds = [self.perturbations[k].seed for k in problem]
+        seeds = {one.kind: one.seed for one in (self.perturbations[k] for k in problem)}
         first = max((self._first(k, start) for k in problem), default=0)
-        key = sample_key("pairing", sum(seeds), self._task.id, start)
-        paired, attempt = self._pairing.row(row, key, first)
+        of_kinds = (seeds.get(kind, 0) for kind in ("objects", "distractors"))
+        keys = [sample_key("pairing", seed, self._task.id, start) for seed in of_kinds]
+        paired, attempt = self._pairing.row(row, keys, first)
         self.attempts[i] = 0
         self.attempts[i, problem] = [attempt + self._first(k, "") for k in problem]
         return paired

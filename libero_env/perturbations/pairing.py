@@ -4,7 +4,7 @@ What both tasks have stays where it is, unless its region was moved; then it mov
 it moves along. What is new finds a free place in its region, and is simulated until it is at rest.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -21,6 +21,7 @@ _GAP = 0.02  # [m] between a new object and what is there, seen from above
 _LIFT = 0.001  # [m] above the surface, from where it settles
 _TRIES = 300
 _ATTEMPTS = 30  # samples of all places
+_MAX_KNOWN = 256  # starts that are remembered
 
 
 class Pairing:
@@ -41,12 +42,12 @@ class Pairing:
         self._simulations: LoopSimulations | None = None
         self._known: dict[tuple[object, ...], tuple[np.ndarray, int]] = {}
 
-    def row(self, row: np.ndarray, key: SampleKey, first: int = 0) -> tuple[np.ndarray, int]:
+    def row(self, row: np.ndarray, keys: Sequence[SampleKey], first: int = 0) -> tuple[np.ndarray, int]:
         """Return the start that belongs to a start of the scene without perturbations, and the number of its sample.
 
         Args:
             row: State [time, qpos, qvel, poses of the fixtures] of that scene.
-            key: Key of the places of what is new.
+            keys: Key of the poses of what was exchanged, and key of the places of what is new.
             first: Number of the first sample of these places that may be used.
 
         Raises:
@@ -54,13 +55,15 @@ class Pairing:
         """
         if self._is_same:
             return row, 0
-        name = row.tobytes(), key.words, first
+        name = row.tobytes(), *(key.words for key in keys), first
         if name not in self._known:
-            self._known[name] = self._first_valid(row, key, first)
+            if len(self._known) == _MAX_KNOWN:
+                self._known.clear()
+            self._known[name] = self._first_valid(row, keys, first)
         paired, attempt = self._known[name]
         return paired.copy(), attempt
 
-    def _first_valid(self, row: np.ndarray, key: SampleKey, first: int) -> tuple[np.ndarray, int]:
+    def _first_valid(self, row: np.ndarray, keys: Sequence[SampleKey], first: int) -> tuple[np.ndarray, int]:
         paired = self._paired(row)
         if self._shifts and self._contacts(self.scene, paired) > self._contacts(self.base, row):
             raise PlacementError(f"{self.scene.problem.language!r}: a moved object touches another")
@@ -68,7 +71,8 @@ class Pairing:
             return paired, 0
         for attempt in range(first, first + _ATTEMPTS):
             try:
-                return self._settled(self._placed(paired, key.generator("places", attempt))), attempt
+                generators = [key.generator("places", attempt) for key in keys]
+                return self._settled(self._placed(paired, *generators)), attempt
             except PlacementError as error:
                 reason = error
         raise reason
@@ -92,12 +96,14 @@ class Pairing:
             after.qpos[address : address + 2] += shift
         return np.concatenate([row[:1], after.qpos, after.qvel, fixtures.ravel()])
 
-    def _placed(self, row: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def _placed(
+        self, row: np.ndarray, exchanged_rng: np.random.Generator, rng: np.random.Generator
+    ) -> np.ndarray:
         """Return a state in which what was exchanged stands in its place, and what is new over a free place."""
         scene, row = self.scene, row.copy()
         surface = scene.workspace.surface_height
         for name in self.exchanged:  # where the one before stood, on the workspace
-            quat, address = scene.objects[name].rest_quat(rng), 1 + scene.pose_address(name)
+            quat, address = scene.objects[name].rest_quat(exchanged_rng), 1 + scene.pose_address(name)
             row[address + 2] = surface - lowest_point(scene, name, quat) + _LIFT
             row[address + 3 : address + 7] = quat
         offset = np.asarray(scene.workspace.offset)[:2]

@@ -291,6 +291,14 @@ def test_places_of_what_is_new_are_named_by_the_start_whatever_was_reset_before(
     assert np.array_equal(*(env.simulations.physics_state(0) for env in (first, second)))
 
 
+def test_a_seed_of_words_moves_no_object(world_of):
+    places = []
+    for perturb in ("distractors=0.2@1", "distractors=0.2@1,instruction=0.5@1"):
+        env, _, _ = world_of(perturb, cameras=())
+        places.append({name: env.view.body_pos(name).tolist() for name in env.scene.objects})
+    assert places[0] == places[1]
+
+
 @pytest.mark.parametrize("perturb", ["layout=1", "layout=1,distractors=0.2"])
 def test_a_start_whose_moved_objects_collide_is_refused(closing, perturb):
     env = closing(BatchEnv("libero_object/3", 1, cameras=(), perturb=perturb))
