@@ -6,6 +6,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from libero_env.assets.arena import SPARE, surface_styles
+from libero_env.errors import InvalidInputError
 from libero_env.geometry import quat_to_mat, rotation_about
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import direction, sign
@@ -85,7 +86,7 @@ def _scaled(ambient: np.ndarray, diffuse: np.ndarray, specular: np.ndarray, fact
 _MATERIALS = {
     "floor": ("floor", "room_floorplane"),
     "wall": ("wall", "room_walls_mat"),
-    "table": ("table", "room_table_texture", "room_living_room_table", "room_desk", "room_coffee_table"),
+    "table": ("table", "room_table_texture", "room_living_room_table", "room_desk", "room_short_coffee_table"),
 }
 _FURNITURE = ("furniture_colours", "room_living_room", "room_kitchen_background", "room_office_book_shelf")
 _SAME = 0.02  # RGB distance below which a style is the surface's own
@@ -111,9 +112,11 @@ def _background(distance: float, rng: np.random.Generator, scene: Scene) -> Appe
 def _other_style(scene: Scene, kind: str, distance: float, rng: np.random.Generator) -> dict[str, str]:
     """Return the material of a surface -> one whose mean colour is about as far from its own, in RGB."""
     colours = _mean_colours(scene.model)
-    own = [name for name in _MATERIALS[kind] if name in colours]
-    if not own:
-        return {}
+    if not (own := [name for name in _MATERIALS[kind] if name in colours]):
+        raise InvalidInputError(
+            f"{scene.workspace_name} has no material {kind} of this package that another could replace; leave the "
+            "perturbations table and background out"
+        )
     spare = [SPARE + name for name in surface_styles()]
     away = {name: float(np.linalg.norm(colours[name] - colours[own[0]])) for name in spare}
     away = {name: far for name, far in away.items() if far > _SAME}

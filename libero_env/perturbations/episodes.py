@@ -94,8 +94,9 @@ class PerturbedEpisodes:
         self._starts = np.zeros((num, _NAME_BYTES), np.uint8)  # their names in UTF-8
         sampled = [k for k, one in enumerate(self.perturbations) if one.layer == "observation"]
         filters = (*self._fixed_of("observation"), *(self._sample(k, "") for k in sampled))
-        for k in self._of("start"):  # a task without what a kind needs is refused before anything runs
-            self._sample(k, "")
+        for k, one in enumerate(self.perturbations):  # without what it needs it is refused before anything runs
+            if one.layer in _NEEDS_SCENE:
+                self._sample(k, "")
         self.has_memory = any(one.has_memory for one in filters)
         self._require_one_view()
 

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from libero_env import BatchEnv, make_task
 from libero_env.assets.arena import load_workspace
 from libero_env.assets.original import OriginalPack, is_original
 from libero_env.assets.original_arena import TEXTURES
@@ -214,6 +215,14 @@ def test_rooms_are_the_original(pack, measured_workspaces, workspace):
     cameras = {name: camera for name, camera in room["cameras"].items() if camera["body"] == "world"}
     assert {model.camera(c).name for c in range(model.ncam)} == set(cameras)
     assert {model.light(i).name for i in range(model.nlight)} == {light["name"] for light in room["lights"]}
+
+
+def test_the_coffee_table_has_another_material_where_perturbations_say_so(pack):
+    objects = {"objects": ["butter", "plate"], "place": {"butter_1": (0, 0.1), "plate_1": (0.05, 0.25)}}
+    task = make_task(scene="coffee", goal="On butter_1 plate_1", language="serve the butter", **objects)
+    with BatchEnv(task, 1, cameras=(), assets=pack, perturb="table=0.5") as env:
+        env.reset(seed=0)
+        assert [*env.perturbed.appearance(0).materials] == ["room_short_coffee_table"]
 
 
 def test_every_style_has_its_picture(pack):

@@ -6,7 +6,7 @@ import pytest
 from libero_env import Expert, LiberoEnv, make_task
 from libero_env.assets.arena import load_workspace
 from libero_env.cli.main import main
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl, write_task
 from libero_env.workspaces import WORKSPACES
 
@@ -153,6 +153,15 @@ def test_what_is_wrong_with_a_workspace_is_one_line(bench, text, room, message):
     with pytest.raises(LiberoError) as caught:
         LiberoEnv(task(), cameras=())
     assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("perturb", ["table=0.5", "camera=0.2,background=0.5@step3"])
+def test_surfaces_of_a_room_of_ones_own_are_not_replaced(bench, closing, perturb):
+    bench(TABLE)
+    closing(LiberoEnv(task(), cameras=(), perturb=perturb))
+    bench(MODEL)
+    with pytest.raises(InvalidInputError, match="bench has no material (floor|wall) of this package"):
+        LiberoEnv(task(), cameras=(), perturb=perturb)
 
 
 def test_a_task_without_its_workspace_is_refused(bench, objects_home):
