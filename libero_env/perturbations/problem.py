@@ -153,6 +153,7 @@ def _objects(share: float, rng: np.random.Generator, task: Task, scene: Scene) -
     others = {name: free[i] for name, i in zip(chosen, rng.permutation(len(free)), strict=False)}
     if not others:
         raise InvalidInputError(f"{task.id} has no object that could be another: all are part of the task")
+    _require(free, len(chosen), task)
     return replace(task, problem=replace(problem, objects={**problem.objects, **others}))
 
 
@@ -169,6 +170,7 @@ def with_instruction(task: Task, instruction: str) -> Task:
 def _distractors(count: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
     """Return the task with more objects, of categories that it neither has nor names."""
     problem, free = task.problem, _unnamed(task, scene)
+    _require(free, int(count), task)
     entities = {*problem.objects, *problem.fixtures}
     chosen = [free[i] for i in rng.permutation(len(free))][: int(count)]
     names = {_free_name(category, entities): category for category in chosen}
@@ -192,6 +194,15 @@ def _unnamed(task: Task, scene: Scene) -> list[str]:
         for category, words in read_yaml("perturbations/data/distractors.yaml")["categories"].items()
         if category not in known and category in there and not used & set(words or category.split("_"))
     ]
+
+
+def _require(free: Sequence[str], count: int, task: Task) -> None:
+    """Raise unless there are as many categories as objects are to be new."""
+    if len(free) < count:
+        raise InvalidInputError(
+            f"{task.id}: {count} objects are to be new, and {len(free)} categories are neither in the task nor named "
+            "by it; choose a lower severity of distractors or objects"
+        )
 
 
 def _free_name(category: str, taken: Iterable[str]) -> str:

@@ -1,6 +1,7 @@
 """Perturbations: each kind does something, nothing at severity 0, and the same for the same seed in any batch."""
 
 import pickle
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from libero_env.perturbations.instructions import edit_distance, reword, split_c
 from libero_env.perturbations.kinds import Episode
 from libero_env.perturbations.pairing import moved
 from libero_env.sim.appearance import Appearance, CameraView, Light
-from libero_env.tasks import get_suite
+from libero_env.tasks import get_suite, get_task
 
 TASK = "libero_goal/3"
 SMALL = {"camera_size": (32, 32), "cameras": ("agentview",)}
@@ -344,6 +345,13 @@ def test_objects_that_places_tell_apart_move_together(world_of):
     env, _, _ = world_of("layout=0.5", task="libero_spatial/1", cameras=())
     steps = [env.view.body_pos(n) - base.view.body_pos(n) for n in env.scene.objects]
     assert np.allclose(steps, steps[0], atol=1e-9) and np.linalg.norm(steps[0]) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("kind", "amount"), [("distractors", 3.0), ("objects", 1.0)])
+def test_fewer_new_objects_than_asked_for_are_refused(kind, amount):
+    scene = SimpleNamespace(pack=SimpleNamespace(categories=lambda: ("yellow_book",)), goal_atoms=())
+    with pytest.raises(InvalidInputError, match="are to be new, and 1 categories are neither in the task"):
+        KINDS[kind].sample(amount, np.random.default_rng(0), get_task("libero_object/0"), scene)
 
 
 def test_other_objects_stand_where_those_were_that_the_task_is_not_about(world_of):
