@@ -59,7 +59,7 @@ class Recording(InputOptions):
         A file of the benchmark, in a folder of its suite's name, is recorded as the benchmark's task.
         """
         if (robot := facade_robot()) != DEFAULT_ROBOT:
-            raise LiberoError(f"{config_file()} names the robot {robot}; by hand only {DEFAULT_ROBOT} is recorded")
+            raise LiberoError(f"{config_file()} names the robot {robot}; by hand only libero is recorded")
         task, suite = read_task(bddl), bddl.absolute().parent.name
         tasks = get_suite(suite).tasks if suite in suite_names() else ()
         same = (t.id for t in tasks if t.name == task.name and same_meaning(t.problem, task.problem))
@@ -68,7 +68,8 @@ class Recording(InputOptions):
         out = self.directory / f"{task.problem.name.lower()}_{task.name}" / "demo.hdf5"
         out.parent.mkdir(parents=True, exist_ok=True)
         options = {one.name: getattr(self, one.name) for one in fields(InputOptions)} | which
-        return teleop(TeleopRequest(out=out, n=self.num_demonstration, size=(self.size, self.size), **options))
+        size = (self.size, self.size)
+        return teleop(TeleopRequest(out=out, n=self.num_demonstration, size=size, **options))
 
 
 @dataclass(frozen=True, kw_only=True)

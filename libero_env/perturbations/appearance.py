@@ -82,11 +82,12 @@ def _scaled(ambient: np.ndarray, diffuse: np.ndarray, specular: np.ndarray, fact
     return Light(ambient=colours[0], diffuse=colours[1], specular=colours[2])
 
 
+_TABLES = ("table_texture", "living_room_table", "desk", "short_coffee_table")
 # Names of the materials of surfaces: the builtin models', then the original's.
 _MATERIALS = {
     "floor": ("floor", "room_floorplane"),
     "wall": ("wall", "room_walls_mat"),
-    "table": ("table", "room_table_texture", "room_living_room_table", "room_desk", "room_short_coffee_table"),
+    "table": ("table", *(f"room_{name}" for name in _TABLES)),
 }
 _FURNITURE = ("furniture_colours", "room_living_room", "room_kitchen_background", "room_office_book_shelf")
 _SAME = 0.02  # RGB distance below which a style is the surface's own

@@ -94,7 +94,7 @@ class PerturbedEpisodes:
         self._starts = np.zeros((num, _NAME_BYTES), np.uint8)  # their names in UTF-8
         sampled = [k for k, one in enumerate(self.perturbations) if one.layer == "observation"]
         filters = (*self._fixed_of("observation"), *(self._sample(k, "") for k in sampled))
-        for k, one in enumerate(self.perturbations):  # without what it needs it is refused before anything runs
+        for k, one in enumerate(self.perturbations):  # refused before anything runs, without what it needs
             if one.layer in _NEEDS_SCENE:
                 self._sample(k, "")
         self.has_memory = any(one.has_memory for one in filters)

@@ -84,7 +84,8 @@ def regenerate(file: Path, config: Regeneration, task: Task | None = None) -> It
     Raises:
         DemoError: The file is broken or does not fit its task's scene.
     """
-    if not str(read_header(file).get("generator")).startswith("scripted-expert"):  # by hand, or the original's
+    # those recorded by hand, and the original's, end as they are
+    if not str(read_header(file).get("generator")).startswith("scripted-expert"):
         config = replace(config, extra_steps=0)
     rendering = RenderConfig(size=config.size, drawing=config.drawing)
     with closing(StateRenderer.of_file(file, rendering, config.pack(), task=task)) as renderer:

@@ -216,7 +216,9 @@ def test_the_facade_downloads_archives(server, tmp_path, monkeypatch, capsys):
         (tmp_path / name).unlink()
         (tmp_path / name).symlink_to(os.path.relpath(target, (tmp_path / name).parent))
     assert not download_utils.check_libero_dataset(tmp_path)
-    assert f"9 of 10 files, no {first}" in capsys.readouterr().out, "what was recorded here is not the original's"
+    assert f"9 of 10 files, no {first}" in capsys.readouterr().out, (
+        "what was recorded here is not the original's"
+    )
     download_utils.libero_dataset_download("libero_goal", tmp_path)
     assert (tmp_path / first).read_bytes() == b"demonstrations"
     assert recorded.read_text() == (tmp_path / second).read_text() == "other demonstrations"

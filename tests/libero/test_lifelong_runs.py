@@ -183,7 +183,9 @@ def test_missing_demonstrations_are_generated(folder, robot, tmp_path, monkeypat
     _, stored, _ = utils.torch_load_model(path / "task0_model.pth")
     assert len(stored.demonstrations) == 2
     (tmp_path / "config.yaml").unlink()  # a run is evaluated with the arm that it has learned with
-    with closing(metric._EvalEnv(stored, get_benchmark("libero_object")().tasks[0], 1, None, None, None)) as env:
+    with closing(
+        metric._EvalEnv(stored, get_benchmark("libero_object")().tasks[0], 1, None, None, None)
+    ) as env:
         assert env.config.robot == env.scene.robot == robot
 
 

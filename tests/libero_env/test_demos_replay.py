@@ -66,7 +66,9 @@ def test_actions_replay_to_the_same_states(path):
 def test_a_recording_longer_than_an_episode_is_replayed_to_its_end(path, tmp_path):
     writer, one = DemoWriter(tmp_path / "long.hdf5", read_header(path)), next(read_episodes(path))
     steps = np.zeros(EnvConfig.horizon + 2, int)
-    writer.write(0, replace(one.select(steps), actions=np.zeros((len(steps), 7)), obs={}, expert_actions=None))
+    writer.write(
+        0, replace(one.select(steps), actions=np.zeros((len(steps), 7)), obs={}, expert_actions=None)
+    )
     (result,) = replay(writer.finish())
     assert result.steps == len(steps) and not result.success
 

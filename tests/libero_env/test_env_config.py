@@ -75,7 +75,9 @@ def test_what_changes_colours_only_is_refused_where_pictures_have_none(perturb):
 
 @pytest.mark.parametrize("perturb", ["proprio_bias=1", "noise=1,proprio_bias=1@step3", [StateBias(0.1)]])
 def test_sensors_that_are_off_are_observed(perturb):
-    with pytest.raises(InvalidInputError, match="not in observations=rgb, joint_velocities; add proprioception"):
+    with pytest.raises(
+        InvalidInputError, match="not in observations=rgb, joint_velocities; add proprioception"
+    ):
         EnvConfig(perturb=perturb, observations=("rgb", "joint_velocities"))
     for names in ((), ("rgb", "proprioception"), ("rgb", "ee_quat")):
         assert EnvConfig(perturb=perturb, observations=names)

@@ -305,7 +305,8 @@ def test_a_start_whose_moved_objects_collide_is_refused(closing, perturb):
     env = closing(BatchEnv("libero_object/3", 1, cameras=(), perturb=perturb))
     shifts = dict(moved(env.base_task.problem, env.task.problem))
     (one, by), (other, away) = list(shifts.items())[:2]
-    start, (at, there) = env.init_states[:1].copy(), (1 + env.base_scene.pose_address(n) for n in (one, other))
+    at, there = (1 + env.base_scene.pose_address(name) for name in (one, other))
+    start = env.init_states[:1].copy()
     start[0, there : there + 2] = start[0, at : at + 2] + by - away  # where both come to the same place
     with pytest.raises(PlacementError, match="a moved object touches another"):
         env.reset(options={"start": start})
