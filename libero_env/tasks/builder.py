@@ -56,20 +56,16 @@ from typing import Any
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.paths import objects_dir
 from libero_env.storage import read_yaml
-from libero_env.tasks import bddl
 from libero_env.tasks.cameras import Camera
-from libero_env.tasks.problem import PLACING, And, Expression, Problem, ProblemError, Region
-from libero_env.tasks.schema import Source, Trace, read_definition, scene_file
+from libero_env.tasks.problem import PLACING, And, Atom, Expression, Problem, ProblemError, Region
+from libero_env.tasks.schema import KEYS, Source, Trace, check_definition, read_definition, scene_file
 from libero_env.tasks.task import FILE, Task, check_name
 from libero_env.text import shown, suggest
 from libero_env.validation import validate
 from libero_env.workspaces import BUILTIN_WORKSPACES, WORKSPACES, is_described
 
 EMPTY: Mapping[str, str] = {
-    "kitchen": "kitchen_table",
-    "living_room": "living_room_table",
-    "study": "study_table",
-    "coffee": "coffee_table",
+    **{room: f"{room}_table" for room in ("kitchen", "living_room", "study", "coffee")},
     "table": "table",
     "floor": "floor",
 }
@@ -77,7 +73,6 @@ _HALF_EXTENT = {"object": 0.025, "fixture": 0.01}  # [m] default, as in the orig
 _TABLE = "main_table"  # name of the fixture `table` in the original's task files
 # sites that tell the original's reader where an object ends
 _PLACEMENT_SITES = frozenset({"default_site", "bottom_site", "top_site", "horizontal_radius_site"})
-_NESTED = re.compile(r"\(\s*(and|or|not|forall|then|never|count)\b", re.IGNORECASE)
 # field of a problem, or section of a task file -> key
 _KEYS_OF = {"name": "problem", "domain": "problem", "views": "cameras"}
 
@@ -167,8 +162,6 @@ def check_keys(definition: Values, source: Source, *more: str) -> None:
     Raises:
         InvalidInputError: A key does not exist; the message has the nearest one.
     """
-    from libero_env.tasks.schema import KEYS
-
     for key in definition:
         if key not in (*KEYS, *more):
             raise InvalidInputError(
@@ -236,11 +229,11 @@ class _Content:
         fixtures: Name -> category.
         objects: Name -> category.
         regions: Target -> name -> keys of the region, or None for one that is removed.
-        init: Atoms such as `On a b`.
-        goal: Atoms, and expressions in brackets.
+        init: Initial conditions.
+        goal: Conditions that must all hold.
         styles: Kind -> style.
         cameras: Name -> keys of the camera.
-        zones: Regions from which the robot should keep away, in brackets.
+        zones: Regions from which the robot should keep away.
         texts: `name`, `language` and `problem`, where they are given.
         interest: Names of interest; None for those of the goal.
     """
@@ -248,8 +241,8 @@ class _Content:
     fixtures: dict[str, str] = field(default_factory=dict)
     objects: dict[str, str] = field(default_factory=dict)
     regions: dict[str, dict[str, Any]] = field(default_factory=dict)
-    init: list[str] = field(default_factory=list)
-    goal: list[str] = field(default_factory=list)
+    init: list[Atom] = field(default_factory=list)
+    goal: list[Expression] = field(default_factory=list)
     styles: dict[str, str] = field(default_factory=dict)
     cameras: dict[str, Any] = field(default_factory=dict)
     zones: list[str] = field(default_factory=list)
@@ -290,8 +283,6 @@ class _Merge:
             inherited: Parameter -> value, which takes precedence over the definition's.
             source: Where the definition stands.
         """
-        from libero_env.tasks.schema import check_definition
-
         parameters = validate(
             dict[str, Any],
             definition.get("with") or {},
@@ -316,22 +307,26 @@ class _Merge:
                 known[name] = None if region is None else _replaced(known.get(name) or {}, region)
                 self.trace.note(f"{target}_{name}", source, "regions", target, name)
         placed = self._place(keys.get("place", {}), content, source)
-        init = self._atoms(keys, "init", source) if "init" in keys else content.init
-        moved = {atom.split()[1] for atom in placed}
+        init = keys.get("init", content.init)
+        moved = {atom.args[0] for atom in placed}
         content.init = [
-            *self._atoms(keys, "init_also", source),
+            *keys.get("init_also", ()),
             *placed,
             *(atom for atom in init if _placed_by(atom) not in moved),
         ]
         if keys.get("goal"):
-            content.goal, content.interest = self._atoms(keys, "goal", source), None
+            content.goal, content.interest = keys["goal"], None
+        for key in ("init", "init_also", "goal"):
+            for i, expression in enumerate(keys.get(key, ())):
+                for atom in expression.atoms():
+                    self.trace.note(str(atom), source, key, i)
         content.interest = keys.get("obj_of_interest", content.interest)
         for name, view in keys.get("cameras", {}).items():
             content.cameras[name] = view
             self.trace.note(f"camera {name}", source, "cameras", name)
         for i, name in enumerate(keys.get("zones", ())):
-            content.zones.append(f"({name})")
-            self.trace.note(content.zones[-1], source, "zones", i)
+            content.zones.append(name)
+            self.trace.note(name, source, "zones", i)
         content.styles |= keys.get("scene_properties", {})
         content.texts |= {key: keys[key] for key in ("name", "language", "problem") if key in keys}
         if self._check_models:
@@ -393,7 +388,7 @@ class _Merge:
                     named[name] = category
         return named
 
-    def _place(self, places: Values, content: _Content, source: Source) -> list[str]:
+    def _place(self, places: Values, content: _Content, source: Source) -> list[Atom]:
         """Add the regions of the key `place`, and return its init atoms."""
         workspace = content.workspace(source)[0]
         entities = {**content.fixtures, **content.objects}
@@ -403,24 +398,15 @@ class _Merge:
             if entity not in entities or entity == workspace:
                 what = f"object or fixture to place of {source.at('place', key)}"
                 raise UnknownNameError(what, entity, set(entities) - {workspace})
-            if isinstance(place, str):
-                predicate, _, support = place.strip("() ").rpartition(" ")
-                atoms.append(f"{predicate or 'On'} {entity} {support}")
+            if isinstance(place, tuple):
+                predicate, support = place
+                atoms.append(Atom(predicate, (entity, support)))
             else:
                 kind = "fixture" if entity in content.fixtures else "object"
                 content.regions.setdefault(workspace, {})[f"{entity}_start"] = _rectangle(place, kind)
-                atoms.append(f"On {entity} {workspace}_{entity}_start")
+                atoms.append(Atom("On", (entity, f"{workspace}_{entity}_start")))
                 self.trace.note(f"{workspace}_{entity}_start", source, "place", key)
-            self.trace.note(atoms[-1], source, "place", key)
-        return atoms
-
-    def _atoms(self, keys: Values, key: str, source: Source) -> list[str]:
-        """Return atoms such as `On a b` without brackets, and expressions with them."""
-        atoms = []
-        for i, text in enumerate(keys.get(key, ())):
-            text = text if text.startswith("(") else f"({text})"
-            atoms.append(text if text.count("(") > 1 or _NESTED.match(text) else text[1:-1].strip())
-            self.trace.note(atoms[-1], source, key, i)
+            self.trace.note(str(atoms[-1]), source, "place", key)
         return atoms
 
     def _declare_sites(self, content: _Content) -> None:
@@ -431,17 +417,16 @@ class _Merge:
         """
         entities = {**content.fixtures, **content.objects}
         declared = {f"{target}_{name}" for target, names in content.regions.items() for name in names}
-        for atom in (*content.init, *content.goal, *content.zones):
-            words = re.findall(r"[^\s()]+", atom)
-            for name in words if atom.startswith("(") else words[1:]:
-                target = max((t for t in entities if name.startswith(f"{t}_")), key=len, default=None)
-                if name in entities or name in declared or target is None or entities[target] in WORKSPACES:
-                    continue
-                site = name.removeprefix(f"{target}_")
-                if site not in (valid := model_regions(entities[target])):
-                    what = f"region of {target} ({self.trace.at(atom)}: {atom})"
-                    raise UnknownNameError(what, site, valid or ("none",))
-                content.regions.setdefault(target, {})[site] = {}
+        named = [(name, str(a)) for e in (*content.init, *content.goal) for a in e.atoms() for name in a.args]
+        for name, where in (*named, *((zone, zone) for zone in content.zones)):
+            target = max((t for t in entities if name.startswith(f"{t}_")), key=len, default=None)
+            if name in entities or name in declared or target is None or entities[target] in WORKSPACES:
+                continue
+            site = name.removeprefix(f"{target}_")
+            if site not in (valid := model_regions(entities[target])):
+                what = f"region of {target} ({self.trace.at(where)}: {where})"
+                raise UnknownNameError(what, site, valid or ("none",))
+            content.regions.setdefault(target, {})[site] = {}
 
 
 def _problem(content: _Content, language: str, trace: Trace) -> Problem:
@@ -471,13 +456,9 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
         if keys is not None
     )
     cameras = tuple(_camera(name, keys, trace) for name, keys in content.cameras.items())
-    parts: tuple[Expression, ...] = ()
+    first, *others = content.goal
     try:
-        init = tuple(bddl.parse_atom(atom, *trace.of(atom)) for atom in content.init)
-        for text in content.goal:
-            parse = bddl.parse_expression if text.startswith("(") else bddl.parse_atom
-            parts += (parse(text, *trace.of(text)),)
-        goal = parts[0] if len(parts) == 1 and content.goal[0].startswith("(") else And(parts)
+        goal = And(tuple(content.goal)) if others or isinstance(first, Atom) else first
         interest = content.interest
         if interest is None:
             interest = entities_in_goal(goal, regions, objects, content.fixtures)
@@ -487,32 +468,30 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
             fixtures=content.fixtures,
             objects=objects,
             regions=regions,
-            init=init,
+            init=tuple(content.init),
             obj_of_interest=tuple(interest),
             scene_properties=content.styles,
             goal=goal,
             cameras=cameras,
-            zones=tuple(zone.strip("()") for zone in content.zones),
+            zones=tuple(content.zones),
         )
     except ProblemError as error:
-        first = error.violations[0]
-        label: object = first.part
+        wrong = error.violations[0]
+        label = wrong.part
         if isinstance(label, int):
-            atoms = content.init if first.section == ":init" else [str(a)[1:-1] for a in goal.atoms()]
-            label = atoms[label] if label < len(atoms) else None
-        key = first.section.removeprefix(":")
+            label = str((content.init if wrong.section == ":init" else goal.atoms())[label])
+        key = wrong.section.removeprefix(":")
         where = trace.at(str(label), _KEYS_OF.get(key, key))
-        raise InvalidInputError(f"{where}: {first.what}; expected {first.expected}") from None
+        raise InvalidInputError(f"{where}: {wrong.what}; expected {wrong.expected}") from None
     except InvalidInputError as error:
         key = str(error.path[0]) if error.path else "goal"
         where = source.at(_KEYS_OF.get(key, key))
         raise InvalidInputError(f"{where}: {str(error).removeprefix('Problem: ')}") from None
 
 
-def _placed_by(atom: str) -> str | None:
+def _placed_by(atom: Atom) -> str | None:
     """Return the object or fixture that an init atom gives its place; None where it places nothing."""
-    words = atom.split()
-    return words[1] if len(words) == 3 and words[0].capitalize() in PLACING else None
+    return atom.args[0] if len(atom.args) == 2 and atom.predicate in PLACING else None
 
 
 def _rectangle(place: Values, kind: str) -> dict[str, Any]:

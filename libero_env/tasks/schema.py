@@ -1,11 +1,12 @@
 """A task's YAML file: where a definition stands, its keys and what they may hold, as `validation` checks it.
 
-Values are checked after parameters are filled in. What comes back is in one form: atoms are texts such as `On a b`,
+Values are checked after parameters are filled in. What comes back is in one form: goals and init atoms are expressions,
 numbers are numbers (`pi/2` is 1.57), a single object is a list of one.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from math import pi
 from pathlib import Path
 from typing import Annotated, Any, Required
@@ -15,8 +16,9 @@ from typing_extensions import TypedDict
 
 from libero_env.errors import BDDLError, InvalidInputError, LiberoError
 from libero_env.storage import read_yaml_file
-from libero_env.tasks.problem import MAX_ENTITIES, MAX_PARTS
-from libero_env.tasks.sexpr import number, parse_tree
+from libero_env.tasks.bddl import parse_atom, parse_expression
+from libero_env.tasks.problem import MAX_ENTITIES, MAX_PARTS, Expression
+from libero_env.tasks.sexpr import number
 from libero_env.tasks.task import MAX_NAME_BYTES, check_name
 from libero_env.tasks.values import Language, Name, Words, check_corners, check_order
 from libero_env.validation import Key, LineOf, validate
@@ -42,13 +44,9 @@ class Source:
     files: tuple[Path, ...] = ()
     line_of: LineOf | None = None
 
-    def line(self, *path: Key) -> int:
-        """Return the line of a path of keys, from 1."""
-        return (self.line_of(path) if self.line_of else None) or 1
-
     def at(self, *path: Key) -> str:
         """Return `file:line` of a path of keys; the name where there are no lines."""
-        return f"{self.name}:{self.line(*path)}" if self.line_of else self.name
+        return f"{self.name}:{self.line_of(path) or 1}" if self.line_of else self.name
 
     def shared_with(self, own: Sequence[Key], index: int) -> LineOf | None:
         """Return the lines of one of the tasks of the file: its own keys are below `tasks`, the others are shared."""
@@ -114,11 +112,6 @@ class Trace:
         """Note where something stands; the first note about it counts."""
         self._notes.setdefault(label, (source, path))
 
-    def of(self, label: str, *otherwise: Key) -> tuple[str, int]:
-        """Return the file and line of what was noted, or of a key of the task."""
-        source, path = self._notes.get(label, (self.source, otherwise))
-        return source.name, source.line(*path)
-
     def at(self, label: str, *otherwise: Key) -> str:
         """Return `file:line` of what was noted, or of a key of the task."""
         source, path = self._notes.get(label, (self.source, otherwise))
@@ -172,15 +165,11 @@ def _words(atom: Any) -> Any:
     return atom
 
 
-def _atom(text: str) -> str:
-    text = text.strip()
+def _parsed(parse: Callable[[str, str], Expression], text: str) -> Expression:
     try:
-        tree = parse_tree(text if text.startswith("(") else f"({text})", "")
+        return parse(text, "")
     except BDDLError as error:
-        raise ValueError(f"{text!r:.60} is not an atom or expression: {error.what}") from None
-    if not tree.items:
-        raise ValueError("it is empty; expected an atom such as On plate_1 stove_1")
-    return text
+        raise ValueError(f"{text!r:.60} is not an atom or expression: {error}") from None
 
 
 def _goal(goal: Any) -> Any:
@@ -206,7 +195,8 @@ _Point = Annotated[list[_Metres], _THREE]
 _Half = Annotated[float, Field(ge=0, le=10), BeforeValidator(_number)]
 _Radians = Annotated[float, AfterValidator(_few_turns), BeforeValidator(_number)]
 _Row = Annotated[list[_Metres], _FOUR, AfterValidator(check_corners)]
-_Atom = Annotated[str, AfterValidator(_atom), BeforeValidator(_words)]
+_Atom = Annotated[str, AfterValidator(partial(_parsed, parse_atom)), BeforeValidator(_words)]
+_Part = Annotated[str, AfterValidator(partial(_parsed, parse_expression)), BeforeValidator(_words)]
 _Atoms = Annotated[list[_Atom], Field(max_length=MAX_PARTS), BeforeValidator(_listed)]
 _Category = Annotated[
     Annotated[Name, Tag("text")]
@@ -228,13 +218,14 @@ class Rectangle(TypedDict, total=False):
     rgba: Annotated[list[_Number], _FOUR]
 
 
-def _support(text: str) -> str:
-    *predicate, _ = text.strip("() ").split() or [""]
-    if [word.capitalize() for word in predicate] not in ([], ["On"], ["In"]):
+def _support(text: str) -> tuple[str, str]:
+    """Return predicate and support of a place such as `plate_1` or `In basket_1_contain_region`."""
+    *predicate, support = text.strip("() ").split() or [""]
+    if [word.capitalize() for word in predicate] not in ([], ["On"], ["In"]) or {*support} & {*"()"}:
         raise ValueError(
             f"{text!r:.60} is not a place; expected such as plate_1, or In basket_1_contain_region"
         )
-    return text
+    return (predicate or ["On"])[0].capitalize(), support
 
 
 def _placed(place: Any) -> Any:
@@ -244,7 +235,7 @@ def _placed(place: Any) -> Any:
 
 
 _Place = Annotated[
-    Annotated[_Atom, AfterValidator(_support), Tag("text")]
+    Annotated[str, AfterValidator(_support), Tag("text")]
     | Annotated[Rectangle, AfterValidator(_placed), Tag("fields")],
     Discriminator(
         _form,
@@ -271,7 +262,7 @@ class Definition(TypedDict, total=False):
     furniture: _Categories
     objects: _Categories
     place: Annotated[dict[Name, _Place], Field(max_length=MAX_ENTITIES)]
-    goal: Annotated[list[_Atom], Field(max_length=MAX_PARTS), BeforeValidator(_goal)]
+    goal: Annotated[list[_Part], Field(max_length=MAX_PARTS), BeforeValidator(_goal)]
     name: Annotated[str, AfterValidator(_task_name)]
     problem: Name
     language: Annotated[Language, BeforeValidator(_instruction)]
