@@ -47,23 +47,21 @@ NoiseKind = Literal["motion", "gaussian", "zoom", "fog", "glass"]
 NOISES: tuple[NoiseKind, ...] = get_args(NoiseKind)  # in the order of their numbers, ten severities each
 SEVERITIES, POSES = 10, 500
 _Scenery = Literal["light", "table", "table_and_wall", "added", "moved", "goal_moved"]
-_SCENERY_KINDS: dict[_Scenery, Kind] = {
-    "light": "light",
-    "table": "background",
-    "table_and_wall": "background",
-    "added": "layout",
-    "moved": "layout",
-    "goal_moved": "layout",
+# What the task file changes -> ending of the id, and kind.
+_SCENERIES: dict[_Scenery, tuple[str, Kind]] = {
+    "light": (r"_light_\d{1,4}", "light"),
+    "table": (r"_table_\d{1,4}", "background"),
+    "table_and_wall": (r"_tb_\d{1,4}", "background"),
+    "added": (r"_add_\d{1,4}", "layout"),
+    "goal_moved": (r"_moved_level\d{1,4}_sample\d{1,4}", "layout"),
+    "moved": (r"_level\d{1,4}_sample\d{1,4}", "layout"),
 }
-_NUMBERED: dict[str, _Scenery] = {"light": "light", "table": "table", "tb": "table_and_wall", "add": "added"}
 _VIEW = re.compile(
-    r"(?:_language_(?P<language>\d{1,4}))?"
+    r"(?P<base>.+?)(?:_language_(?P<language>\d{1,4}))?"
     r"_view_(?P<view>-?\d{1,4}_-?\d{1,4}_\d{1,4}_-?\d{1,4}_-?\d{1,4})"
     r"_initstate_(?P<pose>\d{1,4})(?:_noise_(?P<noise>\d{1,4}))?",
     re.ASCII,
 )
-_SCENE = re.compile(r"_(?P<what>light|table|tb|add)_\d{1,4}", re.ASCII)
-_PLACES = re.compile(r"_(?P<goal>moved_)?level\d{1,4}_sample\d{1,4}", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -127,7 +125,7 @@ class PlusVariant:
     def kind(self) -> Kind:
         """Dimension of LIBERO-Plus that the variant belongs to; of several, the one that is counted there."""
         if self.scenery is not None:
-            return _SCENERY_KINDS[self.scenery]
+            return _SCENERIES[self.scenery][1]
         if self.noise is not None:
             return "noise"
         if self.language is not None:
@@ -154,26 +152,23 @@ def parse_plus_id(name: str) -> PlusVariant:
     Raises:
         InvalidInputError: It has none of the endings, or a number that their code cannot run.
     """
-    for pattern in (_VIEW, _SCENE, _PLACES):
-        for match in pattern.finditer(name):
-            if match.end() == len(name) and match.start():
-                return _variant(name, match)
+    if match := _VIEW.fullmatch(name):
+        return _seen_otherwise(name, **match.groupdict())
+    for scenery, (ending, _) in _SCENERIES.items():
+        if match := re.fullmatch(f"(.+?){ending}", name, re.ASCII):
+            return PlusVariant(name, match[1], file=name, scenery=scenery)
     raise InvalidInputError(
         f"{name!r:.120} is not an id of LIBERO-Plus; expected a task's name and _view_0_0_100_0_0_initstate_0, "
         "_light_1, _table_1, _tb_1, _add_1, _level1_sample1 or _moved_level1_sample1 with other numbers"
     )
 
 
-def _variant(name: str, match: re.Match[str]) -> PlusVariant:
-    """Return the variant of an id whose ending matches one of the patterns."""
-    base, parts = name[: match.start()], match.groupdict()
-    if "what" in parts:
-        return PlusVariant(name, base, file=name, scenery=_NUMBERED[parts["what"]])
-    if "goal" in parts:
-        return PlusVariant(name, base, file=name, scenery="goal_moved" if parts["goal"] else "moved")
-    azimuth, elevation, percent, turn, tilt = map(int, parts["view"].split("_"))
-    language, pose = parts["language"], int(parts["pose"])
-    if not 0 <= pose <= POSES:
+def _seen_otherwise(
+    name: str, base: str, language: str | None, view: str, pose: str, noise: str | None
+) -> PlusVariant:
+    """Return the variant of an id that matches `_VIEW`."""
+    azimuth, elevation, percent, turn, tilt = map(int, view.split("_"))
+    if int(pose) > POSES:
         raise InvalidInputError(
             f"{name!r:.120}: pose {pose}; LIBERO-Plus has 1 to {POSES}, and 0 for LIBERO's"
         )
@@ -182,8 +177,8 @@ def _variant(name: str, match: re.Match[str]) -> PlusVariant:
         base,
         file=base if language is None else f"{base}_language_{language}",
         view=ViewChange(azimuth, elevation, percent / 100, turn, tilt),
-        pose=pose,
-        noise=_noise(name, int(parts["noise"] or 0)),
+        pose=int(pose),
+        noise=_noise(name, int(noise or 0)),
         language=None if language is None else int(language),
     )
 
