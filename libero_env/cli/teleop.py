@@ -64,7 +64,7 @@ def teleop(request: TeleopRequest) -> int:
     """
     from libero_env.tasks import get_task, read_task
     from libero_env.teleop.screens import MouseReader, open_screen
-    from libero_env.teleop.session import HELP, Keyboard, SpaceMouse, Teleop, record_session
+    from libero_env.teleop.session import HELP, Keyboard, Teleop, record_session
 
     if request.task is not None and request.bddl is None:
         task = get_task(request.task)
@@ -78,12 +78,10 @@ def teleop(request: TeleopRequest) -> int:
         raise InvalidInputError("--vendor-id and --product-id name a 3D mouse; add --device spacemouse")
     out = request.out or Path(f"{task.name}_demo.hdf5")
     sensitivity = request.pos_sensitivity, request.rot_sensitivity
-    device, reader = Keyboard(*sensitivity), None
-    if request.device == "spacemouse":
-        device = mouse = SpaceMouse(*sensitivity)
-        reader = MouseReader(mouse, **mouse_ids)
+    with_mouse = request.device == "spacemouse"
+    device = MouseReader(*sensitivity, **mouse_ids) if with_mouse else Keyboard(*sensitivity)
     print(f"{task.language}\n{HELP}")
-    screen = open_screen(request.screen, device, request.camera, reader)
+    screen = open_screen(request.screen, device, request.camera)
     try:
         session = Teleop(task, device, screen, seed=request.seed)
         try:

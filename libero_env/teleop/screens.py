@@ -37,16 +37,13 @@ _MAX_GEOMS = 2000  # geoms that the window can show
 _STEPS_PER_IMAGE = 4  # [control steps] between two images in a terminal
 
 
-def open_screen(
-    kind: str, keyboard: Keyboard, camera: str = "agentview", reader: "MouseReader | None" = None
-) -> Screen:
+def open_screen(kind: str, keyboard: Keyboard, camera: str = "agentview") -> Screen:
     """Open a window, or use the terminal if no window can be opened.
 
     Args:
         kind: `window`, `terminal`, or `auto` for the first of them that works.
         keyboard: Device that receives the keys.
         camera: Camera whose image is shown.
-        reader: Reader of a 3D mouse that is used beside the keys.
 
     Raises:
         RenderError: No screen of this kind works here; the message states why.
@@ -55,17 +52,17 @@ def open_screen(
     for name, screen in (("window", Window), ("terminal", Terminal)):
         if kind in ("auto", name):
             try:
-                return screen(keyboard, camera, reader)
+                return screen(keyboard, camera)
             except RenderError as error:
                 problems.append(str(error))
     raise RenderError("; ".join(problems) or f"screen {kind!r}; valid: {', '.join(SCREENS)}")
 
 
-class MouseReader:
-    """Reads a 3D mouse through the package hidapi.
+class MouseReader(SpaceMouse):
+    """A 3D mouse that is read through the package hidapi.
 
     Args:
-        mouse: Device that receives the reports.
+        sensitivity: Factors on translations and rotations, as of `SpaceMouse`.
         vendor_id: USB vendor of the mouse.
         product_id: USB product of the mouse.
 
@@ -73,8 +70,8 @@ class MouseReader:
         LiberoError: hidapi is not installed, or the mouse cannot be opened.
     """
 
-    def __init__(self, mouse: SpaceMouse, vendor_id: int = 9583, product_id: int = 50741):
-        self.mouse = mouse
+    def __init__(self, *sensitivity: float, vendor_id: int = 9583, product_id: int = 50741):
+        super().__init__(*sensitivity)
         try:
             hid: Any = importlib.import_module("hid")
         except ImportError as error:
@@ -90,21 +87,17 @@ class MouseReader:
         self.device.set_nonblocking(True)
 
     def poll(self) -> None:
-        """Pass all pending reports to the mouse."""
+        """Handle all pending reports."""
         while data := self.device.read(13):
-            self.mouse.report(bytes(data))
+            self.report(bytes(data))
 
 
 class _Timed(Screen):
-    """What screens share: the devices, and a control step that lasts as long as on the robot."""
+    """What screens share: the keys, and a control step that lasts as long as on the robot."""
 
-    def __init__(self, keyboard: Keyboard, camera: str, reader: MouseReader | None):
-        self.keyboard, self.camera, self.reader = keyboard, camera, reader
+    def __init__(self, keyboard: Keyboard, camera: str):
+        self.keyboard, self.camera = keyboard, camera
         self._next = time.monotonic()
-
-    def poll(self, env: BatchEnv) -> None:
-        if self.reader is not None:
-            self.reader.poll()
 
     def _wait(self) -> None:
         self._next = max(self._next + 1.0 / CONTROL_HZ, time.monotonic())
@@ -117,14 +110,13 @@ class Window(_Timed):
     Args:
         keyboard: Device that receives the keys.
         camera: Camera whose image is shown.
-        reader: Reader of a 3D mouse that is used beside the keys.
         size: Width and height of the window, pixels.
 
     Raises:
         RenderError: No window can be opened here.
     """
 
-    def __init__(self, keyboard: Keyboard, camera: str, reader: MouseReader | None = None, size: int = 640):
+    def __init__(self, keyboard: Keyboard, camera: str, size: int = 640):
         require_display()
         try:
             self.glfw: Any = importlib.import_module("glfw")
@@ -136,14 +128,13 @@ class Window(_Timed):
         if not self.window:
             self.glfw.terminate()
             raise RenderError("no window: GLFW cannot open a window with OpenGL")
-        super().__init__(keyboard, camera, reader)
+        super().__init__(keyboard, camera)
         self.glfw.set_key_callback(self.window, self._on_key)
         self.context: mujoco.MjrContext | None = None
 
     def poll(self, env: BatchEnv) -> None:
         """See `Screen`."""
         self.glfw.poll_events()
-        super().poll(env)
         if self.glfw.window_should_close(self.window):
             self.keyboard.press(QUIT)
 
@@ -208,13 +199,12 @@ class Terminal(_Timed):
     Args:
         keyboard: Device that receives the keys.
         camera: Camera whose image is shown.
-        reader: Reader of a 3D mouse that is used beside the keys.
 
     Raises:
         RenderError: Standard input is not a terminal.
     """
 
-    def __init__(self, keyboard: Keyboard, camera: str, reader: MouseReader | None = None):
+    def __init__(self, keyboard: Keyboard, camera: str):
         if not sys.stdin.isatty():
             raise RenderError("no terminal: standard input is not one")
         try:
@@ -224,14 +214,13 @@ class Terminal(_Timed):
             raise RenderError(f"no terminal: {error}") from error
         self.settings = self.termios.tcgetattr(sys.stdin)
         tty.setcbreak(sys.stdin)
-        super().__init__(keyboard, camera, reader)
+        super().__init__(keyboard, camera)
         print(f"\x1b[2J{HELP}")
 
     def poll(self, env: BatchEnv) -> None:
         """See `Screen`."""
         while select.select([sys.stdin], [], [], 0.0)[0]:
             press_typed(self.keyboard, os.read(sys.stdin.fileno(), 64).decode(errors="ignore"))
-        super().poll(env)
 
     def show(self, env: BatchEnv, status: Status) -> None:
         """See `Screen`; every fourth state is shown."""

@@ -89,6 +89,9 @@ class Keyboard:
         if self.steps.get(key.lower()) == math.inf:
             self.steps[key.lower()] = 1
 
+    def poll(self) -> None:
+        """Read what the device has to report; keys come from the screen."""
+
     def action(self) -> np.ndarray:
         """Return the action for the next control step, (7,)."""
         motion = np.zeros(6)
@@ -179,7 +182,7 @@ class Screen(Protocol):
     """What the user looks at and types into."""
 
     def poll(self, env: BatchEnv) -> None:
-        """Pass the user's input to the device; called once per control step."""
+        """Pass the keys that the user has pressed to the device; called once per control step."""
         ...
 
     def show(self, env: BatchEnv, status: Status) -> None:
@@ -239,6 +242,7 @@ class Teleop:
         fixtures = env.simulations.fixtures[0].copy()
         while held < self.hold_steps:
             self.screen.poll(env)
+            self.device.poll()
             if self.device.command is not None:
                 return None
             action = self.device.action()

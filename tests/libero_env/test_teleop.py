@@ -133,7 +133,7 @@ def test_without_a_screen(monkeypatch):
         open_screen("television", Keyboard())
     monkeypatch.setitem(teleop_screens.sys.modules, "hid", None)
     with pytest.raises(LiberoError, match="pip install hidapi"):
-        MouseReader(SpaceMouse())
+        MouseReader()
 
 
 class User:
