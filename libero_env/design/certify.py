@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from statistics import median
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,6 +27,9 @@ from libero_env.sim.scene import build_scene
 from libero_env.storage import read_json, write_json
 from libero_env.tasks import Task
 from libero_env.tasks.builder import FILE
+from libero_env.validation import validate
+
+C = TypeVar("C")
 
 BATCH = 16  # initial states simulated together
 _COLOURS = ("#f4f6ec", "#8fcfc3", "#2379ab", "#14265e")  # from few steps to many; distinct in greyscale too
@@ -131,7 +135,7 @@ def certify(
     ending = "-disturbed" if disturb else ""
     paths = [out / "tasks" / task.suite / f"{task.name}{ending}.json" if out else None for task in tasks]
     if not again:
-        found = [_stored(path, empty) if path else empty for path, empty in zip(paths, found, strict=True)]
+        found = [_stored(path, empty) for path, empty in zip(paths, found, strict=True)]
     counts = [min(states, task.num_starts) for task in tasks]
     chunks = [(k, chunk) for k, known in enumerate(found) for chunk in _missing(known, counts[k])]
     total, left = sum(counts), sum(len(chunk) for _, chunk in chunks)
@@ -297,16 +301,24 @@ def _digest(task: Task, pack: Pack, disturb: bool) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
 
 
-def _stored(path: Path, empty: Certificate) -> Certificate:
-    """Return the certificate on disk if it is of the same scene and expert."""
+def _stored(path: Path | None, empty: Certificate) -> Certificate:
+    known = path and read_certificate(Certificate, path, empty.digest)
+    return replace(empty, outcomes=known.outcomes) if known else empty
+
+
+def read_certificate(kind: type[C], path: Path, digest: str) -> C | None:
+    """Return the certificate on disk if it is of the same scene and expert.
+
+    Raises:
+        LiberoError: The file is not a certificate.
+    """
     if not path.is_file():
-        return empty
+        return None
     try:
-        found = read_json(path)
-        outcomes = tuple(Outcome(**row) for row in found["outcomes"])
-    except (ValueError, KeyError, TypeError) as error:
+        found = validate(kind, read_json(path))
+    except LiberoError as error:
         raise LiberoError(f"{path} is not a certificate ({error}); remove it, or run with --again") from error
-    return replace(empty, outcomes=outcomes) if found.get("digest") == empty.digest else empty
+    return found if found.digest == digest else None
 
 
 def _label(certificate: Certificate) -> str:

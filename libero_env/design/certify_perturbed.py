@@ -14,7 +14,7 @@ import numpy as np
 
 from libero_env.assets.pack import select_pack
 from libero_env.demos.config import GENERATOR
-from libero_env.design.certify import NO_HORIZON, scene_digest
+from libero_env.design.certify import NO_HORIZON, read_certificate, scene_digest
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, LiberoError, PlacementError
 from libero_env.expert import Expert, Shapes
@@ -23,7 +23,7 @@ from libero_env.mujoco_compat import mujoco
 from libero_env.parallel import progress_bar, run_each
 from libero_env.perturbations.kinds import trying
 from libero_env.perturbations.perturbation import Perturbation
-from libero_env.storage import read_json, write_json
+from libero_env.storage import write_json
 from libero_env.tasks import Task
 
 _FORMAT = 2  # of the files; those of another are made again
@@ -99,8 +99,9 @@ def certify_perturbed(
     units = [(task, one) for task in tasks for one in perturbations]
     found: dict[int, PerturbedCertificate] = {}
     counts = [min(starts, task.num_starts) for task, _ in units]
-    for k, (task, one) in enumerate(units):
-        if not again and (stored := _stored(_path(out, task, one), _digest(task, one, counts[k], redraws))):
+    for k, (task, one) in enumerate(() if again else units):
+        digest = _digest(task, one, counts[k], redraws)
+        if stored := read_certificate(PerturbedCertificate, _path(out, task, one), digest):
             found[k] = stored
     left = [k for k in range(len(units)) if k not in found]
     with progress_bar(total=len(units), initial=len(found), desc="certify", unit="variant") as bar:
@@ -201,14 +202,3 @@ def _digest(task: Task, one: Perturbation, starts: int, redraws: int) -> str:
     what = (_FORMAT, task.bddl_text, scene_digest(task, pack), pack.name, str(one), one.definition.at_one)
     parts = (*what, starts, redraws, GENERATOR, mujoco.__version__)
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:16]
-
-
-def _stored(path: Path, digest: str) -> PerturbedCertificate | None:
-    """Return the certificate on disk if it is of the same task, perturbation and expert."""
-    if not path.is_file():
-        return None
-    try:
-        found = PerturbedCertificate(**read_json(path))
-    except (ValueError, TypeError) as error:
-        raise LiberoError(f"{path} is not a certificate ({error}); remove it, or run with --again") from error
-    return found if found.digest == digest else None
