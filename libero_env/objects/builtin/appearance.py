@@ -134,22 +134,12 @@ def _loft(
     return loft(rings, segments, center)
 
 
+_SOLIDS = (solids.arch, solids.bar, solids.block, solids.capsule, solids.prism, solids.turned)
+_MESHES = (mesh.bottle, mesh.box, mesh.packet, mesh.quad, mesh.sweep, mesh.tin, mesh.vessel)
 SHAPES: dict[str, Callable[..., Mesh]] = {
-    "arch": solids.arch,
-    "bar": solids.bar,
-    "block": solids.block,
-    "bottle": mesh.bottle,
-    "box": mesh.box,
-    "capsule": solids.capsule,
     "loft": _loft,
-    "packet": mesh.packet,
-    "prism": solids.prism,
-    "quad": mesh.quad,
-    "sweep": mesh.sweep,
-    "tin": mesh.tin,
     "triangles": lambda *arrays: Mesh(*map(np.array, arrays)),
-    "turned": solids.turned,
-    "vessel": mesh.vessel,
+    **{shape.__name__: shape for shape in (*_SOLIDS, *_MESHES)},
 }
 
 
