@@ -25,11 +25,11 @@ class Voxels:
         self._shape = np.ceil(2 * _HALF_SIZE / _CELL).astype(int)
         self._occupied = np.zeros(self._shape, bool)
         cells, inside = self._cells(points)
-        self._occupied[tuple(cells[inside].T)] = True
+        self._cells_inside, self._heights_inside = cells[inside], points[inside, 2]
+        self._occupied[tuple(self._cells_inside.T)] = True
         self._coarse = np.zeros(self._shape // 2 + 1, bool)
-        self._coarse[tuple(cells[inside].T // 2)] = True
-        self._tops: dict[float, np.ndarray] = {}  # height limit -> highest points below it, for each column
-        self._undersides: dict[float, np.ndarray] = {}  # height limit -> lowest points above it
+        self._coarse[tuple(self._cells_inside.T // 2)] = True
+        self._columns: dict[tuple[np.ufunc, float], np.ndarray] = {}  # results of `_extremes`
 
     def count_occupied(self, points: np.ndarray) -> np.ndarray:
         """Return how many of the points (..., N, 3) are in occupied cells, (...)."""
@@ -59,7 +59,7 @@ class Voxels:
             xy: Spots, (S, 2).
             below: Height above which nothing supports the body, [m].
         """
-        heights = self._top_heights(below)
+        heights = self._extremes(np.maximum, below)
         where = xy[:, None] + profile[None, :, :2]  # (S, N, 2)
         cells = np.clip(((where - self._low[:2]) / _CELL).astype(int), 0, self._shape[:2] - 1)
         return (heights[cells[..., 0], cells[..., 1]] - profile[:, 2]).max(axis=1)
@@ -72,31 +72,26 @@ class Voxels:
             origins: Positions of the body's origin, (S, 3).
             above: Height from which on something counts as an overhang, [m].
         """
-        if above not in self._undersides:
-            cells, inside = self._cells(self.points)
-            keep = inside & (self.points[:, 2] >= above)
-            heights = np.full(self._shape[:2], np.inf)
-            np.minimum.at(heights, (cells[keep, 0], cells[keep, 1]), self.points[keep, 2])
-            heights[heights < above + _WALL_HEIGHT] = np.inf  # a wall that stands there
-            self._undersides[above] = heights
         where = origins[:, None] + profile
         cells = np.clip(((where[..., :2] - self._low[:2]) / _CELL).astype(int), 0, self._shape[:2] - 1)
-        return (self._undersides[above][cells[..., 0], cells[..., 1]] < where[..., 2]).mean(axis=1)
+        lowest = self._extremes(np.minimum, above)[cells[..., 0], cells[..., 1]]
+        hangs = lowest >= above + _WALL_HEIGHT  # else a wall stands there
+        return (hangs & (lowest < where[..., 2])).mean(axis=1)
 
     def is_covered(self, points: np.ndarray) -> np.ndarray:
         """Return which of the points (..., 3) have something above them, (...) bool."""
         cells = np.clip(np.floor((points - self._low) / _CELL).astype(int), 0, self._shape - 1)
-        return self._top_heights(np.inf)[cells[..., 0], cells[..., 1]] > points[..., 2] + 2 * _CELL
+        return self._extremes(np.maximum, np.inf)[cells[..., 0], cells[..., 1]] > points[..., 2] + 2 * _CELL
 
-    def _top_heights(self, below: float) -> np.ndarray:
-        """Return the height of the highest point below a limit in each column, (X, Y)."""
-        if below not in self._tops:
-            cells, inside = self._cells(self.points)
-            keep = inside & (self.points[:, 2] < below)
-            heights = np.full(self._shape[:2], self.surface_height)
-            np.maximum.at(heights, (cells[keep, 0], cells[keep, 1]), self.points[keep, 2])
-            self._tops[below] = heights
-        return self._tops[below]
+    def _extremes(self, extreme: np.ufunc, limit: float) -> np.ndarray:
+        """Return the height of the highest point below a limit, or of the lowest above it, in each column, (X, Y)."""
+        if (extreme, limit) not in self._columns:
+            above = extreme is np.minimum
+            keep = (self._heights_inside >= limit) == above
+            heights = np.full(self._shape[:2], np.inf if above else self.surface_height)
+            extreme.at(heights, tuple(self._cells_inside[keep, :2].T), self._heights_inside[keep])
+            self._columns[extreme, limit] = heights
+        return self._columns[extreme, limit]
 
     def _cells(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the cells of points, and which of the points are inside the space."""

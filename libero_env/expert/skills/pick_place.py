@@ -249,21 +249,12 @@ class PickPlace(Skill):
         gripper = OPEN if away > 0.05 else self._gripper_opening_action(view)
         return self._toward(view, pose.pos + 0.10 * back, pose.mat, gripper)
 
-    def _toward(
-        self,
-        view: StateView,
-        pos: np.ndarray,
-        mat: np.ndarray,
-        gripper: float,
-        lateral_scale: float = 1.0,
-        speed_scale: float = 1.0,
-    ) -> np.ndarray:
-        """Return the action of `Skill._toward`, with a rising hand kept over its spot: a hand that rotates drifts."""
-        if lateral_scale > MAX_VERTICAL_SCALE or self._rise_xy is None:
+    def _steadied(self, view: StateView, pos: np.ndarray, lateral: float) -> tuple[np.ndarray, float]:
+        """Keep a rising hand over its spot: one that rotates drifts."""
+        if lateral > MAX_VERTICAL_SCALE or self._rise_xy is None:
             self._rise_xy = view.eef_pos[:2].copy()
-        else:
-            pos, lateral_scale = np.array([*self._rise_xy, pos[2]]), 1.0
-        return super()._toward(view, pos, mat, gripper, lateral_scale, speed_scale)
+            return pos, lateral
+        return np.array([*self._rise_xy, pos[2]]), 1.0
 
     def _grasp_pose(self, view: StateView) -> tuple[np.ndarray, np.ndarray]:
         """Return the pose (3,), (3, 3) of the grip site at the grasp, which follows small motions of the object."""

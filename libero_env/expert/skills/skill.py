@@ -126,6 +126,7 @@ class Skill:
             lateral_scale: Factor on the horizontal part, in [0, 1].
             speed_scale: Factor on the largest translation, in [0, 1].
         """
+        pos, lateral_scale = self._steadied(view, pos, lateral_scale)
         return action_toward(
             view.eef_pos,
             view.eef_mat,
@@ -137,6 +138,10 @@ class Skill:
             speed=speed_scale * self.style.speed,
             lateral_scale=lateral_scale,
         )
+
+    def _steadied(self, view: StateView, pos: np.ndarray, lateral: float) -> tuple[np.ndarray, float]:
+        """Return position and lateral scale for `_toward`, changed where a skill needs it."""
+        return pos, lateral
 
 
 def gripper_opening(view: StateView) -> float:
