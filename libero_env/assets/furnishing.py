@@ -13,7 +13,7 @@ import numpy as np
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.builtin.mesh import Mesh, Ring, box, loft, merge, quad
-from libero_env.objects.model import VISUAL_GEOM
+from libero_env.objects.model import add_visual
 from libero_env.storage import read_yaml
 
 _SIZE = 128  # [pixels] default side of a texture
@@ -182,10 +182,7 @@ def add_visual_mesh(
         cells[: len(colours)] = colours
         palette = cells.reshape(_CELLS, _CELLS, 3).repeat(_CELL_PIXELS, 0).repeat(_CELL_PIXELS, 1)
         add_texture(spec, added, _as_pixels(palette))
-    faces, points = mesh.faces.ravel(), mesh.texcoords.ravel()
-    added = spec.add_mesh(name=name, uservert=mesh.vertices.ravel(), userface=faces, usertexcoord=points)
-    added.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=name, material=material, **VISUAL_GEOM)
+    add_visual(body, name, mesh.add_to(spec, name), material=material)
 
 
 @cache

@@ -8,7 +8,6 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 from libero_env.assets.arena import Workspace, add_arena, add_cameras_and_lights
 from libero_env.assets.original_arena import arena_spec, restore_drawing, scene_file
@@ -24,11 +23,9 @@ from libero_env.storage import read_yaml
 
 _NAMES = read_yaml("assets/original.yaml")
 # Folder -> its categories; each has one file.
-FAMILIES: Mapping[str, Sequence[str]] = MappingProxyType(_NAMES["families"])
+FAMILIES: Mapping[str, Sequence[str]] = _NAMES["families"]
 # Category that LIBERO-PRO adds -> category that it recolours or enlarges, and by how much.
-LIBERO_PRO: Mapping[str, tuple[str, float]] = MappingProxyType(
-    {name: (base, scale) for name, (base, scale) in _NAMES["libero_pro"].items()}
-)
+LIBERO_PRO: Mapping[str, tuple[str, float]] = _NAMES["libero_pro"]
 _OFFSETS = ("bottom_offset", "top_offset", "horizontal_radius")  # fields that grow with an object
 _STEMS = {"rack": "simple_rack"}
 _ROOM = "room_"

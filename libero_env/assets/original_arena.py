@@ -6,7 +6,6 @@ levels; `restore_drawing` makes the scene what the original compiles, without an
 
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -17,8 +16,8 @@ from libero_env.mujoco_compat import delete, mujoco
 from libero_env.storage import read_yaml
 
 _NAMES = read_yaml("assets/original.yaml")
-SCENES: Mapping[str, str] = MappingProxyType(_NAMES["scenes"])  # workspace -> beginning of its files' names
-TEXTURES: Mapping[str, Mapping[str, str]] = MappingProxyType(_NAMES["textures"])  # name of a style -> file
+SCENES: Mapping[str, str] = _NAMES["scenes"]  # workspace -> beginning of its files' names
+TEXTURES: Mapping[str, Mapping[str, str]] = _NAMES["textures"]  # name of a style -> file
 _TEXTURE_NAMES = {"floor": "texplane", "wall": "tex-wall"}
 _STIFF = 0.004  # [s] smallest time constant that the timestep allows
 _FIRM_SOLREF = (0.02, 1.0)  # time constant [s] and damping ratio

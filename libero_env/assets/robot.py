@@ -23,7 +23,7 @@ from libero_env.assets.published import installer
 from libero_env.assets.simplify import MeshSource, merge_and_simplify
 from libero_env.errors import MissingPackageError
 from libero_env.mujoco_compat import delete, mujoco
-from libero_env.objects.model import VISUAL_GEOM
+from libero_env.objects.model import add_visual
 from libero_env.paths import cache_dir
 from libero_env.storage.caches import cached_folder
 from libero_env.storage.files import atomic_folder
@@ -218,8 +218,7 @@ def _replace_visuals(spec: mujoco.MjSpec, name: str) -> None:
         if len(faces):
             mesh = spec.add_mesh(name=f"visual{i}", uservert=vertices.ravel(), userface=faces.ravel())
             mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
-            look = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": mesh.name, "rgba": rgba}
-            spec.body(body).add_geom(name=f"visual{i}", **look, **VISUAL_GEOM)
+            add_visual(spec.body(body), f"visual{i}", mesh, rgba=rgba)
     for geom in visuals:
         delete(spec, geom)
     used = {g.meshname for g in spec.geoms}

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path, PurePath, PurePosixPath, PureWindowsPath
-from types import MappingProxyType
 from typing import NoReturn
 from xml.etree import ElementTree as ET
 
@@ -23,34 +22,30 @@ from libero_env.objects.xml_file import explain, parse_xml, place_of, write_xml
 from libero_env.text import suggest
 
 # Largest number of elements, those that <replicate> makes included.
-LIMITS = MappingProxyType(
-    {"body": 1000, "geom": 2000, "site": 2000, "joint": 100, "mesh": 2000, "texture": 200}
-)
+LIMITS = {"body": 1000, "geom": 2000, "site": 2000, "joint": 100, "mesh": 2000, "texture": 200}
 MAX_FILE_BYTES = 256 << 20  # of a mesh or texture
 _MAX_INCLUDES = 50
 _LARGEST_NUMBER = 1e10  # as in MuJoCo
-_LARGEST_LENGTH = MappingProxyType({"size": 10.0, "fromto": 10.0, "pos": 1000.0, "offset": 1000.0})  # [m]
+_LARGEST_LENGTH = {"size": 10.0, "fromto": 10.0, "pos": 1000.0, "offset": 1000.0}  # [m]
 _LARGEST_RESOLUTION = 4096  # [pixels] of a generated texture; its other counts are below it too
 
 _IN_BODY = frozenset({"body", "frame", "geom", "site", "joint", "freejoint", "inertial", "replicate"})
 _NONE: frozenset[str] = frozenset()
 # Element -> elements that it may contain.
-_GRAMMAR: Mapping[str, frozenset[str]] = MappingProxyType(
-    {
-        "mujoco": frozenset({"compiler", "default", "asset", "worldbody", "contact", "equality", "tendon"}),
-        "default": frozenset(
-            {"default", "mesh", "material", "joint", "geom", "site", "pair", "equality", "tendon"}
-        ),
-        "asset": frozenset({"mesh", "texture", "material"}),
-        "material": frozenset({"layer"}),
-        **dict.fromkeys(("worldbody", "body", "frame", "replicate"), _IN_BODY),
-        "contact": frozenset({"pair", "exclude"}),
-        "equality": frozenset({"connect", "weld", "joint", "tendon"}),
-        "tendon": frozenset({"spatial", "fixed"}),
-        "spatial": frozenset({"site", "geom", "pulley"}),
-        "fixed": frozenset({"joint"}),
-    }
-)
+_GRAMMAR: Mapping[str, frozenset[str]] = {
+    "mujoco": frozenset({"compiler", "default", "asset", "worldbody", "contact", "equality", "tendon"}),
+    "default": frozenset(
+        {"default", "mesh", "material", "joint", "geom", "site", "pair", "equality", "tendon"}
+    ),
+    "asset": frozenset({"mesh", "texture", "material"}),
+    "material": frozenset({"layer"}),
+    **dict.fromkeys(("worldbody", "body", "frame", "replicate"), _IN_BODY),
+    "contact": frozenset({"pair", "exclude"}),
+    "equality": frozenset({"connect", "weld", "joint", "tendon"}),
+    "tendon": frozenset({"spatial", "fixed"}),
+    "spatial": frozenset({"site", "geom", "pulley"}),
+    "fixed": frozenset({"joint"}),
+}
 # Elements of scenes and robots, without which an object is used. A note counts those of the first lines.
 _COUNTED = frozenset({"light", "camera"})
 _COUNTED_INSIDE = frozenset({"actuator", "sensor", "keyframe"})

@@ -52,6 +52,12 @@ class ObjectModel:
         return rest_quat(self.rotation, rng)
 
 
+def add_visual(body: mujoco.MjsBody, name: str, mesh: mujoco.MjsMesh, **look: Any) -> None:
+    """Add a mesh to a body as a geom that is only seen; `look` are its attributes in MJCF, such as `material`."""
+    kind = mujoco.mjtGeom.mjGEOM_MESH
+    body.add_geom(name=name, type=kind, meshname=mesh.name, **VISUAL_GEOM, **look)
+
+
 def rest_quat(
     rotation: Mapping[str, tuple[float, float]], rng: np.random.Generator | None = None
 ) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 from libero_env.mujoco_compat import mujoco, set_damping
 from libero_env.objects.builtin.appearance import Appearance, appearance_of
 from libero_env.objects.builtin.physics import categories, load_physics
-from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, VISUAL_GEOM, ObjectModel
+from libero_env.objects.model import GLOW_GROUP, ROOT_BODY, VISUAL_GEOM, ObjectModel, add_visual
 
 HIDDEN_GROUP = 3
 GLOWING_SITES = ("burner",)
@@ -74,7 +74,7 @@ def _shape(keys: Mapping[str, Any]) -> dict[str, Any]:
 def _add_visual(
     spec: mujoco.MjSpec, body: mujoco.MjsBody, category: str, appearance: Appearance, *, suffix: str
 ) -> None:
-    root, mesh = body.name == ROOT_BODY, appearance.mesh
+    root = body.name == ROOT_BODY
     prefix = (category if root else f"{category}_{body.name}") + suffix
     # The category is a prefix of each name: scenes share one namespace for textures and materials.
     # A file in `assets`, not a buffer: MuJoCo cannot write buffers as XML.
@@ -85,26 +85,12 @@ def _add_visual(
         name=f"{prefix}_material",
         specular=appearance.specular,
         shininess=appearance.shininess,
-        reflectance=0.0,
         rgba=(1.0, 1.0, 1.0, appearance.alpha),
     )
-    textures = list(material.textures)
-    textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
-    material.textures = textures
-    spec.add_mesh(
-        name=f"{prefix}_mesh",
-        uservert=mesh.vertices.ravel(),
-        userface=mesh.faces.ravel(),
-        usertexcoord=mesh.texcoords.ravel(),
-        inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL,
-    )
-    body.add_geom(
-        name=("visual" if root else f"{body.name}_visual") + suffix,
-        type=mujoco.mjtGeom.mjGEOM_MESH,
-        meshname=f"{prefix}_mesh",
-        material=material.name,
-        **VISUAL_GEOM,
-    )
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = texture.name
+    mesh = appearance.mesh.add_to(spec, f"{prefix}_mesh")
+    name = "visual" if root else f"{body.name}_visual"
+    add_visual(body, f"{name}{suffix}", mesh, material=material.name)
 
 
 def _target_zone() -> ObjectModel:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from libero_env.geometry import quat_to_mat
+from libero_env.mujoco_compat import mujoco
 from libero_env.objects.builtin.paint import Cell
 
 CORNERS = ((-1, -1), (1, -1), (1, 1), (-1, 1))
@@ -35,6 +36,12 @@ class Mesh:
     def rotated(self, quat: Sequence[float] | np.ndarray) -> "Mesh":
         """Return the mesh rotated by a quaternion, (4,) wxyz."""
         return Mesh(self.vertices @ quat_to_mat(np.asarray(quat, float)).T, self.faces, self.texcoords)
+
+    def add_to(self, spec: mujoco.MjSpec, name: str) -> mujoco.MjsMesh:
+        """Add the mesh to a spec, with the inertia of a shell, and return it there."""
+        added = spec.add_mesh(name=name, uservert=self.vertices.ravel(), userface=self.faces.ravel())
+        added.usertexcoord, added.inertia = self.texcoords.ravel(), mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+        return added
 
     def moved(self, offset: Sequence[float] | np.ndarray) -> "Mesh":
         """Return the mesh moved by an offset, (3,) [m]."""
