@@ -34,23 +34,20 @@ def call_limited(function: Callable[..., Any], *args: Any, about: str) -> Any:
     Raises:
         InvalidInputError: The function raised an error, took more than `SECONDS`, or ended its process.
     """
-    process = _current.get()
-    if process is None:
-        with limited_process():
-            return call_limited(function, *args, about=about)
-    return process.call(function, args, about)
+    with limited_process() as process:
+        return process.call(function, args, about)
 
 
 @contextmanager
-def limited_process() -> Iterator[None]:
+def limited_process() -> "Iterator[_Process]":
     """Use the same process for all calls in the block, or that of a block around it: it starts in most of a second."""
-    if _current.get() is not None:
-        yield
+    if (running := _current.get()) is not None:
+        yield running
         return
     process = _Process()
     token = _current.set(process)
     try:
-        yield
+        yield process
     finally:
         _current.reset(token)
         process.end()

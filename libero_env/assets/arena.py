@@ -97,7 +97,7 @@ def load_workspace(category: str) -> Workspace:
 
 @cache
 def _builtin(category: str) -> Workspace:
-    room, specific = _read(_ROOM), _read(category)
+    room, specific = (read_yaml(f"assets/workspaces/{name}.yaml") for name in (_ROOM, category))
     parameters = dict(specific)
     for key in _SHARED:  # entries that are null in the specific file are left out
         both = {**room[key], **specific.get(key, {})}
@@ -248,8 +248,3 @@ def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
         add_visual_mesh(spec, first, "table_visual", mesh, "table")
     for name, pos in table.get("sites", {}).items():
         body.add_site(name=name, pos=pos, size=[0.001] * 3, rgba=[0.0] * 4)
-
-
-@cache
-def _read(name: str) -> Mapping[str, Any]:
-    return read_yaml(f"assets/workspaces/{name}.yaml")

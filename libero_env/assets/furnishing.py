@@ -22,7 +22,6 @@ _CELL_PIXELS = 8  # side of a colour's square
 _COVERS = ("red", "navy", "teal", "cream", "yellow", "black", "orange", "white", "walnut")  # colours of books
 
 
-@cache
 def load_styles() -> Mapping[str, Mapping[str, Mapping[str, Any]]]:
     """Return kind (`floor`, `wall`, `scene`) -> name -> parameters."""
     return read_yaml("assets/workspaces/styles.yaml")
@@ -155,12 +154,8 @@ def _smooth(size: int, widths: tuple[float, float], rng: np.random.Generator) ->
 
 
 _PATTERNS = {
-    "tiles": _tiles,
-    "planks": _planks,
-    "plaster": _plaster,
-    "linen": _linen,
-    "marble": _marble,
-    "wood": _wood,
+    pattern.__name__.removeprefix("_"): pattern
+    for pattern in (_tiles, _planks, _plaster, _linen, _marble, _wood)
 }
 
 
@@ -256,6 +251,5 @@ def _cell(colour: str) -> tuple[float, float]:
     return (column + 0.5) / _CELLS, (row + 0.5) / _CELLS
 
 
-@cache
 def _read_furniture() -> Mapping[str, Any]:
     return read_yaml("assets/workspaces/furniture.yaml")

@@ -60,12 +60,7 @@ def contact_sheet(
 
 
 def compare_starts(
-    task: Task,
-    perturbations: Sequence[Perturbation],
-    path: Path,
-    *,
-    start: int = 0,
-    size: int = 256,
+    task: Task, perturbations: Sequence[Perturbation], path: Path, *, start: int = 0, size: int = 256
 ) -> Task:
     """Write a PNG of an initial state as it is, and beside it with perturbations, a row for each camera.
 

@@ -18,37 +18,14 @@ from typing import Any, NoReturn
 
 from libero_env.errors import BDDLError, InvalidInputError
 from libero_env.tasks.cameras import Camera
-from libero_env.tasks.problem import (
-    And,
-    Atom,
-    Count,
-    Expression,
-    ForAll,
-    Never,
-    Not,
-    Or,
-    Problem,
-    ProblemError,
-    Region,
-    Then,
-)
+from libero_env.tasks.problem import OPERATORS, Atom, Expression, Problem, ProblemError, Region
 from libero_env.tasks.sexpr import MAX_CHARACTERS, List, Word, number, parse_tree, show, text_of
 
-SECTIONS = (
-    ":domain",
-    ":requirements",
-    ":language",
-    ":regions",
-    ":fixtures",
-    ":objects",
-    ":obj_of_interest",
-    ":scene_properties",
-    ":views",
-    ":zones",
-    ":init",
-    ":goal",
+_HEADS = (
+    ":domain :requirements :language :regions :fixtures :objects :obj_of_interest :scene_properties :views :zones "
+    ":init :goal"
 )
-
+SECTIONS = tuple(_HEADS.split())
 # field of a problem -> section, where its name is another
 _SECTIONS_OF = {"name": ":domain", "cameras": ":views"}
 _FORMS = {
@@ -376,17 +353,18 @@ class Reader:
         """Return the expression of a list."""
         parts = node.items[1:] if isinstance(node, List) else ()
         head = node.head if isinstance(node, List) else ""
+        make = OPERATORS.get(head.capitalize())
         if head in ("and", "or"):
-            return (And if head == "and" else Or)(tuple(map(self.expression, parts)))
+            return make(tuple(map(self.expression, parts)))
         if head in ("not", "never") and len(parts) == 1:
-            return (Not if head == "not" else Never)(self.expression(parts[0]))
+            return make(self.expression(parts[0]))
         if head == "then" and len(parts) > 1:
-            return reduce(lambda before, after: Then((before, after)), map(self.expression, parts))
+            return reduce(lambda before, after: make((before, after)), map(self.expression, parts))
         if head == "count" and len(parts) == 2:
-            return Count(self.times(parts[0]), self.expression(parts[1]))
+            return make(self.times(parts[0]), self.expression(parts[1]))
         if head == "forall" and len(parts) == 2 and isinstance(parts[0], List):
             variables = Reader(self.file).names(parts[0].items)
-            return ForAll(tuple(variables.items()), self.expression(parts[1]))
+            return make(tuple(variables.items()), self.expression(parts[1]))
         if head in _FORMS:
             self.fail(node.line, show(node), _FORMS[head])
         return self.atom(node)

@@ -58,7 +58,7 @@ from libero_env.paths import objects_dir
 from libero_env.storage import read_yaml
 from libero_env.tasks.cameras import Camera
 from libero_env.tasks.problem import PLACING, And, Atom, Expression, Problem, ProblemError, Region
-from libero_env.tasks.schema import KEYS, Source, Trace, check_definition, read_definition, scene_file
+from libero_env.tasks.schema import KEYS, Source, check_definition, read_definition, scene_file
 from libero_env.tasks.task import FILE, Task, check_name
 from libero_env.text import shown, suggest
 from libero_env.validation import validate
@@ -200,7 +200,7 @@ def _build(
         shares_with: See `task_from_definition`.
     """
     check_keys(definition, source)
-    merge = _Merge(Trace(source), check_models)
+    merge = _Merge(check_models)
     content = merge.content({k: v for k, v in definition.items() if v is not None}, {}, source)
     for parameter in () if shares_with else definition.get("with") or ():
         if parameter not in merge.parameters:
@@ -218,7 +218,7 @@ def _build(
         check_name(name)
     except LiberoError as error:
         raise InvalidInputError(f"{source.at('language')}: {error}; add `name:`") from None
-    return name, _problem(content, language, merge.trace)
+    return name, _problem(content, language, source, merge.places)
 
 
 @dataclass
@@ -264,15 +264,16 @@ class _Merge:
     """Merging of a definition with its scene, and of that with its own.
 
     Args:
-        trace: Notes where atoms and regions come from.
         check_models: Whether models of objects are asked for, see `_build`.
 
     Attributes:
         parameters: Parameters that the definitions use.
+        places: Atom, region, camera or zone -> `file:line` that it comes from, for errors that are found at the end.
     """
 
-    def __init__(self, trace: Trace, check_models: bool):
-        self.trace, self._check_models = trace, check_models
+    def __init__(self, check_models: bool):
+        self._check_models = check_models
+        self.places: dict[str, str] = {}
         self.parameters: set[str] = set()
 
     def content(self, definition: Values, inherited: Values, source: Source) -> _Content:
@@ -305,7 +306,7 @@ class _Merge:
             known = content.regions.setdefault(target, {})
             for name, region in regions.items():
                 known[name] = None if region is None else _replaced(known.get(name) or {}, region)
-                self.trace.note(f"{target}_{name}", source, "regions", target, name)
+                self.places.setdefault(f"{target}_{name}", source.at("regions", target, name))
         placed = self._place(keys.get("place", {}), content, source)
         init = keys.get("init", content.init)
         moved = {atom.args[0] for atom in placed}
@@ -319,14 +320,14 @@ class _Merge:
         for key in ("init", "init_also", "goal"):
             for i, expression in enumerate(keys.get(key, ())):
                 for atom in expression.atoms():
-                    self.trace.note(str(atom), source, key, i)
+                    self.places.setdefault(str(atom), source.at(key, i))
         content.interest = keys.get("obj_of_interest", content.interest)
         for name, view in keys.get("cameras", {}).items():
             content.cameras[name] = view
-            self.trace.note(f"camera {name}", source, "cameras", name)
+            self.places.setdefault(f"camera {name}", source.at("cameras", name))
         for i, name in enumerate(keys.get("zones", ())):
             content.zones.append(name)
-            self.trace.note(name, source, "zones", i)
+            self.places.setdefault(name, source.at("zones", i))
         content.styles |= keys.get("scene_properties", {})
         content.texts |= {key: keys[key] for key in ("name", "language", "problem") if key in keys}
         if self._check_models:
@@ -405,8 +406,8 @@ class _Merge:
                 kind = "fixture" if entity in content.fixtures else "object"
                 content.regions.setdefault(workspace, {})[f"{entity}_start"] = _rectangle(place, kind)
                 atoms.append(Atom("On", (entity, f"{workspace}_{entity}_start")))
-                self.trace.note(f"{workspace}_{entity}_start", source, "place", key)
-            self.trace.note(str(atoms[-1]), source, "place", key)
+                self.places.setdefault(f"{workspace}_{entity}_start", source.at("place", key))
+            self.places.setdefault(str(atoms[-1]), source.at("place", key))
         return atoms
 
     def _declare_sites(self, content: _Content) -> None:
@@ -424,16 +425,15 @@ class _Merge:
                 continue
             site = name.removeprefix(f"{target}_")
             if site not in (valid := model_regions(entities[target])):
-                what = f"region of {target} ({self.trace.at(where)}: {where})"
+                what = f"region of {target} ({self.places[where]}: {where})"
                 raise UnknownNameError(what, site, valid or ("none",))
             content.regions.setdefault(target, {})[site] = {}
 
 
-def _problem(content: _Content, language: str, trace: Trace) -> Problem:
+def _problem(content: _Content, language: str, source: Source, places: Mapping[str, str]) -> Problem:
     """Return the problem of what all definitions say together."""
     from libero_env.assets.arena import load_workspace
 
-    source = trace.source
     if not content.goal:
         raise InvalidInputError(
             f"{source.at()}: it has no goal; add one, such as `goal: On red_coffee_mug_1 plate_1`"
@@ -450,12 +450,12 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
             f"{source.at('place')}: {', '.join(missing)} has no place; add it below place: `{missing[0]}: [0, 0]`"
         )
     regions = tuple(
-        _region(name, target, keys, trace)
+        _region(name, target, keys, places.get(f"{target}_{name}", source.at("regions", target, name)))
         for target, named in content.regions.items()
         for name, keys in named.items()
         if keys is not None
     )
-    cameras = tuple(_camera(name, keys, trace) for name, keys in content.cameras.items())
+    cameras = tuple(_camera(name, keys, places[f"camera {name}"]) for name, keys in content.cameras.items())
     first, *others = content.goal
     try:
         goal = And(tuple(content.goal)) if others or isinstance(first, Atom) else first
@@ -481,7 +481,7 @@ def _problem(content: _Content, language: str, trace: Trace) -> Problem:
         if isinstance(label, int):
             label = str((content.init if wrong.section == ":init" else goal.atoms())[label])
         key = wrong.section.removeprefix(":")
-        where = trace.at(str(label), _KEYS_OF.get(key, key))
+        where = places.get(str(label), source.at(_KEYS_OF.get(key, key)))
         raise InvalidInputError(f"{where}: {wrong.what}; expected {wrong.expected}") from None
     except InvalidInputError as error:
         key = str(error.path[0]) if error.path else "goal"
@@ -510,9 +510,8 @@ def _replaced(known: Values, own: Values) -> dict[str, Any]:
     return {**{key: value for key, value in known.items() if key not in gone}, **own}
 
 
-def _region(name: str, target: str, keys: Values, trace: Trace) -> Region:
-    """Return the region of its keys."""
-    where = trace.at(f"{target}_{name}", "regions", target, name)
+def _region(name: str, target: str, keys: Values, where: str) -> Region:
+    """Return the region of its keys, which are from `where`."""
     ranges = [tuple(row) for row in keys.get("ranges", ())]
     if ("at" in keys) != ("half" in keys):
         has, lacks, such = ("at", "half", "0.02") if "at" in keys else ("half", "at", "[0, 0.2]")
@@ -531,12 +530,12 @@ def _region(name: str, target: str, keys: Values, trace: Trace) -> Region:
         raise InvalidInputError(f"{where}: {error}") from None
 
 
-def _camera(name: str, keys: Values, trace: Trace) -> Camera:
-    """Return the camera of its keys."""
+def _camera(name: str, keys: Values, where: str) -> Camera:
+    """Return the camera of its keys, which are from `where`."""
     try:
         return Camera(name, **keys)
     except InvalidInputError as error:
-        raise InvalidInputError(f"{trace.at(f'camera {name}', 'cameras', name)}: {error}") from None
+        raise InvalidInputError(f"{where}: {error}") from None
 
 
 def _with_entries(parameters: Values) -> dict[str, Any]:

@@ -9,23 +9,14 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import Field
 
 from libero_env.errors import InvalidInputError
 from libero_env.parallel import send_to_workers
 from libero_env.tasks.cameras import Camera
-from libero_env.tasks.values import (
-    NAME,
-    Colour,
-    EntityName,
-    Language,
-    Name,
-    Rectangle,
-    Words,
-    YawRange,
-)
+from libero_env.tasks.values import NAME, Colour, EntityName, Language, Name, Rectangle, Words, YawRange
 from libero_env.text import suggest
 from libero_env.validation import checked
 from libero_env.workspaces import WORKSPACES
@@ -325,19 +316,14 @@ _PLACE = _ENTITY | {"region"}
 _SOLID = _ENTITY | {"workspace"}
 _ANY, _NUMERIC = _PLACE | _SOLID, frozenset({"number"})
 KINDS: dict[str, tuple[frozenset[str], ...]] = {
-    "On": (_ENTITY, _PLACE),
     "In": (_ENTITY, frozenset({"region"})),
-    "Stack": (_ENTITY, _PLACE),
+    **dict.fromkeys(("On", "Stack"), (_ENTITY, _PLACE)),
     "Up": (_ENTITY,),
-    "Open": (_PLACE,),
-    "Close": (_PLACE,),
-    "Turnon": (_PLACE,),
-    "Turnoff": (_PLACE,),
+    **dict.fromkeys(("Open", "Close", "Turnon", "Turnoff", "Printjointstate"), (_PLACE,)),
     "Incontact": (_SOLID, _SOLID),
-    "Printjointstate": (_PLACE,),
 }
-# no predicate has these names
-OPERATORS = frozenset({"And", "Or", "Not", "Forall", "Then", "Never", "Count"})
+# name, which no predicate has -> class
+OPERATORS: dict[str, Any] = {c.__name__.capitalize(): c for c in (And, Or, Not, ForAll, Then, Never, Count)}
 BUILTIN_PREDICATES = frozenset(KINDS) | {"True", "False"}
 send_to_workers(__name__, "KINDS")
 

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Required
 from pydantic import AfterValidator, BeforeValidator, Discriminator, Field, Tag
 from typing_extensions import TypedDict
 
-from libero_env.errors import BDDLError, InvalidInputError, LiberoError
+from libero_env.errors import BDDLError, InvalidInputError
 from libero_env.storage import read_yaml_file
 from libero_env.tasks.bddl import parse_atom, parse_expression
 from libero_env.tasks.problem import MAX_ENTITIES, MAX_PARTS, Expression
@@ -95,34 +95,6 @@ def scene_file(name: str, source: Source) -> Path:
     if not path.is_file():
         raise InvalidInputError(f"{at}: its scene {path} is missing")
     return path
-
-
-class Trace:
-    """Notes where atoms and regions come from, for errors that are found when all files are merged.
-
-    Args:
-        source: Source of the task, for what is not noted.
-    """
-
-    def __init__(self, source: Source):
-        self.source = source
-        self._notes: dict[str, tuple[Source, tuple[Key, ...]]] = {}
-
-    def note(self, label: str, source: Source, *path: Key) -> None:
-        """Note where something stands; the first note about it counts."""
-        self._notes.setdefault(label, (source, path))
-
-    def at(self, label: str, *otherwise: Key) -> str:
-        """Return `file:line` of what was noted, or of a key of the task."""
-        source, path = self._notes.get(label, (self.source, otherwise))
-        return source.at(*path)
-
-
-def _task_name(text: str) -> str:
-    try:
-        return check_name(text, "name")
-    except LiberoError as error:
-        raise ValueError(str(error)) from None
 
 
 def _instruction(text: Any) -> Any:
@@ -263,7 +235,7 @@ class Definition(TypedDict, total=False):
     objects: _Categories
     place: Annotated[dict[Name, _Place], Field(max_length=MAX_ENTITIES)]
     goal: Annotated[list[_Part], Field(max_length=MAX_PARTS), BeforeValidator(_goal)]
-    name: Annotated[str, AfterValidator(_task_name)]
+    name: Annotated[str, AfterValidator(partial(check_name, what="name"))]
     problem: Name
     language: Annotated[Language, BeforeValidator(_instruction)]
     fixtures: dict[Name, Name]

@@ -20,20 +20,14 @@ from libero_env.demos.write import DemoWriter
 from libero_env.envs.batch import BatchEnv
 from libero_env.tasks import Task
 
-# Key -> (index in the action, sign): translation in the robot's frame, then rotation vector.
+# Keys that make each entry of an action smaller and larger: of the translation in the robot's frame, then of the
+# rotation vector.
+_PAIRS = ("ws", "ad", "fr", "zx", "gt", "cv")
+# Key -> (index in the action, sign)
 MOTIONS: Mapping[str, tuple[int, float]] = {
-    "w": (0, -1.0),
-    "s": (0, 1.0),
-    "a": (1, -1.0),
-    "d": (1, 1.0),
-    "f": (2, -1.0),
-    "r": (2, 1.0),
-    "z": (3, -1.0),
-    "x": (3, 1.0),
-    "t": (4, 1.0),
-    "g": (4, -1.0),
-    "c": (5, -1.0),
-    "v": (5, 1.0),
+    key: (index, sign)
+    for index, pair in enumerate(_PAIRS)
+    for key, sign in zip(pair, (-1.0, 1.0), strict=True)
 }
 GRIPPER, RESET, QUIT = " ", "q", "escape"
 HELP = (

@@ -1,7 +1,7 @@
 """Objects that are made from a mesh: their mass and collision geometry, and their MJCF, OBJ and PNG files."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 from xml.etree import ElementTree as ET
@@ -59,9 +59,8 @@ class Options:
     @property
     def mesh_options(self) -> tuple[str, ...]:
         """Names of the options that are set and that are for meshes only."""
-        usual = Options()
-        names = ("size", "mass", "density", "up", "collision", "faces")
-        return tuple(name for name in names if getattr(self, name) != getattr(usual, name))
+        usual = {field.name: field.default for field in fields(self) if field.name != "container"}
+        return tuple(name for name, default in usual.items() if getattr(self, name) != default)
 
 
 def store_mesh(path: Path, name: str, directory: Path, options: Options, notify: Notify) -> dict[str, Any]:
@@ -122,10 +121,7 @@ def store_mesh(path: Path, name: str, directory: Path, options: Options, notify:
         ET.SubElement(main, "site", {"name": "contain_region", **inside})
     ET.indent(root)
     (directory / MODEL).write_text(ET.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
-    return {
-        "watertight": closed,
-        "collision": {"method": pieces.method, "pieces": len(pieces)},
-    }
+    return {"watertight": closed, "collision": {"method": pieces.method, "pieces": len(pieces)}}
 
 
 def merge_vertices(surfaces: Sequence[Surface]) -> "Trimesh":

@@ -245,10 +245,6 @@ def _shaded(color: Color, shade: np.ndarray) -> np.ndarray:
 
 
 _SURFACES: dict[str, Callable[..., np.ndarray]] = {
-    "brushed": _brushed,
-    "chrome": _chrome,
-    "enamel": _enamel,
-    "paper": _paper,
-    "plain": _plain,
-    "wood": _wood,
+    surface.__name__.removeprefix("_"): surface
+    for surface in (_brushed, _chrome, _enamel, _paper, _plain, _wood)
 }

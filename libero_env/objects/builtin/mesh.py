@@ -125,11 +125,7 @@ def quad(corners: Sequence[Sequence[float] | np.ndarray], cell: Cell) -> Mesh:
 
 
 def sweep(
-    *points: Sequence[float],
-    cell: Cell = SPARE,
-    segments: int = 8,
-    round: float = 2.0,
-    x: float = 0.0,
+    *points: Sequence[float], cell: Cell = SPARE, segments: int = 8, round: float = 2.0, x: float = 0.0
 ) -> Mesh:
     """Return the surface along a path in a plane of constant x, for handles and cutlery.
 

