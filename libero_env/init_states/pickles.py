@@ -177,8 +177,8 @@ class _Parts:
     archive: zipfile.ZipFile
     root: str
 
-    def size(self, name: str) -> int:
-        """Return the size of a part in bytes, after a check that it can be read."""
+    def read(self, name: str) -> bytes:
+        """Return the content of a part, after a check that it can be read."""
         try:
             info = self.archive.getinfo(self.root + name)
         except KeyError:
@@ -187,13 +187,8 @@ class _Parts:
             raise StateFileError(f"{shown(name)} is encrypted or compressed in an unusual way")
         if info.file_size > _MAX_BYTES:
             raise StateFileError(f"{shown(name)} is larger than {_MAX_BYTES >> 20} MiB")
-        return info.file_size
-
-    def read(self, name: str) -> bytes:
-        """Return the content of a part."""
-        size = self.size(name)
-        content = self.archive.read(self.root + name)
-        if len(content) != size:
+        content = self.archive.read(info)
+        if len(content) != info.file_size:
             raise StateFileError(f"{shown(name)} is incomplete")
         return content
 

@@ -144,18 +144,11 @@ def _places(scene: Scene) -> Mapping[str, Place]:
     places = {atom.args[0]: _place_of(scene, atom) for atom in atoms}
     if missing := set(scene.objects) - set(places):
         raise PlacementError(f"no init atom places {', '.join(sorted(missing))}; add (On object region)")
-    ordered: dict[str, Place] = {}
-    while len(ordered) < len(places):
-        waiting = set(places) - set(ordered)
-        ready = {
-            name: place for name, place in places.items() if name in waiting and place.carrier not in waiting
-        }
-        if not ready:
-            raise PlacementError(
-                f"the init atoms place {', '.join(sorted(waiting))} on each other in a circle"
-            )
-        ordered.update(ready)
-    return ordered
+
+    def carriers(name: str) -> int:  # below it; a `Problem` places nothing on itself by way of others
+        return 1 + carriers(places[name].carrier) if name in places else 0
+
+    return {name: places[name] for name in sorted(places, key=carriers)}
 
 
 def _place_of(scene: Scene, atom: Atom) -> Place:

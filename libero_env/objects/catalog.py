@@ -25,23 +25,23 @@ def get_object(category: str) -> ObjectModel:
 
     Raises:
         UnknownNameError: The category does not exist; the message lists the valid ones.
-        LiberoError: A registered builder returned something that a scene cannot attach, or a file in the user's
-            folder is missing or broken.
+        LiberoError: A registered builder, or a file in the user's folder, is of something that a scene cannot attach;
+            or such a file is missing or broken.
     """
     if category in _registered:
         model = _registered[category]()
-        _check(category, model)
-        return model
-    directory = folder.find(category)
-    if category in builtin.builtin_names():
-        if directory is not None:
+    elif category in builtin.builtin_names():
+        if (directory := folder.find(category)) is not None:
             raise LiberoError(
                 f"{category} is an object of the benchmark and one of yours, in {directory}; rename its folder"
             )
         return builtin.build(category)
-    if directory is not None:
-        return folder.load(directory, category)
-    raise UnknownNameError("object category", category, object_names())
+    elif (directory := folder.find(category)) is not None:
+        model = folder.load(directory, category)
+    else:
+        raise UnknownNameError("object category", category, object_names())
+    _check(category, model)
+    return model
 
 
 def version_of(category: str) -> Hashable:

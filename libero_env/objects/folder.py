@@ -14,10 +14,10 @@ import yaml
 from pydantic import AfterValidator, BeforeValidator, Field
 from typing_extensions import TypedDict
 
-from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.mjcf import Mjcf, read_mjcf
-from libero_env.objects.model import ROOT_BODY, ObjectModel
+from libero_env.objects.model import ObjectModel
 from libero_env.paths import objects_dir
 from libero_env.storage import read_yaml_file
 from libero_env.validation import validate
@@ -147,15 +147,9 @@ def load(directory: Path, category: str) -> ObjectModel:
         LiberoError: A file is missing or broken.
     """
     properties = read_properties(directory)
-    spec = read_spec(directory / MODEL)
-    bodies = [body.name for body in spec.worldbody.bodies]
-    if bodies != [ROOT_BODY]:
-        raise LiberoError(
-            f"{directory / MODEL}: expected one body {ROOT_BODY!r} in the world, found {bodies}"
-        )
     given: dict[str, Any] = {key: properties[key] for key in _OF_MODEL if key in properties}
     given |= {key: tuple(properties[key]) for key in ("bottom_offset", "top_offset")}
-    return ObjectModel(category, spec, digest=digest(directory), **given)
+    return ObjectModel(category, read_spec(directory / MODEL), digest=digest(directory), **given)
 
 
 def read_spec(path: Path) -> mujoco.MjSpec:

@@ -12,6 +12,7 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from libero_env.errors import InvalidInputError
+from libero_env.storage import read_bounded
 
 MAX_BYTES = 64 << 20  # our own files hold the points of collision meshes as text
 _MAX_DEPTH = 80  # MuJoCo's own parser ends at 100
@@ -40,11 +41,7 @@ def parse_xml(path: Path) -> Node:
         InvalidInputError: The file is missing, too large, nested too deeply, or not XML; the message names the line.
     """
     try:
-        if not path.is_file():
-            raise InvalidInputError(f"{path}: no such file")
-        if (size := path.stat().st_size) > MAX_BYTES:
-            raise InvalidInputError(f"{path}: {size >> 20} MiB; an XML file may have {MAX_BYTES >> 20} MiB")
-        data = path.read_bytes()
+        data = read_bounded(path, MAX_BYTES)
     except OSError as error:
         raise InvalidInputError(f"{path}: {error.strerror or error}") from error
     return parse_xml_text(data, str(path))
