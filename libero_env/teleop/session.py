@@ -195,14 +195,11 @@ class Teleop:
         device: Input device of the user.
         screen: What the user looks at.
         seed: Seed of the starts.
-        hold_steps: Number of control steps during which the goal must hold before the episode ends.
     """
 
-    def __init__(
-        self, task: Task, device: Keyboard, screen: Screen, *, seed: int = 0, hold_steps: int = HOLD_STEPS
-    ):
+    def __init__(self, task: Task, device: Keyboard, screen: Screen, *, seed: int = 0):
         self.task, self.device, self.screen = task, device, screen
-        self.seed, self.hold_steps = seed, hold_steps
+        self.seed = seed
         self.env = BatchEnv(task, 1, cameras=(), camera_size=VIEW_SIZE)
         self.rng = np.random.default_rng(seed)
 
@@ -234,7 +231,7 @@ class Teleop:
         """Run an episode; return None when the user gives a command."""
         env, actions, states, held = self.env, [], [], 0
         fixtures = env.simulations.fixtures[0].copy()
-        while held < self.hold_steps:
+        while held < HOLD_STEPS:
             self.screen.poll(env)
             self.device.poll()
             if self.device.command is not None:

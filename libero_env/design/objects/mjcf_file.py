@@ -110,14 +110,11 @@ def _root(spec: mujoco.MjSpec, file: Mjcf, notify: Notify) -> mujoco.MjsBody:
         raise InvalidInputError(
             f"{file.path}: a part is named {ROOT_BODY!r}, as the object itself will be; rename it"
         )
-    for equality in spec.equalities:
-        equality.name1, equality.name2 = (
-            ROOT_BODY if name == body.name else name for name in (equality.name1, equality.name2)
-        )
-    for exclude in spec.excludes:
-        exclude.bodyname1, exclude.bodyname2 = (
-            ROOT_BODY if name == body.name else name for name in (exclude.bodyname1, exclude.bodyname2)
-        )
+    users: list[tuple[Any, str]] = [(one, key) for one in spec.equalities for key in ("name1", "name2")]
+    users += [(one, key) for one in spec.excludes for key in ("bodyname1", "bodyname2")]
+    for user, key in users:
+        if getattr(user, key) == body.name:
+            setattr(user, key, ROOT_BODY)
     if abs(_compiled(spec.copy(), file.path).body_quat[1, 0]) < 1 - 1e-6:
         notify(
             f"{file.path.name}: the rotation of its root body is omitted, to which scenes give a pose; rotate its parts"
