@@ -59,12 +59,12 @@ class Shapes:
     def points(self, view: StateView, name: str, spacing: float) -> np.ndarray:
         """Return points on an object or fixture with its parts where they are now, world frame, (N, 3)."""
         pos, quat = (view.simulations.fields[key][view.index] for key in ("xpos", "xquat"))
-        clouds = []
-        for body in self._scene.bodies[name]:
-            local = self._points_of_body(int(body), spacing)
-            if len(local):
-                clouds.append(Pose(pos[body], quat_to_mat(quat[body])).apply(local))
-        return np.concatenate([*clouds, np.zeros((0, 3))])
+        return np.concatenate(
+            [
+                Pose(pos[body], quat_to_mat(quat[body])).apply(self._points_of_body(int(body), spacing))
+                for body in self._scene.bodies[name]
+            ]
+        )
 
 
 def pose_of(view: StateView, name: str) -> Pose:

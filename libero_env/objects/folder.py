@@ -7,6 +7,7 @@ import hashlib
 import os
 import shutil
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, NotRequired
 
@@ -17,13 +18,12 @@ from typing_extensions import TypedDict
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.mjcf import Mjcf, read_mjcf
-from libero_env.objects.model import ObjectModel
+from libero_env.objects.model import ObjectModel, ObjectProperties
 from libero_env.paths import objects_dir
 from libero_env.storage import read_yaml_file
 from libero_env.validation import validate
 
 MODEL, PROPERTIES, PREVIEW = "object.xml", "object.yaml", "preview.png"
-_OF_MODEL = ("horizontal_radius", "joint_damping", "rotation", "rotation_axis", "articulation")
 _MAX_METRES = 10.0  # of an object
 _MAX_ANGLE = 100.0  # [rad], or [m] of a joint that slides
 
@@ -147,7 +147,8 @@ def load(directory: Path, category: str) -> ObjectModel:
         LiberoError: A file is missing or broken.
     """
     properties = read_properties(directory)
-    given: dict[str, Any] = {key: properties[key] for key in _OF_MODEL if key in properties}
+    names = {field.name for field in fields(ObjectProperties)}
+    given: dict[str, Any] = {key: properties[key] for key in names & properties.keys()}
     given |= {key: tuple(properties[key]) for key in ("bottom_offset", "top_offset")}
     return ObjectModel(category, read_spec(directory / MODEL), digest=digest(directory), **given)
 

@@ -17,14 +17,11 @@ OPPOSITE_STATES = {"open": "close", "close": "open", "turnon": "turnoff", "turno
 """State of joints -> the state at the other end; the predicate of a state is its name, capitalised."""
 
 
-@dataclass(frozen=True)
-class ObjectModel:
-    """One category of object, ready to be attached to a scene.
+@dataclass(frozen=True, kw_only=True)
+class ObjectProperties:
+    """What scenes need to know of a category of object besides its MJCF.
 
     Attributes:
-        category: Name in task files, such as `alphabet_soup`.
-        spec: Model whose world body has one child, `main`, without a free joint (the scene adds it). Collision geoms
-            `g0`, `g1`, ... are in group 0, visual geoms in group 1 without mass or contacts.
         joint_damping: Damping of the free joint that the scene adds, [N s/m] and [N m s/rad].
         rotation: Axis (`x`, `y` or `z`) -> (low, high) of the rotation at rest, [rad]; empty for none.
         rotation_axis: Axis of a range that the original gives without an axis; None where it has none.
@@ -33,11 +30,8 @@ class ObjectModel:
         horizontal_radius: Radius that placement keeps free around the object, [m].
         articulation: State (`open`, `close`, `turnon`, `turnoff`) -> (low, high) of the joints, [rad] or [m]: the range
             for an initial condition of that name, and the threshold from which the state holds.
-        digest: Digest of the files it was read from, for caches of scenes with it; "" for a model made in code.
     """
 
-    category: str
-    spec: mujoco.MjSpec
     joint_damping: float = 0.0005
     rotation: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     rotation_axis: str | None = None
@@ -45,7 +39,22 @@ class ObjectModel:
     top_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     horizontal_radius: float = 0.0
     articulation: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    digest: str = ""
+
+
+@dataclass(frozen=True)
+class ObjectModel(ObjectProperties):
+    """One category of object, ready to be attached to a scene; see also `ObjectProperties`.
+
+    Attributes:
+        category: Name in task files, such as `alphabet_soup`.
+        spec: Model whose world body has one child, `main`, without a free joint (the scene adds it). Collision geoms
+            `g0`, `g1`, ... are in group 0, visual geoms in group 1 without mass or contacts.
+        digest: Digest of the files it was read from, for caches of scenes with it; "" for a model made in code.
+    """
+
+    category: str
+    spec: mujoco.MjSpec
+    digest: str = field(default="", kw_only=True)
 
     def rest_quat(self, rng: np.random.Generator | None = None) -> np.ndarray:
         """Return the orientation at rest, (4,) wxyz; see the function `rest_quat`."""

@@ -559,10 +559,11 @@ def _meaning(node: Expression, parts: Iterator[object]) -> object:
 
 
 def _same_region(x: Region, y: Region) -> bool:
-    def close(p, q) -> bool:
-        flat_p, flat_q = ([value for row in rows for value in row] for rows in (p, q))
-        return len(flat_p) == len(flat_q) and all(
-            abs(s - t) <= _TOLERANCE for s, t in zip(flat_p, flat_q, strict=True)
-        )
+    def shape(region: Region) -> tuple[int, int, int]:
+        return len(region.ranges), len(region.yaw), len(region.rgba)
 
-    return close(x.ranges, y.ranges) and close(x.yaw, y.yaw) and close([x.rgba], [y.rgba])
+    def numbers(region: Region) -> list[float]:
+        return [value for row in (*region.ranges, *region.yaw, region.rgba) for value in row]
+
+    pairs = zip(numbers(x), numbers(y), strict=False)
+    return shape(x) == shape(y) and all(abs(s - t) <= _TOLERANCE for s, t in pairs)

@@ -177,15 +177,12 @@ class Screen(Protocol):
 
     def poll(self, env: BatchEnv) -> None:
         """Pass the keys that the user has pressed to the device; called once per control step."""
-        ...
 
     def show(self, env: BatchEnv, status: Status) -> None:
         """Show the state, and wait until the control step has lasted 50 ms."""
-        ...
 
     def close(self) -> None:
         """Close the screen and restore what it changed."""
-        ...
 
 
 class Teleop:

@@ -10,7 +10,7 @@ from libero_env.assets.arena import Workspace
 from libero_env.assets.pack import BUILTIN, Pack
 from libero_env.design.lint.report import Level, Report
 from libero_env.errors import LiberoError, PlacementError
-from libero_env.init_states.placement import sample_start, settle, start_errors
+from libero_env.init_states.placement import collision_boxes, sample_start, settle, start_errors
 from libero_env.init_states.store import load_init_states
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES
@@ -121,16 +121,11 @@ def _corners(region: Region, workspace: Workspace) -> np.ndarray:
 
 def _surfaces(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the top surfaces of the workspace: centre (2,) and half extents (2,) in the world frame, [m]."""
-    model, data, surfaces = scene.model, mujoco.MjData(scene.model), []
+    data, height = mujoco.MjData(scene.model), scene.workspace.surface_height
     data.qpos[:] = initial_qpos(scene)
-    mujoco.mj_kinematics(model, data)
-    for geom in scene.collision_geoms[scene.workspace_name]:
-        centre, half = data.geom_xpos[geom], np.array([np.inf, np.inf, 0.0])
-        if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE:
-            half = np.abs(data.geom_xmat[geom].reshape(3, 3)) @ model.geom_aabb[geom, 3:]
-        if abs(centre[2] + half[2] - scene.workspace.surface_height) < _LEVEL_TOLERANCE:
-            surfaces.append((centre[:2].copy(), half[:2]))
-    return surfaces
+    mujoco.mj_kinematics(scene.model, data)
+    boxes = collision_boxes(scene, data, scene.workspace_name)
+    return [(centre, half) for centre, half, top in boxes if abs(top - height) < _LEVEL_TOLERANCE]
 
 
 def _check_starts(report: Report, task: Task, scene: Scene, starts: int) -> None:

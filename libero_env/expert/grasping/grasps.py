@@ -269,8 +269,6 @@ def _yaw_distance(yaw: float, other: float) -> float:
 
 def _top_collision_depth(obstacles: np.ndarray, pos: np.ndarray, yaw: float) -> float:
     """Return how deep obstacles reach into the open fingers and the palm, [m]; 0 without a collision."""
-    if not len(obstacles):
-        return 0.0
     c, s = np.cos(yaw), np.sin(yaw)
     along, across = np.array([c, s]), np.array([-s, c])
     offset = obstacles - pos
@@ -279,7 +277,7 @@ def _top_collision_depth(obstacles: np.ndarray, pos: np.ndarray, yaw: float) -> 
     fingers = (z > -GRIPPER.tip_below) & (v < GRIPPER.finger_half_width + 0.005)
     palm = (z > GRIPPER.palm_above - 0.01) & (v < GRIPPER.palm_half_width)
     depth = np.maximum(np.where(fingers, outer - u, 0.0), np.where(palm, GRIPPER.palm_half_length - u, 0.0))
-    return float(max(depth.max(), 0.0))
+    return float(depth.max(initial=0.0))
 
 
 def finger_offset(cloud: np.ndarray, pos: np.ndarray, mat: np.ndarray) -> float:

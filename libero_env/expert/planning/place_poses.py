@@ -254,20 +254,15 @@ def _search_spots(
     """Return places of an object, whose points relative to its origin are `body` (N, 3), at some spots."""
     voxels, tested = placement.voxels, body[:: max(1, len(body) // _NUM_TESTED)]
     heights = voxels.resting_heights(lower_surface(body), spots.xy, spots.below)
-    keep = [
-        i
-        for i, (xy, z) in enumerate(zip(spots.xy, heights, strict=True))
-        if spots.holds(np.array([*xy, z + 0.003]))
-    ]
-    if not keep:
+    origins = np.column_stack([spots.xy, heights])
+    keep = np.array([spots.holds(origin) for origin in origins + [0.0, 0.0, 0.003]])
+    if not keep.any():
         return []
-    origins = np.column_stack([spots.xy, heights])[keep]
+    origins = origins[keep]
     overhang = voxels.overhang_overlap(upper_surface(body) + [0, 0, _LIFT], origins, spots.below)
     free = overhang < _MAX_OVERHANG
     costs, origins = (spots.costs[keep] + 2.0 * overhang)[free], origins[free]
     rooms = spots.room[keep][free]
-    if not len(origins):
-        return []
     entries = placement.sides
     if rotation.only_entry is not None:
         entries = [rotation.only_entry]

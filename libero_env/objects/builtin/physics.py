@@ -2,17 +2,14 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from libero_env.objects.model import ROOT_BODY, ObjectModel
+from libero_env.objects.model import ROOT_BODY, ObjectProperties
 from libero_env.storage import parse_yaml
 from libero_env.validation import validate
-
-Vector3 = tuple[float, float, float]
-Range = tuple[float, float]
 
 # Contact parameters of the original's objects: as stiff as the timestep allows (refsafe).
 CONTACT: Mapping[str, Sequence[float]] = {
@@ -23,9 +20,9 @@ CONTACT: Mapping[str, Sequence[float]] = {
 _ROOT_KEYS = ("mass", "com", "inertia", "boxes", "sites")
 
 
-@dataclass(frozen=True)
-class Physics:
-    """Physics and placement of one category, SI units; `ObjectModel` documents the fields that are not listed.
+@dataclass(frozen=True, kw_only=True)
+class Physics(ObjectProperties):
+    """Physics and placement of one category, SI units.
 
     Attributes:
         bodies: Name -> keys of a body as in `parameters/`, where groceries.yaml explains them; the root is the first.
@@ -34,18 +31,11 @@ class Physics:
 
     bodies: Mapping[str, Mapping[str, Any]]
     contact: Mapping[str, Sequence[float]]
-    bottom_offset: Vector3
-    top_offset: Vector3
-    horizontal_radius: float
-    rotation: Mapping[str, Range] = field(default_factory=dict)
-    rotation_axis: str | None = None
-    articulation: Mapping[str, Range] = field(default_factory=dict)
-    joint_damping: float = 0.0005
 
     @property
     def of_model(self) -> dict[str, Any]:
-        """Values of the fields of an `ObjectModel` that are not those of its MJCF."""
-        return {f.name: getattr(self, f.name) for f in fields(ObjectModel) if hasattr(self, f.name)}
+        """The `ObjectProperties` by their names."""
+        return {field.name: getattr(self, field.name) for field in fields(ObjectProperties)}
 
 
 def categories() -> tuple[str, ...]:

@@ -302,17 +302,15 @@ def _task(
 
 def _starts_alike(one: Problem, other: Problem) -> bool:
     """Return whether two problems place the same objects in the same regions, up to the rounding of their files."""
-    same = (one.objects, one.fixtures, one.init) == (other.objects, other.fixtures, other.init)
-    pairs = list(zip(one.regions, other.regions, strict=False))
-    return (
-        same
-        and len(one.regions) == len(other.regions)
-        and all(
-            (a.address, len(a.ranges), len(a.yaw)) == (b.address, len(b.ranges), len(b.yaw)) for a, b in pairs
-        )
-        and all(np.allclose(a.ranges, b.ranges, atol=_SAME) for a, b in pairs)
-        and all(np.allclose(a.yaw, b.yaw, atol=_SAME) for a, b in pairs)
-    )
+
+    def shape(problem: Problem) -> tuple[object, ...]:
+        regions = [(region.address, len(region.ranges), len(region.yaw)) for region in problem.regions]
+        return problem.objects, problem.fixtures, problem.init, regions
+
+    def numbers(problem: Problem) -> list[float]:
+        return [x for region in problem.regions for row in (*region.ranges, *region.yaw) for x in row]
+
+    return shape(one) == shape(other) and np.allclose(numbers(one), numbers(other), atol=_SAME)
 
 
 def _read(file: Path) -> Problem:
