@@ -353,7 +353,7 @@ class Reader:
         """Return the expression of a list."""
         parts = node.items[1:] if isinstance(node, List) else ()
         head = node.head if isinstance(node, List) else ""
-        make = OPERATORS.get(head.capitalize())
+        make: Any = OPERATORS.get(head.capitalize())
         if head in ("and", "or"):
             return make(tuple(map(self.expression, parts)))
         if head in ("not", "never") and len(parts) == 1:

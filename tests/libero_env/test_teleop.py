@@ -3,6 +3,7 @@
 import io
 import json
 import struct
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -98,6 +99,18 @@ def test_reports_of_a_mouse():
     mouse.report(struct.pack("<BH", 3, 2))
     mouse.report(b"")
     assert mouse.command == RESET
+
+
+def test_a_mouse_hands_on_all_reports_that_are_pending(monkeypatch):
+    opened, reports = [], [struct.pack("<Bhhh", 1, 0, 350, 0), struct.pack("<BH", 3, 1), b""]
+    device = SimpleNamespace(
+        open=lambda *ids: opened.append(ids), set_nonblocking=bool, read=lambda _: reports.pop(0)
+    )
+    monkeypatch.setitem(teleop_screens.sys.modules, "hid", SimpleNamespace(device=lambda: device))
+    mouse = MouseReader(2.0, 1.0, vendor_id=5)
+    mouse.poll()
+    assert opened == [(5, 50741)] and not reports
+    assert np.allclose(mouse.action(), (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
 
 
 def test_keys_of_windows_and_terminals():
