@@ -10,6 +10,7 @@ from libero_env.assets.original_arena import SCENES
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.init_states.placement import ARM_NOISE
 from libero_env.sim.scene import workspace_of
+from libero_env.storage import read_yaml
 from libero_env.tasks.problem import Problem
 from libero_env.text import shown
 from libero_env.timing import TIMESTEP
@@ -28,11 +29,6 @@ ONLY: dict[str, tuple[Any, ...]] = {
     "render_collision_mesh": (False,),
     "render_visual_mesh": (True,),
     "renderer": ("mujoco", "default"),
-}
-_SCENE_STYLES = {  # workspace -> styles of the original's scene files beside `base`
-    "coffee_table": ("blue", "warm"),
-    "floor": ("blue", "coffee", "warm"),
-    "table": ("blue", "warm"),
 }
 _USUAL_STYLES = {"floor": "light-gray", "wall": "light-gray-plaster"}  # of the original's arenas
 DEFAULT_NOISE = {"magnitude": ARM_NOISE, "type": "gaussian"}
@@ -107,7 +103,7 @@ def with_room(problem: Problem, scene_xml: Any, scene_properties: Any) -> Proble
     workspace = workspace_of(problem)[1]
     room = {**workspace.parameters["styles"], **problem.scene_properties}
     if scene_xml is not None:
-        styles = ("base", *_SCENE_STYLES.get(workspace.name, ()))
+        styles = ("base", *read_yaml("assets/original.yaml")["scene_styles"].get(workspace.name, ()))
         files = {f"scenes/{SCENES[workspace.name]}_{style}_style.xml": style for style in styles}
         if str(scene_xml) not in files:
             valid = " or ".join(files)

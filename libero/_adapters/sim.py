@@ -185,41 +185,25 @@ class ClientSimulations(LoopSimulations):
         vars(self)["_rest_fields"] = self._fields_at_rest()
 
 
-class BuiltModel:
-    """What a model was when it was built.
+def restore(part: Any, built: Any, large: bool) -> None:
+    """Undo all changes of a model, or of a structure in it.
 
     Args:
-        model: The model that is simulated, which clients change.
-        built: Another one, which nobody changes.
+        part: The model that is simulated, which clients change.
+        built: Another one, as it was built, which nobody changes.
+        large: Whether those of meshes and textures are undone, too.
     """
-
-    def __init__(self, model: mujoco.MjModel, built: mujoco.MjModel):
-        self._small: list[tuple[np.ndarray, np.ndarray]] = []
-        self._large: list[tuple[np.ndarray, np.ndarray]] = []
-        self._numbers: list[tuple[Any, str, Any]] = []
-        parts = [(getattr(model, key), getattr(built, key)) for key in ("opt", "stat")]
-        parts += [(getattr(model.vis, key), getattr(built.vis, key)) for key in _public(model.vis)]
-        for part, origin in [(model, built), *parts]:
-            for name in _public(part):
-                value = getattr(origin, name)
-                if isinstance(value, np.ndarray):
-                    few = value.nbytes < _LARGE
-                    (self._small if few else self._large).append((getattr(part, name), value))
-                elif part is not model:
-                    self._numbers.append((part, name, value))
-
-    def restore(self, large: bool) -> None:
-        """Undo all changes of the model; those of meshes and textures if `large`."""
-        for array, origin in self._small + self._large * large:
-            np.copyto(array, origin)
-        for part, name, value in self._numbers:
+    for name in dir(built):
+        value = getattr(built, name)
+        if name.startswith("_") or callable(value):
+            continue
+        if isinstance(value, np.ndarray):
+            if large or value.nbytes < _LARGE:
+                np.copyto(getattr(part, name), value)
+        elif type(value).__module__.startswith("mujoco"):  # opt, stat, vis and what it consists of
+            restore(getattr(part, name), value, large)
+        elif not isinstance(part, mujoco.MjModel):  # whose sizes and names cannot change
             setattr(part, name, value)
-
-
-def _public(part: Any) -> list[str]:
-    """Return the names of the values of one of MuJoCo's structures."""
-    names = (name for name in dir(part) if not name.startswith("_"))
-    return [name for name in names if not callable(getattr(part, name))]
 
 
 class MjSim:
@@ -247,7 +231,6 @@ class MjSim:
         faithful: bool = True,
     ):
         self._simulations, self._origin = simulations, built
-        self._built: BuiltModel | None = None
         self.model = MjModel(simulations.model, xml)
         self.data = MjData(self.model, simulations.data(0))
         self._renderers: dict[tuple[int, int], Renderer] = {}
@@ -259,10 +242,8 @@ class MjSim:
 
     def restore_model(self) -> None:
         """Undo all changes of the model."""
-        if self._built is None:
-            self._built = BuiltModel(self.model._model, self._origin)
         large = self.model._is_drawn_otherwise
-        self._built.restore(large)
+        restore(self.model._model, self._origin, large)
         if large:  # renderers hold the textures
             self._free_renderers()
             self.model.__dict__["_is_drawn_otherwise"] = False

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from multiprocessing import connection
 from multiprocessing.shared_memory import SharedMemory
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from gymnasium.vector import utils
@@ -22,41 +22,23 @@ from libero_env.errors import ClosedEnvironmentError, LiberoError
 CALL_TIMEOUT = 600.0  # [s] for a call, unless told otherwise; making an environment may take minutes
 
 
-class Layout(NamedTuple):
-    """Shape and type of an array in shared memory."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
-
-
 class Shared:
-    """The observation of one environment in shared memory.
+    """Arrays in memory that processes share.
 
     Args:
-        layout: Space or array, with `shape` and `dtype`, of each entry.
+        dtype: Type with a field for each array.
         name: Name of the block to attach to; by default a new block is made.
 
     Attributes:
         name: Name of the block.
-        views: Array of each entry.
+        views: Array of each field.
     """
 
-    def __init__(self, layout: Mapping[str, Any], name: str | None = None):
-        boxes = [(key, tuple(box.shape or ()), np.dtype(box.dtype)) for key, box in layout.items()]
-        sizes = [int(np.prod(shape)) * dtype.itemsize for _, shape, dtype in boxes]
-        starts = np.cumsum([0, *(-(-size // 64) * 64 for size in sizes)])  # aligned
-        self._memory = SharedMemory(name, create=name is None, size=max(int(starts[-1]), 1))
-        self.name = self._memory.name
-        self._owner = name is None
-        self.views = {
-            key: np.ndarray(shape, dtype, self._memory.buf, int(start))
-            for (key, shape, dtype), start in zip(boxes, starts, strict=False)
-        }
-
-    def write(self, observation: Mapping[str, np.ndarray]) -> None:
-        """Copy an observation to the shared memory."""
-        for key, view in self.views.items():
-            view[...] = observation[key]
+    def __init__(self, dtype: np.dtype, name: str | None = None):
+        self._memory = SharedMemory(name, create=name is None, size=max(dtype.itemsize, 1))
+        self.name, self._owner = self._memory.name, name is None
+        arrays = np.ndarray((), dtype, self._memory.buf)
+        self.views = {key: arrays[key] for key in dtype.names or ()}
 
     def close(self) -> None:
         """Close the block; the process that made it also frees it."""
@@ -100,9 +82,9 @@ class VectorHost(Host):
             inner = getattr(self.env, "env", None)
             setattr(inner if inner is not None and not hasattr(self.env, key) else self.env, key, value)
 
-    def attach(self, name: str, layout: Mapping[str, Layout]) -> None:
-        """Write observations to shared memory, where they fit its layout."""
-        self.shared = Shared(layout, name)
+    def attach(self, name: str, dtype: np.dtype) -> None:
+        """Write observations to shared memory, where they fit its fields."""
+        self.shared = Shared(dtype, name)
 
     def close(self) -> None:
         super().close()
@@ -122,7 +104,7 @@ def arrays_of(observation: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return {
         key: value
         for key, value in observation.items()
-        if isinstance(value, np.ndarray) and not value.dtype.hasobject
+        if isinstance(key, str) and isinstance(value, np.ndarray) and not value.dtype.hasobject
     }
 
 
@@ -155,11 +137,11 @@ class ShArray:
 
     def _open(self, dtype: np.dtype, shape: tuple[int, ...], name: str | None = None) -> None:
         self.dtype, self.shape = dtype, shape
-        self._shared = Shared({"array": np.empty(shape, dtype)}, name)
+        self._shared = Shared(np.dtype([("array", dtype, shape)]), name)
 
     def save(self, array: Any) -> None:
         """Write the array."""
-        self._shared.write({"array": array})
+        self._shared.views["array"][...] = array
 
     def get(self) -> np.ndarray:
         """Return a copy of the array."""
@@ -387,9 +369,9 @@ class SubprocEnvWorker(_HostWorker):
             absent = [key for key in shared.views if observation.get(key, 0) is None]
             observation.update({key: shared.views[key].copy() for key in absent})
         elif arrays := arrays_of(observation):
-            layout = {key: Layout(array.shape, array.dtype) for key, array in arrays.items()}
-            self._shared = shared = Shared(layout)
-            self._answer("attach", self._worker.send("attach", shared.name, layout))
+            dtype = np.dtype([(key, one.dtype, one.shape) for key, one in arrays.items()], align=True)
+            self._shared = shared = Shared(dtype)
+            self._answer("attach", self._worker.send("attach", shared.name, dtype))
 
     def close_env(self) -> None:
         """End the process, by force where it does not answer."""

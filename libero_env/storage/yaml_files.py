@@ -91,10 +91,9 @@ def parse_yaml_text(text: str, source: str = "<string>") -> YamlFile:
         InvalidInputError: The text is not valid YAML, has a key twice, is nested too deeply, or grows too large by its
             aliases; the message starts with file:line.
     """
-    if (depth := _text_depth(text)) > _MAX_DEPTH:
-        raise InvalidInputError(f"{source}: lists within lists, {depth} deep; at most {_MAX_DEPTH} are read")
     loader = _LOADER(text)
     try:
+        _check_depth(text, source)
         node = loader.get_single_node()
         if node is None:
             return YamlFile(source, None, {(): 1})
@@ -114,30 +113,13 @@ def parse_yaml_text(text: str, source: str = "<string>") -> YamlFile:
         loader.dispose()
 
 
-def _text_depth(text: str) -> int:
-    """Return an upper bound of the nesting of a text, without parsing it: parsers in C have no limit of their own."""
-    flow = depth = 0
-    indents: list[int] = []
-    for line in text.splitlines():
-        stripped = line.lstrip(" ")
-        if not stripped or stripped.startswith("#"):
-            continue
-        indent = len(line) - len(stripped)
-        while indents and indents[-1] >= indent:
-            indents.pop()
-        indents.append(indent)
-        marks = 0  # `- - - a` nests within a line
-        for character in stripped:
-            if character not in "-? ":
-                break
-            marks += character in "-?"
-        for character in stripped:
-            if character in "[{":
-                flow += 1
-            elif character in "]}":
-                flow = max(0, flow - 1)
-            depth = max(depth, flow + marks + len(indents))
-    return depth
+def _check_depth(text: str, source: str) -> None:
+    """Check the nesting of a text before its content is built: loaders in C have no limit of their own."""
+    depth = 0
+    for event in yaml.parse(text, Loader=_LOADER):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if depth > _MAX_DEPTH:
+            raise InvalidInputError(f"{source}: lists within lists, more than {_MAX_DEPTH} deep")
 
 
 def _check_size(node: yaml.Node, source: str) -> None:

@@ -2,7 +2,7 @@
 
 import re
 from collections import UserDict
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from functools import cached_property, partialmethod
 from os import PathLike
 from pathlib import Path
@@ -46,6 +46,11 @@ VISUAL_CHANGE_OBJECTS_DICT: dict[str, Any] = {}
 def category_of(name: str) -> str:
     """Return the category of a class name: `chefmate_8_frypan` for `Chefmate8Frypan`."""
     return "_".join(re.sub(r"([A-Z0-9])", r" \1", name).split()).lower()
+
+
+def class_name(category: str) -> str:
+    """Return the class name of a category, the inverse of `category_of`."""
+    return "".join(map(str.title, category.split("_")))
 
 
 def register_object(target_class: Any) -> Any:
@@ -256,8 +261,8 @@ class MujocoXMLObject(BaseObject):
         return model_of(self, self.category_name)
 
 
-def declare(base: type[BaseObject], names: str) -> dict[str, type]:
-    """Register a subclass of `base` for each of the class names, and return them by name."""
+def declare(base: type[BaseObject], categories: Iterable[str]) -> dict[str, type]:
+    """Register a subclass of `base` for each of the categories, and return them by name."""
     facts = {"__module__": base.__module__}
-    classes = [type(name, (base,), {**facts, "__doc__": f"`{category_of(name)}`"}) for name in names.split()]
+    classes = [type(class_name(c), (base,), {**facts, "__doc__": f"`{c}`"}) for c in categories]
     return {cls.__name__: register_object(cls) for cls in classes}

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObject
+from libero.libero.envs.base_object import OBJECTS_DICT, BaseObject, BuiltinObject, class_name
 from libero.libero.envs.objects import SiteObject
 from libero.libero.envs.robots import Panda
 from libero_env.mujoco_compat import mujoco
@@ -30,7 +30,7 @@ def scene_fixtures(scene: Scene) -> dict[str, Any]:
 def _instance(name: str, model: ObjectModel) -> BaseObject:
     cls = OBJECTS_DICT.get(model.category)
     if cls is None:  # a category that is registered only with `libero_env`
-        cls = type("".join(map(str.title, model.category.split("_"))), (BuiltinObject,), {})
+        cls = type(class_name(model.category), (BuiltinObject,), {})
         return cls(name=name, model=model)
     takes_model = (
         isinstance(cls, type) and issubclass(cls, BuiltinObject) and cls.__init__ is BuiltinObject.__init__

@@ -19,6 +19,7 @@ from libero.libero.envs.base_object import (
     register_object,
     register_visual_change_object,
 )
+from libero_env.assets.original import FAMILIES
 from libero_env.parallel import send_to_workers
 from libero_env.sim.predicates import Box, contains, is_over
 
@@ -48,26 +49,10 @@ class TurbosquidObjects(BuiltinObject):
     family = "turbosquid_objects"
 
 
-ARTICULATED = (
-    "BasinFaucet Faucet FlatStove Microwave ShortCabinet ShortFridge SlideCabinet WhiteCabinet Window "
-    "WoodenCabinet"
-)
-SCANNED = "AkitaBlackBowl Basket Chefmate8Frypan GlazedRimPorcelainRamekin Plate Rack WhiteBowl"
-HOPE = (
-    "AlphabetSoup BbqSauce Butter Cherries ChocolatePudding Cookies Corn CreamCheese Ketchup "
-    "MacaroniAndCheese Mayo Milk NewSaladDressing OrangeJuice Popcorn SaladDressing TomatoSauce"
-)
-TURBOSQUID = (
-    "BlackBook BowlDrainer DeskCaddy DiningSetGroup MokaPot PorcelainMug RedCoffeeMug WhiteStorageBox "
-    "WhiteYellowMug WineBottle WineRack WoodenShelf WoodenTray WoodenTwoLayerShelf YellowBook"
-)
-for base, names in (
-    (ArticulatedObject, ARTICULATED),
-    (GoogleScannedObject, SCANNED),
-    (HopeBaseObject, HOPE),
-    (TurbosquidObjects, TURBOSQUID),
-):
-    globals().update(declare(base, names))
+WITHOUT_MODEL = ("cherries", "corn", "mayo")  # of HOPE; the original registers them, but has no files of them
+for base in (ArticulatedObject, GoogleScannedObject, HopeBaseObject, TurbosquidObjects):
+    more = WITHOUT_MODEL if base is HopeBaseObject else ()
+    globals().update(declare(base, sorted((*FAMILIES[base.family], *more))))
 register_visual_change_object(globals()["FlatStove"])
 
 
