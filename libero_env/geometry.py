@@ -151,6 +151,13 @@ def quat_to_mat(quat_wxyz: np.ndarray) -> np.ndarray:
     return mat.reshape(3, 3)
 
 
+def mat_to_quat(mat: np.ndarray) -> np.ndarray:
+    """Return the unit quaternion (4,), wxyz, of a rotation matrix (3, 3)."""
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, np.ravel(mat))
+    return quat
+
+
 def quat_from_axis_angle(axis: np.ndarray, angle: float) -> np.ndarray:
     """Return the quaternion (4,), wxyz, of a rotation by `angle`, rad, about a unit axis (3,)."""
     quat = np.empty(4)
@@ -200,9 +207,8 @@ def rotation_between(mat: np.ndarray, goal_mat: np.ndarray) -> np.ndarray:
     Returns:
         Axis times angle in the world frame, (3,), rad.
     """
-    quat, rotation = np.empty(4), np.empty(3)
-    mujoco.mju_mat2Quat(quat, (goal_mat @ mat.T).ravel())
-    mujoco.mju_quat2Vel(rotation, quat, 1.0)
+    rotation = np.empty(3)
+    mujoco.mju_quat2Vel(rotation, mat_to_quat(goal_mat @ mat.T), 1.0)
     return rotation
 
 

@@ -335,37 +335,31 @@ _WORDS = {
     "none_required": "null",
     "callable_type": "a function or class",
     "string_too_short": "a text that is not empty",
-}
-_LIMITS = {
-    "greater_than": ("above", "gt"),
-    "greater_than_equal": ("at least", "ge"),
-    "less_than": ("below", "lt"),
-    "less_than_equal": ("at most", "le"),
+    "string_too_long": "at most {max_length} characters",
+    "string_pattern_mismatch": "a text that matches {pattern}",
+    "literal_error": "one of {expected}",
+    "greater_than": "above {gt}",
+    "greater_than_equal": "at least {ge}",
+    "less_than": "below {lt}",
+    "less_than_equal": "at most {le}",
+    "too_short": "at least {min_length} {entries}",
+    "too_long": "at most {max_length} {entries}",
+    "is_instance_of": "{class}",
 }
 
 
 def _expected(error: "ErrorDetails") -> str:
-    kind, context = error["type"], error.get("ctx", {})
-    if kind in _LIMITS:
-        words, key = _LIMITS[kind]
-        return f"{words} {_number(context[key])}"
-    if kind in ("too_short", "too_long"):
-        count = context["min_length" if kind == "too_short" else "max_length"]
-        words = "at least" if kind == "too_short" else "at most"
-        return f"{words} {count} {'entry' if count == 1 else 'entries'}"
-    if kind == "literal_error":
-        return f"one of {context['expected']}"
-    if kind == "string_pattern_mismatch":
-        return f"a text that matches {context['pattern']}"
-    if kind == "string_too_long":
-        return f"at most {context['max_length']} characters"
-    if kind == "is_instance_of":
-        return "a list" if context["class"] == "Sequence" else f"{context['class']}"
-    return _WORDS.get(kind) or error["msg"]
+    if (words := _WORDS.get(error["type"])) is None:
+        return error["msg"]
+    context = {key: _number(value) for key, value in error.get("ctx", {}).items()}
+    if context.get("class") == "Sequence":
+        return "a list"
+    bounds = context.get("min_length"), context.get("max_length")
+    return words.format(**context, entries="entry" if "1" in bounds else "entries")
 
 
-def _number(value: float) -> str:
-    return str(value) if isinstance(value, int) else f"{value:g}"
+def _number(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _annotations(kind: Any) -> Mapping[str, Any]:

@@ -20,6 +20,7 @@ from libero_env.demos.config import RenderConfig
 from libero_env.demos.observe import fixture_poses, recorded_frequency, recorded_robot, recorded_task
 from libero_env.demos.read import Episode, read_episodes
 from libero_env.errors import InvalidInputError, LiberoError, require_known, require_package
+from libero_env.geometry import mat_to_quat
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations import KINDS, Perturbation, format_perturbations, parse_perturbations
 from libero_env.sim.observations import image_name
@@ -403,7 +404,7 @@ class Viewer:
             self.scene.update_from_mjdata(env.simulations.data(0))
             for name, frustum in self._frustums.items():
                 pose = env.observer.camera_to_world(0, name)
-                frustum.position, frustum.wxyz = pose[:3, 3], _quaternion(pose[:3, :3])
+                frustum.position, frustum.wxyz = pose[:3, 3], mat_to_quat(pose[:3, :3])
             self.frame.max = max(1, len(stage.frames) - 1)
             self.frame.value = index
             self.text.content = stage.describe(index)
@@ -553,9 +554,3 @@ def display_model(env: ProtocolEnv) -> mujoco.MjModel:
     fixtures = np.isin(model.body_rootid, env.scene.fixture_bodies) & (model.body_weldid == 0)
     model.body_weldid[fixtures] = np.flatnonzero(fixtures)
     return model
-
-
-def _quaternion(mat: np.ndarray) -> np.ndarray:
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, mat.ravel())
-    return quat

@@ -15,7 +15,7 @@ from libero._adapters.lookup import Named, lookup
 from libero._adapters.sim import MjSim
 from libero_env.assets.robot import GRIP_SITE
 from libero_env.errors import LiberoError, require_known
-from libero_env.geometry import quat_to_mat
+from libero_env.geometry import mat_to_quat, quat_to_mat
 from libero_env.mujoco_compat import mujoco
 
 SEGMENTATIONS = ("instance", "class", "element")
@@ -67,8 +67,7 @@ def _kinds(value: object) -> tuple[str, ...]:
 
 def quat_xyzw(mat: np.ndarray) -> np.ndarray:
     """Return a rotation matrix, (3, 3), as robosuite's quaternion xyzw, (4,) float32, whose w is not negative."""
-    quat = np.empty(4)
-    mujoco.mju_mat2Quat(quat, np.ravel(mat))
+    quat = mat_to_quat(mat)
     return np.roll(quat if quat[0] >= 0 else -quat, -1).astype(np.float32)
 
 
@@ -155,13 +154,11 @@ class Observer:
                 values[f"{camera.name}_image"], values[f"{camera.name}_depth"] = image, depth[..., None]
             else:
                 values[f"{camera.name}_image"] = render()
-            if camera.segmentations:
-                for kind in camera.segmentations:
-                    element = kind == "element"
-                    numbers = render(segmentation=True)[..., 1:]
-                    # the background, -1, is the last entry
-                    numbers = numbers if element else self.segments[kind][numbers]
-                    values[f"{camera.name}_segmentation_{kind}"] = numbers.astype(np.int32)
+            for kind in camera.segmentations:
+                numbers = render(segmentation=True)[..., 1:]
+                if kind != "element":
+                    numbers = self.segments[kind][numbers]  # the background, -1, is the last entry
+                values[f"{camera.name}_segmentation_{kind}"] = numbers.astype(np.int32)
         return {key: np.ascontiguousarray(value) for key, value in values.items()}
 
 
@@ -259,14 +256,12 @@ class RobosuiteMethods(Named, names=_SETS):
         A group is a name, names, or an object with `contact_geoms`.
         """
         first, second = _geoms(geoms_1), None if geoms_2 is None else _geoms(geoms_2)
-        pairs = [pair for touching in self._contacts() for pair in (touching, touching[::-1])]
-        return any(a in first and (second is None or b in second) for a, b in pairs)
+        return any(a in first and (second is None or b in second) for a, b in self._contacts())
 
     def get_contacts(self, model: Any) -> set[str]:
         """Return the names of the geoms that touch an object, without its own."""
         geoms = _geoms(model)
-        pairs = [pair for touching in self._contacts() for pair in (touching, touching[::-1])]
-        return {b for a, b in pairs if a in geoms and b not in geoms}
+        return {b for a, b in self._contacts() if a in geoms and b not in geoms}
 
     def _check_grasp(self, gripper: Any, object_geoms: Any) -> bool:
         """Return whether each finger pad of the gripper, or each given group of geoms, touches the object."""
@@ -286,8 +281,10 @@ class RobosuiteMethods(Named, names=_SETS):
         return float(np.linalg.norm(difference)) if return_distance else difference
 
     def _contacts(self) -> list[tuple[str, str]]:
+        """Return the names of the geoms that touch, each pair in both orders."""
         name, data = self.sim.model.geom_id2name, self.sim.data
-        return [(name(c.geom1), name(c.geom2)) for c in data.contact[: data.ncon]]
+        pairs = [(name(c.geom1), name(c.geom2)) for c in data.contact[: data.ncon]]
+        return pairs + [(b, a) for a, b in pairs]
 
     # Observables --------------------------------------------------------------------------------------------
 

@@ -299,9 +299,8 @@ class MjSim:
             a pair of it and (H, W) float32 in [0, 1], the normalised depth buffer.
         """
         height, width = height or 480, width or 640
-        image = np.empty(
-            (height, width) if segmentation else (height, width, 3), np.int32 if segmentation else np.uint8
-        )
+        channels, dtype = ((), np.int32) if segmentation else ((3,), np.uint8)
+        image = np.empty((height, width, *channels), dtype)
         buffer = np.empty((height, width), np.float32) if depth else None
         renderer = self._renderer(height, width)
         camera = renderer.camera_id(camera_name or "frontview")

@@ -140,22 +140,14 @@ def capture(target: Callable[..., Any], flags: Sequence[str] = ()) -> Callable[.
     hints = get_type_hints(target, include_extras=True)
     fields = dataclasses.fields(target) if dataclasses.is_dataclass(target) else ()
     made = {f.name: f.default_factory() for f in fields if f.default_factory is not dataclasses.MISSING}
-    parameters = [
-        inspect.Parameter(
-            name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_quiet(hints[name], default)
-        )
-        for name, p in inspect.signature(target).parameters.items()
-        for default in [made.get(name, p.default)]
-    ]
-    parameters += [
-        inspect.Parameter(
-            flag,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=False,
-            annotation=Annotated[bool, arg(help=FLAGS[flag], help_behavior_hint="")],
-        )
-        for flag in flags
-    ]
+    parameter = functools.partial(inspect.Parameter, kind=inspect.Parameter.KEYWORD_ONLY)
+    parameters = []
+    for name, one in inspect.signature(target).parameters.items():
+        default = made.get(name, one.default)
+        parameters.append(parameter(name, default=default, annotation=_quiet(hints[name], default)))
+    for flag in flags:
+        kind = Annotated[bool, arg(help=FLAGS[flag], help_behavior_hint="")]
+        parameters.append(parameter(flag, default=False, annotation=kind))
     captured.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     captured.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": dict[str, Any]}
     captured.__doc__ = _documentation(target)

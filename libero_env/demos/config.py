@@ -211,7 +211,7 @@ class DemoConfig:
             language=task.language,
             bddl_name=f"{task_home(task)}/{task.name}.bddl",
             bddl_text=task.bddl_text,
-            env_kwargs=_env_kwargs(self.render_config),
+            env_kwargs={**read_yaml("demos/original_env.yaml"), **camera_kwargs(self.render_config)},
             pairing=self.pairing,
             seed=self.seed,
             generator=GENERATOR,
@@ -252,11 +252,6 @@ def _contents(part: Any) -> Iterator[tuple[str, bytes]]:
             yield name, repr(value).encode()
         elif not callable(value):  # opt, vis, stat
             yield from ((f"{name}.{own}", content) for own, content in _contents(value))
-
-
-def _env_kwargs(render: RenderConfig) -> dict[str, Any]:
-    """Return the arguments that the original's environment would be made with."""
-    return {**read_yaml("demos/original_env.yaml"), **camera_kwargs(render)}
 
 
 def camera_kwargs(render: RenderConfig) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 import h5py
 import numpy as np
@@ -186,11 +186,7 @@ def read_pairing(handle: h5py.File, file: Path) -> Pairing:
         BrokenDemoError: The file states something else.
     """
     stated = read_attribute(handle["data"], "pairing", f"{file}: data", "libero")
-    if not isinstance(stated, str) or stated not in get_args(Pairing):
-        raise BrokenDemoError(
-            f"{file}: attribute pairing is {stated!r}; valid: {', '.join(get_args(Pairing))}"
-        )
-    return "aligned" if stated == "aligned" else "libero"
+    return _checked(_Header, {"pairing": stated}, f"{file}: attribute")["pairing"]
 
 
 def is_image(key: str) -> bool:

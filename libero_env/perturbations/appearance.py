@@ -7,7 +7,7 @@ import numpy as np
 
 from libero_env.assets.arena import SPARE, surface_styles
 from libero_env.errors import InvalidInputError
-from libero_env.geometry import quat_to_mat, rotation_about
+from libero_env.geometry import mat_to_quat, quat_to_mat, rotation_about
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import direction, sign
 from libero_env.sim.appearance import HEADLIGHT, Appearance, CameraView, Light
@@ -37,8 +37,7 @@ def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float) -> Cam
     backward = (moved - pivot) / np.linalg.norm(moved - pivot)
     right = np.cross((0.0, 0.0, 1.0), backward)
     right /= np.linalg.norm(right)
-    turned = np.zeros(4)
-    mujoco.mju_mat2Quat(turned, np.stack([right, np.cross(backward, right), backward], axis=1).ravel())
+    turned = mat_to_quat(np.stack([right, np.cross(backward, right), backward], axis=1))
     x, y, z = moved.tolist()
     w, *axis = turned.tolist()
     return CameraView(pos=(x, y, z), quat=(w, axis[0], axis[1], axis[2]))

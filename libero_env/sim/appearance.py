@@ -17,6 +17,7 @@ from libero_env.mujoco_compat import mujoco
 from libero_env.sim.scene import Scene
 
 HEADLIGHT = "headlight"  # name of the light at the camera, which models do not name
+_COLOURS = ("ambient", "diffuse", "specular")  # of a light
 _GEOM = int(mujoco.mjtObj.mjOBJ_GEOM)
 Part = TypeVar("Part", "CameraView", "Light")
 
@@ -178,12 +179,9 @@ class SceneAppearance:
             change = self._lights.get(-1 if light.headlight else next(numbers))
             if change is None:
                 continue
-            for name in ("ambient", "diffuse", "specular"):
-                if (colour := getattr(change, name)) is not None:
-                    getattr(light, name)[:] = colour
-            for name in ("pos", "dir"):
-                if (vector := getattr(change, name)) is not None and not light.headlight:
-                    getattr(light, name)[:] = vector
+            for name in _COLOURS if light.headlight else (*_COLOURS, "pos", "dir"):
+                if (value := getattr(change, name)) is not None:
+                    getattr(light, name)[:] = value
 
 
 def element_index(model: mujoco.MjModel, what: str, name: str) -> int:

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from libero_env.errors import UnknownNameError, require_known
-from libero_env.mujoco_compat import mujoco
+from libero_env.errors import require_known
 from libero_env.objects.model import OPPOSITE_STATES
-from libero_env.sim.scene import zone_boxes
+from libero_env.sim.predicates import region_boxes
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 
@@ -88,14 +87,7 @@ def position_of(view: StateView, name: str) -> np.ndarray:
     Raises:
         UnknownNameError: The object, fixture or region does not exist.
     """
-    if view.is_entity(name):
-        return view.body_pos(name)
-    region = view.scene.problem.region(name)
-    if region is not None and region.ranges:
-        return zone_boxes(region, view.scene.workspace)[0][0]
-    if mujoco.mj_name2id(view.scene.model, mujoco.mjtObj.mjOBJ_SITE, name) < 0:
-        raise UnknownNameError("object, fixture or region", name, view.scene.entities)
-    return view.site_pos(name)
+    return view.body_pos(name) if view.is_entity(name) else region_boxes(view, name)[0].centre
 
 
 def joint_progress(view: StateView, address: str, state: str) -> float:
