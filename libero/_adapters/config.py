@@ -9,6 +9,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 
+from libero_env.text import flatten
+
 CONFIGS = Path(__file__).parents[1] / "configs"
 
 # key without effect -> what to do instead; most had none in the original either
@@ -83,11 +85,9 @@ def assign(node: Any, key: str, value: Any) -> None:
 
 def notes(cfg: Any) -> list[str]:
     """Return one line for each key that was changed but has no effect."""
-    current, defaults = OmegaConf.create(plain(cfg)), OmegaConf.create(plain(load_config()))
-    usual = {key: OmegaConf.select(defaults, key) for key in NO_EFFECT}
-    values = {key: OmegaConf.select(current, key, default=default) for key, default in usual.items()}
-    changed = [key for key in NO_EFFECT if values[key] != usual[key]]
-    return [f"{key}={values[key]} has no effect: {NO_EFFECT[key]}" for key in changed]
+    current, usual = flatten(plain(cfg)), flatten(load_config())
+    changed = [key for key in NO_EFFECT if current.get(key, usual[key]) != usual[key]]
+    return [f"{key}={current[key]} has no effect: {NO_EFFECT[key]}" for key in changed]
 
 
 def _wrap(value: Any) -> Any:

@@ -43,7 +43,7 @@ KINDS: Mapping[str, tuple[str, bool]] = MappingProxyType(
 
 
 class ActionConverter:
-    """Converts the actions of a file's demonstrations; the scene is compiled when the first needs it.
+    """Converts the actions of a file's demonstrations.
 
     Args:
         file: Demonstration file, which states scene and robot.
@@ -61,8 +61,9 @@ class ActionConverter:
     ):
         require_known("kind of actions", kind, KINDS)
         self.kind, self._file = kind, file
+        is_needed = kind != "delta" or task is not None  # which the states have to be of
         self._renderer = (
-            StateRenderer.of_file(file, RenderConfig(()), assets, task=task) if kind != "delta" else None
+            StateRenderer.of_file(file, RenderConfig(()), assets, task=task) if is_needed else None
         )
 
     def convert(self, episode: Episode) -> Episode:
@@ -74,6 +75,8 @@ class ActionConverter:
         if self._renderer is None:
             return episode
         self._renderer.prepare(episode, f"{self._file}: {episode.name}")
+        if self.kind == "delta":
+            return episode
         simulations, controller = self._renderer.env.simulations, get_controller(*KINDS[self.kind])
         kept, goals = None, []
         for state, action in zip(episode.states, episode.actions, strict=True):

@@ -161,24 +161,18 @@ def find_demo_files(paths: Sequence[Path]) -> list[Path]:
     """
     if missing := [path for path in paths if path.suffix != ".hdf5" and not path.exists()]:
         raise DemoError(f"{missing[0]} does not exist; give demonstration files, or folders that hold some")
-    paths = paths or [demos_dir()]
-    groups = [[path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")) for path in paths]
-    found = (  # without parts of unfinished recordings, and links
-        file
-        for group in groups
-        for file in group
-        if file in paths or not (file.is_symlink() or file.parent.suffix == ".parts")
-    )
-    known: dict[Path, Path] = {}
-    for file in found:
-        known.setdefault(file.resolve(), file)  # each once
-    files = list(known.values())
+    paths, files = paths or [demos_dir()], dict[Path, Path]()
+    for path in paths:
+        for file in [path] if path.suffix == ".hdf5" else sorted(path.rglob("*.hdf5")):
+            # without links and parts of unfinished recordings
+            if file in paths or not (file.is_symlink() or file.parent.suffix == ".parts"):
+                files.setdefault(file.resolve(), file)  # each once
     if not files:
         where = ", ".join(map(str, paths))
         raise DemoError(
             f"no demonstrations in {where}; record some with `libero demos generate --benchmark NAME`"
         )
-    return files
+    return list(files.values())
 
 
 def describe(file: Path) -> str:

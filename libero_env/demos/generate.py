@@ -89,7 +89,7 @@ J = TypeVar("J", bound=DemoJob)
 
 
 @contextmanager
-def claim_incomplete(jobs: Iterable[tuple[J, int]]) -> Iterator[list[tuple[J, int]]]:
+def claim_incomplete(jobs: Iterable[tuple[J, int]]) -> Iterator[list[J]]:
     """Yield the jobs that are not complete, while no other process works in their folders.
 
     Args:
@@ -100,7 +100,7 @@ def claim_incomplete(jobs: Iterable[tuple[J, int]]) -> Iterator[list[tuple[J, in
         for folder in sorted({job.path.parent for job, _ in incomplete}):
             locks.enter_context(_recording_lock(folder))
         # another process may have finished some before the folders were locked
-        yield [(job, n) for job, n in incomplete if not job.is_complete(n)]
+        yield [job for job, n in incomplete if not job.is_complete(n)]
 
 
 def number_of_processes(workers: int) -> int:
@@ -190,8 +190,7 @@ def make_demos(
     """
     workers = number_of_processes(workers)
     reports = {job.path: RecordingReport(n) for job in jobs}
-    with claim_incomplete((job, n) for job in jobs) as claimed:
-        incomplete = [job for job, _ in claimed]
+    with claim_incomplete((job, n) for job in jobs) as incomplete:
         for job in incomplete if replace else ():
             try:
                 job.missing(n)
@@ -214,13 +213,12 @@ def _record(
     jobs: Sequence[RecordingJob], n: int, *, workers: int, progress: bool | None
 ) -> dict[Path, RecordingReport]:
     """Record as `make_demos` does, while no other process records in the same folders."""
-    writers = [job.writer for job in jobs]
     missing = [sorted(job.missing(n)) for job in jobs]
-    reports = [RecordingReport(n - len(numbers)) for numbers in missing]
+    reports = {job.path: RecordingReport(n - len(m)) for job, m in zip(jobs, missing, strict=True)}
     chunks = [
-        (j, numbers[i : i + jobs[j].config.batch])
-        for j, numbers in enumerate(missing)
-        for i in range(0, len(numbers), jobs[j].config.batch)
+        (job, numbers[i : i + job.config.batch])
+        for job, numbers in zip(jobs, missing, strict=True)
+        for i in range(0, len(numbers), job.config.batch)
     ]
     if progress is not False:
         count = sum(map(len, missing))
@@ -228,31 +226,31 @@ def _record(
         tell_progress(f"recording {count} demonstrations of {len(jobs)} tasks in {folders}")
     bar = progress_bar(
         total=n * len(jobs),
-        initial=sum(report.recorded for report in reports),
+        initial=sum(report.recorded for report in reports.values()),
         desc="demonstrations",
         unit="demo",
         smoothing=0.1,
         progress=progress,
     )
-    for writer, numbers in zip(writers, missing, strict=True):
+    for job, numbers in zip(jobs, missing, strict=True):
         if not numbers:  # a process was killed after the last part
-            writer.finish()
-    arguments = [(jobs[j].config, writers[j], numbers) for j, numbers in chunks]
+            job.writer.finish()
     results = run_each(
         record_chunk,
-        arguments,
+        [(job.config, job.writer, numbers) for job, numbers in chunks],
         min(workers, len(chunks)),
-        lambda i: not reports[chunks[i][0]].error,  # a job ends at its first error
+        lambda i: not reports[chunks[i][0].path].error,  # a job ends at its first error
     )
     with bar, closing(recorders), closing(results):
-        for i, report in results:
-            j = chunks[i][0]
-            reports[j].add(report)
-            bar.update(report.recorded)
-            bar.set_postfix(failed=sum(r.failure_reasons.total() for r in reports), refresh=False)
-            if reports[j].recorded == n:
-                writers[j].finish()
-    return {job.path: report for job, report in zip(jobs, reports, strict=True)}
+        for i, done in results:
+            job = chunks[i][0]
+            report = reports[job.path]
+            report.add(done)
+            bar.update(done.recorded)
+            bar.set_postfix(failed=sum(r.failure_reasons.total() for r in reports.values()), refresh=False)
+            if report.recorded == n:
+                job.writer.finish()
+    return reports
 
 
 @contextmanager

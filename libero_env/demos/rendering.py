@@ -112,9 +112,9 @@ def ensure_rendered(
     for job in jobs:
         if job.config.perturb and (job.path not in largest or largest[job.path].n < job.n):
             largest[job.path] = job
-    with claim_incomplete((job, job.n) for job in largest.values()) as claimed:
-        if claimed:
-            _render([job for job, _ in claimed], min(workers, len(claimed)), progress)
+    with claim_incomplete((job, job.n) for job in largest.values()) as incomplete:
+        if incomplete:
+            _render(incomplete, min(workers, len(incomplete)), progress)
     return [job.path for job in jobs]
 
 

@@ -11,17 +11,15 @@ mirrored images, as the clients of openpi, OpenVLA-OFT, GR00T and LeRobot do.
 
 import json
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from libero_env.demos.actions import KINDS, ActionConverter
-from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import json_attribute, read_header
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.observe import (
-    StateRenderer,
     recorded_rendering,
     recorded_robot,
     recorded_task,
@@ -118,15 +116,9 @@ def export_demos(
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
             require_default_frequency(file, f"the layout {form}")
             language = recorded_language(file, task)
-            with ExitStack() as stack:
-                converter = stack.enter_context(closing(ActionConverter(file, actions, task)))
-                scene = None if task is None else StateRenderer.of_file(file, RenderConfig(()), task=task)
-                if scene is not None:
-                    stack.callback(scene.close)
+            with closing(ActionConverter(file, actions, task)) as converter:
                 for episode in read_episodes(file):
                     where = f"{file}: {episode.name}"
-                    if scene is not None:  # a file of another task would get this one's instruction
-                        scene.prepare(episode, where)
                     dataset.add(converter.convert(_exported(episode, where, labels)), language, where)
         controller, relative = KINDS[actions]
         control = {"actions": actions, "controller": controller, "control_delta": relative}

@@ -7,10 +7,12 @@ from xml.etree.ElementTree import Element
 
 from libero._adapters.lookup import alias_modules, lookup
 from libero._adapters.models import facade_pack
+from libero.libero.envs.base_object import class_name
 from libero_env.assets.arena import load_workspace
 from libero_env.assets.original_arena import TEXTURES
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.mujoco_compat import mujoco
+from libero_env.workspaces import BUILTIN_WORKSPACES
 
 STYLE_KINDS = ("floor", "wall")
 STYLE_MAPPING = {kind: dict(TEXTURES[kind]) for kind in STYLE_KINDS}
@@ -99,15 +101,8 @@ class WorkspaceArena(Arena):
         """Do nothing: tables have the sizes and places of the benchmark."""
 
 
-_CATEGORIES = {
-    "CoffeeTableArena": "coffee_table",
-    "EmptyArena": "floor",
-    "KitchenTableArena": "kitchen_table",
-    "LivingRoomTableArena": "living_room_table",
-    "StudyTableArena": "study_table",
-    "TableArena": "table",
-}
-for _name, _category in _CATEGORIES.items():
+for _category in BUILTIN_WORKSPACES:
+    _name = "EmptyArena" if _category == "floor" else f"{class_name(_category)}Arena"
     globals()[_name] = type(_name, (WorkspaceArena,), {"__module__": __name__, "category": _category})
 
 alias_modules(

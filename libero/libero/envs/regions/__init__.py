@@ -13,6 +13,7 @@ from libero_env.assets.arena import load_workspace
 from libero_env.errors import PlacementError, UnknownNameError
 from libero_env.objects.model import rest_quat
 from libero_env.parallel import send_to_workers
+from libero_env.workspaces import BUILTIN_WORKSPACES
 
 Placements = dict[str, tuple[tuple[float, float, float], np.ndarray, Any]]
 _TRIES = 5000
@@ -264,18 +265,12 @@ class TurnOnOffSampler(ObjectPropertySampler):
     states = ("turnon", "turnoff")
 
 
-_TABLES = {
-    "libero_tabletop_manipulation": ("table", TableRegionSampler),
-    "libero_kitchen_tabletop_manipulation": ("kitchen_table", Libero100TableRegionSampler),
-    "libero_living_room_tabletop_manipulation": ("living_room_table", Libero100TableRegionSampler),
-    "libero_study_tabletop_manipulation": ("study_table", Libero100TableRegionSampler),
-    "libero_coffee_table_manipulation": ("coffee_table", TableRegionSampler),
-    "libero_floor_manipulation": ("floor", TableRegionSampler),
-}
-REGION_SAMPLERS: dict[str, dict[str, type]] = {
-    problem: {category: type(f"{base.__name__}_{category}", (base,), {"category": category})}
-    for problem, (category, base) in _TABLES.items()
-}
+_OF_LIBERO_100 = ("kitchen_table", "living_room_table", "study_table")
+REGION_SAMPLERS: dict[str, dict[str, type]] = {}  # problem -> workspace -> class
+for _category in BUILTIN_WORKSPACES:
+    _base = Libero100TableRegionSampler if _category in _OF_LIBERO_100 else TableRegionSampler
+    _class = type(f"{_base.__name__}_{_category}", (_base,), {"category": _category})
+    REGION_SAMPLERS[load_workspace(_category).problem.lower()] = {_category: _class}
 
 
 def get_region_samplers(problem_name: str, region_sampler_name: str) -> type:
