@@ -12,7 +12,7 @@ from libero_env.errors import PlacementError
 from libero_env.init_states.placement import collision_boxes, lowest_point, settle
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import SampleKey
-from libero_env.perturbations.starts import contacts, posed
+from libero_env.perturbations.starts import carried, contacts, placements, posed
 from libero_env.sim.scene import Scene, zone_boxes
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.tasks.problem import Problem, Region
@@ -132,8 +132,7 @@ class Pairing:
         return row
 
     def _region(self, name: str) -> Region:
-        atom = next(a for a in self.scene.problem.init if a.args[0] == name)
-        region = self.scene.problem.region(atom.args[1])
+        region = self.scene.problem.region(placements(self.scene.problem)[name])
         if region is None or not region.ranges:
             raise PlacementError(f"{name} is new and has no place on {self.scene.workspace_name}")
         return region
@@ -180,19 +179,10 @@ def _stacked(boxes: Iterable[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 
 def moved(base: Problem, problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the objects whose region was moved, or that stand on one of those, and by how much, (2,) [m]."""
-    shifts: dict[str, np.ndarray] = {}
-    waiting = [a for a in base.init if len(a.args) == 2 and a.args[0] in base.objects]
-    for atom in waiting:
-        now = next((a for a in problem.init if len(a.args) == 2 and a.args[0] == atom.args[0]), atom)
-        before, after = base.region(atom.args[1]), problem.region(now.args[1])
+    there, new = placements(base), placements(problem)
+    for name, load in carried(base).items():
+        before, after = base.region(there[name]), problem.region(new.get(name, there[name]))
         if before is not None and after is not None and before.ranges and after.ranges:
             shift = np.array(after.ranges[0][:2]) - before.ranges[0][:2]
             if shift.any():
-                shifts[atom.args[0]] = shift
-    for _ in waiting:  # what stands on what stands on something
-        for atom in waiting:
-            region = base.region(atom.args[1])
-            carrier = atom.args[1] if region is None else region.target
-            if carrier in shifts:
-                shifts.setdefault(atom.args[0], shifts[carrier])
-    yield from shifts.items()
+                yield from ((one, shift) for one in (name, *load))

@@ -12,7 +12,7 @@ from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.init_states.store import load_init_states
 from libero_env.perturbations.instructions import reword
 from libero_env.perturbations.kinds import direction
-from libero_env.perturbations.starts import carried, contacts, shifted
+from libero_env.perturbations.starts import carried, contacts, placements, shifted
 from libero_env.sim.scene import Scene
 from libero_env.storage import read_yaml
 from libero_env.tasks.builder import entities_in_goal
@@ -96,14 +96,14 @@ def _of_other_places(task: Task) -> Iterator[Task]:
     problem, atom = task.problem, _only_atom(task)
     if atom is None or atom.predicate != "On" or not all(t.endswith(_ON_PLATE) for t in _instructions(task)):
         return
-    carried = atom.args[0]
-    start = next((a.args[1] for a in problem.init if a.args[0] == carried and len(a.args) == 2), "")
+    moved = atom.args[0]
+    start = placements(problem).get(moved, "")
     for region in problem.regions:
         words = _PLACES.get((problem.fixtures.get(region.target, ""), region.name))
         if words is not None and not start.startswith(region.target):
-            changed = And((Atom("On", (carried, region.address)),))
+            changed = And((Atom("On", (moved, region.address)),))
             said = [text.removesuffix(_ON_PLATE) + words for text in _instructions(task)]
-            yield _with_words(task, said, goal=changed, obj_of_interest=(carried, region.target))
+            yield _with_words(task, said, goal=changed, obj_of_interest=(moved, region.target))
 
 
 def _is_named(category: str, text: str) -> bool:
