@@ -134,13 +134,15 @@ class LeRobotPolicy(Policy):
         )
         return policy_class(config)
 
+    @property
+    def _images(self) -> list[str]:
+        """LeRobot's names of the views."""
+        return [IMAGES.get(view, f"observation.images.{view}") for view in self.spec.views]
+
     def _features(self) -> dict[str, dict[str, Any]]:
         types = lerobot_module("configs.types")
         feature, kind = types.PolicyFeature, types.FeatureType
-        inputs = {
-            IMAGES.get(view, f"observation.images.{view}"): feature(kind.VISUAL, (3, *self.spec.image_size))
-            for view in self.spec.views
-        }
+        inputs = {key: feature(kind.VISUAL, (3, *self.spec.image_size)) for key in self._images}
         inputs[STATE] = feature(kind.STATE, (sum(self.spec.proprio.values()),))
         if self.language:
             inputs[EMBEDDING] = feature(kind.ENV, (self.spec.language_dim,))
@@ -284,9 +286,7 @@ class LeRobotPolicy(Policy):
         pick = lambda x: x[:, frames[0]] if single else x[:, list(frames)]  # noqa: E731
         images = pick(observation.images)
         given: dict[str, Any] = {
-            IMAGES.get(view, f"observation.images.{view}"): images[..., k, :, :, :].movedim(-1, -3).float()
-            / 255
-            for k, view in enumerate(self.spec.views)
+            key: images[..., k, :, :, :].movedim(-1, -3).float() / 255 for k, key in enumerate(self._images)
         }
         given[STATE] = pick(torch.cat([observation.proprio[name] for name in self.spec.proprio], dim=-1))
         if self.language:
@@ -316,7 +316,7 @@ class LeRobotPolicy(Policy):
     def lerobot_statistics(self) -> dict[str, dict[str, Tensor]]:
         """Return the statistics as LeRobot has them; of images those of ImageNet, its default."""
         colours = {name: torch.tensor(values).view(3, 1, 1) for name, values in _IMAGENET.items()}
-        statistics = {IMAGES.get(view, f"observation.images.{view}"): colours for view in self.spec.views}
+        statistics = dict.fromkeys(self._images, colours)
         if not bool(self.moments.any()):
             return statistics
         state, action = (

@@ -23,6 +23,7 @@ from libero_env.errors import InvalidInputError, LiberoError, require_known, req
 from libero_env.geometry import mat_to_quat
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations import KINDS, Perturbation, format_perturbations, parse_perturbations
+from libero_env.perturbations.appearance import mean_colour
 from libero_env.sim.observations import image_name
 from libero_env.tasks import Task, find_tasks, read_task
 from libero_eval.plan import load_policy, resolve_protocol
@@ -543,13 +544,9 @@ def display_model(env: ProtocolEnv) -> mujoco.MjModel:
     model.site_group[:] = _HIDDEN_GROUP
     for geom in np.flatnonzero((model.geom_type != mujoco.mjtGeom.mjGEOM_MESH) & (model.geom_matid >= 0)):
         material = model.geom_matid[geom]
-        texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB]
-        if texture >= 0:
-            pixels = model.tex(texture).data
+        if model.mat_texid[material].max() >= 0:
             model.geom_rgba[geom] = model.mat_rgba[material]
-            model.geom_rgba[geom, :3] *= (
-                pixels.reshape(-1, model.tex_nchannel[texture])[:, :3].mean(axis=0) / 255
-            )
+            model.geom_rgba[geom, :3] = mean_colour(model, material)
             model.geom_matid[geom] = -1
     fixtures = np.isin(model.body_rootid, env.scene.fixture_bodies) & (model.body_weldid == 0)
     model.body_weldid[fixtures] = np.flatnonzero(fixtures)

@@ -4,8 +4,6 @@ The model is the environment's own copy, so clients may write to it; a new pose 
 `body_quat` takes effect with the next `forward`.
 """
 
-import os
-import sys
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -13,7 +11,8 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.envs.env import require_display
+from libero_env.errors import LiberoError, RenderError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
 from libero_env.sim.render import Renderer, RenderTarget
 from libero_env.sim.scene import Scene
@@ -392,7 +391,9 @@ class Window:
 
     def _opened(self, model: mujoco.MjModel, data: mujoco.MjData) -> Any:
         self._tried = True
-        if sys.platform.startswith("linux") and not {"DISPLAY", "WAYLAND_DISPLAY"} & set(os.environ):
+        try:
+            require_display()
+        except RenderError:
             message = "has_renderer=True: there is no screen; use camera observations or sim.render"
             warnings.warn(message, stacklevel=4)
             return None

@@ -16,7 +16,7 @@ from libero.libero.utils.download_utils import datasets_folder
 from libero.libero.utils.mu_utils import scene_key
 from libero.scripts.command import script
 from libero_env.cli.options import Positional, arg
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, require_known
 
 Kind = Literal["problem_class", "scene", "object", "arena"]
 
@@ -57,8 +57,7 @@ def create_template(
     """
     kinds = get_args(Kind)
     kind = template or _ask(f"Kind of template ({', '.join(kinds)})", "--template")
-    if kind not in kinds:
-        raise LiberoError(f"{kind!r} is not a template; valid: {', '.join(kinds)}")
+    require_known("template", kind, kinds)
     name = name or _ask("Name of the class, such as MyKitchenScene", "--name")
     if not re.fullmatch(r"[A-Z]\w*", name, re.ASCII):
         raise LiberoError(f"{name!r} is not a valid class name; begin with a capital, use letters and digits")

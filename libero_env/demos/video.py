@@ -1,5 +1,6 @@
 """Videos: GIF and WebP with Pillow, MP4 with PyAV (`pip install libero-lifelong[export]`)."""
 
+import io
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -151,6 +152,13 @@ def _errors_named(path: Path) -> Iterator[None]:
         raise LiberoError(
             f"{path} cannot be written ({error.strerror or error}); choose another folder"
         ) from error
+
+
+def encode_image(image: np.ndarray, form: str, **options: Any) -> bytes:
+    """Return an image (H, W, 3) uint8 as a file of a format of Pillow, with its options."""
+    file = io.BytesIO()
+    Image.fromarray(image).save(file, form, **options)
+    return file.getvalue()
 
 
 def write_video(path: Path, frames: np.ndarray, fps: int) -> Path:

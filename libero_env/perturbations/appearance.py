@@ -131,11 +131,12 @@ _colours: "WeakKeyDictionary[mujoco.MjModel, dict[str, np.ndarray]]" = WeakKeyDi
 def _mean_colours(model: mujoco.MjModel) -> dict[str, np.ndarray]:
     """Return the mean colour of each material, RGB from 0 to 1."""
     if model not in _colours:
-        _colours[model] = {model.material(i).name: _mean_colour(model, i) for i in range(model.nmat)}
+        _colours[model] = {model.material(i).name: mean_colour(model, i) for i in range(model.nmat)}
     return _colours[model]
 
 
-def _mean_colour(model: mujoco.MjModel, material: int) -> np.ndarray:
+def mean_colour(model: mujoco.MjModel, material: int) -> np.ndarray:
+    """Return the mean colour of a material, RGB from 0 to 1, (3,)."""
     texture = int(np.max(model.mat_texid[material]))
     if texture < 0:
         return model.mat_rgba[material, :3]

@@ -12,7 +12,7 @@ from libero_env.errors import PlacementError
 from libero_env.init_states.placement import collision_boxes, lowest_point, settle
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import SampleKey
-from libero_env.perturbations.starts import carried, contacts, placements, posed
+from libero_env.perturbations.starts import carried, contacts, posed
 from libero_env.sim.scene import Scene, zone_boxes
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.tasks.problem import Problem, Region
@@ -132,7 +132,7 @@ class Pairing:
         return row
 
     def _region(self, name: str) -> Region:
-        region = self.scene.problem.region(placements(self.scene.problem)[name])
+        region = self.scene.problem.region(self.scene.problem.places[name])
         if region is None or not region.ranges:
             raise PlacementError(f"{name} is new and has no place on {self.scene.workspace_name}")
         return region
@@ -179,7 +179,7 @@ def _stacked(boxes: Iterable[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
 
 def moved(base: Problem, problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the objects whose region was moved, or that stand on one of those, and by how much, (2,) [m]."""
-    there, new = placements(base), placements(problem)
+    there, new = base.places, problem.places
     for name, load in carried(base).items():
         before, after = base.region(there[name]), problem.region(new.get(name, there[name]))
         if before is not None and after is not None and before.ranges and after.ranges:

@@ -12,7 +12,7 @@ from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.init_states.store import load_init_states
 from libero_env.perturbations.instructions import reword
 from libero_env.perturbations.kinds import direction
-from libero_env.perturbations.starts import carried, contacts, placements, shifted
+from libero_env.perturbations.starts import carried, contacts, shifted
 from libero_env.sim.scene import Scene
 from libero_env.storage import read_yaml
 from libero_env.tasks.builder import entities_in_goal
@@ -97,7 +97,7 @@ def _of_other_places(task: Task) -> Iterator[Task]:
     if atom is None or atom.predicate != "On" or not all(t.endswith(_ON_PLATE) for t in _instructions(task)):
         return
     moved = atom.args[0]
-    start = placements(problem).get(moved, "")
+    start = problem.places.get(moved, "")
     for region in problem.regions:
         words = _PLACES.get((problem.fixtures.get(region.target, ""), region.name))
         if words is not None and not start.startswith(region.target):

@@ -16,7 +16,7 @@ from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import ROBOT, Scene
 from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import PLACING, And, Atom, Problem
+from libero_env.tasks.problem import And, Atom, Problem
 from libero_env.workspaces import WORKSPACES
 
 _DIRECTIONS = 60  # tries for each object
@@ -225,18 +225,13 @@ def _touched(scene: Scene, name: str, touching: set[tuple[int, int]]) -> bool:
     return any(robot & set(pair) and own & set(pair) for pair in touching)
 
 
-def placements(problem: Problem) -> dict[str, str]:
-    """Return the place of each object at the start: the address of a region, or a name."""
-    placing = (atom.args for atom in problem.init if atom.predicate in PLACING)
-    return {name: address for name, address in placing if name in problem.objects}
-
-
 def carried(problem: Problem) -> dict[str, list[str]]:
     """Return the objects that stand on the workspace, each with those that stand on it or lie in it."""
-    places = placements(problem)
-    for name, address in places.items():
-        if (region := problem.region(address)) is not None:
-            places[name] = region.target
+    places: dict[str, str] = {}
+    for name, address in problem.places.items():
+        if name in problem.objects:
+            region = problem.region(address)
+            places[name] = address if region is None else region.target
     roots: dict[str, list[str]] = {
         name: [] for name, on in places.items() if problem.fixtures.get(on) in WORKSPACES
     }

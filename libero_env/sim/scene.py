@@ -197,6 +197,11 @@ class Scene:
         region = self.problem.region(address)
         return region.target if region is not None and region.target in self.entities else None
 
+    def is_place(self, region: Region) -> bool:
+        """Return whether a region has rectangles on the workspace, or is a site of its target's model."""
+        site = mujoco.mj_name2id(self.model, mujoco.mjtObj.mjOBJ_SITE, region.address)
+        return bool(region.ranges) or site >= 0
+
 
 def ground(expression: Expression, scene: Scene) -> Expression:
     """Return a goal with quantifiers replaced by conjunctions over the objects of a scene."""
@@ -286,7 +291,7 @@ def _check_sites(scene: Scene) -> None:
     problem, model = scene.problem, scene.model
     for args in (*(atom.args for atom in (*problem.init, *problem.goal.atoms())), problem.zones):
         for region in filter(None, map(problem.region, args)):
-            if region.ranges or mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SITE, region.address) >= 0:
+            if scene.is_place(region):
                 continue
             prefix = f"{region.target}_"
             sites = [model.site(i).name for i in range(model.nsite)]
@@ -418,14 +423,7 @@ def fixture_pose(
     Returns:
         Position and quaternion wxyz, (7,).
     """
-    region = next(
-        (
-            problem.region(atom.args[1])
-            for atom in problem.init
-            if atom.predicate == "On" and atom.args[0] == name and len(atom.args) == 2
-        ),
-        None,
-    )
+    region = problem.region(problem.places.get(name, ""))
     height = _FIXTURE_LIFT - workspace.parameters.get("table_thickness", 0.05) - item.bottom_offset[2]
     if region is None or not region.ranges or region.target != workspace_name:
         x, y, yaw = 0.0, 0.0, 0.0

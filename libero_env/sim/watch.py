@@ -13,7 +13,7 @@ from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.causes import HARD, Failure, Missing, Trace, explain
 from libero_env.sim.costs import LIMITS, Costs
-from libero_env.sim.predicates import PREDICATES, contains, ground, is_over, region_boxes, region_of
+from libero_env.sim.predicates import PREDICATES, contains, ground, is_over, region_boxes
 from libero_env.sim.scene import ROBOT
 from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom, Expression, Never
@@ -265,7 +265,7 @@ class EpisodeWatch:
     def _possible(self, i: int, handled: Sequence[str]) -> Iterator[Atom]:
         """Yield what a goal could say of the things that were handled, and the goal does not."""
         scene = self._scene
-        regions = [region.address for region in scene.problem.regions if self._has_boxes(region.address)]
+        regions = [region.address for region in scene.problem.regions if scene.is_place(region)]
         for name in handled:
             if name in scene.objects:
                 candidates = [
@@ -281,13 +281,6 @@ class EpisodeWatch:
                 parts = [name, *(r for r in regions if scene.owner(r) == name and scene.joints.get(r))]
                 candidates = [Atom(word, (part,)) for word in words for part in parts]
             yield from (atom for atom in candidates if atom not in self.goals[i])
-
-    def _has_boxes(self, address: str) -> bool:
-        region = region_of(self.views[0], address)
-        return (
-            bool(region.ranges)
-            or mujoco.mj_name2id(self._scene.model, mujoco.mjtObj.mjOBJ_SITE, address) >= 0
-        )
 
 
 def over(view: StateView, atom: Atom) -> bool:

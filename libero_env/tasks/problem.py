@@ -260,6 +260,11 @@ class Problem:
         values = (getattr(self, field.name) for field in fields(self))
         return tuple(tuple(value.items()) if isinstance(value, Mapping) else value for value in values)
 
+    @property
+    def places(self) -> dict[str, str]:
+        """Place of each object and fixture at the start: the address of a region, or a name."""
+        return {atom.args[0]: atom.args[1] for atom in self.init if atom.predicate in PLACING}
+
     def region(self, address: str) -> Region | None:
         """Return the region with an address such as `floor_bin_region`; None where it is not declared."""
         return next((region for region in self.regions if region.address == address), None)

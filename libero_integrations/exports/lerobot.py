@@ -3,7 +3,6 @@
 Statistics of images follow from the histograms of their channels.
 """
 
-import io
 import json
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -12,10 +11,9 @@ from types import ModuleType
 from typing import Any, ClassVar
 
 import numpy as np
-from PIL import Image
 
 from libero_env.demos.read import Episode
-from libero_env.demos.video import H264, Mp4Writer, import_av
+from libero_env.demos.video import H264, Mp4Writer, encode_image, import_av
 from libero_env.errors import DemoError, need
 from libero_env.storage import atomic_write_text
 from libero_integrations.exports.layouts import FILES_PER_CHUNK, ROBOT_TYPE, STATE, Layout
@@ -223,9 +221,8 @@ class EpisodeDatasetWriter(_LeRobotWriter):
         place = {"episode_chunk": number // FILES_PER_CHUNK, "episode_index": number}
         for key, frames in images.items():
             if self.layout.codec is None:
-                rows = [
-                    {"bytes": _png(frame), "path": f"frame_{t:06d}.png"} for t, frame in enumerate(frames)
-                ]
+                pictures = [encode_image(frame, "PNG", compress_level=1) for frame in frames]
+                rows = [{"bytes": png, "path": f"frame_{t:06d}.png"} for t, png in enumerate(pictures)]
                 arrays[key] = pa.array(rows, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
             else:
                 path = self._folder(_V2_VIDEO_PATH.format(video_key=key, **place))
@@ -412,12 +409,6 @@ def _arrays(pa: ModuleType, columns: Mapping[str, np.ndarray]) -> dict[str, Any]
         else pa.array(values)
         for key, values in columns.items()
     }
-
-
-def _png(frame: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, format="PNG", compress_level=1)
-    return buffer.getvalue()
 
 
 def _write_lines(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:

@@ -8,7 +8,6 @@ A record is a message `tf.train.Example` of Protocol Buffers, framed as in TFRec
 CRC-32C, the message, its masked CRC-32C.
 """
 
-import io
 import os
 import re
 from collections.abc import Mapping
@@ -16,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.read import Episode
+from libero_env.demos.video import encode_image
 from libero_env.errors import DemoError, InvalidInputError
 from libero_env.parallel import compiled
 from libero_integrations.exports.layouts import STATE, Layout
@@ -73,7 +72,7 @@ class RldsWriter(DatasetWriter):
         last = np.arange(steps) == steps - 1
         state = np.concatenate([episode.obs[key] for key in STATE], axis=1)
         columns: dict[str, Any] = {
-            f"observation/{key}": [_jpeg(frame) for frame in frames]
+            f"observation/{key}": [encode_image(frame, "JPEG", quality=_QUALITY) for frame in frames]
             for key, frames in self._images(episode, where).items()
         }
         columns |= {
@@ -163,12 +162,6 @@ def _tensor(dtype: str, *shape: int) -> dict[str, Any]:
 
 def _array(dtype: str, *shape: int) -> dict[str, Any]:
     return {"dtype": dtype, "shape": {"dimensions": list(map(str, shape))} if shape else {}}
-
-
-def _jpeg(frame: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, format="JPEG", quality=_QUALITY)
-    return buffer.getvalue()
 
 
 def _example(columns: Mapping[str, Any]) -> bytes:
