@@ -23,7 +23,7 @@ from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS, segmentation_labels
 from libero_env.sim.scene import FAST, Scene, build_scene, default_drawing
 from libero_env.storage import read_yaml
-from libero_env.tasks import Task, get_task, read_task
+from libero_env.tasks import Task, get_task
 from libero_env.tasks.cameras import camera_name
 from libero_env.tasks.suites import OWN
 from libero_env.tasks.task import FILE
@@ -132,7 +132,7 @@ class DemoConfig:
     """What the demonstrations of a task depend on.
 
     Attributes:
-        source: A task, its name such as `libero_object/3`, or the path of a BDDL file.
+        source: A task, its name such as `libero_object/3`, or the path of a task file.
         camera_size: (height, width) of the images, pixels.
         seed: Seed of the starts, motion styles and action noise.
         pairing: Which observation is stored with an action, see `libero_env.demos.read`.
@@ -174,9 +174,7 @@ class DemoConfig:
     @cached_property
     def task(self) -> Task:
         """The task that `source` names."""
-        if isinstance(self.source, Task):
-            return self.source
-        return read_task(self.source) if self.source.endswith(".bddl") else get_task(self.source)
+        return self.source if isinstance(self.source, Task) else get_task(self.source)
 
     @property
     def render_config(self) -> RenderConfig:
