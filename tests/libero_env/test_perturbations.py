@@ -1,6 +1,7 @@
 """Perturbations: each kind does something, nothing at severity 0, and the same for the same seed in any batch."""
 
 import pickle
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,7 +26,9 @@ from libero_env.perturbations.instructions import edit_distance, reword, split_c
 from libero_env.perturbations.kinds import Episode
 from libero_env.perturbations.pairing import moved
 from libero_env.sim.appearance import Appearance, CameraView, Light
+from libero_env.sim.predicates import register_predicate
 from libero_env.tasks import get_suite, get_task
+from libero_env.tasks.problem import Atom
 
 TASK = "libero_goal/3"
 SMALL = {"camera_size": (32, 32), "cameras": ("agentview",)}
@@ -392,6 +395,17 @@ def arriving(name, severity):
         return change.image(name, picture, episode)
 
     return image
+
+
+def test_a_users_predicate_among_the_initial_conditions_places_nothing(closing):
+    register_predicate("near", lambda view, a, b: True)
+    task = get_suite("libero_spatial").tasks[0]
+    near = Atom("Near", ("akita_black_bowl_1", "akita_black_bowl_2"))
+    with_near = replace(task, problem=replace(task.problem, init=(*task.problem.init, near)))
+    envs = [closing(LiberoEnv(one, cameras=(), perturb="object_pose=0.2")) for one in (task, with_near)]
+    for env in envs:
+        env.reset(seed=0)
+    assert np.array_equal(*(env.get_state() for env in envs))  # both bowls move, each its own way
 
 
 def test_pictures_are_blurred_hidden_late_and_lost():
