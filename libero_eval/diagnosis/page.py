@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from libero_env.storage import write_json
 from libero_eval.diagnosis.measure import PARTS, Diagnosis, Swap
 from lifelong.errors import writing
-from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below
+from lifelong.report.figures import LINE_COLOURS, STYLE, as_svg, legend_below
 from lifelong.report.tables import percent, save_page
 
 MEASURES = {"error": "error", "failures": "share of failed rollouts"}
@@ -106,7 +106,6 @@ def swap_figure(found: Diagnosis) -> Figure:
         axes.bar(middle, values, width, color=LINE_COLOURS[place], label=label)
     axes.set_xticks(range(len(swaps)), [str(swap.task + 1) for swap in swaps])
     axes.set(xlabel="task", ylabel="error of actions")
-    axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
-    hide_spines(axes)
+    axes.grid(axis="y")
     legend_below(figure)
     return figure

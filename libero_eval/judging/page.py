@@ -13,7 +13,7 @@ from libero_env.sim.causes import CAUSES
 from libero_env.text import text_table
 from libero_eval.judging.comparison import Comparison, Contrast, Gate, Row
 from libero_eval.judging.group_scores import Profile
-from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, hide_spines, legend_below, shorten
+from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, legend_below, shorten
 from lifelong.report.tables import save_page
 from lifelong.results.failures import NOT_SEEN, QUADRANTS, anything_seen
 from lifelong.stats.episodes import Difference
@@ -284,8 +284,7 @@ def forest_figure(c: Contrast, alpha: float, control: Contrast | None = None) ->
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(len(rows) - 0.4, -0.6)
     axes.set_xlabel(f"{shorten(c.first, 30)} − {shorten(c.second, 30)}, percentage points")
-    axes.grid(axis="x", lw=0.4, alpha=0.3, color=INK)
-    hide_spines(axes)
+    axes.grid(axis="x")
     return figure
 
 
@@ -310,7 +309,6 @@ def sequential_figure(tests: Mapping[str, SequentialTest]) -> Figure:
     axes.axhline(-np.log10(alpha), color=INK, lw=0.7, ls="--")
     axes.set_ylim(bottom=max(lowest - 0.3, -4))
     axes.set(xlabel="pairs, one start of every task after the other", ylabel="evidence, log₁₀ e")
-    hide_spines(axes)
     legend_below(figure)
     return figure
 
@@ -325,6 +323,5 @@ def profile_figure(profiles: Mapping[str, Profile]) -> Figure:
         axes.plot(100 * p.thresholds, 100 * p.shares, color=colour, lw=1.4, label=shorten(label, 60))
         axes.fill_between(100 * p.thresholds, 100 * p.low, 100 * p.high, color=colour, alpha=0.16, lw=0)
     axes.set(xlim=(0, 100), ylim=(0, 101), xlabel="success above (%)", ylabel="of runs and tasks (%)")
-    hide_spines(axes)
     legend_below(figure)
     return figure

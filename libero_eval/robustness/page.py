@@ -18,12 +18,10 @@ from libero_eval.judging.page import interval_text, p_text
 from libero_eval.robustness.results import Axis, EventRow, Outcomes, Robustness, differences, name_of
 from lifelong.errors import writing
 from lifelong.report.figures import (
-    INK,
     LINE_COLOURS,
     LINE_MARKERS,
     STYLE,
     as_svg,
-    hide_spines,
     legend_below,
     shorten,
 )
@@ -243,8 +241,7 @@ def curves_figure(policies: Mapping[str, Sequence[Axis]], units: Mapping[str, st
         axes.set(xlim=(-0.03 * largest, 1.03 * largest), ylim=(0, 102))
         middle = "½" if largest == 1 else f"{largest / 2:g}"
         axes.set_xticks((0, largest / 2, largest), ("0", middle, f"{largest:g}"))
-        axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
-        hide_spines(axes)
+        axes.grid(axis="y")
         if place % columns == 0:
             axes.set_ylabel("success (%)")
         if place + columns >= len(first):
@@ -282,7 +279,7 @@ def radar_figure(policies: Mapping[str, Sequence[Axis]]) -> Figure:
         side = round(np.sin(angle), 3)  # labels grow away from the circle
         text.set_horizontalalignment("left" if side > 0 else "right" if side < 0 else "center")
     axes.set_rlabel_position(180 / len(kinds))  # type: ignore[attr-defined]  # between two kinds
-    axes.grid(lw=0.4, alpha=0.4, color=INK)
+    axes.grid(alpha=0.4)
     axes.spines["polar"].set_linewidth(0.5)
     legend_below(figure)
     return figure

@@ -77,6 +77,7 @@ def cell_colours(rate: float) -> tuple[str, str]:
     return back, "#ffffff" if luminance < 0.24 else "#0d1820"
 
 
+@matplotlib.rc_context(STYLE)
 def heatmap_figure(panels: Sequence[Panel]) -> Figure:
     """Draw success matrices side by side, up to four in a row, in percent, with one colour bar.
 
@@ -84,33 +85,33 @@ def heatmap_figure(panels: Sequence[Panel]) -> Figure:
     """
     columns = min(len(panels), 4)
     rows = math.ceil(len(panels) / columns)
-    with matplotlib.rc_context(STYLE):
-        single = len(panels) == 1
-        first = 0 if single else _first_known([panel.rates.T for panel in panels])
-        shares = [1 - first / len(panel.rates) for panel in panels]
-        width, height = (4.5, 3.4) if single else (2.45 * columns + 0.5, (0.6 + 2 * max(shares)) * rows)
-        figure = Figure(figsize=(width, height), layout="constrained")
-        grid = figure.subplots(rows, columns, squeeze=False)
-        for axes in grid.flat[len(panels) :]:
-            axes.set_axis_off()
-        for place, (axes, panel) in enumerate(zip(grid.flat, panels, strict=False)):
-            image = _draw_matrix(axes, panel, first, font=7.5 if single else 6)
-            if single and len(panel.rates) <= LARGEST_WITH_EVERY_TASK:
-                _name_rows(axes, panel.labels)
-            if place % columns == 0:
-                axes.set_ylabel("after learning task")
-            if place + columns >= len(panels):
-                axes.set_xlabel("success on task")
-        if single and len(panels[0].rates) > 5:  # in the empty triangle
-            place = grid[0, 0].inset_axes((0.56, 0.93, 0.42, 0.035))
-            bar = figure.colorbar(image, cax=place, orientation="horizontal", ticks=(0, 50, 100))
-            bar.set_label("success (%)", labelpad=1)
-        else:
-            bar = figure.colorbar(image, ax=grid, shrink=0.85, pad=0.02, aspect=28, label="success (%)")
-        bar.outline.set_visible(False)
+    single = len(panels) == 1
+    first = 0 if single else _first_known([panel.rates.T for panel in panels])
+    shares = [1 - first / len(panel.rates) for panel in panels]
+    width, height = (4.5, 3.4) if single else (2.45 * columns + 0.5, (0.6 + 2 * max(shares)) * rows)
+    figure = Figure(figsize=(width, height), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat[len(panels) :]:
+        axes.set_axis_off()
+    for place, (axes, panel) in enumerate(zip(grid.flat, panels, strict=False)):
+        image = _draw_matrix(axes, panel, first, font=7.5 if single else 6)
+        if single and len(panel.rates) <= LARGEST_WITH_EVERY_TASK:
+            _name_rows(axes, panel.labels)
+        if place % columns == 0:
+            axes.set_ylabel("after learning task")
+        if place + columns >= len(panels):
+            axes.set_xlabel("success on task")
+    if single and len(panels[0].rates) > 5:  # in the empty triangle
+        place = grid[0, 0].inset_axes((0.56, 0.93, 0.42, 0.035))
+        bar = figure.colorbar(image, cax=place, orientation="horizontal", ticks=(0, 50, 100))
+        bar.set_label("success (%)", labelpad=1)
+    else:
+        bar = figure.colorbar(image, ax=grid, shrink=0.85, pad=0.02, aspect=28, label="success (%)")
+    bar.outline.set_visible(False)
     return figure
 
 
+@matplotlib.rc_context(STYLE)
 def learning_figure(
     curves: Mapping[int, Curve],
     losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float64]]],
@@ -133,65 +134,63 @@ def learning_figure(
     limits = _loss_limits(losses)
     epochs = [c.epochs for c in curves.values()] + [e for e, _ in losses.values()]
     last = max(1, *(int(e.max(initial=1)) for e in epochs))
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height))
-        for place, task in enumerate(tasks):
-            row, column = divmod(place, columns)
-            x, top = left + column * (panel + gap), height - 0.25 - row * row_height
-            bottoms = ((top - upper, upper), (top - upper - between - lower, lower))
-            boxes = [(x / width, y / height, panel / width, h / height) for y, h in bottoms]
-            above, below = (figure.add_axes(box) for box in boxes)
-            above.set_title(f"{task + 1}  {shorten(labels[task], 24)}", loc="left", fontsize=8.5)
-            _draw_curve(above, curves.get(task), kept.get(task))
-            if task in losses:
-                marker = "o" if len(losses[task][0]) < 4 else None
-                below.plot(*losses[task], color=LINE_COLOURS[1], lw=1.2, marker=marker, ms=2.6)
-            below.set_ylim(*limits)
-            below.yaxis.set_major_locator(MaxNLocator(3))
-            for axes, name in ((above, "success (%)"), (below, "loss")):
-                _set_epoch_axis(axes, last, labelbottom=axes is below)
-                axes.tick_params(labelleft=column == 0)
-                if column == 0:
-                    axes.set_ylabel(name)
-                    axes.yaxis.set_label_coords(-0.5 / panel, 0.5)
-            if place + columns >= len(tasks):
-                below.set_xlabel("epoch")
+    figure = Figure(figsize=(width, height))
+    for place, task in enumerate(tasks):
+        row, column = divmod(place, columns)
+        x, top = left + column * (panel + gap), height - 0.25 - row * row_height
+        bottoms = ((top - upper, upper), (top - upper - between - lower, lower))
+        boxes = [(x / width, y / height, panel / width, h / height) for y, h in bottoms]
+        above, below = (figure.add_axes(box) for box in boxes)
+        above.set_title(f"{task + 1}  {shorten(labels[task], 24)}", loc="left", fontsize=8.5)
+        _draw_curve(above, curves.get(task), kept.get(task))
+        if task in losses:
+            marker = "o" if len(losses[task][0]) < 4 else None
+            below.plot(*losses[task], color=LINE_COLOURS[1], lw=1.2, marker=marker, ms=2.6)
+        below.set_ylim(*limits)
+        below.yaxis.set_major_locator(MaxNLocator(3))
+        for axes, name in ((above, "success (%)"), (below, "loss")):
+            _set_epoch_axis(axes, last, labelbottom=axes is below)
+            axes.tick_params(labelleft=column == 0)
+            if column == 0:
+                axes.set_ylabel(name)
+                axes.yaxis.set_label_coords(-0.5 / panel, 0.5)
+        if place + columns >= len(tasks):
+            below.set_xlabel("epoch")
     return figure
 
 
+@matplotlib.rc_context(STYLE)
 def forgetting_figure(lines: Sequence[Line]) -> Figure:
     """Draw average success over the tasks learned so far against their number, with Student's 95 % band over runs.
 
     Lines of the same colour differ in dashes and markers.
     """
     named = any(line.label for line in lines)
-    with matplotlib.rc_context(STYLE):
-        labels = [line.label for line in lines]
-        room = 0.18 * math.ceil(len(labels) / _legend_columns(labels))
-        figure = Figure(figsize=(5.6, 2.8 + room) if named else (3.5, 2.7), layout="constrained")
-        axes = figure.subplots()
-        for number, line in enumerate(lines):
-            columns = [mean_and_half_width(c[~np.isnan(c)]) for c in line.values.T]
-            mean, half = 100 * np.array(columns).T
-            x, look = np.arange(1, len(mean) + 1), _look(number)
-            axes.plot(x, mean, **look, lw=1.4, label=shorten(line.label), clip_on=False)
-            band = 0.18 if len(lines) <= len(LINE_COLOURS) else 0.06
-            low, high = np.clip(mean - half, 0, 100), np.clip(mean + half, 0, 100)
-            axes.fill_between(x, low, high, color=look["color"], alpha=band, lw=0)
-        longest = max(line.values.shape[1] for line in lines)
-        first = 1 + _first_known([line.values for line in lines])
-        axes.set_xlim(first - 0.2, longest + 0.2)
-        axes.set_ylim(0, 100)
-        axes.set_xticks(range(first, longest + 1, max(1, longest // 10)))
-        axes.set_xlabel("tasks learned")
-        axes.set_ylabel("average success (%)")
-        axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
-        hide_spines(axes)
-        if named:
-            legend_below(figure)
+    labels = [line.label for line in lines]
+    room = 0.18 * math.ceil(len(labels) / _legend_columns(labels))
+    figure = Figure(figsize=(5.6, 2.8 + room) if named else (3.5, 2.7), layout="constrained")
+    axes = figure.subplots()
+    for number, line in enumerate(lines):
+        columns = [mean_and_half_width(c[~np.isnan(c)]) for c in line.values.T]
+        mean, half = 100 * np.array(columns).T
+        x, look = np.arange(1, len(mean) + 1), _look(number)
+        axes.plot(x, mean, **look, lw=1.4, label=shorten(line.label), clip_on=False)
+        band = 0.18 if len(lines) <= len(LINE_COLOURS) else 0.06
+        low, high = np.clip(mean - half, 0, 100), np.clip(mean + half, 0, 100)
+        axes.fill_between(x, low, high, color=look["color"], alpha=band, lw=0)
+    longest = max(line.values.shape[1] for line in lines)
+    first = 1 + _first_known([line.values for line in lines])
+    axes.set_xticks(range(first, longest + 1, max(1, longest // 10)))
+    axes.set(
+        xlim=(first - 0.2, longest + 0.2), ylim=(0, 100), xlabel="tasks learned", ylabel="average success (%)"
+    )
+    axes.grid(axis="y")
+    if named:
+        legend_below(figure)
     return figure
 
 
+@matplotlib.rc_context(STYLE)
 def storage_figure(points: Mapping[str, tuple[float, Estimate]]) -> Figure:
     """Draw AUC with its 95 % interval against the bytes that a method keeps from task to task.
 
@@ -201,23 +200,19 @@ def storage_figure(points: Mapping[str, tuple[float, Estimate]]) -> Figure:
     least = min([size for size, _ in points.values() if size > 0], default=1.0)
     most = max(least, *(size for size, _ in points.values()))
     decades = 10.0 ** np.arange(math.floor(math.log10(least)), math.log10(2 * most))
-    with matplotlib.rc_context(STYLE):
-        room = 0.18 * math.ceil(len(points) / _legend_columns(list(points)))
-        figure = Figure(figsize=(5.6, 2.8 + room), layout="constrained")
-        axes = figure.subplots()
-        axes.set_xscale("symlog", linthresh=decades[0])  # methods that keep nothing stand at 0
-        axes.set_xticks([0.0, *decades])
-        for number, (label, (size, auc)) in enumerate(points.items()):
-            ends = np.nan_to_num([[auc.value - auc.low], [auc.high - auc.value]])
-            look = _look(number) | {"ls": "none"}
-            axes.errorbar([size], [100 * auc.value], 100 * ends, **look, elinewidth=0.8, label=shorten(label))
-        axes.xaxis.set_major_formatter(lambda size, _: quantity(size, "B"))
-        axes.set_xlim(-0.3 * decades[0], 2 * most)
-        axes.set_xlabel("kept from one task to the next")
-        axes.set_ylabel("AUC (%)")
-        axes.grid(lw=0.4, alpha=0.3, color=INK)
-        hide_spines(axes)
-        legend_below(figure)
+    room = 0.18 * math.ceil(len(points) / _legend_columns(list(points)))
+    figure = Figure(figsize=(5.6, 2.8 + room), layout="constrained")
+    axes = figure.subplots()
+    axes.set_xscale("symlog", linthresh=decades[0])  # methods that keep nothing stand at 0
+    axes.set_xticks([0.0, *decades])
+    for number, (label, (size, auc)) in enumerate(points.items()):
+        ends = np.nan_to_num([[auc.value - auc.low], [auc.high - auc.value]])
+        look = _look(number) | {"ls": "none"}
+        axes.errorbar([size], [100 * auc.value], 100 * ends, **look, elinewidth=0.8, label=shorten(label))
+    axes.xaxis.set_major_formatter(lambda size, _: quantity(size, "B"))
+    axes.set(xlim=(-0.3 * decades[0], 2 * most), xlabel="kept from one task to the next", ylabel="AUC (%)")
+    axes.grid()
+    legend_below(figure)
     return figure
 
 
@@ -296,7 +291,7 @@ def _draw_matrix(axes: Axes, panel: Panel, first: int, font: float) -> matplotli
     if size <= LARGEST_WITH_EVERY_TASK:
         axes.set_xticks(np.arange(size + 1) - 0.5, minor=True)
         axes.set_yticks(np.arange(first, size + 1) - 0.5, minor=True)
-        axes.grid(which="minor", color="white", lw=1.2)
+        axes.grid(which="minor", color="white", alpha=1, lw=1.2)
         axes.tick_params(which="minor", length=0)
         for i, j in zip(*np.nonzero(~np.isnan(panel.rates)), strict=True):
             colour = cell_colours(float(panel.rates[i, j]))[1]
@@ -321,7 +316,7 @@ def _name_rows(axes: Axes, labels: Sequence[str]) -> None:
 
 def _draw_curve(axes: Axes, curve: Curve | None, kept: int | None) -> None:
     axes.set_ylim(0, 100)
-    axes.grid(axis="y", lw=0.4, alpha=0.3, color=INK)
+    axes.grid(axis="y")
     if curve is None or len(curve.rates) == 0:
         return
     low, high = wilson_interval(curve.rates * curve.episodes, curve.episodes)
@@ -335,7 +330,6 @@ def _draw_curve(axes: Axes, curve: Curve | None, kept: int | None) -> None:
 
 
 def _set_epoch_axis(axes: Axes, last: int, labelbottom: bool) -> None:
-    hide_spines(axes)
     axes.set_xlim(-0.03 * last, 1.03 * last)
     axes.xaxis.set_major_locator(MaxNLocator(4, integer=True))
     axes.tick_params(labelbottom=labelbottom)
@@ -362,8 +356,3 @@ def legend_below(figure: Figure) -> None:
 def _legend_columns(labels: Sequence[str]) -> int:
     longest = max((len(name) for name in labels), default=0)
     return max(1, min(4, 88 // (longest + 8)))
-
-
-def hide_spines(axes: Axes) -> None:
-    """Remove the upper and right edge of a plot."""
-    axes.spines[["top", "right"]].set_visible(False)

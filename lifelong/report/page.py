@@ -12,7 +12,7 @@ import numpy as np
 
 from libero_env.errors import InvalidInputError
 from libero_env.storage import atomic_write_text, read_bounded, require_own_folders, write_json
-from libero_env.text import duration, quantity
+from libero_env.text import duration
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import MUJOCO, Plan, compare, findings, published_metrics
 from lifelong.report.figures import (
@@ -48,7 +48,7 @@ from lifelong.results.shifts import shift_scores
 from lifelong.results.summary import write_episodes
 from lifelong.stats.intervals import Estimate
 from lifelong.stats.methods import compared_transfer
-from lifelong.stats.metrics import METRIC_NAMES, Metrics, Transfer, lifelong_metrics
+from lifelong.stats.metrics import Transfer, lifelong_metrics
 
 METRIC_TEXTS = {
     "fwt": ("FWT", "forward transfer: success averaged over the epochs of learning a task", "up"),
@@ -150,9 +150,9 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "title": f"{record.algo} on {record.benchmark}",
         "facts": _facts(run),
         "notes": run.notes,
-        "metrics": _metric_rows(run.metrics),
+        "metrics": run.metrics,
         "metric_texts": _metric_texts([run]),
-        "later_metrics": _metric_rows(run.results.after_base_stage()),
+        "later_metrics": run.results.after_base_stage(),
         "base_tasks": _base_tasks(record),
         "transfer": TRANSFER_TEXTS[run.results.transfer],
         "published": _published(run),
@@ -219,8 +219,9 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
             for r in g.repeats
         ]
         + found["conditions"],
-        "groups": _group_rows({label: group["metrics"] for label, group in found["groups"].items()}, found),
-        "later_groups": _group_rows(later["metrics"], found) if later else [],
+        "groups": found["groups"],
+        "metrics": {label: group["metrics"] for label, group in found["groups"].items()},
+        "later": later,
         "metric_texts": _metric_texts(counted),
         "other_conventions": _forgotten(found, "other_conventions"),
         "spreads": [
@@ -229,7 +230,6 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
             if any(np.isfinite(group["spreads"][factor]["auc"]) for factor in ("order", "demonstrations"))
         ],
         "differences": found["differences"],
-        "later_differences": later["differences"] if later else [],
         "findings": _findings(found),
         "margin": plan.margin,
         "later_findings": _findings(later),
@@ -352,28 +352,12 @@ def _base_tasks(record: RunRecord) -> int:
     return len(record.groups[0]) if record.has_base_stage else 0
 
 
-def _metric_rows(metrics: Metrics | None) -> list[dict[str, Any]]:
-    return [] if metrics is None else [{"name": n, "estimate": getattr(metrics, n)} for n in METRIC_NAMES]
-
-
 def _published(run: Run) -> dict[str, float] | None:
     """Return FWT and AUC as eq. 3 is written; None if these are the run's own, or unknown."""
     if run.metrics is None or run.results.transfer == "published":
         return None
     values = published_metrics([run])
     return values if np.isfinite(values["fwt"]) else None
-
-
-def _group_rows(metrics: Mapping[str, dict[str, Any]], found: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return a row of metrics for each group."""
-    rows = []
-    for label, cells in metrics.items():
-        group = found["groups"][label]
-        size = group["costs"].get("stored_bytes")
-        stored = "–" if size is None else quantity(size, "B")
-        told, count = group["told_task"], group["measured"]
-        rows.append({"label": label, "count": count, "told": told, "stored": stored, "cells": cells})
-    return rows
 
 
 def _stored(found: dict[str, Any]) -> dict[str, tuple[float, Estimate]]:

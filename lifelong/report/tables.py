@@ -38,7 +38,7 @@ COST_COLUMNS: dict[str, tuple[str, str, Callable[[float], str]]] = {
 
 @cache
 def page_template(name: str, package: str = "lifelong.report") -> jinja2.Template:
-    """Return a template of a package, with the filter `percent`; an undefined name is an error.
+    """Return a template of a package, with the filters `percent` and `quantity`; an undefined name is an error.
 
     Args:
         name: File of the template, which extends `base.html` of `lifelong.report`.
@@ -51,7 +51,7 @@ def page_template(name: str, package: str = "lifelong.report") -> jinja2.Templat
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["percent"] = percent
+    environment.filters.update(percent=percent, quantity=quantity)
     return environment.get_template(name)
 
 
@@ -200,13 +200,10 @@ def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:
 def mean_heatmap(matrices: np.ndarray, mean: np.ndarray, labels: Sequence[str]) -> dict[str, Any]:
     """Return the cells of the mean over runs, with Student's t interval as the tooltip."""
 
-    def spread(i: int, j: int) -> tuple[float, int]:
-        values = matrices[:, i, j][~np.isnan(matrices[:, i, j])]
-        return 100 * mean_and_half_width(values)[1], len(values)
-
     def hint(i: int, j: int) -> str:
-        half, count = spread(i, j)
-        return f"mean of {count} runs ± {half:.1f} (95 %)" if count > 1 else "one run"
+        values = matrices[:, i, j][~np.isnan(matrices[:, i, j])]
+        half = 100 * mean_and_half_width(values)[1]
+        return f"mean of {len(values)} runs ± {half:.1f} (95 %)" if len(values) > 1 else "one run"
 
     return _grid(mean, labels, hint, lambda i, j: "")
 

@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 from numpy.typing import NDArray
 
 from libero_env.storage import atomic_write_text, write_json
-from lifelong.report.figures import INK, LINE_COLOURS, STYLE, hide_spines, save
+from lifelong.report.figures import INK, LINE_COLOURS, STYLE, save
 
 Errors = list[list[float]]  # of one trial: after each stage, the error on each task so far
 _TICKS = (1.0, 1.05, 1.1, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 8.0, 9.0)  # of factors
@@ -147,6 +147,7 @@ def render(frontier: Frontier, default: str | None) -> str:
     return "\n".join(lines)
 
 
+@matplotlib.rc_context(STYLE)
 def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
     """Draw what is kept against what is learned and write `stem`.png and `stem`.pdf; below and left is better.
 
@@ -158,33 +159,29 @@ def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
         title: Title of the picture.
         stem: Path without suffix.
     """
-    with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(4.6, 3.6), layout="constrained")
-        axes = figure.subplots()
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        learned = [o.learned.value for o in frontier.outcomes]
-        axes.plot(
-            learned, [o.kept.value for o in frontier.outcomes], color=LINE_COLOURS[0], lw=0.8, alpha=0.6
-        )
-        for outcome in frontier.outcomes:
-            chosen = outcome is frontier.chosen
-            _point(axes, outcome, "o", LINE_COLOURS[0], filled=frontier.is_efficient(outcome), large=chosen)
-        for outcome in frontier.others:
-            _point(axes, outcome, "s", LINE_COLOURS[-1], filled=True, large=False)
-        _equal_scores(axes, frontier.chosen)
-        _name_points(axes, frontier)
-        for axis in (axes.xaxis, axes.yaxis):
-            low, high = axis.get_view_interval()
-            axis.set_major_locator(LogLocator(base=10, subs=_FEW_TICKS if high > 2 * low else _TICKS))
-            axis.set_minor_locator(NullLocator())
-            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
-            axis.set_minor_formatter(NullFormatter())
-        axes.set_xlabel("error on the newest task\n(1: just learned by fine-tuning)")
-        axes.set_ylabel("error on earlier tasks")
-        axes.set_title(title, loc="left")
-        hide_spines(axes)
-        save(figure, stem)
+    figure = Figure(figsize=(4.6, 3.6), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xscale="log", yscale="log")
+    learned = [o.learned.value for o in frontier.outcomes]
+    axes.plot(learned, [o.kept.value for o in frontier.outcomes], color=LINE_COLOURS[0], lw=0.8, alpha=0.6)
+    for outcome in frontier.outcomes:
+        chosen = outcome is frontier.chosen
+        _point(axes, outcome, "o", LINE_COLOURS[0], filled=frontier.is_efficient(outcome), large=chosen)
+    for outcome in frontier.others:
+        _point(axes, outcome, "s", LINE_COLOURS[-1], filled=True, large=False)
+    _equal_scores(axes, frontier.chosen)
+    _name_points(axes, frontier)
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        axis.set_major_locator(LogLocator(base=10, subs=_FEW_TICKS if high > 2 * low else _TICKS))
+        axis.set_minor_locator(NullLocator())
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
+        axis.set_minor_formatter(NullFormatter())
+    axes.set(
+        xlabel="error on the newest task\n(1: just learned by fine-tuning)", ylabel="error on earlier tasks"
+    )
+    axes.set_title(title, loc="left")
+    save(figure, stem)
 
 
 def _point(axes: Axes, outcome: Outcome, marker: str, colour: str, *, filled: bool, large: bool) -> None:
