@@ -80,15 +80,8 @@ def checked_actions(answer: Any, replan: int | None, where: str) -> np.ndarray:
     Raises:
         ServerError: The answer has another type, dtype or shape, too few actions, or values that are not finite.
     """
-    wanted = f"({'H' if replan else 1}, {ACTION_DIM}) numbers" + (f" with H >= {replan}" if replan else "")
-    try:
-        actions = np.asarray(answer)
-    except ValueError as error:
-        raise ServerError(
-            f"{where} sent actions that are not an array ({error}); expected {wanted}"
-        ) from error
-    if actions.dtype.kind not in "fiu":
-        raise ServerError(f"{where} sent actions of dtype {actions.dtype}; expected {wanted}")
+    wanted = f"(H, {ACTION_DIM}) with H >= {replan}" if replan else f"(1, {ACTION_DIM})"
+    actions = checked_numbers(answer, f"the actions of {where}", (wanted,), ServerError)
     chunk = actions[None] if actions.ndim == 1 else actions
     if chunk.ndim != 2 or chunk.shape[1] != ACTION_DIM:
         raise ServerError(f"{where} sent actions of shape {actions.shape}; expected {wanted}")
@@ -99,10 +92,6 @@ def checked_actions(answer: Any, replan: int | None, where: str) -> np.ndarray:
         )
     if len(chunk) < (replan or 1):
         raise ServerError(f"{where} sent {len(chunk)} actions; the protocol executes {replan} of each answer")
-    chunk = chunk.astype(np.float64)
-    if not np.isfinite(chunk).all():
-        bad = chunk[~np.isfinite(chunk)][0]
-        raise ServerError(f"{where} sent actions that are not finite ({bad}); expected {wanted}")
     return chunk
 
 
