@@ -14,13 +14,12 @@ from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from pydantic import Field
-from typing_extensions import TypedDict
 
 from libero_env.errors import UnknownNameError
 from libero_env.geometry import rotation_between
 from libero_env.text import shown
 from libero_env.timing import CONTROL_HZ
-from libero_env.validation import validate
+from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Hears, TakesNote, WatchesWorld
 from lifelong.evaluation.environments import Obs
@@ -118,13 +117,6 @@ class Latency:
             yield math.ceil(min(max(value, 0.0), LONGEST) / per_step - 1e-9)
 
 
-class _Words(TypedDict, total=False):
-    wait: Literal["rest", "hold", "repeat"]
-    merge: Literal["replace", "ensemble", "rtc"]
-    every: Annotated[int, Field(ge=1)]
-    m: Annotated[float, Field(ge=0)]
-
-
 @dataclass(frozen=True)
 class Clock:
     """When answers of a policy are used, and what is executed until then.
@@ -141,9 +133,9 @@ class Clock:
     """
 
     latency: Latency = Latency()
-    wait: str = "rest"
-    merge: str = "replace"
-    every: int | None = None
+    wait: Literal["rest", "hold", "repeat"] = "rest"
+    merge: Literal["replace", "ensemble", "rtc"] = "replace"
+    every: Annotated[int, Field(ge=1)] | None = None
     m: float = ENSEMBLE_M
 
     @classmethod
@@ -157,8 +149,8 @@ class Clock:
         given: dict[str, Any] = {}
         for part in filter(None, map(str.strip, text.split(","))):
             name, _, value = part.partition("=")
-            if name not in ("latency", *_Words.__annotations__):
-                raise UnknownNameError("word of a clock", name, ("latency", *_Words.__annotations__))
+            if name not in vars(Clock()):
+                raise UnknownNameError("word of a clock", name, vars(Clock()))
             if name in given:
                 raise ConfigError(f"clock: {name} is named twice")
             given[name] = value
@@ -167,7 +159,8 @@ class Clock:
             elif name == "every" and value.isdecimal():
                 given[name] = int(value)
         latency = Latency.read(given.pop("latency", "0ms"))
-        clock = cls(latency, **validate(_Words, given, prefix=("clock",), error=ConfigError))
+        validate_arguments(cls, given, prefix=("clock",), error=ConfigError)
+        clock = cls(latency, **given)
         if "m" in given and clock.merge != "ensemble":
             raise ConfigError(f"clock: m is of merge=ensemble, and merge is {clock.merge}")
         if clock.merge == "rtc" and clock.wait != "rest":
@@ -177,9 +170,9 @@ class Clock:
         return clock
 
     def __str__(self) -> str:
-        words = {name: getattr(self, name) for name in _Words.__annotations__}
-        changed = {name: value for name, value in words.items() if value != getattr(Clock, name)}
-        return ",".join(f"{name}={value}" for name, value in {"latency": self.latency, **changed}.items())
+        default = vars(Clock())
+        words = vars(self).items()
+        return ",".join(f"{k}={value}" for k, value in words if k == "latency" or value != default[k])
 
     def check(self, chunk: int | None, inpaints: bool) -> None:
         """Check that a policy can be merged like this.
