@@ -7,6 +7,7 @@ language embedding.
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from functools import reduce
 from typing import Annotated, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from pydantic import Field
 from torch import Tensor
 
 from lifelong.data.memory import TaskMemory, even_shares
-from lifelong.data.windows import JoinedWindows, TaskWindows
+from lifelong.data.windows import TaskWindows, divided
 from lifelong.errors import DataError
 from lifelong.types import Batch, Count, Observation
 
@@ -291,7 +292,7 @@ class CompressedMemory(TaskMemory[CompressedWindows]):
     def __init__(self, budget: Count, quality: Quality = 60, keep_decoded: bool = True) -> None:
         super().__init__(budget)
         self.quality, self.keep_decoded = quality, keep_decoded
-        self._decoded: dict[int, _Decoded] = {}
+        self._decoded: dict[int, Tensor] = {}  # all pictures of each task
 
     def nbytes(self) -> int:
         """Return the number of bytes that are kept; never more than the budget."""
@@ -332,9 +333,9 @@ class CompressedMemory(TaskMemory[CompressedWindows]):
         """Return windows on the CPU; see `ReplayMemory.sample`."""
         drawn = self._draw(n, generator)
         if self.keep_decoded and not self._decoded:
-            self._decoded = {task: _Decoded(windows) for task, windows in self.tasks.items()}
-        held = self._decoded if self.keep_decoded else self.tasks
-        return JoinedWindows(list(held.values())).batch(drawn)
+            self._decoded = {t: w.pictures(torch.arange(len(w.ends))) for t, w in self.tasks.items()}
+        parts = divided(list(self.tasks.values()), drawn)
+        return reduce(Batch.join, [w.batch(rows, self._decoded.get(w.task_id)) for w, rows in parts])
 
     def load_state_dict(
         self, state: Mapping[str, Any], datasets: Mapping[int, TaskWindows] | None = None
@@ -354,16 +355,3 @@ class CompressedMemory(TaskMemory[CompressedWindows]):
                 f"the compressed windows of task {odd[0]} are those of task {tasks[odd[0]].task_id}"
             )
         self.budget, self.tasks, self._decoded = int(state["budget"]), tasks, {}
-
-
-class _Decoded:
-    """Windows with their frames decoded."""
-
-    def __init__(self, windows: CompressedWindows):
-        self.windows, self.images = windows, windows.pictures(torch.arange(len(windows.ends)))
-
-    def __len__(self) -> int:
-        return len(self.windows)
-
-    def batch(self, indices: Tensor) -> Batch:
-        return self.windows.batch(indices, self.images)

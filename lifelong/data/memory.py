@@ -142,7 +142,7 @@ class ReplayMemory(TaskMemory[Tensor]):
 
     def count_frames(self) -> int:
         """Count the frames of the windows, one that several windows cover once."""
-        return sum(count_frames(held.dataset, held.places) for held in self._held.values())
+        return sum(count_frames(held.dataset, held.chosen) for held in self._held.values())
 
     def state_dict(self) -> dict[str, Any]:
         """Return the budget and the indices by task id; frames are read again from the demonstrations."""

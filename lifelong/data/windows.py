@@ -136,17 +136,15 @@ class WindowSubset:
 
 
 @dataclass(frozen=True, eq=False)
-class KeptWindows:
+class KeptWindows(WindowSubset):
     """Windows of a dataset that are kept when it is gone, with the ids that they had in it.
 
+    `dataset` holds their frames, and no others where it can.
+
     Attributes:
-        dataset: Dataset that holds their frames, and no others where it can.
-        places: Their indices in it, (n,) int64.
         ids: Their indices in the dataset that they are of, (n,) int64.
     """
 
-    dataset: WindowDataset
-    places: Tensor
     ids: Tensor
 
     @classmethod
@@ -156,19 +154,12 @@ class KeptWindows:
 
     def first(self, count: int) -> "KeptWindows":
         """Return the first windows."""
-        return KeptWindows(*_holding(self.dataset, self.places[:count]), self.ids[:count].clone())
-
-    def __len__(self) -> int:
-        return len(self.ids)
+        return KeptWindows(*_holding(self.dataset, self.chosen[:count]), self.ids[:count].clone())
 
     def batch(self, indices: Tensor) -> Batch:
         """Return the windows of the given indices ((B,) int64 in [0, n)) as one batch."""
-        batch = self.dataset.batch(self.places[indices])
+        batch = super().batch(indices)
         return replace(batch, window_ids=to_device(self.ids[indices], batch.window_ids.device))
-
-    def expect(self, indices: Tensor) -> None:
-        """Read the windows of the given indices, (B,) int64 in [0, n), ahead where the dataset can."""
-        _expect(self.dataset, self.places[indices])
 
 
 def _holding(dataset: WindowDataset, indices: Tensor) -> tuple[WindowDataset, Tensor]:
