@@ -96,7 +96,7 @@ def load(path: Path, device: torch.device | str = "cpu") -> dict[str, Any]:
             parts = ", or that of ".join(["its content", *sorted(set(head.get("elsewhere", {}).values()))])
             raise ValueError(f"{parts} does not have the checksum that it was written with")
         placed = {name: tensor.to(device) for name, tensor in tensors.items()}
-        tree = _decode(head["tree"], placed, 0)
+        tree = _decode(head["tree"], placed)
         if not isinstance(tree, dict):
             raise ValueError("it holds no dictionary")
         return tree
@@ -173,32 +173,24 @@ def _encode(node: Any, path: str, tensors: dict[str, Tensor], depth: int) -> Any
     raise CheckpointError(f"cannot store a {type(node).__name__} at {path}")
 
 
-def _decode(node: Any, tensors: Mapping[str, Tensor], depth: int) -> Any:
+def _decode(node: Any, tensors: Mapping[str, Tensor], depth: int = 0) -> Any:
     """Return the tree that `_encode` described; raise ValueError where the description is not one of its."""
-    if depth > MAX_DEPTH or not isinstance(node, dict) or len(node) != 1:
-        raise ValueError("its tree is not valid")
-    ((kind, content),) = node.items()
-    if kind == "value" and (content is None or isinstance(content, str | int | float | bool)):
-        return content
-    if kind == "tensor" and isinstance(content, str) and content in tensors:
-        return tensors[content]
-    if kind in ("list", "tuple") and isinstance(content, list):
-        values = [_decode(v, tensors, depth + 1) for v in content]
-        return values if kind == "list" else tuple(values)
-    if kind == "dict" and isinstance(content, list):
-        return _decode_dict(content, tensors, depth)
-    raise ValueError(f"its tree is not valid: {kind!r}")
-
-
-def _decode_dict(items: list[Any], tensors: Mapping[str, Tensor], depth: int) -> dict[str | int, Any]:
-    found: dict[str | int, Any] = {}
-    for item in items:
-        if not isinstance(item, list) or len(item) != 2 or type(item[0]) not in (str, int):
-            raise ValueError("its tree is not valid: a key is missing")
-        if item[0] in found:
-            raise ValueError(f"its tree is not valid: {item[0]!r} occurs twice")
-        found[item[0]] = _decode(item[1], tensors, depth + 1)
-    return found
+    try:
+        ((kind, content),) = node.items() if depth <= MAX_DEPTH else ()
+        if kind == "tensor":
+            return tensors[content]
+        if kind == "dict":
+            found = {key: _decode(value, tensors, depth + 1) for key, value in content}
+            if len(found) == len(content) and {type(key) for key in found} <= {str, int}:
+                return found
+        elif kind in ("list", "tuple") and isinstance(content, list):
+            values = [_decode(value, tensors, depth + 1) for value in content]
+            return values if kind == "list" else tuple(values)
+        elif kind == "value" and (content is None or isinstance(content, str | int | float)):
+            return content
+    except (AttributeError, KeyError, TypeError, ValueError):
+        pass
+    raise ValueError("its tree is not valid")
 
 
 def _head(metadata: Mapping[str, str]) -> dict[str, Any]:
