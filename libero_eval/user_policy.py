@@ -242,8 +242,8 @@ class ProtocolActor(_UserActor):
     replan: int | None
 
     def reset(self, num_envs: int) -> None:
-        """Let the next observation begin the episodes: the object's `reset` is called with its instruction."""
-        self._num_envs: int | None = num_envs
+        """Call the object's `reset`, if it has one; see `Planner`."""
+        self._reset(self.adapter.protocol.prompt(self.adapter.task), num_envs)
 
     def plan(self, obs: Obs, rows: Sequence[int]) -> np.ndarray:
         """Return the object's chunks for some simulations; see `Planner`.
@@ -252,9 +252,6 @@ class ProtocolActor(_UserActor):
             PolicyError: The actions have the wrong shape, are too few, or are not finite.
         """
         inputs = self.adapter.inputs(obs)
-        if self._num_envs is not None:
-            self._reset(inputs[0].prompt, self._num_envs)
-            self._num_envs = None
         images = {name: np.stack([one.images[name] for one in inputs]) for name in inputs[0].images}
         states = np.stack([one.state for one in inputs])
         count, dim = len(inputs), self.action_dim

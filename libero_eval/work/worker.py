@@ -3,6 +3,7 @@
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from multiprocessing.process import BaseProcess
@@ -117,9 +118,7 @@ class Worker:
         open_units = [u for u in self._evaluation.units if u.name not in done and u.name not in held]
         left = [unit for unit in open_units if self._tries(unit, errors) <= self._evaluation.retries]
         busy = {unit.task.id for unit in self._evaluation.units if unit.name in held}
-        counts: dict[str, int] = {}
-        for unit in left:
-            counts[unit.task.id] = counts.get(unit.task.id, 0) + 1
+        counts = Counter(unit.task.id for unit in left)
 
         def preference(unit: Unit) -> tuple:
             task = unit.task.id
