@@ -1,14 +1,16 @@
-"""The original's configuration, composed by Hydra from `libero/configs`."""
+"""The original's configuration, composed by Hydra from `libero/configs`, and the options of its evaluation."""
 
 import copy
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from pydantic.dataclasses import dataclass
 
+from libero_env.cli.options import Positive
 from libero_env.text import flatten
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -96,3 +98,38 @@ def _wrap(value: Any) -> Any:
     if type(value) in (list, tuple):
         return type(value)(_wrap(part) for part in value)
     return value
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """Measure the success of a stored policy on a task.
+
+    Attributes:
+        experiment_dir: Folder of the runs.
+        benchmark: Name of the benchmark, such as libero_object.
+        task_id: Position of the task in the benchmark.
+        algo: Algorithm of the run.
+        policy: Policy of the run.
+        seed: Seed of the run.
+        ep: Epoch of a multitask run's checkpoint (default: the last).
+        load_task: Last task before the checkpoint of another run (default: task_id).
+        run: Number of the run (default: the newest).
+        device_id: Number of the GPU, if there is one.
+        n_eval: Number of episodes (default: as in the run).
+        max_steps: Maximum steps of an episode (default: as in the run).
+        save_videos: Write a video of each episode.
+    """
+
+    experiment_dir: Path = Path("experiments")
+    benchmark: str
+    task_id: int
+    algo: Literal["agem", "base", "er", "ewc", "multitask", "packnet", "single_task"]
+    policy: Literal["bc_rnn_policy", "bc_transformer_policy", "bc_vilt_policy"]
+    seed: int
+    ep: int | None = None
+    load_task: int | None = None
+    run: Positive | None = None
+    device_id: int = 0
+    n_eval: Positive | None = None
+    max_steps: Positive | None = None
+    save_videos: bool = False

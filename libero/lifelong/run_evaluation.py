@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from libero._adapters.config import load_config
+from libero._adapters.config import Evaluation, load_config
 from libero.libero.benchmark import get_benchmark
 from libero.libero.utils.video_utils import VideoWriter
 from libero.lifelong.algos import PackNet, Sequential, get_algo_class
 from libero.lifelong.datasets import SequenceVLDataset, get_dataset
-from libero.lifelong.evaluate import Evaluation
 from libero.lifelong.metric import evaluate_loss, rollouts
 from libero.lifelong.run import fill_in
 from libero.lifelong.utils import control_seed, get_task_embs, latest_run, safe_device, torch_load_model
