@@ -38,9 +38,7 @@ def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float) -> Cam
     right = np.cross((0.0, 0.0, 1.0), backward)
     right /= np.linalg.norm(right)
     turned = mat_to_quat(np.stack([right, np.cross(backward, right), backward], axis=1))
-    x, y, z = moved.tolist()
-    w, *axis = turned.tolist()
-    return CameraView(pos=(x, y, z), quat=(w, axis[0], axis[1], axis[2]))
+    return CameraView(tuple(moved.tolist()), tuple(turned.tolist()))
 
 
 def pivot_of(scene: Scene) -> np.ndarray:

@@ -102,10 +102,8 @@ class PerturbedEpisodes:
 
     def _require_one_view(self) -> None:
         """Raise where a sampled view of the agent's camera would replace one that was given."""
-        view, model = (
-            joined(self._fixed_of("appearance")).cameras.get(CAMERA, CameraView()),
-            self._scene.model,
-        )
+        view = joined(self._fixed_of("appearance")).cameras.get(CAMERA, CameraView())
+        model = self._scene.model
         index, by_kind = model.camera(CAMERA).id, {one.kind: one for one in self.perturbations}
         for kind, given, own in (
             ("camera", view.pos, model.cam_pos),
@@ -259,9 +257,8 @@ class PerturbedEpisodes:
 
     def _of(self, layer: Layer, i: int | None = None) -> list[int]:
         """Return the positions of the perturbations of a layer; of events those that have begun in simulation i."""
-        begun = (
-            [] if i is None else [k for k, at in zip(self.events, self.began[i], strict=True) if at != NEVER]
-        )
+        steps = () if i is None else zip(self.events, self.began[i], strict=True)
+        begun = [k for k, at in steps if at != NEVER]
         found = [k for k, one in enumerate(self.perturbations) if one.layer == layer]
         return [k for k in found if k not in self.events or k in begun]
 

@@ -65,9 +65,8 @@ class ArmIndex:
     def from_model(cls, model: mujoco.MjModel) -> "ArmIndex":
         """Find the arm by the names of its joints; it must be the first kinematic chain of the model."""
         joints = np.array([model.joint(n).id for n in ARM_JOINTS], np.int64)
-        assert (joints == np.arange(7)).all() and (model.jnt_dofadr[:7] == joints).all(), (
-            "the arm comes first"
-        )
+        comes_first = (joints == np.arange(7)).all() and (model.jnt_dofadr[:7] == joints).all()
+        assert comes_first, "the arm comes first"
         address = _mass_address(model)
         fingers = np.array([model.joint(n).id for n in FINGER_JOINTS], np.int64)
         limit, finger_range = model.actuator_ctrlrange[:7, 1].copy(), model.actuator_ctrlrange[7:9].copy()

@@ -95,6 +95,13 @@ class Task:
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:16]
 
 
+def task_order(suite: str, size: int, index: int) -> list[int]:
+    """Return the indices of a suite's tasks in one of the sequences of the original benchmark; see `Suite.order`."""
+    orders: list[list[int]] = read_yaml("tasks/data/task_orders.yaml") if size == 10 else [list(range(size))]
+    require_known(f"task order of {suite}", index, range(len(orders)))
+    return orders[index]
+
+
 @dataclass(frozen=True)
 class Suite:
     """Tasks in their published order.
@@ -124,6 +131,4 @@ class Suite:
         Raises:
             UnknownNameError: The suite has no such order.
         """
-        orders = read_yaml("tasks/data/task_orders.yaml") if len(self) == 10 else [list(range(len(self)))]
-        require_known(f"task order of {self.name}", order_index, range(len(orders)))
-        return tuple(self.tasks[i] for i in orders[order_index])
+        return tuple(self.tasks[i] for i in task_order(self.name, len(self), order_index))

@@ -17,6 +17,7 @@ from libero_env.storage import read_yaml
 from libero_env.tasks import get_suite, suite_names
 from libero_env.tasks import get_task as get_native_task
 from libero_env.tasks.builder import language_from_name
+from libero_env.tasks.task import task_order
 
 BENCHMARK_MAPPING: dict[str, type["Benchmark"]] = {}
 
@@ -103,9 +104,7 @@ class Benchmark:
 
     def _make_benchmark(self) -> None:
         tasks = self._entries()
-        orders = read_yaml("tasks/data/task_orders.yaml") if len(tasks) == 10 else [list(range(len(tasks)))]
-        require_known(f"task order of {self.name}", self.task_order_index, range(len(orders)))
-        self.tasks = [tasks[i] for i in orders[self.task_order_index]]
+        self.tasks = [tasks[i] for i in task_order(self.name, len(tasks), self.task_order_index)]
         self.n_tasks = len(self.tasks)
 
     def _entries(self) -> list[Task]:
