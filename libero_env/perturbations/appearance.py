@@ -38,7 +38,8 @@ def orbit(scene: Scene, axis_angle: float, degrees: float, factor: float) -> Cam
     right = np.cross((0.0, 0.0, 1.0), backward)
     right /= np.linalg.norm(right)
     turned = mat_to_quat(np.stack([right, np.cross(backward, right), backward], axis=1))
-    return CameraView(tuple(moved.tolist()), tuple(turned.tolist()))
+    w, *axis = turned.tolist()
+    return CameraView(tuple(moved.tolist()), (w, axis[0], axis[1], axis[2]))
 
 
 def pivot_of(scene: Scene) -> np.ndarray:
