@@ -175,8 +175,10 @@ def _encode(node: Any, path: str, tensors: dict[str, Tensor], depth: int) -> Any
 
 def _decode(node: Any, tensors: Mapping[str, Tensor], depth: int = 0) -> Any:
     """Return the tree that `_encode` described; raise ValueError where the description is not one of its."""
+    if depth > MAX_DEPTH:
+        raise ValueError(f"its tree is nested deeper than {MAX_DEPTH}")
     try:
-        ((kind, content),) = node.items() if depth <= MAX_DEPTH else ()
+        ((kind, content),) = node.items()
         if kind == "tensor":
             return tensors[content]
         if kind == "dict":
