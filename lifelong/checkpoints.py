@@ -190,7 +190,7 @@ def _decode(node: Any, tensors: Mapping[str, Tensor], depth: int = 0) -> Any:
             return values if kind == "list" else tuple(values)
         elif kind == "value" and (content is None or isinstance(content, str | int | float)):
             return content
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError):
         pass
     raise ValueError("its tree is not valid")
 
