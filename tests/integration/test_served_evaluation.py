@@ -217,7 +217,7 @@ def test_an_openpi_connection_that_breaks_is_no_episode(card, tmp_path, capsys):
 
 def test_a_protocol_that_counts_errors_does_not_count_those_of_servers(card, tmp_path, capsys):
     answers = {
-        "not finite": {"actions": np.full((3, 7), np.nan)},
+        "must be finite": {"actions": np.full((3, 7), np.nan)},
         "2 actions; the protocol executes 3": {"actions": lift(2)},
         "its traceback": "Traceback ...\nKeyError: 'image'",
     }
