@@ -39,11 +39,22 @@ def add(
         replace: Replace a user-defined object of this name.
         out: Folder (default: LIBERO_OBJECTS, else objects beside the configuration file).
     """
-    options = {name: value for name, value in locals().items() if name != "file"}
     from libero_env.design.objects import add_object
     from libero_env.paths import objects_dir
 
-    added = add_object(file, **options)
+    added = add_object(
+        file,
+        name=name,
+        size=size,
+        mass=mass,
+        density=density,
+        up=up,
+        collision=collision,
+        faces=faces,
+        container=container,
+        replace=replace,
+        out=out,
+    )
     print(f"{added.name}: {added.folder}")
     print("\n".join(describe(added.properties)))
     for note in added.notes:
