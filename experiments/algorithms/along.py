@@ -9,6 +9,7 @@ Forgotten is the share of it that is gone after a later task: 1 - sum(later) / s
 import argparse
 import re
 from collections.abc import Callable, Iterator
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from libero_env.text import duration, quantity
 from lifelong.language.encoder import embed
 from lifelong.results.log import ResultLog
 from lifelong.results.results import Results
+from lifelong.stats.episodes import Counts, mcnemar_exact
 
 DISTANCES = (1, 2, 4, 10, 30, 60, 130)  # tasks learned since; ends of bins
 SIMILARITIES = (-1.0, 0.5, 0.7, 0.8, 0.9, 1.01)  # largest cosine to the instructions learned since
@@ -92,6 +94,23 @@ def by_similarity(results: Results) -> Iterator[tuple[str, list[tuple[float, flo
         yield title, [pair for is_same, pair in again if is_same == same]
 
 
+def at_end(runs: dict[str, Results]) -> Iterator[list[str]]:
+    """Yield of each two methods the tasks on which only one succeeds at the end, where a cell has one episode."""
+    for (a, one), (b, other) in combinations(runs.items(), 2):
+        rates, episodes = zip(
+            *((m[-1], n[-1]) for m, n in (one.success_matrix(), other.success_matrix())), strict=True
+        )
+        if one.run.tasks == other.run.tasks and (np.array(episodes) == 1).all():
+            x, y = (row == 1 for row in rates)
+            counts = Counts(*(int(c.sum()) for c in (x & y, x & ~y, ~x & y, ~x & ~y)))
+            yield [
+                f"{a}, {b}",
+                str(counts.only_first),
+                str(counts.only_second),
+                f"{mcnemar_exact(counts):.2g}",
+            ]
+
+
 def costs(results: Results) -> Iterator[tuple[str, str]]:
     """Yield the costs of a task after some numbers of tasks."""
     found = results.costs_by_task()
@@ -125,6 +144,9 @@ def main() -> None:
         }
         first = next(iter(cut.values()))  # all methods are measured in the same cells
         show("forgotten", lost, {name: sum(len(seed[name]) for seed in first) for name in first[0]})
+    if pairs := list(at_end({method: found[0] for method, found in runs.items()})):
+        heads = ["at the end", "only the first", "only the second", "p (McNemar)"]
+        print("\n".join(table(heads, pairs)), end="\n\n")
     spent = {method: dict(costs(found[0])) for method, found in runs.items()}
     names = list(next(iter(spent.values())))
     print(
