@@ -111,7 +111,7 @@ def _launch(options: argparse.Namespace, ranks: Ranks) -> int:
         folder = config.hydra.sweep.dir
         if not any(word.startswith("hydra.sweep.dir=") for word in words):
             # a folder of its own, by which the same command finds it again
-            folder = f"{config.runs_dir}/{FOLDER}/{sweep_name(sorted(words), list(lists))}"
+            folder = f"{Path(config.runs_dir).expanduser()}/{FOLDER}/{sweep_name(sorted(words), list(lists))}"
             words.append(f"hydra.sweep.dir='{folder}'")
         sweep = Path(folder).resolve()
         jobs = math.prod(map(len, lists.values()))

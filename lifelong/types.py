@@ -3,6 +3,7 @@
 Shape legend: B batch, T time, V views, H W C image, A action, D size of a reading, L language embedding.
 """
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -17,7 +18,7 @@ def _check_path(text: str) -> str:
     if not text or "\0" in text or len(text) > 4000 or max(map(len, text.split("/"))) > 255:
         shown = text if len(text) <= 80 else f"{text[:77]}..."
         raise ValueError(f"{shown!r} is not a path")
-    return text
+    return os.path.expanduser(text)
 
 
 # Ranges of settings. Their upper ends are beyond what any machine can do; what this one can do is checked apart.

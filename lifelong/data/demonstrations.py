@@ -100,7 +100,7 @@ def _named_files(
         DataError: One is not of a task of the run or does not fit, or two are of the same task.
     """
     files: dict[str, Path] = {}
-    for path in (Path(name).expanduser() for name in data.files):
+    for path in map(Path, data.files):
         stated = recorded_task(path)
         task = next((one for one in tasks if same_meaning(one.problem, stated.problem)), None)
         if task is None and any(same_meaning(one.problem, stated.problem) for one in others):
@@ -267,7 +267,7 @@ def check_folder(data: DataSettings) -> Path | None:
     """
     if data.folder is None:
         return None
-    folder = Path(data.folder).expanduser()
+    folder = Path(data.folder)
     if folder.is_dir():
         return folder
     beside = [p.name for p in folder.parent.iterdir() if p.is_dir()] if folder.parent.is_dir() else []

@@ -282,7 +282,10 @@ def _unlike_draws(groups: Sequence[Group]) -> list[str]:
             for alike in sets.values()
             if len(alike) > 1
         ]
-    return lines
+    subsets = {group.label: len({frozenset(r.record.tasks) for r in group.runs}) for group in groups}
+    return lines + [
+        f"The runs of {name} learn {n} different sets of tasks." for name, n in subsets.items() if n > 1
+    ]
 
 
 def _unlike_demonstrations(groups: Sequence[Group]) -> list[str]:

@@ -17,7 +17,7 @@ from lifelong.results.provenance import (
     source_digest,
 )
 from lifelong.results.records import DemonstrationsRecord, from_line, to_line
-from lifelong.settings import RunSettings
+from lifelong.settings import BenchmarkSettings, RunSettings
 from tests.harness.records import run_start
 
 START = run_start(["a"], conditions=present_conditions(torch.device("cpu"), renderer="llvmpipe"))
@@ -32,6 +32,14 @@ SETTINGS = RunSettings(
     deterministic=False,
     init_from=None,
 )
+
+
+def test_paths_of_the_configuration_may_begin_in_the_home_folder(monkeypatch):
+    monkeypatch.setenv("HOME", "/home/a")
+    settings = replace(SETTINGS, runs_dir="~/runs", init_from="~/runs/base")
+    assert (settings.runs_dir, settings.init_from) == ("/home/a/runs", "/home/a/runs/base")
+    benchmark = BenchmarkSettings(suite="own", files=["~/a.yaml", "b~.yaml"])
+    assert list(benchmark.files) == ["/home/a/a.yaml", "b~.yaml"]
 
 
 def changed(**conditions: str):

@@ -864,6 +864,14 @@ def test_what_differs_between_all_runs_of_two_methods_is_told(
     assert len(lines) == bool(told) and (told or "") in "".join(lines)
 
 
+def test_runs_of_a_method_that_learn_different_tasks_are_told(tmp_path: Path):
+    told = "The runs of er learn 2 different sets of tasks."
+    first, second = (load_run(make_run(tmp_path / str(n), "er", n, tasks=2, order=n)) for n in (0, 1))
+    assert told not in unlike(group_runs([first, second]))
+    others = replace(second.record, tasks=(first.record.tasks[0], "another"))
+    assert told in unlike(group_runs([first, replace(second, record=others)]))
+
+
 def test_the_start_of_a_run_that_its_methods_name_tells_is_not_told_again(tmp_path: Path):
     runs = [make_run(tmp_path / name, "er", 1, tasks=2) for name in "ab"]
     groups = group_runs([load_run(runs[0]), load_run(configure(runs[1], init_from="base"))])
