@@ -29,7 +29,7 @@ from libero_env.tasks.suites import OWN
 from libero_env.tasks.task import FILE
 from libero_env.validation import checked
 
-GENERATOR = "scripted-expert-15"  # change it when the same seed yields different demonstrations
+GENERATOR = "scripted-expert-16"  # change it when the same seed yields different demonstrations
 PERTURBED_HEADER = ("perturb", "perturb_draws")  # attributes of a file that was rendered under perturbations
 MASK_NAMES = "segmentation_names"  # attribute: JSON, number in a segmentation -> name
 PERTURB_DRAWS = 1  # change it when the same perturbation of the same demonstration gives other observations

@@ -15,6 +15,7 @@ from libero_env.sim.state import StateView
 from libero_env.tasks.problem import Atom
 
 _DROP_HEIGHTS = np.array([0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18])  # [m] above the place
+_FEW_HITS = 30  # of a hand's points: one that hits more does not fit into a place entered from a side
 _TILTS = (0.5, 0.8, 1.1, 1.45)  # [rad] of approaches that suit places entered from a side
 
 
@@ -208,6 +209,7 @@ def _rank_pairs(placement: Placement, grasps: list[Grasp], places: list[PlacePos
             colliding[from_side] = False
             if not colliding.any():
                 break
+        hits[from_side] += 10 * np.maximum(hits[from_side] - _FEW_HITS, 0)
         height_cost = 0.01 * hits + 0.3 * (hits > 0) + 4.0 * _DROP_HEIGHTS
         heights[g] = height_cost.argmin(axis=1)
         cost[g] += height_cost.min(axis=1)

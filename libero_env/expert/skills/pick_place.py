@@ -11,7 +11,7 @@ from libero_env.expert.planning.pick_plan import FailedAttempt
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.expert.skills.skill import BackOff, Skill, funnel_lift, gripper_opening
-from libero_env.expert.skills.transport import SINKING, Move, Transport
+from libero_env.expert.skills.transport import Move, Transport
 from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
 from libero_env.sim.predicates import evaluate
@@ -61,7 +61,7 @@ class PickPlace(Skill):
         self._transport: Transport | None = None
         self._replans = 0
         self._opens_partially = False  # others are where the fingers would open to
-        self._sinks = False  # the hand goes on down while the fingers begin to open
+        self._onward = np.zeros(3)  # way of the hand while the fingers begin to open, m
         self._closed_opening = 0.0  # [m] between the fingers when they began to
         self._back_off = BackOff()
         self._on_line = False  # of the approach; else the hand passes over obstacles to it
@@ -196,7 +196,7 @@ class PickPlace(Skill):
         if move != "arrived" and self._replan_place(view, self._transport, blocked=move == "blocked"):
             return self._toward(view, view.eef_pos, view.eef_mat, CLOSE)
         self._hold_pose = Pose(view.eef_pos, view.eef_mat)
-        self._sinks = move == "arrived" and self._transport.sinks
+        self._onward = self._transport.onward if move == "arrived" else np.zeros(3)
         return self._start("release", view)
 
     def _make_transport(self, view: StateView, exit_pose: Pose | None = None) -> Transport:
@@ -228,8 +228,8 @@ class PickPlace(Skill):
         if self._steps > 10:
             self._enter("withdraw")
         target, speed = pose.pos, 1.0
-        if self._sinks and gripper_opening(view) < self._closed_opening + OPENED:
-            target, speed = pose.pos - [0, 0, SINKING], SLOW
+        if self._onward.any() and gripper_opening(view) < self._closed_opening + OPENED:
+            target, speed = pose.pos + self._onward, SLOW
         return self._toward(view, target, pose.mat, self._gripper_opening_action(view), speed_scale=speed)
 
     def _gripper_opening_action(self, view: StateView) -> float:

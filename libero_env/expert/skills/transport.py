@@ -30,7 +30,7 @@ ALIGNED, ALIGNED_TURN = 0.008, 0.1  # [m], [rad] from the middle, where it goes 
 MISALIGNED, MISALIGNED_TURN = 0.03, 0.4  # [m], [rad] from the middle, where it goes up again
 MAX_SAG = 0.01  # [m] that a hand is commanded to be higher, as its load draws it down
 # a hand that brakes before it lets go cannot be cloned: the clone comes to rest just short of where the fingers open
-SINKING = 0.02  # [m] below its place, where the hand is commanded to
+SINKING = 0.02  # [m] below its place, or behind it, where the hand is commanded to
 BLOCKED_DISTANCE = 0.03  # [m] before its place, at which an object that stops is blocked
 # an object that stands below a fixture, such as a drawer just opened, is drawn out before it is lifted
 CLEAR = 0.03  # [m] around the object over which no fixture may hang, as a clone does not rise as straight
@@ -95,9 +95,12 @@ class Transport:
         self._inserting = False  # on the last part of the way: down between walls, or in from a side
 
     @property
-    def sinks(self) -> bool:
-        """Whether the object is lowered onto its place, not dropped or pushed in from a side."""
-        return self.plan.place.from_above and self.plan.drop_height <= MIN_DROP
+    def onward(self) -> np.ndarray:
+        """Way that the hand goes on while the fingers begin to open, (3,), [m]; none where the object is dropped."""
+        place = self.plan.place
+        if not place.from_above:
+            return SINKING * place.entry
+        return np.array([0.0, 0.0, 0.0 if self.plan.drop_height > MIN_DROP else -SINKING])
 
     def next_move(self, view: StateView, velocity: np.ndarray) -> Move | Outcome:
         """Return the next target of the hand, or how the transport ended.
@@ -178,7 +181,7 @@ class Transport:
             below: Extent of object and hand below the grip site, [m].
             slow: Whether the hand hardly moves.
         """
-        pos, style, drops = view.eef_pos, self.style, not self.sinks
+        pos, style, drops = view.eef_pos, self.style, self.plan.drop_height > MIN_DROP
         away = float(np.linalg.norm(goal[:2] - pos[:2]))
         self._blocked_steps = self._blocked_steps + 1 if slow and away < 0.04 else 0
         aligned = away < (0.025 if drops else self._accuracy) and turn < 0.2
@@ -239,12 +242,15 @@ class Transport:
             return Move(target, self._mat, lateral_ramp(pos[2], target[2], 0.0, 0.05))
         left = float((goal - pos) @ entry)
         self._blocked_steps = self._blocked_steps + 1 if slow else 0
-        if left < 0.003 and np.linalg.norm(goal - pos) < 0.03:
+        if left < self._accuracy and np.linalg.norm(goal - pos) < 0.03:
+            return "arrived"
+        if self._blocked_steps > 1 and (left < 0.012 or evaluate(self.atom, view)):
             return "arrived"
         if self._blocked_steps > 8:
-            return "arrived" if left < 0.012 or evaluate(self.atom, view) else "blocked"
+            return "blocked"
         sag = np.clip(goal[2] - pos[2], 0.0, MAX_SAG)
-        return Move(goal - max(left - 0.06, 0.0) * entry + [0, 0, sag], self._mat)
+        ahead = min(SINKING, 0.06 - left)
+        return Move(goal + ahead * entry + [0, 0, sag], self._mat, slow=left < 0.04)
 
     def _corrected_release_mat(self, view: StateView) -> np.ndarray:
         """Return the hand's orientation at the place, (3, 3), for the object as it is rotated in the hand now."""
