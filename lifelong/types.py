@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 from torch import Tensor
 
 
-def _check_path(text: str) -> str:
+def _user_path(text: str) -> str:
     if not text or "\0" in text or len(text) > 4000 or max(map(len, text.split("/"))) > 255:
         shown = text if len(text) <= 80 else f"{text[:77]}..."
         raise ValueError(f"{shown!r} is not a path")
@@ -30,7 +30,7 @@ Layers = Annotated[int, Field(ge=1, le=1000)]  # the same, at least one
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
-PathText = Annotated[str, AfterValidator(_check_path)]
+PathText = Annotated[str, AfterValidator(_user_path)]
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from study import REFERENCES, Planned, planned
 from libero_env.text import duration, quantity
 from lifelong.results.log import ResultLog
 from lifelong.results.records import LossRecord
-from lifelong.stats.intervals import Estimate
+from lifelong.stats.intervals import Estimate, holm
 from lifelong.stats.methods import paired_difference, welch_difference
 from lifelong.stats.metrics import metric_values
 
@@ -163,14 +163,18 @@ def shifts(groups: dict[str, dict], order: list[str]) -> Iterator[tuple[str, lis
 
 
 def by_bytes() -> Iterator[tuple[str, list[str]]]:
-    """Final success of replay with each memory, compressed and not, in the same bytes; less that with 247 MB."""
+    """Final success of replay with each memory, compressed and not, in the same bytes; less that with 247 MB.
+
+    P-values of the differences are Holm's over the memories.
+    """
     by_method, largest = measures("memory", "final_success"), measures("goal", "final_success").get("er", {})
     sizes = dict.fromkeys(method.partition(" ")[2] for method in by_method)
-    rows = []
+    rows, tested = [], []
     for size in sizes:
         plain, compressed = (by_method.get(f"{name} {size}", {}) for name in ("er", "compressed_er"))
         both = sorted(plain.keys() & compressed.keys())
         less = [compressed[seed] - plain[seed] for seed in both]
+        tested.append(paired_difference(np.array(less)).p_value if less else math.nan)
         means = (f"{statistics.mean(v.values()):.2f}" if v else "–" for v in (plain, compressed))
         rows.append(
             [
@@ -182,7 +186,17 @@ def by_bytes() -> Iterator[tuple[str, list[str]]]:
                 ),
             ]
         )
-    heads = ["memory", "seeds", "`er`", "`compressed_er`", "`compressed_er` less `er`", "each seed"]
+    for row, p in zip(rows, holm(tested), strict=True):
+        row.insert(6, f"{p:.2g}")
+    heads = [
+        "memory",
+        "seeds",
+        "`er`",
+        "`compressed_er`",
+        "`compressed_er` less `er`",
+        "each seed",
+        "p (Holm)",
+    ]
     if rows:
         yield (
             "memory: by bytes",

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.config import DemoConfig
+from libero_env.demos.config import GENERATOR, DemoConfig
 from libero_env.demos.generate import demo_path
 from libero_env.tasks import get_suite
 from lifelong.data import demonstrations
@@ -134,7 +134,7 @@ def test_demonstrations_that_do_not_fit_are_refused_by_name(kwargs, words, tmp_p
 
 
 def test_what_the_expert_recorded_otherwise_is_told_and_recorded_again(tmp_path, recorded, capsys):
-    own(tmp_path / "expert.hdf5", size=16, generator="scripted-expert-16", robot="libero")
+    own(tmp_path / "expert.hdf5", size=16, generator=GENERATOR, robot="libero")
     demonstrations.find_demos(TASKS[1:2], [2], settings(str(tmp_path)), False)
     assert recorded == [TASKS[1].name] and "not used" in capsys.readouterr().err
     demonstrations.find_demos(TASKS[:1], [2], settings(str(tmp_path)), False)
@@ -151,7 +151,7 @@ def test_a_file_in_the_layout_is_refused_where_it_states_another_task(tmp_path, 
 def test_a_file_of_the_user_goes_before_what_the_expert_recorded_in_its_folder(tmp_path, recorded):
     path = demo_path(tmp_path, DemoConfig(TASKS[1], (8, 8)))
     path.parent.mkdir(parents=True)
-    expert = {"generator": "scripted-expert-16", "robot": "libero"}
+    expert = {"generator": GENERATOR, "robot": "libero"}
     own(path, **expert)
     own(tmp_path / "seed5.hdf5", **expert | {"seed": 5})
     demonstrations.find_demos(TASKS[1:2], [2], settings(str(tmp_path)), False)
