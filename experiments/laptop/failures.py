@@ -5,6 +5,9 @@
 For each rollout that fails: each time an object of the goal is carried, the steps, how high it came and what it
 touched; then where the hand is at the end, whether it still moves, and how far the fingers are open. Last, what was
 touched on the way in failures and in successes.
+
+With `--draw-fingers` a policy with a mixture acts by its mean but for the fingers, whose action is that of a component
+that is drawn.
 """
 
 import argparse
@@ -16,11 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.sim.state import StateView
 from lifelong.evaluation.restore import LoadedRun, restore
 from lifelong.evaluation.rollout import Rollouts, rollout
+from lifelong.nn import GMMHead
 
 CARRIED = 0.02  # height above the start from which an object counts as carried, m
 STILL = 0.01  # way of the hand in its last steps below which it stands, m
@@ -117,10 +122,24 @@ class Watched:
         return f"hand {entities[near]:.2f} m from {near}, {manner}, fingers {opening:.0f} mm apart"
 
 
-def watch(run: LoadedRun, task: int, starts: int) -> tuple[Rollouts, Watched, list[str]]:
+class FingersDrawn(GMMHead):
+    """Mixture of which a policy that draws takes the mean, and for the fingers a drawn component's mean."""
+
+    def sample(self, params: dict[str, torch.Tensor], generator: torch.Generator | None) -> torch.Tensor:
+        """Return an action, (1, A), of a mixture (1, K, A)."""
+        choice = torch.multinomial(params["logits"].softmax(-1), 1, generator=generator)
+        fingers = params["means"][..., -1].gather(-1, choice)
+        return torch.cat([self.mean(params)[..., :-1], fingers], dim=-1)
+
+
+def watch(run: LoadedRun, task: int, starts: int, draw_fingers: bool) -> tuple[Rollouts, Watched, list[str]]:
     """Run a task's rollouts, watched; return the outcomes and how each ends."""
     horizon = run.eval.horizon
     with closing(run.environment(task, starts, horizon)) as env, run.acting(run.tasks[task]) as policy:
+        if draw_fingers:
+            if not isinstance(policy.head, GMMHead):
+                raise SystemExit("--draw-fingers: the policy has no mixture")
+            policy.stochastic, policy.head.__class__ = True, FingersDrawn
         watched = Watched(env)
         done = rollout(
             policy,
@@ -143,8 +162,10 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="directory of a run of one task after the other")
     parser.add_argument("--task", type=int, required=True, help="position of the task, from 0")
     parser.add_argument("--starts", type=int, default=40, help="number of rollouts (default: %(default)s)")
+    parser.add_argument("--draw-fingers", action="store_true")
     args = parser.parse_args()
-    done, watched, ends = watch(restore(args.run, after=args.task), args.task, args.starts)
+    run = restore(args.run, after=args.task)
+    done, watched, ends = watch(run, args.task, args.starts, args.draw_fingers)
     touched: dict[bool, Counter[str]] = {True: Counter(), False: Counter()}
     for i, episode in enumerate(done.episodes):
         touched[episode.success].update({name for carry in watched.carries[i] for name in carry.touched})
