@@ -162,7 +162,7 @@ def main() -> None:
     parser.add_argument("run", type=Path, help="directory of a run of one task after the other")
     parser.add_argument("--task", type=int, required=True, help="position of the task, from 0")
     parser.add_argument("--starts", type=int, default=40, help="number of rollouts (default: %(default)s)")
-    parser.add_argument("--draw-fingers", action="store_true")
+    parser.add_argument("--draw-fingers", action="store_true", help="draw the fingers' action of a mixture")
     args = parser.parse_args()
     run = restore(args.run, after=args.task)
     done, watched, ends = watch(run, args.task, args.starts, args.draw_fingers)
