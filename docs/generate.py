@@ -1,31 +1,39 @@
-"""What the documentation takes from elsewhere while it is built: the first page, the references, and three tables.
+"""What the documentation takes from elsewhere while it is built: pages at the root, the references, and tables.
 
-MkDocs calls the functions `on_...` (`hooks` in mkdocs.yml). The references have a page for each group of commands and
-of keys. A page asks for a part with a line such as `<!-- generated: commands -->`. Links to files outside this folder
-become their paths, as the site has none of these.
+MkDocs calls the functions `on_...` (`hooks` in mkdocs.yml). The references have a page for each package, and each group
+of commands and of keys. A page asks for a part with a line such as `<!-- generated: commands -->`. Links to files
+outside this folder become their paths, as the site has none of these.
 """
 
+import argparse
+import base64
 import contextlib
+import hashlib
+import importlib
 import inspect
 import io
+import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import configuration_keys
 import yaml
+from configuration_keys import as_cell
 from markdown.extensions.toc import slugify
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
-from libero_env.cli.main import COMMANDS, bind
-from libero_env.objects import object_names
+from libero_cli.main import COMMANDS, bind
+from libero_env import __version__
+from libero_env.objects.builtin import builtin_names
 from libero_env.tasks import get_suite, suite_names
 
 ROOT = Path(__file__).parents[1]
-CONFIGS = ROOT / "configs"
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 OUTSIDE = re.compile(r"(?<!!)\[([^\]]+)\]\(\.\./([^)#]+)(?:#[^)]*)?\)")
 
 
@@ -35,6 +43,8 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
         marker = f"<!-- generated: {name} -->"
         if marker in markdown:
             markdown = markdown.replace(marker, part())
+    for name, page in ROOT_PAGES.items():
+        markdown = markdown.replace(f"](../{name}", f"]({page}")
     return OUTSIDE.sub(_outside, markdown)
 
 
@@ -45,33 +55,109 @@ def _outside(link: re.Match[str]) -> str:
         server = "https://colab.research.google.com/github" if notebook else "https://github.com"
         text += " (in Colab)" if notebook else ""
         return f"[{text}]({server}/{repository}/blob/{os.environ['GITHUB_REF_NAME']}/{path})"
+    path = path.removesuffix("/README.md")
     return f"`{path}`" if text in path else f"{text} (`{path}`)"
 
 
 def on_config(config: MkDocsConfig) -> None:
-    """Put the pages of the references into the navigation, each below the page that lists them."""
-    for section in (entry for entry in config.nav if "Reference" in entry):
-        section["Reference"] = [
-            {title: [page, *pages(page)]} if (title := REFERENCES.get(page)) else page
-            for page in section["Reference"]
-        ]
+    """Put the pages of the references into the navigation, the version into the head, and a link to the source."""
+    below = {page: {title: [page, *pages(page)]} for page, title in REFERENCES.items()}
+    below["walkthroughs.md"] = {"Walk-throughs": ["walkthroughs.md", *map(notebook_name, NOTEBOOKS)]}
+    for section in config.nav:
+        for title, entries in section.items() if isinstance(section, dict) else ():
+            if isinstance(entries, list):
+                section[title] = [below.get(entry, entry) for entry in entries]
+    config.site_name += f" {__version__}"
+    if repository := os.environ.get("GITHUB_REPOSITORY"):
+        config.repo_url = f"https://github.com/{repository}"
 
 
 def on_files(files: Files, config: MkDocsConfig) -> None:
-    """Add the pages that no file in this folder holds: the first one, which is README.md, and the references."""
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    first = re.sub(r"\]\((?!https?:|#)(docs/)?", lambda link: "](" if link[1] else "](../", readme)
-    files.append(File.generated(config, "index.md", content=first))
+    """Add the pages that no file in this folder holds: those of the files at the root, and the references."""
+    for source, name in ROOT_PAGES.items():
+        text = (ROOT / source).read_text(encoding="utf-8")
+        own = re.sub(r"\]\((?!https?:|#)(docs/)?", lambda link: "](" if link[1] else "](../", text)
+        files.append(File.generated(config, name, content=own))
     for reference in REFERENCES:
         for name, content in pages(reference).items():
             files.append(File.generated(config, name, content=content))
+    for path in NOTEBOOKS:
+        content, pictures = notebook_page(path)
+        files.append(File.generated(config, notebook_name(path), content=content))
+        for name, picture in pictures.items():
+            files.append(File.generated(config, name, content=picture))
+
+
+def notebook_name(path: Path) -> str:
+    """Name of a notebook's page."""
+    return f"notebook-{path.stem}.md"
+
+
+def executed(path: Path) -> Path:
+    """Where the copy of a notebook with its outputs is, until its text changes."""
+    return (
+        ROOT
+        / "build"
+        / "notebooks"
+        / f"{path.stem}-{hashlib.sha256(path.read_bytes()).hexdigest()[:12]}.ipynb"
+    )
+
+
+def execute_notebooks() -> None:
+    """Execute each notebook of which there is no copy with outputs; `make docs` does so before it builds the site."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    for path in NOTEBOOKS:
+        if not (out := executed(path)).exists():
+            print(f"executing {path.name}", flush=True)
+            notebook = nbformat.read(path, as_version=4)
+            folder = {"metadata": {"path": str(path.parent)}}
+            NotebookClient(notebook, timeout=3600, kernel_name="python3", resources=folder).execute()
+            out.parent.mkdir(parents=True, exist_ok=True)
+            nbformat.write(notebook, out)
+
+
+def notebook_page(path: Path) -> tuple[str, dict[str, bytes]]:
+    """A notebook as Markdown, with outputs where it was executed, and its pictures by name."""
+    done = executed(path)
+    cells = json.loads((done if done.exists() else path).read_text(encoding="utf-8"))["cells"]
+    parts, pictures = list[str](), dict[str, bytes]()
+    for cell in cells:
+        text = "".join(cell["source"]).replace("](../docs/", "](")
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+        for output in cell.get("outputs", ()):
+            found = output.get("data", {})
+            if "image/png" in found:
+                name = f"images/notebooks/{path.stem}-{len(pictures)}.png"
+                pictures[name] = base64.b64decode("".join(found["image/png"]))
+                parts.append(f"![output]({name})")
+            elif output.get("name") != "stderr":
+                told = "".join(output.get("text") or found.get("text/plain", ()))
+                parts.append(f"```text\n{told.rstrip()}\n```")
+    title, _, rest = parts[0].partition("\n")
+    link = f"[Open it](../notebooks/{path.name})" + ("" if done.exists() else "; not executed in this build")
+    return "\n\n".join([title, f"{link}.", rest, *parts[1:]]), pictures
+
+
+def notebook_list() -> str:
+    """A list of the notebooks: the title of each, and its first paragraph."""
+    lines = []
+    for path in NOTEBOOKS:
+        title, about, *_ = notebook_page(path)[0].split("\n\n")[0::2]
+        lines.append(f"- [{title.lstrip('# ')}]({notebook_name(path)}): {' '.join(about.split())}")
+    return "\n".join(lines)
 
 
 @cache
 def pages(reference: str) -> dict[str, str]:
     """The pages of a reference: the name of each, and its text."""
-    parts = command_reference() if reference == "commands.md" else configuration_reference()
     stem = reference.removesuffix(".md")
+    parts = {
+        "commands": command_reference,
+        "configuration": configuration_keys.configuration_reference,
+        "python": python_reference,
+    }[stem]()
     return {
         f"{stem}-{title.lower().replace(' ', '-')}.md": f"# {title}\n\n{text}"
         for title, text in parts.items()
@@ -86,6 +172,20 @@ def listed(reference: str) -> str:
         sections = [f"[`{s}`]({name}#{slugify(s, '-')})" for s in re.findall("^## (.*)$", text, re.M)]
         lines.append(f"- [{title}]({name}): {', '.join(sections)}")
     return "\n".join(lines)
+
+
+def python_reference() -> dict[str, str]:
+    """A page for each package, with a section for each public name: what its docstring says."""
+    found = {}
+    for package in ("libero_env", "lifelong", "libero_eval"):
+        module, sections = importlib.import_module(package), []
+        for name in module.__all__:
+            one = getattr(module, name)
+            file = one.__module__.replace(".", "/") + ".py"
+            head = f"`from {package} import {name}`, defined in [{file}](../{file})"
+            sections.append(f"## {name}\n\n{head}\n\n::: {one.__module__}.{one.__qualname__}\n")
+        found[package] = f"{inspect.getdoc(module)}\n\n" + "\n".join(sections)
+    return found
 
 
 def command_reference() -> dict[str, str]:
@@ -106,227 +206,6 @@ def command_help(name: str) -> str:
     return "".join(line.removeprefix("│").removesuffix("│").rstrip() + "\n" for line in lines)
 
 
-def groups() -> dict[str, list[Path]]:
-    """Return the files of each configuration group, in the order of configs/config.yaml; subgroups after theirs."""
-    defaults = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))["defaults"]
-    keys = [next(iter(d)) for d in defaults if isinstance(d, dict)]
-    names = dict.fromkeys(key.removeprefix("optional ").partition("@")[0] for key in keys)
-    folders = [f for name in names for f in (CONFIGS / name, *sorted((CONFIGS / name).glob("*/")))]
-    found = {f.relative_to(CONFIGS).as_posix(): sorted(f.glob("*.yaml")) for f in folders}
-    return {name: files for name, files in found.items() if files}
-
-
-def top_keys() -> str:
-    """A table of the keys at the top."""
-    from lifelong.settings import RunSettings
-
-    comments = _comments(CONFIGS / "config.yaml")
-    top = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))
-    rows = [
-        f"| `{k}` | {_value(v)} | {_valid('lifelong.settings.RunSettings', k)} | {_cell(comments.get(k, ''))} |"
-        for k, v in top.items()
-        if k in RunSettings.__dataclass_fields__
-    ]
-    return "\n".join(["| key | default | valid | what |", "|---|---|---|---|", *rows])
-
-
-def configuration_reference() -> dict[str, str]:
-    """A page for each group of keys, with a section for itself and one for each of its subgroups."""
-    top = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))
-    chosen = {k: v for d in top["defaults"] if isinstance(d, dict) for k, v in d.items()}
-    found: dict[str, str] = {}
-    for name, files in groups().items():
-        section = f"## {name}\n\n{_group(name, files, chosen.get(name))}\n\n"
-        page = name.partition("/")[0]
-        found[page] = found.get(page, "") + section
-    return found
-
-
-def _group(name: str, files: list[Path], default: str | None) -> str:
-    listed = [f"- `{name}={f.stem}`{_default(name, f.stem, default)}{_about(f)}" for f in files]
-    whole, targets = [], {}
-    for file in files:
-        values = yaml.safe_load(file.read_text(encoding="utf-8")) or {}
-        if "_target_" not in values or any(isinstance(x, dict) for x in values.get("augmentations", ())):
-            whole.append(f"`configs/{name}/{file.name}`\n\n```yaml\n{file.read_text(encoding='utf-8')}```")
-        else:
-            targets.setdefault(values["_target_"], []).append(file)
-    tables = [_table(name, target, own) for target, own in targets.items()]
-    return "\n\n".join(["\n".join(listed), *tables, *whole])
-
-
-def _default(name: str, option: str, default: str | None) -> str:
-    """Return what to add to an option: whether it is the default, and whether the default preset changes that."""
-    chosen = yaml.safe_load((CONFIGS / "config.yaml").read_text(encoding="utf-8"))["defaults"]
-    preset = next(d["preset"] for d in chosen if isinstance(d, dict) and "preset" in d)
-    values = yaml.safe_load((CONFIGS / "preset" / f"{preset}.yaml").read_text(encoding="utf-8"))
-    replaced = {
-        k.removeprefix("override /"): v
-        for d in values["defaults"]
-        if isinstance(d, dict)
-        for k, v in d.items()
-    }
-    if replaced.get(name, default) != default:
-        by_preset = {default: "default before the preset", replaced[name]: f"default, by `preset={preset}`"}
-        return f" ({by_preset[option]})" if option in by_preset else ""
-    if option != default:
-        return ""
-    return (
-        f" (default before the preset: `preset={preset}` sets some of its keys)"
-        if name in values
-        else " (default)"
-    )
-
-
-def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str, str, Any]]:
-    """Yield dotted key, target, key of the target and value of a node and of the components in it."""
-    for key, value in node.items():
-        if isinstance(value, dict):
-            yield from leaves(value, f"{prefix}{key}.")
-        elif key not in ("_target_", "_partial_", "defaults"):
-            yield f"{prefix}{key}", node["_target_"], key, value
-
-
-def _table(group: str, target: str, files: list[Path]) -> str:
-    """Return the keys of the files that build one class, with their values in each file."""
-    found = {f.stem: list(leaves(yaml.safe_load(f.read_text(encoding="utf-8")))) for f in files}
-    values = {stem: {dotted: value for dotted, *_, value in own} for stem, own in found.items()}
-    sources = {dotted: (built, key) for own in found.values() for dotted, built, key, _ in own}
-    title = f"`{target}`"
-    if not sources:
-        return f"{title} has no keys."
-    rows = [
-        f"| `{group.replace('/', '.')}.{dotted}` | {' | '.join(_value(v.get(dotted)) for v in values.values())} "
-        f"| {_valid(built, key)} | {_cell(meaning(built, key, files))} |"
-        for dotted, (built, key) in sources.items()
-    ]
-    head = "| key | " + " | ".join(f"`{stem}`" for stem in values) + " | valid | what |"
-    return "\n".join([title, "", head, "|---" * (len(values) + 3) + "|", *rows])
-
-
-def _valid(target: str, key: str) -> str:
-    """The values that a key takes, by its annotation; upper ends beyond what any machine can do are left out."""
-    from hydra.utils import get_object
-
-    from libero_env.validation import parameters_of
-
-    known = parameters_of(get_object(target))
-    words = accepted(known.types[key]) if known and key in known.types else ""
-    return _cell(re.sub(r", (at most 1000000(000)?|below 9223372036854775808)\b", "", words))
-
-
-def meaning(target: str, key: str, files: list[Path]) -> str:
-    """What a key means: the docstring of what it builds, with the comment in the file where that lists choices."""
-    comment = next((c for c in (_comments(f).get(key) for f in files) if c), "")
-    text = _entry(target, key)
-    if not text:
-        return comment
-    found = [leaf for f in files for leaf in leaves(yaml.safe_load(f.read_text(encoding="utf-8")))]
-    values = [value for *_, name, value in found if name == key]
-    choices = any(isinstance(v, str) and comment.startswith(f"{v},") and f"`{v}`" not in text for v in values)
-    return f"{text.rstrip('.')} ({comment})" if choices else text
-
-
-def accepted(kind: Any) -> str:
-    """Return in words which values a type takes, such as `whole number, at least 1`; empty where that is not known."""
-    from pydantic import TypeAdapter
-
-    from libero_env.validation import is_plain
-
-    if not is_plain(kind):
-        return ""
-    adapter = TypeAdapter(tuple[kind], config={"arbitrary_types_allowed": True})
-    return _in_words(adapter.json_schema()["prefixItems"][0])
-
-
-def _in_words(schema: Mapping[str, Any]) -> str:
-    """Return a JSON schema in words."""
-    if "anyOf" in schema:
-        return " or ".join(dict.fromkeys(filter(None, map(_in_words, schema["anyOf"]))))
-    if "enum" in schema or "const" in schema:
-        return ", ".join(map(str, schema.get("enum", [schema.get("const")])))
-    kind = str(schema.get("type", ""))
-    if kind == "array":
-        entries = _in_words(schema.get("items", {}))
-        return f"list of {entries}" if entries else "list"
-    words = {"integer": "whole number", "number": "number", "boolean": "true, false", "string": "text"}
-    bounds = {
-        "minimum": "at least",
-        "exclusiveMinimum": "above",
-        "maximum": "at most",
-        "exclusiveMaximum": "below",
-    }
-    limits = []
-    for key, text in bounds.items():
-        if key in schema:
-            bound = schema[key]
-            limits.append(f"{text} {bound if isinstance(bound, int) else format(bound, 'g')}")
-    return ", ".join(filter(None, [words.get(kind, kind), *limits]))
-
-
-def _entry(target: str, key: str) -> str:
-    """A docstring's entry; where it says "see `Name`", what that says of the key, whose name there may be shorter."""
-    import lifelong.nn
-
-    text = _documented(target).get(key, "")
-    for name in re.findall(r"see `(\w+)`", text):
-        for file in sorted(Path(lifelong.nn.__path__[0]).glob("*.py")):
-            if f"class {name}(" not in file.read_text(encoding="utf-8"):
-                continue
-            other = f"lifelong.nn.{file.stem}.{name}"
-            names = (key, key.rpartition("_")[0], key.partition("_")[2])
-            found = next((_entry(other, n) for n in names if n != "proprio" and n in _documented(other)), "")
-            if len(found) > 2:  # more than a letter of the legend
-                return found
-    return re.sub(r",? ?[Ss]ee `\w+`[^.;]*", "", text).strip(" .;,")
-
-
-@cache
-def _documented(target: str) -> dict[str, str]:
-    """The entries under Args and Attributes in the docstrings of a class, by name."""
-    from hydra.utils import get_object
-
-    built = get_object(target)
-    entries: dict[str, str] = {}
-    for doc in (inspect.getdoc(built), inspect.getdoc(built.__init__)):
-        for section in re.findall(r"^(?:Args|Attributes):\n((?:(?: {4}.*)?\n?)+)", doc or "", re.M):
-            for entry in re.split(r"\n(?= {4}\S)", section):
-                names, colon, text = entry.partition(":")
-                if colon:
-                    found = " ".join(text.split())
-                    entries.update({n.strip(): found for n in names.split(",")})
-    return entries
-
-
-@cache
-def _comments(file: Path) -> dict[str, str]:
-    """The comment beside each key of a YAML file."""
-    found = re.findall(r"^ *(\w+):[^#\n]*# *(.+)$", file.read_text(encoding="utf-8"), re.M)
-    return dict(found)
-
-
-def _about(file: Path) -> str:
-    """The comment a file begins with."""
-    lines = file.read_text(encoding="utf-8").splitlines()
-    said = []
-    for line in lines:
-        if not line.startswith("#"):
-            break
-        said += [] if "@package" in line else [line.lstrip("# ")]
-    return f": {_cell(' '.join(said))}" if said else ""
-
-
-def _value(value: Any) -> str:
-    text = "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-    return f"`{text}`"
-
-
-def _cell(text: str) -> str:
-    """Return text for the cell of a table; outside of code, what stands in angle brackets is not HTML."""
-    parts = " ".join(text.split()).replace("|", "\\|").split("`")
-    return "`".join(part if i % 2 else part.replace("<", "&lt;") for i, part in enumerate(parts))
-
-
 PROTOCOL_ROWS = {
     "fixtures": ("world.fixture_poses", "world.env_seed", "world.seeding"),
     "waiting": ("episode.settle_steps",),
@@ -345,8 +224,8 @@ PROTOCOL_ROWS = {
 
 def protocol_table() -> str:
     """A row for each protocol, with the values in which they differ most."""
-    from libero_eval.cli.protocols import shown_values
     from libero_eval.protocols.files import load_protocol, protocol_names
+    from libero_eval.protocols.naming import shown_values
 
     lines = [
         "| protocol |" + "".join(f" {title} |" for title in PROTOCOL_ROWS),
@@ -368,8 +247,45 @@ def perturbation_table() -> str:
     """A row for each kind of perturbation, in the order in which they are applied."""
     from libero_env.perturbations import KINDS
 
-    rows = [f"| `{k.name}` | {k.layer} | {k.at_one:g} {k.unit} | {_cell(k.what)} |" for k in KINDS.values()]
+    rows = [f"| `{k.name}` | {k.layer} | {k.at_one:g} {k.unit} | {as_cell(k.what)} |" for k in KINDS.values()]
     return "\n".join(["| kind | layer | severity 1 | what changes |", "|---|---|---|---|", *rows])
+
+
+def known_answers() -> str:
+    """A table of published success with what agrees with it, and a section for each policy."""
+    from libero_eval.judging.published import PLANNED, protocol_file, published
+
+    known = published()
+    suites = list(next(iter(known.values())).successes)
+    heads = [suite.removeprefix("libero_") for suite in suites]
+    lines = [f"| name | {' | '.join(heads)} | of | run here |", "|---" * (len(suites) + 3) + "|"]
+    parts = []
+    for name, one in known.items():
+        cells = []
+        for suite in suites:
+            low, high = (100 * count / PLANNED for count in one.agreeing(suite))
+            cells.append(f"{100 * one.successes[suite] / one.episodes:.1f}<br>[{low:.1f}, {high:.1f}]")
+        run = f"[yes]({one.run_here})" if one.run_here else "no"
+        lines.append(f"| [`{name}`](#{name}) | {' | '.join(cells)} | {one.episodes} | {run} |")
+        there = f"MuJoCo {one.mujoco or 'not stated'}"
+        sources = ", ".join(f"[{as_cell(what)}]({address})" for what, address in one.sources.items())
+        project, _, serve = one.server.partition(": ")
+        parts += [
+            f"## {one.title} {{ #{name} }}",
+            f"Weights: `{one.checkpoint}`. Served by {project}: `{serve}`. Published under "
+            f"`{one.conditions}`, {there}. Sources: {sources}.",
+        ]
+        if text := protocol_file(one):
+            parts.append(f"`{name}.yaml`:\n\n```yaml\n{text}```")
+        parts.append(f"```sh\n{one.command(name)}\nlibero compare eval/{name} --published {name}\n```")
+    return "\n\n".join(["\n".join(lines), *parts])
+
+
+def not_offered() -> str:
+    """A table of the original's names that are missing."""
+    rows = yaml.safe_load((ROOT / "docs" / "not_offered.yaml").read_text(encoding="utf-8"))
+    lines = [f"| {row['names']} | {row['instead']} |" for row in rows]
+    return "\n".join(["| names | instead, or why |", "|---|---|", *lines])
 
 
 FAMILIES = {
@@ -410,7 +326,7 @@ def families() -> dict[str, list[str]]:
         for family in filter(None, FAMILIES)
         for name in yaml.safe_load((folder / f"{family}.yaml").read_text(encoding="utf-8"))
     }
-    names = object_names()
+    names = sorted(builtin_names())
     return {family: [n for n in names if owner.get(n, "") == family] for family in FAMILIES}
 
 
@@ -426,12 +342,21 @@ def _pictures(found: Sequence[str]) -> str:
     return "\n".join(['<div class="pictures">', *found, "</div>"])
 
 
-REFERENCES = {"commands.md": "Commands", "configuration.md": "Configuration"}
+REFERENCES = {"python.md": "Python", "commands.md": "Commands", "configuration.md": "Configuration"}
+ROOT_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changes.md"}
 PARTS = {
     "commands": partial(listed, "commands.md"),
     "configuration": partial(listed, "configuration.md"),
     "gallery": gallery,
-    "keys": top_keys,
+    "keys": configuration_keys.top_keys,
+    "known answers": known_answers,
+    "not offered": not_offered,
+    "notebooks": notebook_list,
     "perturbations": perturbation_table,
+    "python": partial(listed, "python.md"),
     "protocols": protocol_table,
 }
+
+if __name__ == "__main__":
+    argparse.ArgumentParser(description="Execute the notebooks that have changed.").parse_args()
+    execute_notebooks()

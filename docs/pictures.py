@@ -4,7 +4,7 @@ PYTHONPATH=. python docs/pictures.py film OUT.jpg RECORDING ...         a row of
 PYTHONPATH=. python docs/pictures.py matrices OUT.png ALGORITHM ...     mean success in experiments/algorithms
 PYTHONPATH=. python docs/pictures.py page OUT.png PAGE.html TOP HEIGHT  a part of a page, in pixels
 
-film.jpg: `libero eval expert --suite libero_goal/3 libero_10/2 libero_object/0 --episodes 1 --videos 1 --size 256`,
+film.jpg: `libero eval expert --suite libero_goal/3 libero_10/2 --episodes 1 --videos 1 --size 256`,
 then `film` of eval/expert/videos/*. forgetting.png: `matrices` of sequential, packnet and er. first-run-*: what the
 commands of docs/first-run.md write.
 """
@@ -36,7 +36,7 @@ def film(out: Path, *recordings: str) -> None:
 def matrices(out: Path, *algorithms: str) -> None:
     """Draw the success matrices of algorithms on LIBERO-Goal, means over the seeds, side by side."""
     sys.path.append(str(STUDY))
-    from study import planned
+    from study import EARLIER, planned
 
     from lifelong.report.figures import Panel, heatmap_figure
     from lifelong.results import ResultLog
@@ -45,7 +45,9 @@ def matrices(out: Path, *algorithms: str) -> None:
     for algorithm in algorithms:
         with tempfile.TemporaryDirectory() as folder:
             runs = [
-                run for run in planned() if f"{run.name}/".startswith(f"goal/{algorithm}/") and run.is_done()
+                run
+                for run in planned(EARLIER)
+                if f"{run.name}/".startswith(f"goal/{algorithm}/") and run.is_done()
             ]
             logs = [ResultLog(run.unpack(Path(folder)) / "results.jsonl").read() for run in runs]
         measured = np.ma.masked_invalid([log.success_matrix()[0] for log in logs])

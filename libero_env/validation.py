@@ -12,7 +12,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import NoneType
+from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, TypeVar, dataclass_transform, get_args, get_type_hints
 
 from libero_env.errors import InvalidInputError, LiberoError
@@ -127,8 +127,7 @@ def checked(cls: Class) -> Class:
                     raise original from None
                 first, *rest = one["loc"]
                 loc = (names[first] if isinstance(first, int) else first, *rest)
-                kind = one["type"].replace("tuple_type", "python_tuple_type")
-                errors.append({**one, "loc": loc, "type": kind})
+                errors.append({**one, "loc": loc})
             values = {**dict(zip(names, args, strict=False)), **kwargs}
             described = _describe_all(errors, cls, values)
             message = _limited([_joined(path, text) for path, text in described])
@@ -220,6 +219,8 @@ def _json(value: Any, error: type[LiberoError], depth: int = 0) -> Any:
         raise error(f"the text {shown(value)} has a character that is none (a lone surrogate)")
     if value is None or isinstance(value, bool | int | float | str):
         return value  # numbers that are not finite become NaN or Infinity, which every type refuses
+    if isinstance(value, PurePath):  # whose name may be any bytes
+        return str(value).encode(errors="replace").decode()
     tolist = getattr(value, "tolist", None)  # of arrays and numbers of NumPy
     converted = tolist() if callable(tolist) else str(value)
     return converted if isinstance(converted, str) else _json(converted, error, depth + 1)
@@ -263,37 +264,22 @@ def _limited(parts: Sequence[str]) -> str:
 
 
 def _describe_all(errors: Sequence[Any], kind: Any, value: Any) -> list[tuple[tuple[Key, ...], str]]:
-    """Return path and text of each value that is not valid; the branches of a union are one."""
-    by_value: dict[tuple[Key, ...], list[ErrorDetails]] = {}
+    """Return path and text of each value that is not valid; what the branches of a union say of one value is one."""
+    by_path: dict[tuple[Key, ...], list[ErrorDetails]] = {}
     for error in errors:
-        by_value.setdefault(_real_path(error, value), []).append(error)
-    exact: dict[tuple[Key, ...], list[ErrorDetails]] = {}
-    for path, group in by_value.items():
-        is_one_branch = len({error["loc"][: len(path) + 1] for error in group}) == 1
-        for error in group:
-            exact.setdefault(_real_path(error, value, skip=True) if is_one_branch else path, []).append(error)
-    return [(path, _describe(path, group, kind)) for path, group in exact.items()]
+        by_path.setdefault(_real_path(error, value), []).append(error)
+    return [(path, _describe(path, group, kind)) for path, group in by_path.items()]
 
 
-def _real_path(error: "ErrorDetails", value: Any, skip: bool = False) -> tuple[Key, ...]:
-    """Return the part of a location that consists of keys; pydantic adds the names of branches of unions.
-
-    Args:
-        error: Error of pydantic.
-        value: Value that was validated.
-        skip: Whether to go on behind the name of a branch, which is right where there is only one.
-    """
+def _real_path(error: "ErrorDetails", value: Any) -> tuple[Key, ...]:
+    """Return the part of a location that consists of keys; pydantic adds the names of branches of unions."""
     path: list[Key] = []
     for key in error["loc"]:
         listed = isinstance(value, list | tuple) and isinstance(key, int) and key < len(value)
         if listed or (isinstance(value, Mapping) and key in value):
             value = value[key]
-        elif isinstance(value, Mapping) and error["type"].startswith("missing") and key == error["loc"][-1]:
-            value = None
-        elif skip:
+        elif not (error["type"].startswith("missing") and key == error["loc"][-1]):
             continue
-        else:
-            break
         path.append(key)
     return tuple(path)
 
@@ -308,58 +294,18 @@ def _describe(path: tuple[Key, ...], group: Sequence["ErrorDetails"], kind: Any)
         return "is missing"
     if first["type"] == "value_error":
         return f": {first['ctx']['error']}" if "ctx" in first else f": {first['msg']}"
-    wanted = list(dict.fromkeys(map(_expected, group)))
-    if path and NoneType in get_args(_type_at(kind, path)):
-        wanted.append("null")
+    said = [one["msg"].replace("Input should be", "expected", 1) for one in group]
+    wanted = " or ".join(dict.fromkeys(text[0].lower() + text[1:] for text in said)).replace(
+        " or expected", " or"
+    )
     names = [
         name
-        for error in group
-        if error["type"] == "literal_error"
-        for name in re.findall(r"'([^']*)'", error["ctx"]["expected"])
+        for one in group
+        if one["type"] == "literal_error"
+        for name in re.findall(r"'([^']*)'", one["ctx"]["expected"])
     ]
     near = suggest(first["input"], names) if isinstance(first["input"], str) else ""
-    return f"is {shown(first['input'])}; expected {' or '.join(wanted)}{near and f'.{near}'}"
-
-
-_WORDS = {
-    **dict.fromkeys(("int_type", "int_from_float", "int_parsing"), "a whole number"),
-    **dict.fromkeys(("list_type", "tuple_type", "sequence_type"), "a list"),
-    **dict.fromkeys(("dict_type", "mapping_type", "model_type"), "keys with values"),
-    **dict.fromkeys(("dataclass_type", "dataclass_exact_type"), "keys with values"),
-    "python_tuple_type": "a tuple",
-    "sequence_str": "a list",
-    "float_type": "a number",
-    "finite_number": "a finite number",
-    "bool_type": "true or false",
-    "string_type": "a text",
-    "none_required": "null",
-    "callable_type": "a function or class",
-    "string_too_short": "a text that is not empty",
-    "string_too_long": "at most {max_length} characters",
-    "string_pattern_mismatch": "a text that matches {pattern}",
-    "literal_error": "one of {expected}",
-    "greater_than": "above {gt}",
-    "greater_than_equal": "at least {ge}",
-    "less_than": "below {lt}",
-    "less_than_equal": "at most {le}",
-    "too_short": "at least {min_length} {entries}",
-    "too_long": "at most {max_length} {entries}",
-    "is_instance_of": "{class}",
-}
-
-
-def _expected(error: "ErrorDetails") -> str:
-    if (words := _WORDS.get(error["type"])) is None:
-        return error["msg"]
-    context = {key: _number(value) for key, value in error.get("ctx", {}).items()}
-    if context.get("class") == "Sequence":
-        return "a list"
-    bounds = context.get("min_length"), context.get("max_length")
-    return words.format(**context, entries="entry" if "1" in bounds else "entries")
-
-
-def _number(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return f"is {shown(first['input'])}; {wanted}{near and f'.{near}'}"
 
 
 def _annotations(kind: Any) -> Mapping[str, Any]:

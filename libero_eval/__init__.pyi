@@ -16,4 +16,5 @@ __all__ = [
     "load_protocol",
 ]
 
+__distribution__: str
 __version__: str

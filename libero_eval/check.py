@@ -14,7 +14,7 @@ from libero_env.text import to_json
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
 from lifelong.errors import LifelongError, ResultsError
 from lifelong.results.log import ResultLog
-from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord, measured_tasks
+from lifelong.results.records import EvalRecord, LossRecord, TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.results.run_directory import BROKEN_SUFFIX, CheckpointFolder, RunDirectory, read_saved_config
 from lifelong.results.summary import summarize
@@ -168,7 +168,7 @@ def _missing_records(results: Results) -> Iterator[str]:
     ended = sorted({record.task for record in results.of(TaskEndRecord)})
     for task in ended:
         run = results.run
-        row = measured_tasks(run.cells, run.group(task), len(run.tasks), run.cells_share)
+        row = run.row(run.group(task))
         if absent := [seen for seen in row if results.evaluation("matrix", task, seen) is None]:
             yield f"evaluations after task {task} of tasks {_listed(absent)}"
     curves = {task: set(curve.epochs.tolist()) for task, curve in results.curves().items()}

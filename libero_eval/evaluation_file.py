@@ -7,7 +7,6 @@ stands apart, under `times`: two evaluations with the same outcomes have the sam
 
 import hashlib
 import json
-import shlex
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -18,15 +17,17 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 
+from libero_env.errors import LiberoError
 from libero_env.sim.backend import MUJOCO
 from libero_env.storage import read_json, write_json
-from libero_env.text import json_safe
+from libero_env.tasks import get_suite
+from libero_env.text import json_safe, shorten, shown
 from libero_env.validation import validate
+from libero_eval.stats.sequential import anytime_interval
 from lifelong.errors import EvaluationFileError, writing
 from lifelong.results.records import Count, Episodes
 from lifelong.results.subgoals import predicate_of
-from lifelong.stats.intervals import Estimate, combine_intervals, wilson_interval
-from lifelong.stats.sequential import anytime_interval
+from lifelong.stats.intervals import LEAST_EPISODES, Estimate, mean_success
 
 FORMAT = "libero-evaluation/1"
 FILE_NAME = "eval.json"
@@ -45,6 +46,7 @@ class TaskResult(Episodes):
 
     Attributes:
         task: Id of the task, such as `libero_goal/3`.
+        name: Name of the task, that of its file.
         instruction: Instruction that the policy received.
         digest: Digest of the task, see `libero_env.tasks.Task.digest`; empty where it was not recorded.
         errors: Error of each episode that the protocol counts as a failure, or None; empty if there are none.
@@ -92,7 +94,7 @@ class TaskResult(Episodes):
 
     @classmethod
     def joined(cls, parts: "Sequence[TaskResult]") -> "TaskResult":
-        """Return the results of a task from those of parts of its episodes, in order."""
+        """Return the results of a task from those of parts of its episodes, in the order of the starts' numbers."""
         raised = any(part.errors for part in parts)
         rows: dict[str, tuple] = {
             f.name: sum((getattr(part, f.name) for part in parts), ())
@@ -100,10 +102,13 @@ class TaskResult(Episodes):
             if isinstance(getattr(parts[0], f.name), tuple)
             and f.name not in ("atoms", "errors", "limits_reached")
         }
-        if raised:
-            rows["errors"] = sum((p.errors or (None,) * len(p.init_states) for p in parts), ())
+        rows["errors"] = sum((p.errors or (None,) * len(p.init_states) for p in parts), ()) if raised else ()
         limits = sum((Counter(dict(part.limits_reached)) for part in parts), Counter[str]())
         rows["limits_reached"] = tuple(sorted(limits.items()))
+        order = sorted(range(len(rows["init_states"])), key=rows["init_states"].__getitem__)
+        for name in ("init_states", "successes", "lengths", *cls.OPTIONAL, *cls.OF_ATOMS):
+            rows[name] = tuple(rows[name][i] for i in order) if rows[name] else ()
+        rows["simulation_errors"] = tuple(sorted(rows["simulation_errors"]))
         first = parts[0]
         return cls(first.task, first.name, first.instruction, first.digest, atoms=first.atoms, **rows)
 
@@ -149,10 +154,8 @@ class TaskResult(Episodes):
 
     @property
     def success(self) -> Estimate:
-        """Success rate with Wilson's interval; NaN in [0, 1] if no episode counts."""
-        wins, count = sum(self.successes), len(self.successes)
-        low, high = wilson_interval(wins, count)
-        return Estimate(wins / count if count else float("nan"), float(low), float(high))
+        """Success rate with Wilson's interval; NaN if no episode counts."""
+        return overall([self])
 
     @property
     def steps(self) -> float:
@@ -207,6 +210,9 @@ class EvaluationResult:
     times: Mapping[str, Any] = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
+        for section in ("world", "episode", "action"):
+            if not isinstance(found := self.protocol.get(section, {}), Mapping):
+                raise EvaluationFileError(f"protocol.{section} is {shown(found)}; expected keys with values")
         names = [result.task for result in self.tasks]
         if not names:
             raise EvaluationFileError("there are no tasks")
@@ -230,10 +236,7 @@ class EvaluationResult:
 
     def success_of(self, tasks: Sequence[TaskResult]) -> Estimate:
         """Return the mean success over some of the tasks, with an interval as of `success`."""
-        if self.stopped is None:
-            return overall(tasks)
-        wins, count = (sum(sum(task.successes) for task in tasks), sum(len(t.successes) for t in tasks))
-        return replace(anytime_interval(wins, count), value=overall(tasks).value)
+        return overall(tasks, stopped=self.stopped is not None)
 
     @property
     def stop_note(self) -> str:
@@ -244,6 +247,13 @@ class EvaluationResult:
         return (
             f"stopped after {count} of {self.stopped.planned}; {self.stopped.until}: {self.stopped.verdict}"
         )
+
+    @property
+    def suite_labels(self) -> dict[str, str]:
+        """Label of each suite, see `suite_label`."""
+        return {
+            name: suite_label(name, [task.task for task in tasks]) for name, tasks in self.by_suite.items()
+        }
 
     @property
     def suites(self) -> dict[str, Estimate]:
@@ -358,16 +368,31 @@ def world_of(environment: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in environment.items() if k.partition("_")[0] in WORLD and v is not None}
 
 
-def overall(results: Sequence[TaskResult]) -> Estimate:
-    """Return the mean success over tasks, with the interval from Wilson's of the tasks (see `combine_intervals`).
+def known_by(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a policy is known by: of a server that was given a name this, its address may change."""
+    return {key: value for key, value in identity.items() if key != "server" or not identity.get("name")}
 
-    The tasks are fixed, so the interval covers the chance in the episodes, not the choice of tasks.
+
+def suite_label(suite: str, tasks: Collection[str]) -> str:
+    """Return the name of a suite; where not all of its tasks were run, with how many: `libero_goal (1 of 10 tasks)`."""
+    try:
+        count = len(get_suite(suite).tasks)
+    except LiberoError:  # of a user, or of others and not here
+        return suite
+    return suite if len(tasks) >= count else f"{suite} ({len(tasks)} of {count} tasks)"
+
+
+def overall(results: Sequence[TaskResult], *, stopped: bool = False) -> Estimate:
+    """Return the mean success over tasks with its interval, see `mean_success`; tasks of several runs count each.
+
+    The tasks are fixed, so the interval covers the chance in the episodes, not the choice of tasks. That of episodes
+    whose number depends on their outcomes is always valid, see `anytime_interval`.
     """
-    rates = [r.success for r in results]
-    weights = np.full(len(rates), 1 / max(1, len(rates)))
-    return combine_intervals(
-        weights, [e.value for e in rates], [e.low for e in rates], [e.high for e in rates]
-    )
+    found = mean_success([sum(r.successes) for r in results], [len(r.successes) for r in results])
+    wins, count = (sum(sum(r.successes) for r in results), sum(len(r.successes) for r in results))
+    if not stopped or count < LEAST_EPISODES:
+        return found
+    return replace(anytime_interval(wins, count), value=found.value)
 
 
 def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
@@ -379,26 +404,6 @@ def predicate_rates(results: Sequence[TaskResult]) -> dict[str, float]:
     return {name: float(np.mean(values)) for name, values in rates.items()}
 
 
-def permission_names(policy: str) -> list[str]:
-    """Return the names by which a user allows that a result's policy is run again; none where that needs no permission.
-
-    Code of a module would be run. A server would be sent pictures, and the key that is in the environment.
-    """
-    if "://" in policy:
-        host = policy.partition("://")[2].partition("/")[0]
-        return [policy, host, host.rpartition(":")[0]]
-    if ":" in policy and not Path(policy).exists():
-        module = policy.partition(":")[0]
-        return [module.partition(".")[0], module]
-    return []
-
-
-def again(result: EvaluationResult, path: str) -> str:
-    """Return the command that runs a result again, from its file."""
-    names = permission_names(result.policy or "")
-    return shlex.join(["libero", "eval", path, *(["--allow", names[0]] if names else [])])
-
-
 def _digest(rows: Any) -> str:
     return "sha256:" + hashlib.sha256(json.dumps(rows, sort_keys=True).encode()).hexdigest()
 
@@ -408,9 +413,16 @@ def _check_format(values: Any, path: Path) -> None:
     if stated == FORMAT:
         return
     if str(stated).partition("/")[0] == FORMAT.partition("/")[0]:
+        versions = values.get("versions")
+        wrote = versions.get("libero-lifelong") if isinstance(versions, dict) else None
+        reader = (
+            f"libero-lifelong {shorten(str(wrote), 40)}, which"
+            if wrote
+            else "the version of libero-lifelong that"
+        )
         raise EvaluationFileError(
-            f"{path}: the format is {stated}; this version reads {FORMAT}: update libero-lifelong, or read it with "
-            "the version that wrote it"
+            f"{path}: the format is {stated}, and this program reads {FORMAT}: read it with {reader} wrote it, "
+            "or evaluate the policy again"
         )
     what = "has no format" if stated is None else f"has the format {stated!r}"
     raise EvaluationFileError(

@@ -1,41 +1,33 @@
 """From a request to a result: what is to be run, the processes that run it, and a result that is run again."""
 
-import io
+import hashlib
 import re
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, redirect_stderr, suppress
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
 
-from pydantic import Field
-from typing_extensions import TypedDict
-
-from libero_env.cli import ending
-from libero_env.init_states.store import NUM_INIT_STATES
-from libero_env.memory import require_memory
-from libero_env.perturbations import format_perturbations, parse_perturbations
+from libero_env.perturbations import Perturbation, format_perturbations, parse_perturbations
+from libero_env.published import require_available
 from libero_env.sim.backend import Backend
+from libero_env.sim.render import renderer_name
 from libero_env.tasks import Task
-from libero_env.tasks.published import require_available
-from libero_env.tasks.task import FILE
-from libero_env.text import json_safe
-from libero_env.timing import CONTROL_HZ
-from libero_env.validation import validate
-from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, permission_names
-from libero_eval.policies import AVOIDING, EXPERT, SELECTION, ExpertPolicy, PolicyUnderTest, RunPolicy
+from libero_env.tasks.task import NUM_INIT_STATES
+from libero_eval.evaluation_file import EvaluationResult, TaskResult
+from libero_eval.policies import SELECTION, ExpertPolicy, PolicyUnderTest, RunPolicy
 from libero_eval.protocols.clock import Clock
 from libero_eval.protocols.environment import resolve_world
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.repeating import check_same, is_result, repeated
 from libero_eval.requests import EvalRequest, Request
-from libero_eval.work.evaluation import Evaluation, iso_time
+from libero_eval.words import check_options, policy_kind
+from libero_eval.work.evaluation import Evaluation
 from libero_eval.work.progress import Progress
+from libero_eval.work.scheduler import carry_out
 from libero_eval.work.stopping import StoppingRule
-from libero_eval.work.worker import Worker, Workers
-from lifelong.errors import ConfigError, ResultsError
+from libero_eval.work.store import PLAN_NAME, read_plan
+from lifelong.errors import ConfigError
 from lifelong.results.provenance import installed_versions, source_digest
 
 
@@ -62,71 +54,12 @@ def evaluate(
             another evaluation.
         EvaluationIncompleteError: Episodes ended with errors; the others are kept.
     """
-    evaluation = evaluation or plan_evaluation(request)
-    store, units = evaluation.store, evaluation.units
-    count = min(request.workers, len(units))
-    remedy = "fewer --workers, --unit-starts or --videos, or a smaller --size"
-    require_memory(evaluation.memory(count), f"an evaluation by {count} processes", remedy)
-    if request.again:
-        store.clear()
-    store.join(units)
-    done = store.done(units)
-    here = str(evaluation.versions.get("source"))
-    if others := sorted({str(one.versions.get("source")) for one in done.values()} - {here}):
-        print(
-            f"note: {store.path}: units that are done are of another source of this package ({', '.join(others)}; "
-            f"here {here}), as the result will say; --again repeats them",
-            file=sys.stderr,
-        )
-    if any(unit.name in done and not evaluation.is_filmed(unit) for unit in units):
-        print(
-            f"note: {store.path}: some of the episodes to be filmed are done, and are not filmed; --again repeats them",
-            file=sys.stderr,
-        )
-    if evaluation.starts_needed(done):
-        count, when = 1, iso_time(max(one.finished for one in done.values()))
-        print(f"note: {store.path}: finished {when}, nothing was run; --again repeats it", file=sys.stderr)
-    try:
-        with policy_threads(evaluation), Workers(count - 1, _help, replace(request, again=False)) as workers:
-            worker = Worker(evaluation, on_result=on_task, on_progress=on_progress, on_wait=workers.supervise)
-            result = worker.run()
-    except KeyboardInterrupt as error:
-        error.add_note(f"{evaluation.out} keeps what is done; the same command goes on")
-        raise
-    assert result is not None, "others were waited for"
-    return result
+    evaluations = {"": evaluation or plan_evaluation(request)}
+    return carry_out(_plan, request, evaluations, on_task=on_task, on_progress=on_progress)[""]
 
 
-@contextmanager
-def further_process() -> Iterator[None]:
-    """Let an error of the block, all that a further process does, end the process with one line."""
-    with suppress(KeyboardInterrupt), ending.interruptible():
-        try:
-            yield
-        except Exception as error:  # noqa: BLE001 - told by kind
-            sys.exit(ending.report(error, who="a worker ended: "))
-
-
-@further_process()
-def _help(request: EvalRequest) -> None:
-    """Work on the evaluation of another process, which prints it; errors go to the standard error."""
-    with redirect_stderr(io.StringIO()):  # the other process says the same
-        evaluation = plan_evaluation(request)
-    with policy_threads(evaluation):
-        Worker(evaluation).run()
-
-
-@contextmanager
-def policy_threads(evaluation: Evaluation) -> Iterator[None]:
-    """Give PyTorch the number of threads that the evaluation names; their number changes the bits of a policy."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(evaluation.policy_threads or before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+def _plan(request: EvalRequest) -> dict[str, Evaluation]:
+    return {"": plan_evaluation(request)}
 
 
 def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None) -> Evaluation:
@@ -137,7 +70,8 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
         policy: The policy that it names, where it is loaded already.
 
     Raises:
-        LiberoError: The policy, a task, the protocol or the set of initial states does not exist.
+        LiberoError: The policy, a task, the protocol or the set of initial states does not exist, or nothing can be
+            drawn here.
     """
     from libero_env.tasks import find_tasks
 
@@ -147,7 +81,7 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
     else:
         base = EvalProtocol.read(earlier.protocol, request.policy_name)
         request = repeated(request, earlier)
-    _check_options(request, earlier)
+    check_options(request, earlier is not None)
     policy = policy or load_policy(request)
     tasks = find_tasks(request.suite) if request.suite else policy.tasks
     if not tasks:
@@ -166,6 +100,8 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
             f"{told[0]}: {request.policy_name} cannot be told another instruction during an episode; "
             "runs and the expert can"
         )
+    if protocol.pixels.cameras and not Backend.read(protocol.world.backend).is_warp:
+        renderer_name()  # before a folder is made
     identity = {**policy.identity, "seed": request.seed}
     versions = {**installed_versions(request.assets), "source": source_digest()}
     if earlier is None:
@@ -185,14 +121,16 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
             f"{' and '.join(twice)}: task files are evaluated one by one; name one with --suite"
         )
     until = StoppingRule.read(request.until, protocol, tasks, init_states) if request.until else None
+    out = request.out or policy.folder(*setting(request))
     return Evaluation(
         identity=identity,
         tasks=tasks,
         until=until,
         stopped=earlier.stopped if earlier else None,
+        shuffled=_shuffled(request, out, until is not None or bool(earlier and earlier.stopped)),
         init_states=init_states,
         protocol=protocol,
-        out=request.out or policy.out,
+        out=out,
         env=lambda task, count: policy.env(task, count, protocol),
         actor=lambda task, states: policy.actor(task, states, protocol),
         unit_starts=request.unit_starts,
@@ -206,10 +144,16 @@ def plan_evaluation(request: EvalRequest, policy: PolicyUnderTest | None = None)
     )
 
 
+def _shuffled(request: EvalRequest, out: Path, default: bool) -> bool:
+    """Return whether units are of starts in the order in which `--until` looks at them: as the folder was begun."""
+    begun = (out / PLAN_NAME).is_file() and not request.again
+    return read_plan(out)["shuffled"] if begun else default
+
+
 def load_policy(request: Request) -> PolicyUnderTest:
     """Return the policy that is asked for: the expert, a server's, a user's own, or a run's."""
     policy: PolicyUnderTest
-    match _kind(request.policy_name):
+    match policy_kind(request.policy_name):
         case "server":
             from libero_eval.servers.policy import ServerPolicy
 
@@ -224,22 +168,39 @@ def load_policy(request: Request) -> PolicyUnderTest:
             policy = RunPolicy(request)
     if request.name:
         policy.identity = {**policy.identity, "name": request.name}
-        word = re.sub(r"[^\w.-]+", "_", request.name)
-        policy.out = policy.out.with_name(f"{policy.out.name}_{word}")
+        policy.place = policy.place.with_name(re.sub(r"[^\w.-]+", "_", request.name).lstrip(".") or "_")
     return policy
 
 
-def _kind(policy: str) -> str:
-    if "://" in policy:
-        return "server"
-    if Path(policy).exists():
-        return "run"
-    if re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[\w.-]+):\d+(/.*)?", policy):
-        raise ConfigError(
-            f"{policy} is an address without the kind of its server: write ws://{policy} (openpi, libero serve), "
-            f"vla-eval://{policy} or gr00t://{policy}"
-        )
-    return "expert" if policy in (EXPERT, AVOIDING) else "module" if ":" in policy else "run"
+def setting(request: Request) -> tuple[str, ...]:
+    """Return the folder, below that of the policy, of an evaluation that is not the protocol `libero` as it is.
+
+    It names what was asked for: `openpi`, `camera=0.5@lifted+latency=120ms`; nothing for the plain evaluation.
+    """
+    words = []
+    for name in _SETTINGS:
+        value = getattr(request, name, plain := getattr(EvalRequest(), name))
+        if value == plain:
+            continue
+        text = ",".join(value) if isinstance(value, tuple) else str(value)
+        if name in ("protocol", "assets"):
+            words.append(Path(text).stem)
+        else:
+            words.append(
+                text if text and name in ("perturb", "event", "clock") else f"{name}={text or 'none'}"
+            )
+    word = re.sub(r"[^\w.=,@%+-]+", "_", "+".join(words))
+    if len(word) > _LONGEST:
+        word = f"{word[: _LONGEST - 9]}-{hashlib.sha256(word.encode()).hexdigest()[:8]}"
+    return (word,) if word else ()
+
+
+# What an evaluation may ask for besides the policy and its tasks, in the order in which its folder names it
+_SETTINGS = (
+    *("protocol", "perturb", "perturb_seed", "event", "clock", "horizon", "control_freq", "robot", "backend"),
+    *("size", "names", "assets", "starts", "seed"),
+)
+_LONGEST = 80  # characters of a folder's name
 
 
 def choose_init_states(
@@ -303,7 +264,9 @@ def resolve_protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[T
     changes: dict[str, object] = {name: value for name, value in asked.items() if value}
     perturb = protocol.world.perturb
     if request.perturb is not None:
-        perturb = format_perturbations(parse_perturbations(request.perturb, request.perturb_seed))
+        asked_for = parse_perturbations(request.perturb, request.perturb_seed)
+        _require_severity("--perturb", asked_for)
+        perturb = format_perturbations(asked_for)
         changes["world.perturb"] = perturb
     if request.event:
         known = parse_perturbations(perturb, events=True)
@@ -312,6 +275,7 @@ def resolve_protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[T
             raise ConfigError(
                 f"--event {at_start[0]}: expected KIND=SEVERITY@TRIGGER, such as camera=0.5@lifted"
             )
+        _require_severity("--event", events)
         changes["world.perturb"] = format_perturbations((*known, *events))
     if request.clock is not None:
         changes["action.clock"] = str(Clock.read(request.clock)) if request.clock else ""
@@ -325,155 +289,8 @@ def resolve_protocol(request: EvalRequest, base: EvalProtocol, tasks: Sequence[T
     return protocol
 
 
-def _check_options(request: EvalRequest, earlier: EvaluationResult | None) -> None:
-    """Check that no option is given that means nothing for this kind of policy.
-
-    Raises:
-        ConfigError: One is; the message says what it is of.
-    """
-    kind = _kind(request.policy_name)
-    for name, kinds in _OF.items():
-        if kind not in kinds and (given := _given(request, [name])):
-            of = " and ".join(_KINDS[one] for one in kinds)
-            raise ConfigError(f"{given[0]} is of {of}, and {request.policy} is {_KINDS[kind]}")
-    if request.allow and kind != "run" and earlier is None:
-        raise ConfigError("--allow is of runs, and of results that are run again")
-    if request.perturb_seed and request.perturb is None and not request.event and earlier is None:
-        raise ConfigError("--perturb-seed draws what --perturb and --event ask for, and neither is given")
-    if request.control_freq not in (None, CONTROL_HZ) and kind == "expert":
-        raise ConfigError(f"--control-freq {request.control_freq}: the expert acts at {CONTROL_HZ} Hz only")
-    if request.despite and earlier is None:
-        raise ConfigError(f"--despite is of results that are run again, and {request.policy} is none")
-
-
-def _given(request: EvalRequest, names: Iterable[str]) -> list[str]:
-    """Return the options of these names that have other values than the defaults."""
-    plain = EvalRequest()
-    return [f"--{name.replace('_', '-')}" for name in names if getattr(request, name) != getattr(plain, name)]
-
-
-_KINDS = {
-    "run": "a run",
-    "module": "a policy of your own",
-    "server": "a policy server",
-    "expert": "the expert",
-}
-_OF: dict[str, tuple[str, ...]] = {  # option -> the kinds that obey it
-    **dict.fromkeys(("after", "device"), ("run",)),
-    **dict.fromkeys(("names", "size"), ("module",)),
-    **dict.fromkeys(("timeout", "in_flight"), ("server",)),
-    "policy_threads": ("run", "module"),
-}
-# What a result states, so that it is run again with this
-_STATED = (
-    *("after", "starts", "episodes", "protocol", "perturb", "perturb_seed", "event", "clock", "horizon"),
-    *("control_freq", "size", "names", "name", "seed", "robot", "unit_starts", "until"),
-)
-
-
-class _Evaluated(TypedDict, total=False):
-    """What of `evaluated` an evaluation is repeated by."""
-
-    run: Annotated[str, Field(min_length=1)]
-    policy: Annotated[str, Field(min_length=1)]
-    server: Annotated[str, Field(min_length=1)]
-    name: Annotated[str, Field(min_length=1, max_length=100)]
-    after: Annotated[int, Field(ge=0)] | None
-    names: Literal["native", "original", "protocol"] | None
-    seed: Annotated[int, Field(ge=0)]
-
-
-def is_result(text: str) -> bool:
-    """Return whether a word of the command line is a result: `eval.json`, or a folder that has one and is not a run."""
-    path = Path(text)
-    if path.is_dir():
-        return (path / FILE_NAME).is_file() and not (path / "config.yaml").is_file()
-    return path.suffix == ".json" and path.is_file()
-
-
-def repeated(request: EvalRequest, result: EvaluationResult) -> EvalRequest:
-    """Return the request that repeats a result.
-
-    Args:
-        request: Request with the result's file as the policy; processes, folder and device are taken from it.
-
-    Raises:
-        ResultsError: The result does not say which policy it is of.
-        ConfigError: It is of a policy in a module or on a server that the user has not allowed, or of another backend.
-    """
-    path = Path(request.policy_name)
-    stated = {key: value for key, value in result.evaluated.items() if key in _Evaluated.__annotations__}
-    evaluated = validate(_Evaluated, stated, source=str(path), prefix=("evaluated",), error=ResultsError)
-    policy = result.policy
-    if policy is None:
-        raise ResultsError(f"{path} does not say which policy it is of: {dict(result.evaluated)}")
-    _check_allowed(policy, request)
-    if request.backend is not None and (asked := Backend.read(request.backend).name) != result.backend:
+def _require_severity(option: str, perturbations: Sequence[Perturbation]) -> None:
+    if none := [str(one) for one in perturbations if not one.severity]:
         raise ConfigError(
-            f"--backend {asked}: the result is of backend={result.backend}, which it is repeated with"
-        )
-    if given := _given(request, _STATED):
-        raise ConfigError(f"{', '.join(given)}: the result is run again as it was; leave this out")
-    own = [task.name for task in result.tasks if task.suite == FILE]
-    if own and not request.suite:
-        raise ConfigError(f"the result is of a task file, {own[0]}; name the file with --suite")
-    if request.suite and not own:
-        raise ConfigError("--suite: the result is run again on its own tasks; leave this out")
-    threads = result.environment.get("policy_threads") if result.evaluated.get("run") else None
-    if not (isinstance(threads, int) and 1 <= threads <= 1024):
-        threads = None
-    return replace(
-        request,
-        policy=policy,
-        after=evaluated.get("after"),
-        names=evaluated.get("names"),
-        name=evaluated.get("name"),
-        seed=evaluated.get("seed", 0),
-        suite=request.suite or tuple(task.task for task in result.tasks),
-        unit_starts=result.unit_starts or len(result.init_states),
-        policy_threads=request.policy_threads or threads,
-        out=request.out or (path if path.is_dir() else path.parent) / "again",
-    )
-
-
-def _check_allowed(policy: str, request: EvalRequest) -> None:
-    """Refuse code and servers that a result, which may be somebody else's, names: unless the user has allowed them."""
-    names = permission_names(policy)
-    what = "which would be connected to" if "://" in policy else "whose code would be run"
-    if names and not set(names) & set(request.allow):
-        raise ConfigError(
-            f"{request.policy} is of the policy {policy}, {what}; if you know and trust it, "
-            f"allow it with --allow {names[0]}"
-        )
-
-
-def check_same(
-    result: EvaluationResult, identity: Mapping[str, Any], now: Mapping[str, Any], despite: Sequence[str]
-) -> None:
-    """Check that an evaluation is the one of a result.
-
-    Args:
-        identity: What identifies the policy now.
-        now: Versions, and digests of the protocol and of each task; those that the result does not have are not
-            compared.
-        despite: Names of differences that the user accepts.
-
-    Raises:
-        ConfigError: Something differs; the message names both values of each.
-    """
-    then, identity = {**result.versions, "protocol": result.protocol.get("digest")}, json_safe(identity)
-    then |= {f"task {task.task}": task.digest for task in result.tasks if task.digest}
-    both = {
-        name: (result.evaluated.get(name), identity.get(name)) for name in {**result.evaluated, **identity}
-    }
-    both |= {name: (value, now[name]) for name, value in then.items() if name in now}
-    wrong = [
-        f"{name}: {old} in the result, {new} here"
-        for name, (old, new) in both.items()
-        if old != new and name not in despite
-    ]
-    if wrong:
-        names = " ".join(text.partition(":")[0] for text in wrong)
-        raise ConfigError(
-            f"the result cannot be repeated as it was; {'; '.join(wrong)}. To run it all the same: --despite {names}"
+            f"{option} {none[0]}: severity 0 changes nothing; leave it out, or ask for one up to 1"
         )

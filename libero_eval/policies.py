@@ -8,19 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from libero_env.init_states.store import NUM_INIT_STATES
-from libero_env.storage import require_own_folders
+from libero_env.storage import own_folder
 from libero_env.tasks import Task
+from libero_env.tasks.task import NUM_INIT_STATES
 from libero_eval.protocols.adapter import ACTION_DIM, view_of
 from libero_eval.protocols.clock import Clock, ClockedActor, Planner
 from libero_eval.protocols.environment import OBSERVATIONS, ProtocolEnv, run_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
+from libero_eval.words import AVOIDING
 from lifelong.data.settings import CAMERAS
 from lifelong.errors import ConfigError
-from lifelong.evaluation.actors import Actor, PolicyActor
-from lifelong.evaluation.environments import Obs
-from lifelong.evaluation.restore import restore
+from lifelong.evaluation.actors import Actor, Obs, PolicyActor
 from lifelong.seeding import EVALUATION, generator
 
 if TYPE_CHECKING:
@@ -39,7 +38,8 @@ class PolicyUnderTest(ABC):
 
     Attributes:
         identity: Plain data that identify the policy.
-        out: Default folder of the results.
+        home: Folder of its results, which may be somebody else's.
+        place: Where in it they are by default.
         tasks: Tasks of its run, if it has one.
         selection: Initial states by which it may have been chosen.
         on_cpu: Whether it is a network of this package on the CPU, whose bits depend on its number of threads.
@@ -52,7 +52,8 @@ class PolicyUnderTest(ABC):
     """
 
     identity: Mapping[str, Any]
-    out: Path
+    home: Path = Path("eval")
+    place: Path
     tasks: Sequence[Task] = ()
     selection: Sequence[int] = SELECTION
     on_cpu: bool = False
@@ -65,6 +66,10 @@ class PolicyUnderTest(ABC):
 
     def __init__(self, request: Request):
         self.request = request
+
+    def folder(self, *parts: str) -> Path:
+        """Return the default folder of the results, or one in it; see `own_folder`."""
+        return own_folder(self.home, *self.place.parts, *parts, error=ConfigError)
 
     def protocol(self, base: EvalProtocol) -> EvalProtocol:
         """Return the protocol as it is run with the policy, such as with the image size that it was trained on."""
@@ -119,15 +124,15 @@ class RunPolicy(PolicyUnderTest):
     hears = relative = True
 
     def __init__(self, request: Request):
+        from lifelong.evaluation.restore import restore  # with PyTorch
+
         super().__init__(request)
         run = restore(
             Path(request.policy_name), after=request.after, device=request.device, allow=request.allow
         )
         self.run = run
         self.identity = {"run": str(run.path), "after": run.learned, "weights": run.weights_digest}
-        self.out = run.path / "eval" / f"after_{run.learned:02d}"
-        if request.out is None:
-            require_own_folders(run.path, "eval", f"eval/{self.out.name}", error=ConfigError)
+        self.home, self.place = run.path, Path("eval", f"after_{run.learned:02d}")
         self.tasks = run.tasks
         self.selection = tuple(run.eval.init_states("curve"))
         self.on_cpu = run.device.type == "cpu"
@@ -156,9 +161,6 @@ class RunPolicy(PolicyUnderTest):
             yield PolicyActor(policy, run.embed(task), run.device, run.eval.precision, draws, run.embed)
 
 
-EXPERT, AVOIDING = "expert", "expert-avoid"
-
-
 class ExpertPolicy(PolicyUnderTest):
     """The scripted expert, which sees the whole state: how much of a task can be done at all, or done safely."""
 
@@ -169,7 +171,7 @@ class ExpertPolicy(PolicyUnderTest):
 
         super().__init__(request)
         self.identity = {"policy": request.policy_name, "generator": GENERATOR}
-        self.out = Path("eval", request.policy_name)
+        self.place = Path(request.policy_name)
         self.cameras = ("agentview",) if request.videos else ()
         self.observations = ("rgb",) if request.videos else ()
 

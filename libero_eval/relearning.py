@@ -21,11 +21,11 @@ from typing import Literal
 import torch
 
 from libero_env.demos.read import demo_origin
-from libero_env.errors import SimulationError
+from libero_env.errors import DemoError, SimulationError
+from libero_env.paths import demos_dir
 from libero_eval.requests import RelearnRequest
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.demonstrations import DemoDatasets, demo_copies, find_demos, perturb_demos
-from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows, WindowDataset
 from lifelong.errors import DataError, LifelongError
 from lifelong.evaluation.environments import VectorEnv
@@ -43,12 +43,13 @@ from lifelong.streams import StageData, StreamSettings
 from lifelong.training.fit import EpochEnd, fit
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import BatchAugmentation
-from lifelong.tuning.proxy import CHUNK, MEASURED
 from lifelong.types import Batch
 
 Start = Literal["final", "initial"]
 Measure = Callable[[Policy], float]  # 0 is perfect
 STARTS: tuple[Start, ...] = ("final", "initial")
+MEASURED = 512  # largest number of held-out windows of a task
+CHUNK = 128  # windows of a forward pass
 
 
 @dataclass(frozen=True)
@@ -111,7 +112,7 @@ def relearn(request: RelearnRequest, initial: Policy) -> list[RelearnRecord]:
         LifelongError: The run is not finished, a position is not one of its tasks, or demonstrations are missing.
     """
     device, allow = request.device, request.allow
-    run = restore(request.run, device=device, allow=allow)
+    run = with_demos(restore(request.run, device=device, allow=allow), request.demos)
     if run.learned != len(run.tasks) - 1:
         raise LifelongError(
             f"{request.run} is not finished: {run.learned + 1} of {len(run.tasks)} tasks are learned"
@@ -128,26 +129,27 @@ def relearn(request: RelearnRequest, initial: Policy) -> list[RelearnRecord]:
         starts = [start for start in STARTS if (task, start) not in known]
         if not starts:
             continue
+        own = request.demos is not None
         before = restore(run.path, after=_stage_end(run, task), device=device, allow=allow)
-        training, held_out = task_windows(run, task, request.demos_held_out, config)
+        training, held_out = task_windows(run, task, request.demos_held_out, config, request.demos)
         with measured_on(run, task, held_out, request.episodes) as measure:
             with before.acting(task) as then:
                 learned = measure(then)
             trial = Trial(task, training, measure, back_limit(learned, request.tolerance, request.episodes))
             for start in starts:
                 acting = run.acting(task) if start == "final" else None
-                with acting or nullcontext(_met(run, initial, task, config)) as policy:
+                with acting or nullcontext(_met(run, initial, task, config, own)) as policy:
                     record = _relearned(run, policy, start, trial, learned, request, config)
                     log.append(replace(record, weights=weights if start == "initial" else ""))
     return recorded()
 
 
-def _met(run: LoadedRun, initial: Policy, task: int, config: Configuration) -> Policy:
+def _met(run: LoadedRun, initial: Policy, task: int, config: Configuration, own: bool) -> Policy:
     """Return a copy of the initial policy that has met a task as the run had before it learned it."""
     policy = copy.deepcopy(initial)
     last = _stage_end(run, task)
     instruction = run.learned_task(last).language
-    windows = stage_windows(run, config)
+    windows = stage_windows(run, config, own)
     meet(policy, windows, list(windows), last, instruction, run.data.statistics, {})
     return policy
 
@@ -278,14 +280,15 @@ def _repeats(r: RelearnRecord, request: RelearnRequest, rate: float, weights: st
     )
 
 
-def stage_windows(run: LoadedRun, config: Configuration) -> StageData:
+def stage_windows(run: LoadedRun, config: Configuration, own: bool) -> StageData:
     """Return the windows that the run learned from in each stage, as recorded: without perturbations of what is seen.
 
     Args:
         config: Configuration of the run.
+        own: Whether the folder of its demonstrations is the user's word, see `with_demos`.
     """
     stream, learned = _learned_from(run, config)
-    paths, read = find_demos(run.tasks, learned, run.data, None), replace(run.data, memory="host")
+    paths, read = _demos(run, learned, learned, own), replace(run.data, memory="host")
     languages = torch.stack([run.embed(task) for task in range(len(run.tasks))])
     windows = DemoDatasets(paths, learned, run.policy.spec, languages, read, run.device)
     return StageData(windows, run.stages, stream, run.seed)
@@ -293,35 +296,57 @@ def stage_windows(run: LoadedRun, config: Configuration) -> StageData:
 
 def _learned_from(run: LoadedRun, config: Configuration) -> tuple[StreamSettings, tuple[int, ...]]:
     """Return the run's stream, and the number of demonstrations of each task."""
-    data: DataSettings = config.build("data")
     stream: StreamSettings = config.build("stream") if "stream" in config.values else StreamSettings()
-    return stream, stream.demos(data.demos, len(run.tasks), (run.group_sizes or (1,))[0])
+    return stream, stream.demos(run.data.demos, len(run.tasks), (run.group_sizes or (1,))[0])
+
+
+def with_demos(run: LoadedRun, folder: Path | None) -> LoadedRun:
+    """Return a run whose demonstrations are looked for in a folder, where one is given."""
+    return run if folder is None else replace(run, data=replace(run.data, folder=str(folder), files=()))
+
+
+def _demos(run: LoadedRun, needed: Sequence[int], learned: Sequence[int], own: bool = False) -> list[Path]:
+    """Return the demonstration file of each task of a run, which may be somebody else's; see `find_demos`."""
+    with _demos_named():
+        return find_demos(run.tasks, needed, run.data, None, learned=learned, own=own)
+
+
+@contextmanager
+def _demos_named() -> Iterator[None]:
+    """Say in what an error about demonstrations that are missing says how others are named."""
+    try:
+        yield
+    except (DataError, DemoError) as error:
+        raise DataError(f"{error}; name the folder of the run's demonstrations with --demos DIR") from None
 
 
 def task_windows(
-    run: LoadedRun, task: int, held_out: int, config: Configuration
+    run: LoadedRun, task: int, held_out: int, config: Configuration, demos: Path | None = None
 ) -> tuple[TaskWindows, Batch | None]:
     """Read the windows that the run learned from, and those to measure the error on.
 
     Args:
         held_out: Number of demonstrations to measure on, which follow those that were learned from; 0: None for them.
         config: Configuration of the run.
+        demos: The folder of `with_demos`, into which more may be written.
     """
-    data: DataSettings = config.build("data")
+    data, own = run.data, [] if demos is None else [demos]
     _, learned = _learned_from(run, config)
     learned_from, needed = learned[task], list(learned)
     needed[task] += held_out
     try:
-        recorded = find_demos(run.tasks, needed, data, None)[task]  # data.files may name files of every task
+        recorded = _demos(run, needed, learned, bool(own))[task]  # data.files may name files of every task
     except DataError as error:
         if not held_out:
             raise
         more = f"--held-out reads {held_out} demonstrations more than the run learned from"
         raise DataError(f"{error}; {more}") from None
-    _require_learned(run, task, recorded, learned_from)
+    with _demos_named():
+        _require_learned(run, task, recorded, learned_from)
     tasks, perturb = [run.tasks[task]], [run.perturbations(task)]
-    (path,) = perturb_demos([recorded], tasks, [needed[task]], perturb, data, None)
-    copies = demo_copies([recorded], tasks, [learned_from], perturb, data, None)
+    with _demos_named():
+        (path,) = perturb_demos([recorded], tasks, [needed[task]], perturb, data, None, [*own, demos_dir()])
+        copies = demo_copies([recorded], tasks, [learned_from], perturb, data, None, own)
     languages, read = run.embed(task)[None], replace(data, memory="host")
 
     def windows(count: int, copies: Sequence[Sequence[Path]] = ()) -> TaskWindows:
@@ -330,8 +355,8 @@ def task_windows(
     training = windows(learned_from, copies)
     if not held_out:
         return training, None
-    everything, own = windows(needed[task]), len(training) // (1 + len(copies[0]))
-    rest = torch.arange(own, len(everything))  # windows are in the order of the demonstrations
+    everything, count = windows(needed[task]), len(training) // (1 + len(copies[0]))
+    rest = torch.arange(count, len(everything))  # windows are in the order of the demonstrations
     return training, everything.batch(rest[torch.linspace(0, len(rest) - 1, min(MEASURED, len(rest))).long()])
 
 
@@ -340,8 +365,7 @@ def _require_learned(run: LoadedRun, task: int, file: Path, count: int) -> None:
     found = ResultLog(run.path / "results.jsonl").read().of(DemonstrationsRecord)
     if found and demo_origin(file, count).digest != found[-1].digests[task]:
         raise DataError(
-            f"{file} has other demonstrations than {run.path} learned {run.tasks[task].name!r} from; "
-            "data.files or data.folder of the run's config.yaml say where they are looked for"
+            f"{file} has other demonstrations than {run.path} learned {run.tasks[task].name!r} from"
         )
 
 

@@ -1,5 +1,6 @@
 """What an evaluation is asked for: a policy, the episodes to run it in, and how they are run."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,9 +21,9 @@ from libero_env.cli.options import (
     Seed,
     Side,
 )
-from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.parallel import cpu_count
 from libero_env.perturbations import format_perturbations, parse_perturbations
+from libero_env.tasks.task import NUM_INIT_STATES
 from libero_env.timing import ControlFreq
 from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
@@ -57,7 +58,7 @@ class Request:
 
     Attributes:
         policy: A run's directory, one of its checkpoints, module:function that returns an object with predict, the
-            address of a policy server: ws://host:port (openpi, libero serve), vla-eval://..., gr00t://..., or `expert`,
+            address of a policy server: ws://host:port (openpi), vla-eval://..., gr00t://..., or `expert`,
             the scripted one, which as `expert-avoid` keeps clear of what the goal does not need.
         suite: Suites or tasks (default: the run's).
         after: Of a run: the policy after this task, from 0 (default: the last).
@@ -73,8 +74,8 @@ class Request:
         size: Image size in pixels, for a policy that does not define it.
         names: What a policy of your own receives: this package's observations, the original's, or the protocol's inputs
             (default: native for upright images, otherwise original).
-        name: Name of the policy, such as pi0_step30000: part of its identity, and of the default folder. Needed where a
-            policy server does not say which policy it serves.
+        name: Name of the policy, such as pi0_step30000: part of its identity, and name of its default folder. Needed
+            where a policy server does not say which policy it serves.
         videos: Record this number of episodes of each task.
         seed: Seed of stochastic policies.
         assets: `builtin`, `original`, or the folder of the original's models.
@@ -83,7 +84,8 @@ class Request:
             (default: the protocol's, mujoco).
         unit_starts: Episodes of a task that are run in one batch.
         policy_threads: Threads of a policy on the CPU (default: 1 for a run's).
-        out: Folder of the results (default: in the run, or eval/POLICY).
+        out: Folder of the results (default: in the run, or eval/POLICY; of what is not the plain protocol libero, a
+            folder in it that says so).
         workers: Processes that share the work.
         retries: Further attempts after an error.
         device: auto, cpu, cuda, cuda:1.
@@ -166,6 +168,13 @@ class EvalRequest(Request):
     until: str | None = None
     despite: tuple[str, ...] = ()
 
+    def given(self, names: Iterable[str]) -> list[str]:
+        """Return the options of these names that have other values than the defaults."""
+        plain = EvalRequest()
+        return [
+            f"--{name.replace('_', '-')}" for name in names if getattr(self, name) != getattr(plain, name)
+        ]
+
 
 @dataclass(frozen=True, kw_only=True)
 class RobustnessRequest(Request):
@@ -228,6 +237,8 @@ class RelearnRequest(_Checked):
             fall short of it.
         held_out: Demonstrations to measure the error on, after those that were learned from (default: 5).
         episodes: Rollouts to measure success by, instead of the error; 0: the error.
+        demos: Folder of the demonstrations that the run learned from (default: what its configuration names, which is
+            only read, or the cache).
         initial: The pretrained weights that the run began with: a finished run, or one of its checkpoints.
 
     Raises:
@@ -241,6 +252,7 @@ class RelearnRequest(_Checked):
     tolerance: Annotated[float, Field(ge=0, le=10)] = 0.05
     held_out: Annotated[int, Field(ge=1, le=1000)] | None = None
     episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
+    demos: FilePath | None = None
     initial: FilePath | None = None
 
     def __post_init__(self) -> None:
@@ -264,6 +276,8 @@ class DiagnoseRequest(_Checked):
         run: The directory of a run with checkpoints after its tasks.
         held_out: Demonstrations to measure on, after those that were learned from.
         episodes: Rollouts to measure success by, besides the error; 0: none.
+        demos: Folder of the demonstrations that the run learned from (default: what its configuration names, which is
+            only read, or the cache).
 
     Raises:
         ConfigError: A value is of another kind or outside of its range.
@@ -272,6 +286,7 @@ class DiagnoseRequest(_Checked):
     run: Positional[RunFolder]
     held_out: Annotated[int, Field(ge=1, le=1000)] = 5
     episodes: Annotated[int, Field(ge=0, le=NUM_INIT_STATES)] = 0
+    demos: FilePath | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -26,11 +26,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from libero_env.errors import SimulationError
-from libero_env.storage import atomic_path, atomic_write_text, require_own_folders
+from libero_env.storage import atomic_path, atomic_write_text, own_folder
 from libero_eval.requests import SaliencyRequest
 from lifelong.errors import ConfigError, PolicyError
-from lifelong.evaluation.actors import PolicyActor, observe
-from lifelong.evaluation.environments import Obs
+from lifelong.evaluation.actors import Obs, PolicyActor, observe
 from lifelong.evaluation.restore import LoadedRun, restore
 from lifelong.evaluation.rollout import run_episodes
 from lifelong.policies.base import Policy, in_mode
@@ -244,14 +243,14 @@ def draw_saliency(request: SaliencyRequest) -> Path:
         text file beside it.
 
     Raises:
-        ConfigError: The task does not exist, or the folder is a link that leads out of the run.
+        ConfigError: The task does not exist, or the folder is a link.
         LiberoError: The run cannot be read, or its policy has no `predict` or plans several actions at once.
     """
     run = restore(request.run, after=request.after, device=request.device, allow=request.allow)
     task, settings = request.task, SaliencySettings(stride=request.stride)
     if task >= len(run.tasks):
         raise ConfigError(f"there is no task {task}; valid: tasks 0 to {len(run.tasks) - 1}")
-    require_own_folders(run.path, "saliency", error=ConfigError)
+    folder = own_folder(run.path, "saliency", error=ConfigError)
     horizon = request.horizon or run.eval.horizon
     frames, success = _run_episode(run, task, request.start, horizon)
     steps = sorted({round(i) for i in np.linspace(0, len(frames) - 1, request.moments)})
@@ -264,7 +263,6 @@ def draw_saliency(request: SaliencyRequest) -> Path:
         heats = [saliency(policy, batch, settings).cpu().numpy() for batch in batches]
     pictures = [frames[step]["images"][0, 0].cpu().numpy() for step in steps]
     enlarge = -(-SHEET_HEIGHT // pictures[0].shape[1])
-    folder = run.path / "saliency"
     folder.mkdir(exist_ok=True)
     path = folder / f"task_{task:02d}_after_{run.learned:02d}_start_{request.start:02d}.png"
     with atomic_path(path) as part:

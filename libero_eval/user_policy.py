@@ -1,17 +1,16 @@
 """A policy of the user's own: an object with `predict`, from `module:function`."""
 
-import ast
+import gc
 import hashlib
 import importlib
 import inspect
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from types import BuiltinMethodType, MethodType, ModuleType
+from types import FunctionType, ModuleType
 from typing import Annotated, Any
 
 import numpy as np
@@ -28,11 +27,16 @@ from libero_eval.protocols.clock import Planner
 from libero_eval.protocols.environment import OBSERVATIONS
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
-from lifelong.errors import ConfigError, LifelongError, MissingObservationError, PolicyError
-from lifelong.evaluation.environments import Obs
-from lifelong.settings.configuration import require_same_module
+from libero_eval.words import WRITE, no_module, require_module
+from lifelong.errors import (
+    ConfigError,
+    LifelongError,
+    MissingObservationError,
+    PolicyError,
+    require_same_module,
+)
+from lifelong.evaluation.actors import Obs
 
-_WRITE = "write module:function, such as my_policy:make"
 _PROJECT = ("libero", "libero_env", "libero_eval", "lifelong")  # whose version is in the result
 # Keys of a result's `evaluated` that are not the user's
 _STATED = ("policy", "source", "names", "name", "seed", "run", "after", "server", "announced")
@@ -75,7 +79,7 @@ class UserPolicy(PolicyUnderTest):
             named = {"weights": weights, **named}
         names = {} if request.names is None else {"names": request.names}
         self.identity = {"policy": name, "source": source_digest(name.partition(":")[0]), **named, **names}
-        self.out = Path("eval") / name.replace(":", ".")
+        self.place = Path(name.removesuffix(":make").replace(":", "."))
 
     def protocol(self, base: EvalProtocol) -> EvalProtocol:
         """Return the protocol with the policy's own image size, if it has one; see `PolicyUnderTest`."""
@@ -86,6 +90,15 @@ class UserPolicy(PolicyUnderTest):
             )
         size = own or ((asked, asked) if asked else None)
         protocol = base if size is None else base.changed({"pixels.render_size": size})
+        if self._names(protocol) == "protocol":
+            known = {*protocol.pixels.cameras, *OBSERVATIONS}
+            if strange := [name for name in (*(self.cameras or ()), *self.observations) if name not in known]:
+                raise ConfigError(
+                    f"{self.request.policy_name} names {', '.join(strange)}; the inputs of protocol {protocol.name} "
+                    f"are images of {' and '.join(protocol.pixels.cameras)}, the state and the instruction: --names "
+                    "native gives it this package's observations"
+                )
+            self.cameras, self.observations = None, OBSERVATIONS
         unlike = [name for name in self.observations if name.startswith(("depth", "segmentation"))]
         if unlike and self._names(protocol) == "original":
             raise ConfigError(
@@ -281,10 +294,10 @@ def load_callable(text: str) -> Any:
         sys.path.insert(0, folder)
     try:
         with code_of(f"the module {module}"):
-            make = getattr(_imported(module, text), name, None)
+            make = getattr(_imported(text), name, None)
         if not callable(make):
             what = "has no function" if make is None else f"has a {type(make).__name__}, not a function,"
-            raise LifelongError(f"{text}: module {module} {what} {name}; {_WRITE}")
+            raise LifelongError(f"{text}: module {module} {what} {name}; {WRITE}")
         with code_of(f"{text}()"):
             policy = make()
     finally:
@@ -297,67 +310,38 @@ def load_callable(text: str) -> Any:
     return policy
 
 
-def _imported(module: str, text: str) -> ModuleType:
+def _imported(text: str) -> ModuleType:
     """Return a module; one that it imports itself and that does not exist is an error of its own."""
+    module = require_module(text)
     parts = module.split(".")
-    if module.endswith(".py"):
-        function = text.removeprefix(module)
-        raise LifelongError(
-            f"{text}: a module is named without .py: write {Path(module).stem}{function}, in the folder of the file"
-        )
-    if not all(part.isidentifier() for part in parts):
-        raise LifelongError(f"{text}: {module!r} is not a name of a module; {_WRITE}")
     require_same_module(parts[0], sys.path, text)
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         if error.name not in {".".join(parts[: i + 1]) for i in range(len(parts))}:
             raise
-        raise LifelongError(
-            f"{text}: there is no module {error.name}, neither in the current folder ({Path.cwd()}) nor installed; "
-            f"type the command in the folder of {error.name}.py"
-        ) from error
+        raise no_module(error.name or module, text) from error
 
 
 def source_digest(module: str) -> str | None:
-    """Return the digest of the source of a module and of what it imports from its own folder, directly or not.
+    """Return the digest of the source of a module and of what it has imported from its own folder, directly or not.
 
-    Nothing is imported for it. None for a module without a file.
+    None for a module without a file.
     """
     file = getattr(sys.modules[module], "__file__", None)
     if file is None or not Path(file).is_file():
         return None
     path = Path(file).resolve()
     folder = path.parents[module.count(".") + (path.name == "__init__.py")]
-    sources = {module: path.read_bytes()}
-    waiting = [*_imports(sources[module], module, path)]
-    while waiting:
-        name = waiting.pop()
-        top, place = name.partition(".")[0], folder.joinpath(*name.split("."))
-        files = [one for one in (place.with_suffix(".py"), place / "__init__.py") if one.is_file()]
-        own = top == module.partition(".")[0] or not {"site-packages", "dist-packages"} & set(folder.parts)
-        if files and own and name not in sources and top not in _PROJECT:
-            sources[name] = files[0].read_bytes()
-            waiting += _imports(sources[name], name, files[0])
+    installed = {"site-packages", "dist-packages"} & set(folder.parts)
+    sources = {}
+    for name, one in list(sys.modules.items()):
+        top, place = name.partition(".")[0], Path(getattr(one, "__file__", None) or "").resolve()
+        own = top == module.partition(".")[0] or not installed and top not in _PROJECT
+        if own and place.suffix == ".py" and place.is_relative_to(folder) and place.is_file():
+            sources[place.relative_to(folder).as_posix()] = place.read_bytes()
     parts = [part for name in sorted(sources) for part in (name.encode(), sources[name])]
     return hashlib.sha256(b"\0".join(parts)).hexdigest()[:16]
-
-
-def _imports(source: bytes, name: str, path: Path) -> Iterator[str]:
-    """Yield the names of modules that a source may import, packages above them included."""
-    try:
-        nodes = list(ast.walk(ast.parse(source)))
-    except (SyntaxError, ValueError):  # it is not of Python
-        return
-    for node in nodes:
-        found = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
-        if isinstance(node, ast.ImportFrom):
-            kept = name.count(".") + 1 - node.level + (path.name == "__init__.py")
-            base = [*(name.split(".")[:kept] if node.level else []), *([node.module] if node.module else [])]
-            found = [".".join(base), *(".".join([*base, one]) for one in found)]
-        for one in filter(None, found):
-            parts = one.split(".")
-            yield from (".".join(parts[: i + 1]) for i in range(len(parts)))
 
 
 def weights_digest(policy: Any) -> str | None:
@@ -365,18 +349,16 @@ def weights_digest(policy: Any) -> str | None:
 
     Attributes, and what functions were made with, are followed a few steps.
     """
-    digest = hashlib.sha256()
-    seen: dict[int, Any] = {}
-    kind = type(policy)
+    kind, seen = type(policy), dict[int, Any]()
     module = getattr(sys.modules.get(kind.__module__), "__dict__", {})
-    counts = [_add_arrays(part, digest, seen) for part in (policy, dict(vars(kind)), dict(module))]
-    return digest.hexdigest()[:16] if any(counts) else None
+    found = [digest for part in (policy, dict(vars(kind)), dict(module)) for digest in _arrays(part, seen)]
+    return hashlib.sha256(b"".join(sorted(found))).hexdigest()[:16] if found else None
 
 
-def _add_arrays(value: Any, digest: Any, seen: dict[int, Any], left: int = 8) -> int:
-    """Add the arrays in an object to a digest, and return their number; what is kept in `seen` keeps its id."""
+def _arrays(value: Any, seen: dict[int, Any], left: int = 16) -> Iterator[bytes]:
+    """Yield the digests of the arrays in an object; what is kept in `seen` keeps its id."""
     if id(value) in seen or not left or isinstance(value, type | ModuleType):
-        return 0
+        return
     seen[id(value)] = value
     torch = sys.modules.get("torch")
     if torch is not None and isinstance(value, torch.nn.Module):
@@ -385,30 +367,12 @@ def _add_arrays(value: Any, digest: Any, seen: dict[int, Any], left: int = 8) ->
         value = value.detach().cpu()
         value = value if value.is_sparse else value.contiguous().reshape(-1).view(torch.uint8).numpy()
     if hasattr(value, "__array__") and hasattr(value, "dtype"):
-        try:
+        with suppress(TypeError, ValueError, RuntimeError):  # of objects, or sparse
             array = np.ascontiguousarray(value)
-            digest.update(f"{array.dtype} {array.shape}".encode())
+            digest = hashlib.sha256(f"{array.dtype} {array.shape}".encode())
             digest.update(array.reshape(-1).view(np.uint8).data)
-        except (TypeError, ValueError, RuntimeError):  # of objects, or sparse
-            return 0
-        return 1
-    return sum([_add_arrays(part, digest, seen, left - 1) for part in _held(value)])
-
-
-def _held(value: Any) -> list[Any]:
-    """Return what an object holds: its entries, attributes, and, as a function, what it was made with."""
-    if isinstance(value, list | tuple):
-        return list(value)
-    if isinstance(value, Mapping):
-        return list(value.values())
-    if isinstance(value, partial):
-        return [value.func, *value.args, *value.keywords.values()]
-    slots = [getattr(kind, "__slots__", ()) for kind in type(value).__mro__]  # each one name, or several
-    names = [name for part in slots for name in ([part] if isinstance(part, str) else part)]
-    held = [*getattr(value, "__dict__", {}).values(), *(getattr(value, name, None) for name in names)]
-    if isinstance(value, MethodType | BuiltinMethodType):
-        held.append(value.__self__)
-    for cell in getattr(value, "__closure__", None) or ():
-        with suppress(ValueError):  # it is empty
-            held.append(cell.cell_contents)
-    return held
+            yield digest.digest()
+        return
+    held = value.__closure__ or () if isinstance(value, FunctionType) else gc.get_referents(value)
+    for part in held:
+        yield from _arrays(part, seen, left - 1)

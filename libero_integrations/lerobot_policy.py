@@ -6,7 +6,6 @@ with it, because it asks for other versions of some packages.
 Shape legend: B batch, T steps of a window, A action, D sizes of all readings, L language embedding.
 """
 
-import importlib
 import inspect
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,30 +16,29 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from libero_env.errors import MissingPackageError
+from libero_env.storage import own_folder
+from libero_integrations.lerobot_modules import lerobot_module
 from lifelong.data.windows import WindowDataset
-from lifelong.errors import ConfigError, PolicyError
+from lifelong.errors import CheckpointError, ConfigError, PolicyError
 from lifelong.policies.base import Policy
 from lifelong.types import Batch, Count, Observation, PolicySpec, Unfinished
 
 # type -> its setting for the number of actions in a chunk, which is the length of a window
-CHUNKS = {
-    "act": "chunk_size",
-    "diffusion": "horizon",
-    "vqbet": "action_chunk_size",
-    "smolvla": "chunk_size",
-    "pi0": "chunk_size",
-    "pi0_fast": "chunk_size",
-    "pi05": "chunk_size",
-    "xvla": "chunk_size",
-}
+CHUNKS = dict.fromkeys(("act", "smolvla", "pi0", "pi0_fast", "pi05", "xvla"), "chunk_size")
+CHUNKS |= {"diffusion": "horizon", "vqbet": "action_chunk_size"}
 # they read the instruction's embedding as observation.environment_state
 WITH_EMBEDDING = ("act", "diffusion")
 WITH_TEXT = ("smolvla", "pi0", "pi0_fast", "pi05", "xvla")  # they read the instruction as text
 DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     "act": {"pretrained_backbone_weights": None},
     # a chunk's actions follow from its first noise alone, so they do not depend on what else is simulated
-    "diffusion": {"noise_scheduler_type": "DDIM", "num_inference_steps": 10, "crop_shape": None},
+    "diffusion": {
+        "noise_scheduler_type": "DDIM",
+        "num_inference_steps": 10,
+        "crop_shape": None,
+        "pretrained_backbone_weights": None,
+        "use_group_norm": True,  # running statistics of batches would drift from task to task
+    },
 }
 # of LeRobot's data sets of LIBERO
 IMAGES = {"agentview_rgb": "observation.images.image", "eye_in_hand_rgb": "observation.images.image2"}
@@ -49,6 +47,10 @@ FOLDER = "lerobot"  # in a run's directory, in LeRobot's format
 _IMAGENET = {"mean": (0.485, 0.456, 0.406), "std": (0.229, 0.224, 0.225)}
 _TASKS, _LETTERS = 256, 256  # instructions that a policy can remember, and bytes of each
 _KINDS = ("mean", "std", "min", "max")
+# settings whose texts choose among LeRobot's own functions
+_LOADS_NOTHING = """
+    beta_schedule feedforward_activation noise_scheduler_type normalization_mapping prediction_type vision_backbone
+""".split()  # noqa: SIM905
 
 
 class LeRobotPolicy(Policy):
@@ -71,6 +73,35 @@ class LeRobotPolicy(Policy):
         ConfigError: There is no such type, or a setting is not valid.
     """
 
+    @classmethod
+    def loads_from_elsewhere(cls, values: Mapping[str, Any]) -> tuple[str, str]:
+        """Return the package, and the first key by which it would load files that a configuration names; "" for none.
+
+        Policies that read text have a tokenizer and a language model. Of the others only numbers and names of
+        functions are known to load nothing.
+        """
+        settings = values.get("settings")
+        plain = settings if isinstance(settings, Mapping) else {}
+        unknown = {key: value for key, value in plain.items() if key not in _LOADS_NOTHING}
+        named = [f"settings.{key}" for key, value in unknown.items() if _has_text(value)]
+        pretrained = [] if values.get("pretrained") is None else ["pretrained"]
+        with_text = [] if values.get("type") in ("act", "diffusion", "vqbet") else ["type"]
+        return "lerobot", next(iter([*pretrained, *with_text, *named]), "")
+
+    @classmethod
+    def saved_arguments(cls, values: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
+        """Return the arguments with what `save_beside` wrote in place of `pretrained`; see `Policy`.
+
+        Raises:
+            CheckpointError: It is not there.
+        """
+        if values.get("pretrained") is None:
+            return values
+        saved = own_folder(folder, FOLDER, error=CheckpointError)
+        if not saved.is_dir():
+            raise CheckpointError(f"{saved} is missing, in which the run saved its policy")
+        return {**values, "pretrained": str(saved)}
+
     by_window = False  # the axis of time comes first in ACT's layers
     statistics = "first"
 
@@ -89,9 +120,7 @@ class LeRobotPolicy(Policy):
         self.language = language and type in WITH_EMBEDDING
         given = {"policy.act_steps": act_steps, "policy.settings": settings or None}
         if pretrained is not None and (own := [name for name, value in given.items() if value is not None]):
-            raise ConfigError(
-                f"policy.pretrained={pretrained} has its own settings: leave out {', '.join(own)}"
-            )
+            raise ConfigError(f"policy.pretrained={pretrained} has its settings: leave out {', '.join(own)}")
         if act_steps is not None and "n_action_steps" in settings:
             raise ConfigError("policy.act_steps is policy.settings.n_action_steps: leave out one of them")
         try:
@@ -117,6 +146,9 @@ class LeRobotPolicy(Policy):
     def _build(self, settings: Mapping[str, Any], act_steps: int | None, pretrained: str | None) -> Any:
         factory = lerobot_module("policies.factory")
         policy_class = factory.get_policy_class(self.type)
+        if pretrained is not None and torch.empty(0).is_meta:  # its size is asked for
+            configs = lerobot_module("configs.policies")
+            return policy_class(configs.PreTrainedConfig.from_pretrained(pretrained))
         if pretrained is not None:
             return policy_class.from_pretrained(pretrained)
         chunk = {CHUNKS[self.type]: self.spec.seq_len} if self.type in CHUNKS else {}
@@ -129,10 +161,8 @@ class LeRobotPolicy(Policy):
         if "n_action_steps" in known:
             frames = chosen.get("n_obs_steps", known["n_obs_steps"].default)
             chosen.setdefault("n_action_steps", act_steps or self.spec.seq_len - frames + 1)
-        config = factory.make_policy_config(
-            self.type, **chosen, **self._features(), device="cpu", push_to_hub=False
-        )
-        return policy_class(config)
+        own = {**chosen, **self._features(), "device": "cpu", "push_to_hub": False}
+        return policy_class(factory.make_policy_config(self.type, **own))
 
     @property
     def _images(self) -> list[str]:
@@ -146,10 +176,8 @@ class LeRobotPolicy(Policy):
         inputs[STATE] = feature(kind.STATE, (sum(self.spec.proprio.values()),))
         if self.language:
             inputs[EMBEDDING] = feature(kind.ENV, (self.spec.language_dim,))
-        return {
-            "input_features": inputs,
-            "output_features": {ACTION: feature(kind.ACTION, (self.spec.action_dim,))},
-        }
+        actions = {ACTION: feature(kind.ACTION, (self.spec.action_dim,))}
+        return {"input_features": inputs, "output_features": actions}
 
     def meet_task(self, dataset: WindowDataset, instruction: str) -> None:
         """Take note of the text of the instruction; see `Policy`."""
@@ -182,8 +210,7 @@ class LeRobotPolicy(Policy):
             same = (self.keys[: int(self.met)] == embedding.to(self.keys)).all(1).nonzero()
             if not len(same):
                 raise PolicyError(
-                    f"policy.type={self.type} reads instructions as text, and this one is of no task that it has "
-                    "learned"
+                    f"policy.type={self.type} reads texts of instructions, and has not learned a task of this one"
                 )
             letters = bytes(self.texts[int(same[-1])].tolist())
             texts.append(letters.rstrip(b"\0").decode())
@@ -192,8 +219,7 @@ class LeRobotPolicy(Policy):
     def loss(self, batch: Batch) -> Tensor:
         """Return LeRobot's loss of a batch, a scalar."""
         with self._learning():
-            loss: Tensor = self.inner(self.to_lerobot(batch))[0]
-        return loss
+            return self.inner(self.to_lerobot(batch))[0]
 
     def window_losses(self, batch: Batch) -> Tensor:
         """Return the loss of each window, one by one: LeRobot computes that of a batch; see `Policy`."""
@@ -222,7 +248,7 @@ class LeRobotPolicy(Policy):
         self.inner.reset()
 
     def _act(self, observation: Observation, generators: Sequence[torch.Generator] | None) -> Tensor:
-        batch = self._processed(self._observed(observation, [0], squeeze=True))
+        batch = self.processors()[0](self._observed(observation, [0], squeeze=True))
         if not self._takes_noise:
             return self._unnormalised(self.inner.select_action(batch))
         if generators is None:
@@ -273,7 +299,7 @@ class LeRobotPolicy(Policy):
         if actions:
             steps = [k - self._first for k in self.inner.config.action_delta_indices]
             given[ACTION], given["action_is_pad"] = batch.actions[:, steps], batch.padding()[:, steps]
-        return self._processed(given)
+        return self.processors()[0](given)
 
     def _observed(
         self, observation: Observation, frames: Sequence[int], *, squeeze: bool = False
@@ -296,13 +322,8 @@ class LeRobotPolicy(Policy):
             given["task"] = self.instructions(observation.language)
         return given
 
-    def _processed(self, given: dict[str, Any]) -> dict[str, Any]:
-        done: dict[str, Any] = self.processors()[0](given)
-        return done
-
-    def _unnormalised(self, actions: Tensor) -> Tensor:
-        done: Tensor = self.processors()[1](actions)
-        return done.to(actions.device)
+    def _unnormalised(self, actions: Tensor) -> Any:
+        return self.processors()[1](actions).to(actions.device)
 
     def processors(self) -> tuple[Any, Any]:
         """Return LeRobot's processors of what goes in and of the actions that come out."""
@@ -319,15 +340,9 @@ class LeRobotPolicy(Policy):
         statistics = dict.fromkeys(self._images, colours)
         if not bool(self.moments.any()):
             return statistics
-        state, action = (
-            self.moments.detach()
-            .cpu()
-            .split([self.moments.shape[1] - self.spec.action_dim, self.spec.action_dim], dim=1)
-        )
-        return statistics | {
-            STATE: dict(zip(_KINDS, state, strict=True)),
-            ACTION: dict(zip(_KINDS, action, strict=True)),
-        }
+        moments, count = self.moments.detach().cpu(), self.spec.action_dim
+        parts = {STATE: moments[:, :-count], ACTION: moments[:, -count:]}
+        return statistics | {key: dict(zip(_KINDS, part, strict=True)) for key, part in parts.items()}
 
     def rate_factors(self) -> Mapping[str, float]:
         """Return the factors of the learning rate that LeRobot's optimiser groups have; see `Policy`."""
@@ -362,34 +377,7 @@ class LeRobotPolicy(Policy):
             model.training = before
 
 
-def lerobot_module(module: str) -> Any:
-    """Import a module of LeRobot, such as `policies.factory`.
-
-    Raises:
-        MissingPackageError: It is not installed, or does not fit the versions beside it.
-    """
-    try:
-        _declare_operators()
-        return importlib.import_module(f"lerobot.{module}")
-    except (ImportError, RuntimeError, TypeError) as error:
-        reason = f"LeRobot cannot be imported ({error})"
-        raise MissingPackageError(reason, "`make lerobot`, which makes an environment with it") from error
-
-
-def _declare_operators() -> None:
-    """Declare torchvision's operators where its build does not fit torch's, as of a CPU build; LeRobot calls none."""
-    try:
-        importlib.import_module("torchvision")
-    except RuntimeError as error:
-        if "torchvision::" not in str(error):
-            raise
-        library = torch.library.Library("torchvision", "FRAGMENT")
-        _KEPT.append(library)
-        for name in _OPERATORS:
-            library.define(f"{name}(Tensor x) -> Tensor")
-        importlib.import_module("torchvision")
-
-
-_KEPT: list[Any] = []  # operators are forgotten with their library
-_BACKWARD = ("roi_align", "roi_pool", "ps_roi_align", "ps_roi_pool", "deform_conv2d")
-_OPERATORS = ("nms", "qnms", *_BACKWARD, *(f"_{name}_backward" for name in _BACKWARD))
+def _has_text(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return any(map(_has_text, value.values()))
+    return any(map(_has_text, value)) if isinstance(value, list | tuple) else isinstance(value, str)

@@ -25,4 +25,5 @@ __all__ = [
     "write_report",
 ]
 
+__distribution__: str
 __version__: str

@@ -1,7 +1,8 @@
 """From the words of a command line to a configuration; for a key or file that does not exist, the nearest is named."""
 
-import re
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -14,32 +15,23 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from libero_env.errors import LiberoError, UnknownNameError, require_package
-from libero_env.text import closest, flatten, suggest
+from libero_env.errors import LiberoError, UnknownNameError, require_known, require_package
+from libero_env.text import flatten, suggest
 from lifelong.errors import ConfigError
+from lifelong.settings.obeyed import require_obeyed
 
-# launcher -> package of its plug-in, and the extra that installs it
+# launcher -> package of its plug-in
 LAUNCHERS = {
-    "joblib": ("hydra_plugins.hydra_joblib_launcher", "joblib"),
-    "submitit_local": ("hydra_plugins.hydra_submitit_launcher", "submitit"),
-    "submitit_slurm": ("hydra_plugins.hydra_submitit_launcher", "submitit"),
-    "ray": ("hydra_plugins.hydra_ray_launcher", "ray"),
+    "joblib": "hydra_plugins.hydra_joblib_launcher",
+    "submitit_local": "hydra_plugins.hydra_submitit_launcher",
+    "submitit_slurm": "hydra_plugins.hydra_submitit_launcher",
+    "ray": "hydra_plugins.hydra_ray_launcher",
 }
 # errors by which Hydra says that an override cannot be applied
 REFUSALS = (
     *(HydraException, OmegaConfBaseException),
     *(AssertionError, AttributeError, OSError, TypeError, ValueError),
 )
-# of LeRobot, which users name as policies
-LEROBOT_TYPES = ("act", "diffusion", "vqbet", "tdmpc", "smolvla", "pi0", "pi0_fast", "pi05", "groot")
-# keys at the top of the original's configuration -> those of this package
-ORIGINAL_KEYS = {
-    "lifelong": "algo",
-    "benchmark_name": "benchmark",
-    "task_embedding_format": "language",
-    "use_wandb": "tracker",
-    "pretrain_model_path": "init_from",
-}
 
 
 def compose_run(words: Sequence[str], config_dir: Path | None = None) -> tuple[DictConfig, dict[str, str]]:
@@ -72,17 +64,24 @@ def compose_first(words: Sequence[str], folders: Sequence[Path]) -> DictConfig:
     Raises:
         LiberoError: An override names something that does not exist, or cannot be applied.
     """
+    for group, names in swept(words, folders).items():
+        for name in names if any((folder / group).is_dir() for folder in folders) else ():
+            require_known(group, name, _names(group, folders))
     first = _first(words, folders)
     try:
         config = _compose(first, folders)
     except REFUSALS as error:
         raise explained(error, words, folders) from error
-    check_obeyed(config, config.hydra.runtime.choices, first, folders)
+    check_obeyed(config, config.hydra.runtime.choices, first, folders, swept(words, folders))
     return config
 
 
 def check_obeyed(
-    config: DictConfig, choices: Mapping[str, str], words: Sequence[str], folders: Sequence[Path]
+    config: DictConfig,
+    choices: Mapping[str, str],
+    words: Sequence[str],
+    folders: Sequence[Path],
+    varied: Collection[str] = (),
 ) -> None:
     """Check that what the words of a single run choose is not replaced or unused.
 
@@ -91,11 +90,14 @@ def check_obeyed(
         choices: Name of the file chosen in each group.
         words: Overrides.
         folders: Folders of configuration files, from `config_folders`.
+        varied: Keys that other jobs of the sweep have with other values, some of which may read what this one does not.
 
     Raises:
         ConfigError: `compat` replaces a file within a group, as of algo/estimator=sample, or no one reads a key.
     """
-    for key, _, name in (word.partition("=") for word in words):
+    pairs = [word.lstrip("+~").partition("=") for word in words]
+    require_obeyed(config, [key for key, _, value in pairs if value != "null"], varied)
+    for key, _, name in pairs:
         if key == "benchmark.horizon" and not OmegaConf.is_interpolation(config.eval, "horizon"):
             raise ConfigError(
                 f"{key} has no effect with preset={choices['preset']}, where eval.horizon is {config.eval.horizon}; "
@@ -132,57 +134,38 @@ def explained(error: Exception, words: Sequence[str], folders: Sequence[Path]) -
     Args:
         words: Overrides.
     """
-    said = " ".join(str(error).split())
-    if file := re.search(r"Could not find '([^']+)/([^/']+)'", said):
-        if file[1] == "hydra/launcher" and file[2] in LAUNCHERS:
-            require_package(*LAUNCHERS[file[2]])
-        if file[1] == "policy" and file[2] in LEROBOT_TYPES:
-            return ConfigError(
-                f"unknown policy {file[2]!r}; LeRobot's is policy=lerobot policy.type={file[2]}"
-            )
-        return UnknownNameError(file[1], file[2], _names(file[1], folders))
-    key = re.search(r"Could not override '([^']+)'", said)
-    try:
-        if key:
-            groups = [
-                word
-                for word in _first(words, folders)
-                if any((f / word.partition("=")[0]).is_dir() for f in folders)
-            ]
-            return _unknown_key(
-                key[1], _compose([w for w in groups if not w.startswith(f"{key[1]}=")], folders)
-            )
-    except REFUSALS:
-        pass
-    return ConfigError(f"the configuration cannot be composed: {said}")
+    group, _, name = str(getattr(error, "missing_cfg_file", None) or "").rpartition("/")
+    if group == "hydra/launcher" and name in LAUNCHERS:
+        require_package(LAUNCHERS[name])
+    if group:
+        return UnknownNameError(group, name, _names(group, folders))
+    if key := getattr(error.__cause__, "full_key", None):
+        typed = next((one for word in words if (one := word.partition("=")[0]).startswith(key)), key)
+        with suppress(*REFUSALS):
+            for chosen in _choices(words, folders):
+                config: Any = OmegaConf.to_container(_compose(chosen, folders))
+                del config["hydra"]
+                if (known := flatten(config)).keys() & {typed}:
+                    continue
+                beside = [one for one in known if one.startswith(f"{typed.partition('.')[0]}.")]
+                valid = [one for one in beside or config if not one.rpartition(".")[2].startswith("_")]
+                error = UnknownNameError("key of the configuration", typed, valid, unlisted=[*config, *known])
+                inner = [one for one in known if one.endswith(f".{typed}")]
+                return ConfigError(f"{error}; there is {' and '.join(inner)}") if inner else error
+    return ConfigError(f"the configuration cannot be composed: {' '.join(str(error).split())}")
 
 
-def _unknown_key(name: str, config: DictConfig) -> ConfigError:
-    """Return the error for a key that a configuration does not have."""
-    choices = {group: file for group, file in config.hydra.runtime.choices.items() if "hydra" not in group}
-    plain: Any = OmegaConf.to_container(config)
-    del plain["hydra"]
-    top, slash, inner = name.replace("/", ".", 1).partition(".")
-    if "/" in name and top in choices:
-        return ConfigError(
-            f"a chosen file of {top} has no group {inner}; leave out {name}, or choose another file with {top}=NAME"
-        )
-    if top not in plain and top not in choices:
-        tops = sorted({*filter(str.isidentifier, choices), *plain})
-        leaves = [key for key in flatten(plain) if key.endswith(f".{name}")]
-        near = ORIGINAL_KEYS.get(top) or " or ".join(leaves) or closest(top, tops)
-        hint = f" Did you mean {near}?" if near else ""
-        return ConfigError(f"unknown key {name} of the configuration.{hint} Valid: {', '.join(tops)}")
-    node = plain.get(top)
-    keys = flatten(node, f"{top}.") if isinstance(node, dict) else {}
-    valid = sorted(key for key in keys if not key.rpartition(".")[2].startswith("_"))
-    what = f"{top}={choices[top]}" if top in choices else top
-    if not valid:
-        advice = f"choose another with {top}=NAME" if top in choices else f"write {top}=VALUE"
-        return ConfigError(f"unknown key {name} of the configuration: {what} has no keys; {advice}")
-    return ConfigError(
-        f"unknown key {name} of the configuration.{suggest(name, valid)} Valid with {what}: {', '.join(valid)}"
+def _choices(words: Sequence[str], folders: Sequence[Path]) -> Iterator[tuple[str, ...]]:
+    """Yield the words by which each job of a command chooses files of groups."""
+    lists = swept(words, folders)
+    keys = [word.partition("=")[0] for word in words]
+    groups = {
+        key: word for key, word in zip(keys, words, strict=True) if any((f / key).is_dir() for f in folders)
+    }
+    named = (
+        [f"{key}={value}" for value in lists[key]] if key in lists else [word] for key, word in groups.items()
     )
+    return itertools.product(*named)
 
 
 def swept(words: Sequence[str], folders: Sequence[Path] = ()) -> dict[str, list[str]]:
@@ -195,7 +178,7 @@ def swept(words: Sequence[str], folders: Sequence[Path] = ()) -> dict[str, list[
         folders: Folders of configuration files, whose names glob() matches; none for the package's.
 
     Raises:
-        ConfigError: A word is not an override.
+        ConfigError: A word is not an override, or one of several values for a key stands beside another word for it.
     """
     try:
         overrides = OverridesParser.create().parse_overrides(list(words))
@@ -204,6 +187,11 @@ def swept(words: Sequence[str], folders: Sequence[Path] = ()) -> dict[str, list[
             f"{' '.join(str(error).split())} (an override is KEY=VALUE, such as algo=ewc or seed=1,2)"
         ) from error
     folders = folders or [config_folder()]
+    given = [o.get_key_element() for o in overrides]
+    for key in (o.get_key_element() for o in overrides if o.is_sweep_override()):
+        if given.count(key) > 1:
+            several = " and ".join(word for word in words if word.partition("=")[0] == key)
+            raise ConfigError(f"{several}: {key} is given twice; leave one of them out")
     return {o.get_key_element(): _values(o, folders) for o in overrides if o.is_sweep_override()}
 
 

@@ -1,10 +1,14 @@
 """The context of a run: everything it consists of, as one value."""
 
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
+from libero_env.parallel import cpu_count
 from libero_env.perturbations import Perturbation, reword_task
 from libero_env.tasks import Task
 from lifelong.algorithms.base import Algorithm
@@ -18,6 +22,29 @@ from lifelong.tracking import Tracker
 from lifelong.training.distributed import Ranks
 from lifelong.training.settings import FitSettings
 from lifelong.training.step import BatchAugmentation
+
+
+@runtime_checkable
+class Learner(Protocol):
+    """How a stage is learned other than from its demonstrations."""
+
+    def check(self, context: "RunContext") -> None:
+        """Raise a ConfigError if a run cannot learn so."""
+
+    def training(
+        self,
+        context: "RunContext",
+        stage: Sequence[int],
+        seed: Sequence[int],
+        resume: Mapping[str, Any] | None,
+    ) -> AbstractContextManager[dict[str, Any]]:
+        """Yield arguments of `lifelong.training.fit.fit` for a phase of training.
+
+        Args:
+            stage: Positions of the tasks.
+            seed: Integers that identify the phase within the run.
+            resume: State of `fit` that it goes on from; None from the start.
+        """
 
 
 @dataclass(frozen=True)
@@ -39,10 +66,12 @@ class RunContext:
         directory: Directory of checkpoints and records.
         tracker: Copies the metrics to another program.
         seed: Seed from which all randomness of the run is derived.
-        progress: Whether to show progress bars; None prints lines where demonstrations are recorded.
+        progress: Whether to show progress bars; None prints lines where demonstrations are recorded
+            and policies are evaluated.
         ranks: Rank of this process among those that train together.
         perturb: Perturbations of each task, under which it is learned and evaluated; () for none at all.
         shift: Held-out shift under which policies are evaluated besides; None for none.
+        learner: How stages are learned; None for behaviour cloning.
     """
 
     tasks: tuple[Task, ...]
@@ -65,6 +94,13 @@ class RunContext:
     ranks: Ranks = Ranks()
     perturb: tuple[tuple[Perturbation, ...], ...] = ()
     shift: HeldOutShift | None = None
+    learner: Learner | None = None
+
+    @property
+    def works_beside(self) -> bool:
+        """Whether rollouts and recordings run in processes of their own while this one learns, see `eval.beside`."""
+        alone = self.ranks.size == 1 and self.device.type == "cpu" and not self.eval.back_end.is_warp
+        return self.eval.beside and alone and cpu_count() > 1
 
     @property
     def perturbed(self) -> tuple[tuple[Perturbation, ...], ...]:

@@ -1,10 +1,15 @@
 """Errors of the learning side; all derive from `LifelongError`."""
 
-from collections.abc import Iterator
+import os
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.machinery import PathFinder
 from pathlib import Path
 
 from libero_env.errors import LiberoError
+
+RESUME = "the same command resumes the run"
 
 
 class LifelongError(LiberoError):
@@ -97,3 +102,38 @@ def writing(path: Path, what: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise ResultsError(f"{path}: {what} cannot be written ({error})") from error
+
+
+def require_run(path: Path) -> Path:
+    """Return the path of a run, or of something of one, if it exists.
+
+    Raises:
+        LifelongError: There is nothing.
+    """
+    if not path.exists():
+        raise LifelongError(
+            f"{path} does not exist; give the directory of a run, such as runs/libero_object/er/NAME"
+        )
+    return path
+
+
+def require_same_module(package: str, folders: Sequence[str], text: str) -> None:
+    """Check that a module that has been imported is the one that an import from some folders would find.
+
+    Args:
+        package: Name of the module, without points.
+        folders: Folders in the order in which they are searched.
+        text: What names the module, with which the message begins.
+
+    Raises:
+        ConfigError: It is another file.
+    """
+    loaded = getattr(sys.modules.get(package), "__file__", None)
+    if not loaded or package == "__main__":  # which is run, not found
+        return
+    found = PathFinder.find_spec(package, folders)
+    if found and found.origin and os.path.realpath(loaded) != os.path.realpath(found.origin):
+        raise ConfigError(
+            f"{text}: this process has already imported {package} from {loaded}, which is not {found.origin}; "
+            "use the other in a process of its own"
+        )

@@ -1,11 +1,9 @@
 """A run, step by step: build everything from the configuration, learn the task sequence, write the results."""
 
-import os
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,46 +12,41 @@ from omegaconf import DictConfig
 
 from libero_env.assets.pack import select_pack
 from libero_env.assets.robot import robot_assets
-from libero_env.demos.read import demo_origin
+from libero_env.cli.ending import told_if_interrupted
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import is_quiet
 from libero_env.memory import memory_limit
 from libero_env.perturbations import format_perturbations
-from libero_env.sim.scene import default_drawing
-from libero_env.tasks import Task
+from libero_env.sim.render import renderer_name
+from libero_env.sim.scene_spec import default_drawing
+from libero_env.text import counted
 from lifelong.algorithms.rehearsal import Rehearsal
 from lifelong.context import RunContext
-from lifelong.data.demonstrations import (
-    DemoDatasets,
-    check_folder,
-    check_pairing,
-    demo_copies,
-    find_demos,
-    perturb_demos,
-)
+from lifelong.data.demonstrations import check_folder
 from lifelong.data.settings import DataSettings
-from lifelong.errors import ConfigError, DataError
+from lifelong.errors import RESUME, ConfigError
 from lifelong.evaluation.environments import EnvPool, held_out_shift, renderer_name_or_none, run_environment
 from lifelong.policies.base import Policy
-from lifelong.pretraining import policy_at_start, pretraining_context
+from lifelong.pretraining import policy_at_start, pretraining_context, tasks_learned
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import (
     all_conditions,
     changed_conditions,
-    changed_demonstrations,
     present_conditions,
     recorded_threads,
     start_record,
     utc_now,
 )
-from lifelong.results.records import DemonstrationsRecord, PhaseRecord, RunEndRecord, RunRecord
-from lifelong.results.run_directory import RunDirectory, config_digest, read_saved_config
+from lifelong.results.records import PhaseRecord, RunEndRecord, RunRecord
+from lifelong.results.run_directory import RunDirectory, check_writable, config_digest
 from lifelong.results.summary import write_summary
+from lifelong.run_demonstrations import check_learned_from, later_demos, open_datasets
 from lifelong.sequence import TaskSequence, is_measured
 from lifelong.settings import Configuration, RunSettings, plain_data
 from lifelong.streams import TaskPlan, plan_tasks
 from lifelong.training.distributed import Ranks
+from lifelong.training.fit import check_warmup
 from lifelong.training.memory import check_memory, policy_bytes, training_needs
 from lifelong.training.precision import check_compiler, check_precision, deterministic, keep_freed_memory
 from lifelong.training.settings import FitSettings
@@ -64,13 +57,19 @@ LARGE_FOR_CPU = 4_000_000
 EXAMPLE_DIM = 384  # of instructions' embeddings, by which a policy is measured before they are computed
 
 
-def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) -> Path:  # noqa: B008 - frozen
+def run(
+    config: DictConfig,
+    names: Mapping[str, str],
+    ranks: Ranks = Ranks(),  # noqa: B008 - frozen
+    overrides: Sequence[str] = (),
+) -> Path:
     """Run a configuration to its end, or resume a run that was interrupted.
 
     Args:
         config: Configuration composed from configs/config.yaml.
         names: Name of the file chosen in each group, such as algo -> ewc; they name the run.
         ranks: Rank of this process among those that train together.
+        overrides: What the command line says, to be recorded.
 
     Returns:
         The run's directory, with results.json and report.html in it.
@@ -78,29 +77,32 @@ def run(config: DictConfig, names: Mapping[str, str], ranks: Ranks = Ranks()) ->
     Raises:
         LiberoError: The configuration, the data or the directory is invalid.
     """
-    plain = with_drawing(plain_data(config))
+    plain = with_chosen(plain_data(config))
     configuration = Configuration(plain)
     settings = configuration.settings()
     directory = RunDirectory(Path(settings.runs_dir) / _run_name(names, settings))
-    _check_writable(directory.path)
+    check_writable(directory.path)
     keep_freed_memory()
     with deterministic(settings.deterministic), _threads(settings, directory.path):
         # before anything is written: an invalid configuration leaves no trace
         context, pretraining = _build_contexts(configuration, settings, directory, ranks)
-        with _held(context, plain, settings.resume):
+        if not context.eval.back_end.is_warp and not directory.log.read().finished:
+            renderer_name()
+        with told_if_interrupted(RESUME), _held(context, plain, settings.resume):
             if not ranks.broadcast(_is_finished, context):
                 if ranks.first:
                     _note_single_frames(context.policy, names["policy"])
+                    _note_known_tasks(context, settings.init_from)
                     context.tracker.start(_run_name(names, settings), str(directory.path), plain)
                 try:
                     if ranks.first:
-                        _record_start(context, names, plain)
+                        _record_start(context, names, plain, overrides)
                     _run_sequence(context, pretraining, plain)
                 finally:  # else the next job of a sweep would log into this run
                     if ranks.first:
                         context.tracker.finish()
             elif ranks.first:
-                _check_learned_from(context, pretraining, plain)
+                check_learned_from(context, pretraining, plain)
                 print(
                     f"{directory.path} is finished; its report is written again (resume=false repeats the run)"
                 )
@@ -115,7 +117,7 @@ def check(config: DictConfig) -> None:
     Raises:
         LiberoError: A run would refuse the configuration, or this machine lacks what it needs.
     """
-    configuration = Configuration(with_drawing(plain_data(config)))
+    configuration = Configuration(with_chosen(plain_data(config)))
     settings = configuration.settings()
     _, parts = _checked_parts(configuration, Ranks().device(settings.device))
     configuration.build("language")
@@ -123,12 +125,18 @@ def check(config: DictConfig) -> None:
         configuration.build("policy", spec=parts["data"].spec(EXAMPLE_DIM))
 
 
-def with_drawing(config: dict[str, Any]) -> dict[str, Any]:
-    """Return a configuration that names how images are drawn, so that the saved one does."""
-    data = config.get("data")
-    if not isinstance(data, dict) or data.get("drawing") is not None:
-        return config
-    return {**config, "data": {**data, "drawing": default_drawing(select_pack())}}
+def with_chosen(config: dict[str, Any]) -> dict[str, Any]:
+    """Return a configuration that names what it leaves to be chosen, so that the saved one does.
+
+    That is how images are drawn, and by which seed the cells of the success matrix are.
+    """
+    data, evaluation = config.get("data"), config.get("eval")
+    if isinstance(data, dict) and data.get("drawing") is None:
+        config = {**config, "data": {**data, "drawing": default_drawing(select_pack())}}
+    sampled = evaluation if isinstance(evaluation, dict) and evaluation.get("cells") == "sampled" else None
+    if sampled is not None and sampled.get("cells_seed") is None and "seed" in config:
+        config = {**config, "eval": {**sampled, "cells_seed": config["seed"]}}
+    return config
 
 
 def _run_name(names: Mapping[str, str], settings: RunSettings) -> str:
@@ -136,19 +144,6 @@ def _run_name(names: Mapping[str, str], settings: RunSettings) -> str:
     own = [] if settings.run_id is None else [str(settings.run_id)]
     words = [names["policy"], f"seed{settings.seed}", *own]
     return f"{names['benchmark']}/{names['algo']}/{'_'.join(words)}"
-
-
-def _check_writable(directory: Path) -> None:
-    """Check that a directory exists or can be made, and files in it.
-
-    Raises:
-        ConfigError: They cannot.
-    """
-    nearest = next(folder for folder in (directory, *directory.parents) if os.path.lexists(folder))
-    if not nearest.is_dir():
-        raise ConfigError(f"runs_dir: {nearest} is a file; expected a folder, in which {directory} is made")
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise ConfigError(f"runs_dir: nothing can be written into {nearest}, in which {directory} is made")
 
 
 @contextmanager
@@ -191,6 +186,8 @@ def _build_contexts(
     device = ranks.device(settings.device)
     plan, parts = _checked_parts(config, device)
     data, evaluation = parts["data"], parts["eval"]
+    if parts["fit"].steps_per_epoch and not directory.log.path.exists():
+        check_warmup(parts["fit"], parts["algorithm"], 0)
     if ranks.first and settings.device == "auto" and device.type == "cpu":
         _warn_of_cpu(data, parts["fit"])
 
@@ -229,8 +226,15 @@ def _build_contexts(
     )
     precisions = {"train.precision": context.fit.precision, "eval.precision": evaluation.precision}
     check_precision(context.policy, device, precisions)
+    if context.learner:
+        context.learner.check(context)
     if not first:
         return context, None
+    if context.learner:
+        raise ConfigError(
+            "pretrain.suite is learned from demonstrations, for which learner=grpo has no train settings: make that "
+            "run first, and give it as init_from"
+        )
     pretrain = config.build("pretrain")
     # equal ones are shared by runs; the size of one-hot embeddings depends on the run's tasks, too
     keys = {key: config.values[key] for key in PRETRAIN_KEYS} | {"language_dim": languages.shape[1]}
@@ -262,6 +266,8 @@ def _checked_parts(config: Configuration, device: torch.device) -> tuple[TaskPla
     parts = {
         name: config.build(group) for name, group in (("tracker", "tracker"), ("augment", "augmentation"))
     }
+    if "learner" in config.values:
+        parts["learner"] = config.build("learner")
     parts |= {"tasks": plan.tasks, "stream": plan.stream, "group_sizes": plan.group_sizes, "demos": demos}
     parts |= {"data": data, "fit": fit, "eval": evaluation, "algorithm": algorithm}
     return plan, parts | {"perturb": plan.perturb if plan.stream.perturb else ()}
@@ -279,21 +285,6 @@ def _is_finished(context: RunContext) -> bool:
     return results.finished and (complete or is_measured(context, results))
 
 
-def _check_learned_from(
-    context: RunContext, pretraining: RunContext | None, plain: Mapping[str, Any]
-) -> None:
-    """Check that another `data.folder` than before has the demonstrations that a finished run learned from.
-
-    Raises:
-        DataError: It has others.
-    """
-    was = read_saved_config(context.directory.path / "config.yaml").get("data", {}).get("folder")
-    if was != plain["data"].get("folder") and context.directory.log.read().demonstrations is not None:
-        others = pretraining.tasks if pretraining else ()
-        found = find_demos(context.tasks, context.demos, context.data, context.progress, others)
-        _record_demonstrations(context, found, learned=True)
-
-
 def _note_single_frames(policy: Policy, name: str) -> None:
     """Say where a policy that uses its history is given windows of one frame, as by the preset `laptop`."""
     if policy.uses_history and policy.spec.seq_len == 1:
@@ -304,7 +295,20 @@ def _note_single_frames(policy: Policy, name: str) -> None:
         )
 
 
-def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> None:
+def _note_known_tasks(context: RunContext, init_from: str | None) -> None:
+    """Say where the run begins with weights that have learned tasks of it."""
+    learned = tasks_learned(Path(init_from)) if init_from else []
+    if known := [task.name for task in context.tasks if task.name in learned]:
+        print(
+            f"note: {init_from} has learned {len(known)} of the {len(context.tasks)} tasks, such as {known[0]}: "
+            "forward transfer to them is not that to new tasks",
+            file=sys.stderr,
+        )
+
+
+def _record_start(
+    context: RunContext, names: Mapping[str, str], plain: Any, overrides: Sequence[str] = ()
+) -> None:
     """Record the start; say where it is a resume under conditions that give other bits."""
     context.directory.log.append(
         start_record(
@@ -322,10 +326,12 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
             group_sizes=context.group_sizes,
             cells=context.eval.cells,
             cells_share=context.eval.cells_share if context.eval.cells == "sampled" else 1.0,
+            cells_seed=context.eval.cells_seed,
             conditions=present_conditions(
                 context.device, processes=context.ranks.size, renderer=renderer_name_or_none()
             ),
             transfer=context.eval.transfer_estimate,
+            overrides=overrides,
         )
     )
     starts = context.directory.log.read().of(RunRecord)
@@ -340,8 +346,8 @@ def _record_start(context: RunContext, names: Mapping[str, str], plain: Any) -> 
 def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Mapping[str, Any]) -> None:
     """Make sure of the demonstrations, pretrain, and learn the task sequence."""
     began = time.perf_counter()
-    datasets = _open_datasets(context, pretraining.tasks if pretraining else ())
-    with context.envs:
+    with later_demos(context) as later, context.envs:
+        datasets = open_datasets(context, pretraining.tasks if pretraining else (), later=later)
         TaskSequence(context, datasets, prepare=lambda: _pretrain(pretraining, context, plain)).run()
     if context.ranks.first:
         _record_end(context, began)
@@ -349,55 +355,6 @@ def _run_sequence(context: RunContext, pretraining: RunContext | None, plain: Ma
 
 def _record_end(context: RunContext, began: float) -> None:
     context.directory.log.append(RunEndRecord(seconds=time.perf_counter() - began, finished=utc_now()))
-
-
-def _open_datasets(context: RunContext, others: Sequence[Task], learned: bool = False) -> DemoDatasets:
-    """Find the tasks' demonstrations, record those that are missing, and return their windows.
-
-    Args:
-        others: Tasks that the run learns besides, of which `data.files` may have files, too.
-        learned: Whether they are learned already, by a pretraining that runs with the same demonstrations share.
-    """
-    paths, copies = context.ranks.broadcast(_find_demos, context, others, learned)
-    spec = context.policy.spec
-    return DemoDatasets(paths, context.demos, spec, context.languages, context.data, context.device, copies)
-
-
-def _find_demos(
-    context: RunContext, others: Sequence[Task], learned: bool
-) -> tuple[list[Path], list[tuple[Path, ...]]]:
-    """Return the demonstration file of each task, and those of further copies."""
-    began = time.perf_counter()
-    recorded = find_demos(context.tasks, context.demos, context.data, context.progress, others)
-    own = (context.tasks, context.demos, context.perturbed, context.data, context.progress)
-    paths, copies = perturb_demos(recorded, *own), demo_copies(recorded, *own)
-    check_pairing([*paths, *chain(*copies)], context.data)
-    _record_demonstrations(context, recorded, learned)
-    context.directory.log.append(PhaseRecord(phase="demos", seconds=time.perf_counter() - began))
-    return paths, copies
-
-
-def _record_demonstrations(context: RunContext, paths: Sequence[Path], learned: bool) -> None:
-    """Record what the tasks' demonstrations are; say where a resume learns from others than the run did before."""
-    origins = [demo_origin(path, count) for path, count in zip(paths, context.demos, strict=True)]
-    record = DemonstrationsRecord(
-        counts=tuple(one.count for one in origins),
-        generators=tuple(one.generator for one in origins),
-        digests=tuple(one.digest for one in origins),
-    )
-    log = context.directory.log
-    before = log.read().of(DemonstrationsRecord)
-    names = [t.name for t in context.tasks]
-    changes = changed_demonstrations(before[-1], record, names) if before else ""
-    if changes and learned:
-        raise DataError(
-            f"what {context.directory.path} has learned cannot be shared by a run {changes.partition(':')[0]}; "
-            "use another runs_dir (for a run that is finished, run_id=NAME as well), or move that folder away"
-        )
-    if not before or before[-1] != record:
-        log.append(record)
-    if changes:
-        print(f"resumed {changes}", file=sys.stderr)
 
 
 def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mapping[str, Any]) -> None:
@@ -412,10 +369,10 @@ def _pretrain(pretraining: RunContext | None, context: RunContext, plain: Mappin
             _compare_conditions(pretraining, context)
         if not done and ranks.first:
             count = len(pretraining.tasks)
-            print(f"Before the sequence: {count} tasks of {suite} in {directory.path}", flush=True)
+            print(f"Before the sequence: {counted(count, 'task')} of {suite} in {directory.path}", flush=True)
             names = {"algo": "multitask", "benchmark": suite, "policy": "pretrained"}
             _record_start(pretraining, names, config)
-        TaskSequence(pretraining, _open_datasets(pretraining, context.tasks, done)).run(evaluate=False)
+        TaskSequence(pretraining, open_datasets(pretraining, context.tasks, done)).run(evaluate=False)
         if not done and ranks.first:
             _record_end(pretraining, began)
     if ranks.first:
@@ -446,4 +403,4 @@ def _write_results(directory: RunDirectory, config: Mapping[str, Any]) -> None:
             f"the run is finished and its results are kept; `libero report {directory.path}` writes its report"
         )
         raise
-    print(f"{results.learned_tasks()} tasks learned. Report: {page}")
+    print(f"{counted(results.learned_tasks(), 'task')} learned. Report: {page}")

@@ -1,5 +1,6 @@
 """What a policy knows before the first task: the weights of another run, or a suite learned jointly."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +12,11 @@ from libero_env.text import flatten
 from lifelong import checkpoints
 from lifelong.algorithms.multitask import Multitask
 from lifelong.context import RunContext
-from lifelong.errors import CheckpointError, ConfigError
+from lifelong.errors import CheckpointError, ConfigError, LifelongError
 from lifelong.evaluation.restore import read_config, restore
 from lifelong.policies.base import Policy
 from lifelong.results.log import ResultLog
+from lifelong.results.records import RunRecord
 from lifelong.results.run_directory import RunDirectory, read_saved_config
 from lifelong.seeding import INIT, seeded
 from lifelong.settings import Configuration, PretrainSettings
@@ -77,7 +79,13 @@ def initial_policy(run: Path, *, weights: Path | None = None, allow: Sequence[st
         raise ConfigError(
             f"{run} began with pretrained weights; name them with --initial, such as a folder in runs/pretrain"
         )
-    return policy_at_start(config, loaded.policy.spec, loaded.seed, weights or config.values.get("init_from"))
+    stated = config.values.get("init_from")
+    try:
+        return policy_at_start(config, loaded.policy.spec, loaded.seed, weights or stated)
+    except LifelongError as error:
+        if weights is not None or stated is None:
+            raise
+        raise CheckpointError(f"{error}; name the weights that the run began with by --initial") from None
 
 
 def policy_at_start(config: Configuration, spec: PolicySpec, seed: int, weights: str | Path | None) -> Policy:
@@ -116,6 +124,14 @@ def _check_inputs(config: Configuration, file: Path) -> None:
             )
 
 
+def tasks_learned(path: Path) -> list[str]:
+    """Return the names of the tasks that weights given as `init_from` have learned, as far as their run tells."""
+    file = _last_checkpoint(path) if path.is_dir() else path
+    starts = ResultLog(file.parent.parent / "results.jsonl").read().of(RunRecord)
+    place = re.fullmatch(r"task_(\d+)", file.stem)
+    return list(starts[-1].tasks[: int(place[1]) + 1]) if starts and place else []
+
+
 def _last_checkpoint(run: Path) -> Path:
     """Return the checkpoint after the last task of a finished run."""
     folder = RunDirectory(run).checkpoints
@@ -123,7 +139,7 @@ def _last_checkpoint(run: Path) -> Path:
         raise CheckpointError(
             f"{run} has no checkpoints/task_<k>.safetensors: it is not a run directory, or no task is learned yet"
         )
-    last = folder.task_path(found[-1])
+    folder.require_own(last := folder.task_path(found[-1]))
     if not ResultLog(run / "results.jsonl").read().finished:
         raise CheckpointError(
             f"{run} is not finished; finish it, or name one of its checkpoints, such as init_from={last}"

@@ -3,11 +3,16 @@
 A run's seed is followed by a word that says what is drawn with it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
+
+if TYPE_CHECKING:  # judging needs no PyTorch
+    import torch
 
 INIT = 0  # the policy's first weights
 FIT = 1  # batches of training
@@ -22,12 +27,16 @@ EVALUATION = 4  # the same as ROLLOUT in `libero eval`, whose seed is not a run'
 
 def generator(*seed: int, device: torch.device | str = "cpu") -> torch.Generator:
     """Return a generator that is seeded with a list of integers."""
+    import torch
+
     return torch.Generator(device).manual_seed(_to_word(seed))
 
 
 @contextmanager
 def seeded(*seed: int, device: torch.device | str = "cpu") -> Iterator[None]:
     """Seed torch's global generators with a list of integers; restore them when the context ends."""
+    import torch
+
     device = torch.device(device)
     with torch.random.fork_rng(devices=[device] if device.type == "cuda" else []):
         torch.manual_seed(_to_word(seed))

@@ -16,6 +16,7 @@ from libero_env.perturbations import Perturbation, reword_task
 from libero_env.tasks import Task
 from libero_env.validation import checked
 from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.multitask import Multitask
 from lifelong.data.settings import PerturbSetting, read_perturbations, require_switched_on
 from lifelong.data.windows import StageWindows, TaskWindows, WindowSubset
 from lifelong.errors import ConfigError
@@ -176,14 +177,21 @@ def plan_tasks(config: Configuration) -> TaskPlan:
     """Return the tasks of a run's configuration.
 
     Raises:
-        ConfigError: They cannot be divided into groups as the configuration says, the stream perturbs or blurs what has
-            only one group or stage, or it rewords instructions of tasks that are known by their position.
+        ConfigError: They cannot be divided into groups as the configuration says, all are in one group of an algorithm
+            that is not joint training, the pretraining learns some of them, the stream perturbs or blurs what has only
+            one group or stage, or it rewords instructions of tasks that are known by their position.
         UnknownNameError: A suite, an order or a task does not exist.
     """
     benchmark, stream = config.build("benchmark"), config.build("stream")
     tasks, before = benchmark.sequence(), config.build("pretrain").sequence()
     groups = stream.group_sizes(len(tasks), benchmark.group_size)
     plan = TaskPlan(before, tasks, stream, groups, stream.perturbations(groups))
+    if known := {task.digest for task in before} & {task.digest for task in tasks} if before else ():
+        names = [task.name for task in before if task.digest in known]
+        raise ConfigError(
+            f"pretrain learns {len(names)} of the run's tasks before their turn, such as {names[0]}, and transfer to "
+            "them would be measured as if they were new; name others in pretrain.suite or pretrain.tasks"
+        )
     reworded = plan.instructions[len(before) :] != tuple(task.language for task in tasks)
     if reworded and config.build("language").by_position:
         raise ConfigError(
@@ -191,6 +199,15 @@ def plan_tasks(config: Configuration) -> TaskPlan:
             "another, such as language=minilm"
         )
     stages, base = len(config.build("algo").stages(len(groups))), config.values["algo"].get("base_tasks")
+    if len(groups) == 1 < len(tasks) and not isinstance(config.build("algo"), Multitask):
+        key = (
+            f"stream.base_tasks={stream.base_tasks}"
+            if stream.base_tasks
+            else f"benchmark.group_size={len(tasks)}"
+        )
+        raise ConfigError(
+            f"{key} joins all tasks, and joint training is algo=multitask; lower it, or choose that"
+        )
     if stream.blur and stages == 1:
         raise ConfigError(
             "stream.blur has no effect on one stage, which has no neighbours; use stream.blur=0"

@@ -10,19 +10,18 @@ the process that started the sweep reads them all. A sweep that is started again
 """
 
 import hashlib
-import math
-import os
 import re
-import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
+from filelock import FileLock, Timeout
 from pydantic import Field
 
-from libero_env.parallel import is_running, process_start, this_machine
+from libero_env.parallel import this_process
 from libero_env.storage import read_json, write_json
 from libero_env.text import duration
 from libero_env.validation import validate
@@ -30,7 +29,7 @@ from lifelong.errors import ResultsError, RunLockedError, writing
 from lifelong.results.provenance import utc_now
 
 SWEEP_FILE, JOB_FILE, FOLDER = "sweep.json", "job.json", "sweep"
-Status = Literal["running", "done", "failed", "interrupted"]
+Status = Literal["done", "running", "failed", "interrupted", "lost"]
 # values that the name of every run has; and one run is evaluated under several shifts
 IN_NAME = ("seed", "algo", "policy", "benchmark", "run_id", "eval.shift")
 _LONGEST = 60  # characters of what a sweep adds to a run's name
@@ -45,15 +44,11 @@ class JobRecord:
         number: Number of the job in the sweep, from 0.
         key: Digest of what its results depend on.
         words: Its overrides of the configuration.
-        status: `running`; `done`; `failed`, with an error; `interrupted`, by a signal.
-        host: Name of the machine.
-        machine: Identity of the machine's process numbers.
-        pid: Process.
-        process_start: When the process started, [s] after the boot.
+        status: `running`; `done`; `failed`, with an error; `interrupted`, by a signal; `lost`: it ended without a word.
+        process: Machine and number of the process.
         started: When it began, UTC.
         seconds: Time that it took, [s].
         run: Directory of the run; None before there is one.
-        metrics: Metrics of the run that is done, by name.
         error: The error in one line.
         exit_status: Exit status that the error calls for; 0 without one.
     """
@@ -62,22 +57,12 @@ class JobRecord:
     key: str
     words: tuple[str, ...]
     status: Status
-    host: str = field(default_factory=socket.gethostname)
-    machine: str = field(default_factory=this_machine)
-    pid: Annotated[int, Field(ge=1, le=2**31 - 1)] = field(default_factory=os.getpid)
-    process_start: float = field(default_factory=process_start)
+    process: str = field(default_factory=this_process)
     started: str = field(default_factory=utc_now)
     seconds: float = 0.0
     run: str | None = None
-    metrics: Mapping[str, float | None] = field(default_factory=dict)
     error: str | None = None
     exit_status: Annotated[int, Field(ge=0, le=255)] = 0
-
-    @property
-    def is_lost(self) -> bool:
-        """Whether its process has ended without a word. False where that cannot be known: on another machine."""
-        here = self.status == "running" and self.machine == this_machine()
-        return here and not is_running(self.pid, self.process_start)
 
     @property
     def is_finished(self) -> bool:
@@ -113,7 +98,9 @@ class Sweep:
     @property
     def exit_status(self) -> int:
         """Exit status of the sweep: the worst of its jobs; 1 where one has not ended."""
-        unfinished = self.missing or any(job.status in ("running", "interrupted") for job in self.jobs)
+        unfinished = self.missing or any(
+            job.status in ("running", "interrupted", "lost") for job in self.jobs
+        )
         return max([*(job.exit_status for job in self.jobs), int(bool(unfinished))], default=0)
 
 
@@ -194,7 +181,9 @@ def read_job(file: Path) -> JobRecord | None:
     """
     if not file.is_file():
         return None
-    return validate(JobRecord, _read_json(file), prefix=(str(file),), error=ResultsError)
+    known = {key: value for key, value in _read_json(file).items() if key in JobRecord.__dataclass_fields__}
+    job: JobRecord = validate(JobRecord, known, prefix=(str(file),), error=ResultsError)
+    return replace(job, status="lost") if job.status == "running" and not _is_locked(file) else job
 
 
 def run_job(
@@ -227,14 +216,19 @@ def run_job(
         print(f"job {job.number} is done: {earlier.run}", flush=True)
         return earlier
     began = time.monotonic()
-    _write(file, job)
 
     def ended(status: Status, **more: Any) -> JobRecord:
         record = replace(job, status=status, seconds=round(time.monotonic() - began, 1), **more)
         _write(file, record)
         return record
 
+    lock = FileLock(file.with_suffix(".lock"))
     try:
+        with writing(file, "the record of the job"):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with suppress(Timeout):  # another start of the sweep has the job, and its run
+                lock.acquire(timeout=0)
+        _write(file, job)
         path = _when_free(learn)
     except (KeyboardInterrupt, SystemExit) as error:
         ended("interrupted", error=type(error).__name__)
@@ -242,34 +236,27 @@ def run_job(
     except Exception as error:  # noqa: BLE001 - told by kind; the other jobs of a sweep go on
         status, line = report(error)
         return ended("failed", error=line, exit_status=status)
-    return ended("done", run=str(path.resolve()), metrics=_metrics(path))
+    else:
+        return ended("done", run=str(path.resolve()))
+    finally:
+        lock.release()
 
 
 def status_lines(sweep: Sweep) -> Iterator[str]:
     """Yield the lines that say how far a sweep is: what runs, what failed, and what is left."""
-    counts = {name: sum(_state(job) == name for job in sweep.jobs) for name in _STATES}
+    counts = {name: sum(job.status == name for job in sweep.jobs) for name in get_args(Status)}
     told = [f"{count} {name}" for name, count in counts.items() if count]
     told += [f"{sweep.missing} not begun"] if sweep.missing else []
     of = "" if sweep.planned is None else f" of {sweep.planned} jobs"
     yield f"{sweep.folder}: {', '.join(told) or 'nothing begun'}{of}"
     common = set.intersection(*(set(job.words) for job in sweep.jobs)) if len(sweep.jobs) > 1 else set()
     for job in sweep.jobs:
-        state = _state(job)
         own = " ".join(word for word in job.words if word not in common)
-        took = "" if job.status == "running" else duration(job.seconds)
-        line = f"{job.number:>4}  {state:<11}  {took:>11}  {own}"
-        if state == "done" and (auc := job.metrics.get("auc")) is not None:
-            line += f"  AUC {auc:.3f}"
-        if state in ("running", "lost"):
-            line += f"  ({job.host}:{job.pid})"
+        took = "" if job.status in ("running", "lost") else duration(job.seconds)
+        line = f"{job.number:>4}  {job.status:<11}  {took:>11}  {own}"
+        if job.status in ("running", "lost"):
+            line += f"  ({job.process})"
         yield line + (f"\n      {job.error}" if job.error else "")
-
-
-_STATES = ("done", "running", "failed", "interrupted", "lost")
-
-
-def _state(job: JobRecord) -> str:
-    return "lost" if job.is_lost else job.status
 
 
 def _when_free(learn: Callable[[], Path]) -> Path:
@@ -285,11 +272,15 @@ def _when_free(learn: Callable[[], Path]) -> Path:
             time.sleep(_POLL)
 
 
-def _metrics(run: Path) -> dict[str, float | None]:
-    """Return the metrics in a run's results.json, by name."""
-    found = (_read_json(run / "results.json").get("metrics") or {}).items()
-    values = {name: entry["value"] for name, entry in found if isinstance(entry, dict) and "value" in entry}
-    return {name: value for name, value in values.items() if value is None or math.isfinite(value)}
+def _is_locked(file: Path) -> bool:
+    """Return whether the process that runs a job still does."""
+    lock = FileLock(file.with_suffix(".lock"))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        return True
+    lock.release()
+    return False
 
 
 def _write(file: Path, job: JobRecord) -> None:

@@ -58,7 +58,7 @@ class WandB(Tracker):
         project: str = "libero-lifelong",
         entity: str | None = None,
     ):
-        require_package("wandb", "wandb")
+        require_package("wandb")
         self.mode, self.project, self.entity = mode, project, entity
 
     def start(self, name: str, directory: str, config: Mapping[str, Any]) -> None:
@@ -102,7 +102,7 @@ class Trackio(Tracker):
     """
 
     def __init__(self, *, project: str = "libero-lifelong", space_id: str | None = None):
-        require_package("trackio", "trackio")
+        require_package("trackio")
         self.project, self.space_id = project, space_id
 
     def start(self, name: str, directory: str, config: Mapping[str, Any]) -> None:
@@ -134,7 +134,7 @@ class TensorBoard(Tracker):
     """
 
     def __init__(self) -> None:
-        require_package("tensorboard", "tensorboard")
+        require_package("tensorboard")
 
     def start(self, name: str, directory: str, config: Mapping[str, Any]) -> None:
         """Start a run; see `Tracker`."""

@@ -3,15 +3,19 @@
 Shape legend: B batch, T time, V views, H W C image, A action, D size of a reading, L language embedding.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import torch
 from pydantic import AfterValidator, Field
-from torch import Tensor
+
+if TYPE_CHECKING:  # judging needs no PyTorch
+    import torch
+    from torch import Tensor
 
 
 def _user_path(text: str) -> str:
@@ -81,6 +85,8 @@ def to_device(x: Tensor, device: torch.device | str) -> Tensor:
 
     An asynchronous copy to the host returns before its values are there, and whoever reads them at once gets others.
     """
+    import torch
+
     return x.to(device=device, non_blocking=torch.device(device).type == "cuda")
 
 
@@ -98,12 +104,12 @@ class Observation:
     proprio: Mapping[str, Tensor]
     language: Tensor
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> "Observation":
+    def map(self, change: Callable[[Tensor], Tensor]) -> Observation:
         """Return the observation with every tensor changed."""
         proprio = {name: change(reading) for name, reading in self.proprio.items()}
         return Observation(change(self.images), proprio, change(self.language))
 
-    def to(self, device: torch.device | str) -> "Observation":
+    def to(self, device: torch.device | str) -> Observation:
         """Return the observation on another device."""
         return self.map(partial(to_device, device=device))
 
@@ -133,35 +139,40 @@ class Batch:
     def __len__(self) -> int:
         return self.actions.shape[0]
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> "Batch":
+    def map(self, change: Callable[[Tensor], Tensor]) -> Batch:
         """Return the batch with every tensor changed."""
         changed = {name: change(getattr(self, name)) for name in _COLUMNS}
         is_pad = None if self.is_pad is None else change(self.is_pad)
         return replace(self, observation=self.observation.map(change), is_pad=is_pad, **changed)
 
-    def to(self, device: torch.device | str) -> "Batch":
+    def to(self, device: torch.device | str) -> Batch:
         """Return the batch on another device."""
         return self.map(partial(to_device, device=device))
 
-    def rows(self, rows: slice | Tensor) -> "Batch":
-        """Return some of the windows: those of a slice as views, those of indices as copies in the given order."""
+    def rows(self, rows: slice | Tensor) -> Batch:
+        """Return some rows, each a window: those of a slice as views, of indices (N,) as copies in their order."""
         return self.map(lambda x: x[rows])
 
     def padding(self) -> Tensor:
         """Return `is_pad`, False where it is not known, (B, T) bool."""
         if self.is_pad is None:
+            import torch
+
             return torch.zeros(self.actions.shape[:2], dtype=torch.bool, device=self.actions.device)
         return self.is_pad
 
-    def join(self, other: "Batch") -> "Batch":
-        """Return this batch followed by another one."""
-        a, b = self.observation, other.observation
+    def join(self, *others: Batch) -> Batch:
+        """Return this batch followed by others."""
+        import torch
+
+        batches = (self, *others)
+        seen = [batch.observation for batch in batches]
         joined = Observation(
-            torch.cat([a.images, b.images]),
-            {k: torch.cat([a.proprio[k], b.proprio[k]]) for k in a.proprio},
-            torch.cat([a.language, b.language]),
+            torch.cat([one.images for one in seen]),
+            {name: torch.cat([one.proprio[name] for one in seen]) for name in seen[0].proprio},
+            torch.cat([one.language for one in seen]),
         )
-        rest = {name: torch.cat([getattr(self, name), getattr(other, name)]) for name in _COLUMNS}
-        known = self.is_pad is not None or other.is_pad is not None
-        is_pad = torch.cat([self.padding(), other.padding()]) if known else None
+        rest = {name: torch.cat([getattr(batch, name) for batch in batches]) for name in _COLUMNS}
+        known = any(batch.is_pad is not None for batch in batches)
+        is_pad = torch.cat([batch.padding() for batch in batches]) if known else None
         return replace(self, observation=joined, is_pad=is_pad, **rest)

@@ -1,18 +1,26 @@
 """Fixtures shared by all tests."""
 
 import contextlib
+import ctypes
 import gc
 import importlib
 import os
+import resource
 import sys
-from collections import UserDict
+from collections import Counter, UserDict
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from libero_env import parallel
+from libero_env.paths import cache_dir
+from tests.harness import home
 
+# machine code is named by its source, and takes long to make: it alone is shared, and kept
+os.environ.setdefault("NUMBA_CACHE_DIR", str(cache_dir() / "compiled"))
+os.environ.setdefault("WARP_CACHE_PATH", str(cache_dir() / "compiled_by_warp"))
+home.move_in()
 REGISTRIES = (  # which users add to, besides those that are sent to workers
     "libero.libero.benchmark:BENCHMARK_MAPPING", "libero.libero.utils.mu_utils:MU_DICT",
     "libero.libero.utils.mu_utils:SCENE_DICT", "libero.libero.utils.object_utils:EXCEPTION_DICT",
@@ -20,6 +28,9 @@ REGISTRIES = (  # which users add to, besides those that are sent to workers
     "libero.lifelong.models.base_policy:REGISTERED_POLICIES"
 )  # fmt: skip
 os.fsync = lambda handle: None  # what a test writes does not outlive the machine
+LIBC = ctypes.CDLL(None)
+if hasattr(LIBC, "mallopt"):
+    LIBC.mallopt(-8, 2)  # M_ARENA_MAX: each of many threads would keep what it frees in one of its own
 KEPT: set[str] = set()  # modules that are not of a temporary folder
 
 
@@ -39,6 +50,18 @@ def forgetting(tmp_path_factory):
         if str(getattr(sys.modules[name], "__file__", None)).startswith(folder):
             del sys.modules[name]
     KEPT.update(sys.modules)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def giving_back() -> Iterator[None]:
+    """Give free memory back after each module: runs ask glibc to keep it for their process, here that of all tests."""
+    yield
+    if hasattr(LIBC, "malloc_trim"):
+        mmap_max, trim_threshold, top_pad = -4, -1, -2  # of mallopt(3)
+        for setting, value in ((mmap_max, 65536), (trim_threshold, 2**26), (top_pad, 2**17)):
+            LIBC.mallopt(setting, value)
+        gc.collect()
+        LIBC.malloc_trim(0)
 
 
 def registry(address: str) -> dict:
@@ -109,12 +132,42 @@ def pytest_collection() -> Iterator[None]:
         gc.set_threshold(10_000)
 
 
+PEAKS: dict[str, int] = {}  # process of tests -> KiB
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Note the most memory that this process had at once."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["peak"] = peak
+    elif not PEAKS:
+        PEAKS["pytest"] = peak
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node) -> None:
+    PEAKS[node.gateway.id] = getattr(node, "workeroutput", {}).get("peak", 0)
+
+
+def pytest_terminal_summary(terminalreporter) -> None:
+    """Say what memory was needed, and in one line why tests were skipped, the most frequent reason first."""
+    told = ", ".join(f"{name} {peak / 2**20:.2f} GB" for name, peak in sorted(PEAKS.items()))
+    terminalreporter.write_line(f"most memory at once: {told}")
+    reasons = Counter(str(report.longrepr[2]) for report in terminalreporter.stats.get("skipped", ()))
+    if reasons:
+        told = "; ".join(
+            f"{count}: {reason.removeprefix('Skipped: ')}" for reason, count in reasons.most_common(5)
+        )
+        terminalreporter.write_line(f"skipped {told}{'; and others' * (len(reasons) > 5)}")
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark as `unit` every test that is not marked as `sim`."""
+    """Mark as `unit` every test that is not marked as `sim`; begin with those that take long."""
     assert not parallel.user_entries(), (
         "a test module registers as it is imported; every worker would import it"
     )
     for item in items:
         if item.get_closest_marker("sim") is None:
             item.add_marker("unit")
+    items.sort(key=lambda item: item.get_closest_marker("slow") is None)

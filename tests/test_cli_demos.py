@@ -7,8 +7,9 @@ from pathlib import Path
 import h5py
 import pytest
 
-from libero_env.cli import demos as cli_demos
-from libero_env.cli import main as cli
+from libero_cli import main as cli
+from libero_cli.recording import resolved
+from libero_env.cli import recording as cli_demos
 from libero_env.cli.options import Size, parse
 from libero_env.demos.read import read_demos
 from libero_env.demos.record import RecordingReport
@@ -47,16 +48,16 @@ def test_options_are_recorded(file):
 
 def test_images_have_the_size_that_a_run_reads():
     request = cli_demos.RecordingRequest(task="libero_goal/3", training=("preset=laptop",))
-    (config,) = cli_demos.demo_configs(request)
+    (config,) = cli_demos.demo_configs(resolved(request))
     assert config.camera_size == (64, 64)
-    (config,) = cli_demos.demo_configs(replace(request, size=(32, 48)))
+    (config,) = cli_demos.demo_configs(resolved(replace(request, size=(32, 48))))
     assert config.camera_size == (32, 48)
 
 
 def test_the_seed_is_that_of_a_run_unless_it_is_given():
     request = cli_demos.RecordingRequest(task="libero_goal/3", training=("preset=laptop", "data.seed=7"))
     for given, seed in ((None, 7), (0, 0)):
-        (config,) = cli_demos.demo_configs(replace(request, seed=given))
+        (config,) = cli_demos.demo_configs(resolved(replace(request, seed=given)))
         assert config.seed == seed
 
 
@@ -64,7 +65,7 @@ def test_the_seed_is_that_of_a_run_unless_it_is_given():
 def test_the_robot_is_that_of_a_run_unless_it_is_given(given, robot):
     training = ("preset=laptop", "data.robot=robosuite-1.4.1")
     request = cli_demos.RecordingRequest(task="libero_goal/3", training=training, robot=given)
-    (config,) = cli_demos.demo_configs(request)
+    (config,) = cli_demos.demo_configs(resolved(request))
     assert config.robot == robot
 
 
@@ -151,7 +152,7 @@ def test_invalid_input_gives_one_line_and_a_status(argv, hint, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    "words", ["generate --task nowhere/0", "replay a.hdf5 --video a.gif", "rerender a b"]
+    "words", ["generate --task libero_goal/0", "replay a.hdf5 --video a.gif", "rerender a b"]
 )
 def test_cameras_have_names(words, capsys):
     with pytest.raises(SystemExit):

@@ -1,9 +1,15 @@
 """README.md, CONTRIBUTING.md and docs/: what they show runs, what they name exists, and nothing is left out of them."""
 
+import ast
+import base64
 import importlib.util
 import inspect
+import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from functools import cache
@@ -14,15 +20,17 @@ import pytest
 import torch
 import yaml
 
+from experiments.structure import measure
 from libero._adapters.config import load_config
-from libero_env.cli.main import ALL, bind, find, load, main
+from libero_cli.main import ALL, bind, find, load, main
 from libero_env.cli.options import options_of
 from libero_env.envs.env import LiberoEnv
 from libero_env.objects import catalog
 from libero_env.objects.builtin import builtin_names
 from libero_env.perturbations import KINDS
 from libero_env.tasks import Task, get_suite, suite_names
-from libero_env.tasks.builder import build_problem, load_scene
+from libero_env.tasks.builder import build_problem
+from libero_env.tasks.merging import load_scene
 from lifelong.algorithms import Algorithm
 from lifelong.composition import compose_run, swept
 
@@ -31,7 +39,7 @@ DOCS = ROOT / "docs"
 CONFIGS = ROOT / "configs"
 PAGES = sorted(DOCS.glob("*.md"))
 GUIDE = ROOT / "CONTRIBUTING.md"
-GENERATED = ("commands.md", "configuration.md")
+GENERATED = ("commands.md", "configuration.md", "python.md")
 NOT_RUN = r"<!-- not run: \S[^>]*-->\n+"  # before a block that is not, with the reason
 
 
@@ -41,7 +49,9 @@ def generate() -> ModuleType:
     spec = importlib.util.spec_from_file_location("docs_generate", DOCS / "generate.py")
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
+    sys.path.insert(0, str(DOCS))  # as MkDocs does
     spec.loader.exec_module(module)
+    sys.path.remove(str(DOCS))
     return module
 
 
@@ -87,18 +97,18 @@ def test_the_policy_of_the_guide_is_evaluated(tmp_path, monkeypatch, capsys):
     (code,) = blocks(DOCS / "evaluating.md", "python")
     (tmp_path / "my_policy.py").write_text(code)
     monkeypatch.chdir(tmp_path)
-    tiny = ["--suite", "libero_object/0", "--episodes", "2", "--horizon", "3"]
+    tiny = ["--suite", "libero_object/0", "--episodes", "2", "--horizon", "3", "--out", "eval/my_policy"]
     assert main(["eval", "my_policy:make", *tiny]) == 0
-    assert "eval/my_policy.make/eval.json" in capsys.readouterr().out
+    assert "eval/my_policy/eval.json" in capsys.readouterr().out
     (reading,) = re.findall(
         r"^```python\n(from libero_eval.evaluation_file.*?)^```", text(DOCS / "evaluating.md"), re.M | re.S
     )
     exec(compile(reading, "evaluating.md", "exec"), {})  # noqa: S102
     assert "libero_object/0 Estimate(value=0.0" in capsys.readouterr().out
-    (again,) = (line for line in lines(DOCS / "evaluating.md") if "my_policy.make/eval.json" in line)
+    (again,) = (line for line in lines(DOCS / "evaluating.md") if "my_policy/eval.json" in line)
     assert main(shlex.split(again)[1:]) == 0
-    assert "eval/my_policy.make/again/eval.json" in capsys.readouterr().out
-    assert main(["eval", "--status", "eval/my_policy.make"]) == 0
+    assert "eval/my_policy/again/eval.json" in capsys.readouterr().out
+    assert main(["eval", "--status", "eval/my_policy"]) == 0
     assert "1 of 1 units, 2 of 2 episodes" in capsys.readouterr().out
 
 
@@ -240,13 +250,13 @@ def test_hooks_of_the_guide_are_those_of_algorithms():
 
 
 def test_every_key_is_in_the_reference_with_its_meaning():
-    page = "".join(generate().configuration_reference().values())
+    page = "".join(generate().configuration_keys.configuration_reference().values())
     for group, option in OPTIONS:
         values = yaml.safe_load((CONFIGS / group / f"{option}.yaml").read_text(encoding="utf-8"))
         assert f"- `{group}={option}`" in page
         if f"`configs/{group}/{option}.yaml`\n\n```yaml" in page:  # shown whole
             continue
-        for key, *_ in generate().leaves(values or {}):
+        for key, *_ in generate().configuration_keys.leaves(values or {}):
             assert f"| `{group.replace('/', '.')}.{key}` |" in page
     rows = re.findall(r"^\| `[\w.]+` \|.*$", page, re.M)
     assert len(rows) > 100
@@ -302,7 +312,61 @@ def test_what_a_page_names_exists(page):
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: page.stem)
 def test_pages_are_short(page):
     assert len(text(page).split()) <= 1500
-    assert page.name != "README.md" or len(text(page).splitlines()) <= 130
+    assert page.name != "README.md" or len(text(page).splitlines()) <= 110
+
+
+NOT_OF_A_USER = ("make", "pip")  # CI does these: they install, train for minutes, and run all tests
+
+
+@pytest.mark.sim
+@pytest.mark.slow
+def test_commands_of_the_readme_run_one_after_another_and_both_tasks_are_learned(tmp_path, demos):
+    home = {"HOME": str(tmp_path / "home"), "LIBERO_CACHE": str(tmp_path / "cache"), "LIBERO_QUIET": "1"}
+    home["LIBERO_DEMOS"] = str(demos)  # recorded with other seeds of this training, in test_smoke
+    ran = []
+    for line in "".join(blocks(ROOT / "README.md", "sh")).splitlines():
+        program, *words = shlex.split(line, comments=True)
+        if program in NOT_OF_A_USER or words == ["doctor"]:
+            continue
+        assert program == "libero"
+        done = subprocess.run(
+            [sys.executable, "-m", "libero_cli", *words],
+            cwd=tmp_path,
+            env={**os.environ, **home, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, (line, done.stdout, done.stderr)
+        ran.append((words[0], done.stdout))
+    assert [word for word, _ in ran] == ["train", "eval", "eval", "compare", "tasks"]
+    (file,) = (tmp_path / "runs" / "first_steps").rglob("results.json")
+    (first, _), (_, second) = json.loads(file.read_text())["success_matrix"]["rates"]
+    assert first >= 0.6 and second >= 0.3
+    assert re.search(r"^mine +1 +10 ", ran[3][1], re.M) and re.search(r"^expert +1 +10 ", ran[3][1], re.M)
+
+
+def test_the_two_commands_stand_in_one_block_before_any_picture():
+    start = text(ROOT / "README.md").partition("![")[0]
+    block = start.partition("```sh\n")[2].partition("```")[0]
+    assert [line.split("#")[0].strip() for line in block.splitlines()] == ["make train", "make test"]
+    assert len(start.splitlines()) <= 40
+
+
+def test_small_scale_numbers_of_table_8_are_those_of_the_study():
+    study, page = text(ROOT / "experiments/algorithms/README.md"), text(DOCS / "reproducing.md")
+    paper = text(ROOT / "experiments/paper/README.md").split("## Table 8")[1]
+    columns = {"goal": (4, 2), "ten_demonstrations": (3, 4)}  # of the paper's table, of the page's
+    for name, (published, here) in columns.items():
+        table = study.split(f"<!-- {name}: metrics -->")[1].split("<!--")[0]
+        for algo in ("sequential", "er", "ewc", "packnet"):
+            row = re.search(rf"^\| `{algo}` \|.*$", page, re.M)[0].split("|")
+            theirs = re.search(rf"^\| {algo} \|.*$", paper, re.M)[0].split("|")[published + 1]
+            assert re.sub(r"±[.\d]+", "", theirs).split() == row[here].split()
+            measured = re.search(rf"^\| {algo} \|.*$", table, re.M)
+            cells = [measured[0].split("|")[c].split()[0] for c in (8, 10, 11)] if measured else ["not run"]
+            assert [c.replace("0.", ".").replace("-", "−") for c in cells] == row[here + 1].strip().split(
+                " / "
+            )
 
 
 def test_every_page_is_in_the_navigation():
@@ -311,7 +375,7 @@ def test_every_page_is_in_the_navigation():
             yield from [part] if isinstance(part, str) else pages(part)
 
     nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))["nav"]
-    names = ["index.md", *(page.name for page in PAGES)]  # the first is README.md
+    names = [*generate().ROOT_PAGES.values(), *(page.name for page in PAGES)]
     assert sorted(pages(nav)) == sorted(names)
 
 
@@ -319,7 +383,7 @@ def test_files_outside_lead_to_their_repository_where_it_is_known(monkeypatch):
     monkeypatch.delenv("GITHUB_REPOSITORY", raising=False)
     shown = "[First](../notebooks/1_quick_walkthrough.ipynb), [laptop](../experiments/laptop/README.md)"
     assert generate().on_page_markdown(shown) == (
-        "First (`notebooks/1_quick_walkthrough.ipynb`), `experiments/laptop/README.md`"
+        "First (`notebooks/1_quick_walkthrough.ipynb`), `experiments/laptop`"
     )
     monkeypatch.setenv("GITHUB_REPOSITORY", "someone/robots")
     monkeypatch.setenv("GITHUB_REF_NAME", "v1.0.0")
@@ -328,6 +392,36 @@ def test_files_outside_lead_to_their_repository_where_it_is_known(monkeypatch):
         f"[First (in Colab)]({colab}/notebooks/1_quick_walkthrough.ipynb), "
         "[laptop](https://github.com/someone/robots/blob/v1.0.0/experiments/laptop/README.md)"
     )
+
+
+def test_a_notebook_is_a_page_with_its_outputs(tmp_path, monkeypatch):
+    picture, module = b"\x89PNG", generate()
+    outputs = [
+        {"output_type": "stream", "name": "stdout", "text": ["two\n", "lines\n"]},
+        {"output_type": "stream", "name": "stderr", "text": ["progress"]},
+        {"output_type": "display_data", "data": {"image/png": base64.b64encode(picture).decode()}},
+    ]
+    cells = [
+        {
+            "cell_type": "markdown",
+            "source": ["# A title\n", "\n", "What it is, as in [tasks](../docs/tasks.md)."],
+        },
+        {"cell_type": "code", "source": ["print(1)"], "outputs": []},
+    ]
+    source, done = tmp_path / "one.ipynb", tmp_path / "done.ipynb"
+    source.write_text(json.dumps({"cells": cells}))
+    monkeypatch.setattr(module, "executed", lambda path: done)
+    content, pictures = module.notebook_page(source)
+    assert "not executed" in content and not pictures
+    cells[1]["outputs"] = outputs
+    done.write_text(json.dumps({"cells": cells}))
+    content, pictures = module.notebook_page(source)
+    assert "not executed" not in content and "progress" not in content
+    assert content.startswith("# A title\n") and "[tasks](tasks.md)" in content
+    assert "```python\nprint(1)\n```\n\n```text\ntwo\nlines\n```" in content
+    assert pictures == {"images/notebooks/one-0.png": picture}
+    monkeypatch.setattr(module, "NOTEBOOKS", [source])
+    assert module.notebook_list() == "- [A title](notebook-one.md): What it is, as in [tasks](tasks.md)."
 
 
 def test_the_gallery_is_whole():
@@ -358,3 +452,25 @@ def test_tests_that_are_named_exist():
     assert named
     for file, name in named:
         assert f"def {name}(" in (ROOT / file).read_text(), f"{file}::{name}"
+
+
+def test_the_guide_answers_questions_with_functions_that_exist():
+    places = re.findall(r"`([\w/]+\.py):([\w.]+)`", text(GUIDE))
+    assert len(places) > 12
+    for path, name in places:
+        nodes: list[ast.AST] = [ast.parse(text(ROOT / path))]
+        for part in name.split("."):
+            inside = [n for node in nodes for n in ast.iter_child_nodes(node)]
+            nodes = [n for n in inside if isinstance(n, ast.ClassDef | ast.FunctionDef) and n.name == part]
+        assert nodes, f"{path} has no {name}"
+
+
+def test_the_files_to_read_first_are_few_and_short():
+    block = text(GUIDE).split("Twelve files")[1].split("| question")[0]
+    files = [ROOT / name for name in re.findall(r"`([\w/]+\.py)`", block)]
+    assert len(files) == 12 and sum(measure.code_lines(text(f), ast.parse(text(f))) for f in files) < 3000
+
+
+def test_the_documents_have_no_more_words_than_were_agreed():
+    """A reader's time; what is added is paid for by what goes."""
+    assert measure.words([ROOT / "README.md", GUIDE, *DOCS.glob("*.md")]) <= 24_000

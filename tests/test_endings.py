@@ -9,17 +9,19 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import Mock
 
 import mujoco
 import numpy as np
 import pytest
 
+from libero_cli import main as cli
 from libero_env import memory, mujoco_compat
 from libero_env.cli import ending
-from libero_env.cli import main as cli
-from libero_env.demos.video import Mp4Writer
-from libero_env.errors import DEBUG_VARIABLE, LiberoError, code_of
+from libero_env.curating.video import Mp4Writer
+from libero_env.errors import DEBUG_VARIABLE, LiberoError, RenderError, code_of
 from libero_env.parallel import spawn_pool
+from libero_env.storage import atomic_path
 from libero_env.tasks import get_task
 from libero_eval.protocols.files import load_protocol
 from libero_eval.work.evaluation import Evaluation
@@ -105,6 +107,33 @@ def test_what_the_system_refuses_is_one_line(number, monkeypatch, capsys):
     assert capsys.readouterr().err == f"error: some/file: {os.strerror(number)}\n"
 
 
+def test_a_working_folder_that_was_removed_is_one_line(tmp_path, monkeypatch, capsys):
+    here = tmp_path / "here"
+    here.mkdir()
+    monkeypatch.chdir(here)
+    here.rmdir()
+    assert cli.main(["tasks", "list"]) == ending.MISTAKE
+    assert capsys.readouterr().err == "error: the working folder was removed; change to one that exists\n"
+    assert ending.report(ValueError("no folder")) == ending.DEFECT, "and errors are told there"
+
+
+def test_the_exporters_errors_are_this_packages(monkeypatch, capsys):
+    from libero_integrations.exports import results
+
+    with pytest.raises(AttributeError) as caught:
+        results.export_lerobot(None, Path())
+    assert ending.report(caught.value) == ending.DEFECT
+    assert "code of yours" not in capsys.readouterr().err
+
+
+def test_a_write_that_fails_names_its_file(tmp_path):
+    target = tmp_path / "kept.json"
+    target.write_text("old")
+    with pytest.raises(OSError, match=r"No space left.*kept\.json"), atomic_path(target):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert [path.name for path in tmp_path.iterdir()] == ["kept.json"] and target.read_text() == "old"
+
+
 def test_a_full_disk_is_one_line_for_videos_too(capsys):
     """PyAV is compiled, and its tracebacks name files that are not there; closing again raises nothing else."""
     pytest.importorskip("av")
@@ -138,7 +167,7 @@ def test_errors_by_kind(capsys):
     ("ending_policy:missing", "module ending_policy has no function missing"),
     ("ending_policy:number", "module ending_policy has a int, not a function, number"),
     ("ending_policy:nothing", "returns a NoneType without predict"),
-    ("ending_policy:misshapen", "the policy's cameras is 5; expected a list"),
+    ("ending_policy:misshapen", "the policy's cameras is 5; expected a valid array"),
     ("ending_policy:without_weights", "ending_policy:without_weights() raised FileNotFoundError: [Errno 2]"),
     ("ending_broken:make", "the module ending_broken raised File"),
     ("ending_lacking:make", "the module ending_lacking raised ModuleNotFoundError: No module named 'a_package"),
@@ -169,6 +198,40 @@ def test_a_policy_that_raises_shows_its_own_frames(here, capsys):
     assert "the actions of Policy.predict: expected finite numbers of shape" in capsys.readouterr().err
 
 
+@pytest.mark.sim
+def test_a_module_that_is_imported_registers_predicates_for_every_command(tmp_path):
+    """In a process of its own, as what is registered stays; workers know them, too."""
+    (tmp_path / "my_predicates.py").write_text(
+        "from libero_env import register_predicate\n"
+        "register_predicate('afloat', lambda view, name, height: view.body_pos(name)[2] > float(height))\n"
+    )
+    (tmp_path / "near.yaml").write_text(
+        "scene: kitchen\nobjects: [plate]\nplace: {plate_1: [0, 0]}\n"
+        "goal: (And (Afloat plate_1 5) (Up plate_1))\nlanguage: lift the plate\n"
+    )
+
+    def run(*words):
+        command = [sys.executable, "-m", "libero_cli", *words]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        return done.returncode, done.stdout + done.stderr
+
+    status, said = run("tasks", "lint", "near.yaml", "--starts", "1")
+    assert status == ending.MISTAKE and "near.yaml:4: (Afloat plate_1 5): Afloat is not a predicate" in said
+    status, said = run("tasks", "lint", "near.yaml", "--starts", "1", "--import", "my_predicates")
+    assert (status, said) == (0, "1 task: 0 errors, 0 warnings, 0 notes\n")
+    words = ("tasks", "certify", "near.yaml", "--states", "2", "--jobs", "2")
+    status, said = run("--import", "my_predicates", *words)
+    assert "Afloat" not in said.replace("(Afloat plate_1 5)", "") and "0/2 = 0.0 %" in said and status == 1, (
+        said
+    )
+    for module, message in (
+        ("my_predicatez", "there is no my_predicatez.py in "),
+        ("x.py/", "expected a module"),
+    ):
+        status, said = run("tasks", "list", "--import", module)
+        assert status == ending.MISTAKE and message in said and said.count("\n") == 1
+
+
 def test_an_error_keeps_its_type_where_it_is_caught():
     with pytest.raises(ValueError, match="mine") as found, code_of("the policy"):
         raise ValueError("mine")
@@ -185,17 +248,6 @@ def test_debug_shows_the_traceback_of_a_mistake(words, here, capsys):
     assert cli.main(words) == ending.MISTAKE
     found = capsys.readouterr().err
     assert found.startswith("Traceback") and "\nerror: unknown task 'nope'" in found
-
-
-def test_debug_reaches_train(here, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["train.py"])
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    assert launch.main(["preset=smoke", "--debug", "algo=evc"]) == ending.MISTAKE
-    found = capsys.readouterr().err
-    assert found.startswith("Traceback") and "\nerror: unknown algo 'evc'" in found
-    monkeypatch.setenv(DEBUG_VARIABLE, "1")
-    assert launch.main(["preset=smoke", "algo=evc"]) == ending.MISTAKE
-    assert capsys.readouterr().err.startswith("Traceback")
 
 
 OWN_ALGORITHM = """
@@ -224,7 +276,7 @@ def test_an_algorithm_of_the_user_shows_its_own_frames(here, monkeypatch, capsys
 
 def test_closed_streams_lead_nowhere(here):
     """Files that are opened would take their numbers; the status is that of the command, as in a cron job."""
-    command = [sys.executable, "-m", "libero_env.cli"]
+    command = [sys.executable, "-m", "libero_cli"]
     right, wrong = (["protocols", "list"], 0), (["eval", "nowhere", "--out", "out"], 2)
     for closed, (words, status) in ((">&-", right), ("2>&-", wrong), ("<&- >&- 2>&-", wrong)):
         line = " ".join(["exec", '"$@"', closed])
@@ -237,12 +289,12 @@ def test_closed_streams_lead_nowhere(here):
     assert not Path("out").exists()
 
 
-def test_mistyped_options_are_one_line(capsys):
+def test_mistyped_options_are_named(capsys):
     for words in (["eval", "--sise", "3"], ["tasks", "list", "--order", "x"]):
         with pytest.raises(SystemExit, match="2"):
             cli.main(words)
         found = capsys.readouterr().err
-        assert found.startswith("error: ") and found.count("\n") == 1 and "--help" in found
+        assert words[-2] in found and "--help" in found and "Traceback" not in found
 
 
 @pytest.mark.parametrize("words", [  # of each kind; that every number has a range is tested in tests/fuzz
@@ -259,12 +311,12 @@ def test_mistyped_options_are_one_line(capsys):
     ["demos", "generate", "--task", "libero_goal/3", "--size", "99999999"],
     ["objects", "add", "a.obj", "--mass", "-1"],
 ], ids=" ".join)  # fmt: skip
-def test_numbers_out_of_range_are_one_line(words, capsys):
+def test_numbers_out_of_range_are_named(words, capsys):
     with pytest.raises(SystemExit, match="2"):
         cli.main(words)
     found = capsys.readouterr().err
     option = [word for word in words if word.startswith("--")][-1]
-    assert found.startswith("error: ") and option in found and found.count("\n") == 1
+    assert option in found and "Traceback" not in found
 
 
 @pytest.mark.parametrize(("words", "message"), [
@@ -342,7 +394,7 @@ def heeded():
         signal.signal(number, handler)
 
 
-def test_signals_interrupt_once_and_keep_what_is_ignored(heeded):
+def test_signals_interrupt_once_and_keep_what_is_ignored(heeded, monkeypatch):
     def handlers() -> list[object]:
         return [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
 
@@ -352,7 +404,12 @@ def test_signals_interrupt_once_and_keep_what_is_ignored(heeded):
             try:
                 signal.raise_signal(number)
             finally:
-                assert handlers() == [signal.SIG_DFL] * 3, "a second signal ends the process"
+                signal.raise_signal(number)  # at once, as `timeout` sends it: the same request
+                with monkeypatch.context() as patch:
+                    patch.setattr(ending.time, "monotonic", Mock(return_value=time.monotonic() + 2))
+                    patch.setattr(ending.signal, "raise_signal", ended := Mock())
+                    signal.getsignal(number)(number, None)
+                assert ended.call_args.args == (number,) and signal.getsignal(number) is signal.SIG_DFL
         assert ending.report(found.value) == 128 + number
     assert handlers() == before
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -374,7 +431,7 @@ def test_a_killed_worker_is_told():
 def started(words: list[str], folder: Path, ready: Callable[[int], bool]) -> subprocess.Popen:
     """A process of `libero`, as soon as it is ready, by its number."""
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-m", "libero_env.cli", *words]
+    command = [sys.executable, "-m", "libero_cli", *words]
     process = subprocess.Popen(command, cwd=folder, env=env, stderr=subprocess.PIPE, text=True)
     assert within(lambda: ready(process.pid) or process.poll() is not None) and process.poll() is None
     return process
@@ -433,7 +490,7 @@ def test_a_signal_ends_an_evaluation_and_its_workers(name, here):
         f"interrupted by {name}; eval/ending_policy.waiting keeps what is done; the same command goes on"
         in told
     )
-    assert "Traceback" not in told and not list(here.rglob("claims/*.json"))
+    assert "Traceback" not in told and not list(here.rglob("claims/*"))
 
 
 @pytest.mark.sim
@@ -449,3 +506,52 @@ def test_a_signal_ends_a_recording_and_its_workers(name, here, heeded):
         assert process.returncode == 129
         assert "interrupted by SIGHUP; what is recorded is kept; the same command goes on" in told
         assert "Traceback" not in told
+
+
+EVAL = ["eval", "expert", "--suite", "libero_object/0", "--episodes", "1", "--horizon", "2", "--out", "made"]
+TRAIN = ["train", "preset=smoke", "device=cpu", "runs_dir=made"]
+
+
+@pytest.mark.parametrize(
+    ("words", "place"),
+    [
+        (EVAL, "libero_env.cli.options.parse"),
+        (EVAL, "libero_eval.plan.plan_evaluation"),
+        (TRAIN, "lifelong.jobs._launch"),
+        (TRAIN, "lifelong.experiment._build_contexts"),
+    ],
+)
+def test_an_interrupt_before_anything_is_begun_says_so(words, place, here, monkeypatch, heeded, capsys):
+    monkeypatch.setattr(place, lambda *args: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(sys, "argv", ["libero"])
+    assert cli.main(words) == 130
+    assert capsys.readouterr().err == "interrupted; nothing was begun\n" and not (here / "made").exists()
+    monkeypatch.undo()
+    monkeypatch.chdir(here)
+    if words is EVAL:
+        assert cli.main(["eval", "--status", "made"]) == 2
+        assert capsys.readouterr().err == "error: made holds no evaluation: none was begun there\n"
+
+
+@pytest.mark.parametrize("words", [EVAL, TRAIN, ["robustness", *EVAL[1:], "--kinds", "light"]])
+def test_where_nothing_can_be_drawn_no_folder_is_made(words, here, monkeypatch, capsys):
+    def broken():
+        raise RenderError("no OpenGL backend works here")
+
+    monkeypatch.setattr("libero_env.sim.render._opengl", broken)
+    monkeypatch.setattr(sys, "argv", ["libero"])
+    assert cli.main(words) == 2
+    assert capsys.readouterr().err == "error: no OpenGL backend works here\n"
+    assert not list((here / "made").rglob("*.json*"))
+
+
+def test_a_unit_that_cannot_be_drawn_is_not_tried_again(here, monkeypatch, capsys):
+    tried = []
+
+    def broken(self, unit, *rest):
+        tried.append(unit)
+        raise RenderError("the window is gone")
+
+    monkeypatch.setattr(Evaluation, "evaluate", broken)
+    assert cli.main(EVAL) == 2
+    assert len(tried) == 1 and capsys.readouterr().err.endswith("error: the window is gone\n")

@@ -11,24 +11,27 @@ from pathlib import Path
 import pytest
 
 import libero
+import libero_cli
 import libero_env
 import libero_eval
 import lifelong
+from experiments.benchmarks.start_up import LISTS, REFUSED
+from libero_cli.main import ALL
 
 ROOT = Path(__file__).parents[1]
-NEEDS_EXTRA = "libero_env.sim.mjwarp."  # modules of the back end `warp`, whose package looks for GPUs
+NEEDS_EXTRA = "libero_env.warp."  # modules of the back end `warp`, whose package looks for GPUs
 ENV_SIDE = sorted(
     module.name
     for module in pkgutil.walk_packages(libero_env.__path__, "libero_env.")
     if not module.name.startswith(NEEDS_EXTRA)
 )
+COMMAND = sorted(m.name for m in pkgutil.walk_packages(libero_cli.__path__, "libero_cli."))
 FACADE = sorted(module.name for module in pkgutil.walk_packages(libero.__path__, "libero."))
 LEARNING_SIDE = sorted(module.name for module in pkgutil.walk_packages(lifelong.__path__, "lifelong."))
 JUDGING_SIDE = sorted(module.name for module in pkgutil.walk_packages(libero_eval.__path__, "libero_eval."))
 
-# What other packages do when they are imported: numba tries whether its cache can be written, matplotlib lists the
-# fonts once per machine, gymnasium silences pygame.
-THEIRS = re.compile(r"/__pycache__|/matplotlib|/\.(config|cache)$")
+# What other packages do when they are imported: matplotlib lists the fonts once per machine, gymnasium silences pygame.
+THEIRS = re.compile(r"/matplotlib|/\.(config|cache)$")
 THEIR_VARIABLES = ("PYGAME_HIDE_SUPPORT_PROMPT",)
 
 # Imports groups of modules and tells what each changed; each time as if nothing of ours were there yet. The audit hook
@@ -92,9 +95,9 @@ limited._limit_memory()
 home = Path.home()
 check_trusted(home)
 write_json(home / "content.json", {}, fsync=True)
-claim = Claims(home).take("a")
-assert Claims(home).take("a") is None
-Claims(home).release(claim)
+claims = Claims(home)
+assert claims.take("a") and not Claims(home).take("a")
+claims.release("a")
 with LiberoEnv("libero_object/0", cameras=()) as env:
     env.reset(seed=0)
     env.step([0.0] * 7)
@@ -121,6 +124,7 @@ def imported(tmp_path_factory) -> dict[str, dict]:
     groups = {
         "libero_env": ENV_SIDE,
         "libero": FACADE,
+        "libero_cli": COMMAND,
         "libero_eval": JUDGING_SIDE,
         "lifelong": LEARNING_SIDE,
     }
@@ -128,7 +132,7 @@ def imported(tmp_path_factory) -> dict[str, dict]:
     return dict(zip(groups, found, strict=True))
 
 
-@pytest.mark.parametrize("package", ["libero_env", "libero", "lifelong", "libero_eval"])
+@pytest.mark.parametrize("package", ["libero_env", "libero", "libero_cli", "lifelong", "libero_eval"])
 def test_importing_does_nothing(package, imported):
     done = imported[package]
     theirs = {f"set {name}" for name in THEIR_VARIABLES}
@@ -150,7 +154,55 @@ def test_the_environment_loads_nothing_of_learning(imported):
     assert not {"lifelong", "warp", "torch", "hydra", "omegaconf", "robosuite", "matplotlib"} & set(loaded)
 
 
-def test_the_command_line_starts_light(tmp_path):
-    """`libero --help` must not wait for PyTorch or MuJoCo."""
-    ((_, loaded),) = (done.values() for done in import_in_fresh_process(tmp_path, ["libero_env.cli.main"]))
-    assert not {"torch", "mujoco", "hydra", "transformers", "matplotlib", "numba"} & set(loaded)
+def test_the_environment_names_nothing_of_learning():
+    """Nor in its texts and data: a name in a text is an import that no contract sees."""
+    named = re.compile(r"(?<![\w-])(lifelong|libero_(eval|cli))\b")
+    files = [f for f in (ROOT / "libero_env").rglob("*") if f.suffix in (".py", ".pyi", ".yaml")]
+    lines = [f"{f.relative_to(ROOT)}: {line}" for f in files for line in f.read_text("utf-8").splitlines()]
+    assert [line for line in lines if named.search(line.partition(": ")[2])] == []
+
+
+# Runs command lines, each in a child of a process that has imported the command alone; tells status and modules.
+_COMMANDS = """
+import contextlib, io, json, os, sys
+import libero_eval.words, typeguard  # what most of them load
+from libero_cli import main
+for words in json.loads(sys.argv[1]):
+    read, write = os.pipe()
+    if not os.fork():
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            try:
+                status = main.main(words.split())
+            except SystemExit as ended:
+                status = ended.code
+        os.write(write, json.dumps([status, sorted(sys.modules)]).encode())
+        os._exit(0)
+    os.close(write)
+    print(os.fdopen(read).read())
+    os.wait()
+"""
+HEAVY = {
+    *("gymnasium", "h5py", "hydra", "jinja2", "matplotlib", "mujoco", "numba", "PIL.Image", "scipy.special"),
+    *("scipy.stats", "torch", "transformers", "trimesh"),
+}
+MAY = {
+    "a key of the configuration": {"hydra"},
+    "a value of the configuration": {"gymnasium", "h5py", "hydra", "mujoco", "PIL.Image"},
+    "power": {"scipy.special"},
+}
+
+
+def test_commands_say_what_they_are_and_what_is_wrong_before_they_load_anything_heavy(tmp_path):
+    lines = {f"{name} --help": (0, set()) for name in ALL} | {
+        line: (0, MAY.get(line, set())) for line in LISTS
+    }
+    lines |= {line: (2, MAY.get(kind, set())) for kind, refused in REFUSED.items() for line in refused}
+    env = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", _COMMANDS, json.dumps([*lines])]
+    done = subprocess.run(command, env=env, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    ended = dict(zip(lines, map(json.loads, done.stdout.splitlines()), strict=True))
+    assert {line: status for line, (status, _) in ended.items()} == {
+        n: status for n, (status, _) in lines.items()
+    }
+    loaded = {line: HEAVY & {*names} - lines[line][1] for line, (_, names) in ended.items()}
+    assert not {line: names for line, names in loaded.items() if names}

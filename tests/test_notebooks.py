@@ -16,8 +16,10 @@ ROOT = Path(__file__).parents[1]
 PICTURES = {"1_quick_walkthrough": 6, "2_scenes_and_tasks": 2, "3_custom_objects": 3, "4_algorithms": 1}
 LARGEST = 300_000  # bytes
 SHORTER = {  # than for a reader
+    '"data.demos=20",': '"data.demos=1", "train.epochs=1", "train.steps_per_epoch=10", "train.warmup_steps=0", '
+    '"eval.horizon=20", "eval.episodes=2", "eval.curve_episodes=1",',
     "data.demos=40": "data.demos=4",
-    '"train.epochs=4",': '"train.epochs=1", "train.steps_per_epoch=20",',
+    '"train.epochs=4",': '"train.epochs=1", "train.steps_per_epoch=20", "train.warmup_steps=0",',
     '"eval.curve=none",': '"eval.curve=none", "eval.horizon=60",',
 }
 
@@ -38,6 +40,7 @@ def test_notebooks_are_small_and_sound(name):
 
 @pytest.mark.sim
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a kernel that ends late
 @pytest.mark.parametrize("name", PICTURES)
 def test_notebook(name, tmp_path, monkeypatch):
     monkeypatch.setenv("LIBERO_ASSETS", "builtin")  # whatever is installed

@@ -13,7 +13,7 @@ import libero_eval
 import lifelong
 
 OFFERED = {
-    "libero_env": {*("BatchEnv", "Camera", "Expert", "LiberoEnv", "LiberoError", "SubprocEnv", "Suite", "Task",
+    "libero_env": {*("BatchEnv", "Camera", "Expert", "LiberoEnv", "LiberoError", "Suite", "Task",
      "UnknownNameError"), *("ensure_demos", "get_suite", "get_task", "make_task", "read_demos", "read_task"),
      *("register_object", "register_predicate")},
     "lifelong": {*("Algorithm", "Batch", "EvalSettings", "FitSettings", "LifelongError", "Policy", "PolicySpec"),

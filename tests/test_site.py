@@ -15,8 +15,8 @@ ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 TAGS = re.findall(
     r"\w+",
-    "a article aside body br button circle code dd details div dl dt em figcaption figure footer form g h1 h2 h3 h4 h5 "
-    "h6 head header hr html i img input kbd label li line link main meta nav ol option p path polygon polyline pre "
+    "a article aside b body br button circle code dd details div dl dt em figcaption figure footer form g h1 h2 h3 h4 "
+    "h5 h6 head header hr html i img input kbd label li line link main meta nav ol option p path polygon polyline pre "
     "rect script small span strong style sub summary sup svg table tbody td text th thead title tr ul use video",
 )
 
@@ -44,7 +44,8 @@ def built(site: Path) -> Iterator[tuple[Path, str]]:
 def test_every_page_is_built_and_fetches_nothing(site):
     names = {page.stem for page, _ in built(site)}
     assert {page.stem for page in PAGES} < names
-    assert {"commands-evaluation", "configuration-algo"} < names
+    assert {"commands-evaluation", "configuration-algo", "python-lifelong", "contributing", "changes"} < names
+    assert {f"notebook-{path.stem}" for path in ROOT.glob("notebooks/*.ipynb")} < names
     for page, content in built(site):
         assert "<!-- generated" not in content
         fetched = re.findall(r'<(?:script|img|link)[^>]+(?:src|href)="(https?://[^"]+)"', content)

@@ -1,4 +1,4 @@
-"""What happens along a stream: plasticity, forgetting by distance and by what was learned since, and cost.
+"""What happens along a stream: plasticity, alone and beside single_task, forgetting by distance and likeness, and cost.
 
     python experiments/algorithms/along.py libero_130     # the finished runs of a stream of the study
 
@@ -10,17 +10,16 @@ import argparse
 import re
 from collections.abc import Callable, Iterator
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
+from kept import share
+from reading import difference, of_method, table
 from scipy.stats import linregress
-from table import finished, table
 
 from libero_env.text import duration, quantity
+from libero_eval.stats.episodes import Counts, mcnemar_exact
 from lifelong.language.encoder import embed
-from lifelong.results.log import ResultLog
 from lifelong.results.results import Results
-from lifelong.stats.episodes import Counts, mcnemar_exact
 
 DISTANCES = (1, 2, 4, 10, 30, 60, 130)  # tasks learned since; ends of bins
 SIMILARITIES = (-1.0, 0.5, 0.7, 0.8, 0.9, 1.01)  # largest cosine to the instructions learned since
@@ -39,6 +38,51 @@ def trend(results: Results) -> Iterator[tuple[str, float]]:
     learned = np.diag(results.success_matrix()[0])
     line = linregress(np.linspace(0, 1, len(learned)), learned)
     yield from {"from the first to the last": line.slope, "standard error, of a run": line.stderr}.items()
+
+
+def beside_alone(runs: dict[str, dict[int, Results]]) -> list[str]:
+    """Return a table of success just after learning less that of `single_task`, on the same tasks and starts."""
+    alone, rows = runs["single_task"], []
+    for method, by_seed in ((m, found) for m, found in runs.items() if m != "single_task"):
+        slopes, second = [], []
+        for seed, results in by_seed.items():
+            less = np.diag(results.success_matrix()[0]) - np.diag(alone[seed].success_matrix()[0])
+            slopes.append(linregress(np.linspace(0, 1, len(less) - 1), less[1:]).slope)
+            second.append(less[1])
+        pairs = [(results, alone[seed]) for seed, results in by_seed.items()]
+        rows.append(
+            [method, difference(slopes), *_episodes(pairs, 0, 1, 2), difference(second), *_episodes(pairs, 1)]
+        )
+    heads = [
+        "just learned, less `single_task`",
+        "rises from task 2 to 10",
+        "tasks 1 to 3",
+        "only it, only alone, p",
+    ]
+    return table([*heads, "task 2, by seed", "task 2", "only it, only alone, p"], rows)
+
+
+def _episodes(pairs: list[tuple[Results, Results]], *tasks: int) -> tuple[str, str]:
+    """Return the mean success of two runs on tasks just learned, and McNemar's test of their episodes."""
+    found = []
+    for task in tasks:
+        for both in pairs:
+            cells = [results.evaluation("matrix", task, task) for results in both]
+            outcomes = [dict(zip(cell.init_states, cell.successes, strict=True)) for cell in cells]
+            found += [(outcomes[0][start], outcomes[1][start]) for start in outcomes[0].keys() & outcomes[1]]
+    x, y = np.array(found).T
+    counts = Counts(*(int(c.sum()) for c in (x & y, x & ~y, ~x & y, ~x & ~y)))
+    tested = f"{counts.only_first}, {counts.only_second}, {mcnemar_exact(counts):.2g}"
+    return f"{x.mean():.2f} for {y.mean():.2f}", tested
+
+
+def streams(stream: str) -> dict[str, dict[int, Results]]:
+    """Return the results of the finished runs by method and seed; all tasks at once are no stream."""
+    return {
+        method: runs
+        for method, runs in of_method(stream).items()
+        if not any(np.isnan(results.success_matrix()[0][0, 0]) for results in runs.values())
+    }
 
 
 def cells(results: Results) -> Iterator[tuple[int, int, tuple[float, float]]]:
@@ -129,25 +173,27 @@ def main() -> None:
     )
     parser.add_argument("stream", help="name of a stream of the study")
     stream = parser.parse_args().stream
-    runs: dict[str, list[Results]] = {}
-    for run, folder in finished(stream):
-        results = ResultLog(Path(folder) / "results.jsonl").read()
-        if not np.isnan(results.success_matrix()[0][0, 0]):  # all tasks at once are no stream
-            runs.setdefault(run.method, []).append(results)
+    by_seed = streams(stream)
+    runs = {method: list(found.values()) for method, found in by_seed.items()}
     for title, curve in (("just learned", plasticity), ("a line through it", trend)):
         show(title, {method: [dict(curve(r)) for r in found] for method, found in runs.items()})
+    if "single_task" in runs:
+        print("\n".join(beside_alone(by_seed)), end="\n\n")
     for measure in (by_distance, by_row, by_similarity):
         cut = {method: [dict(measure(results)) for results in found] for method, found in runs.items()}
         lost = {
             method: [{name: forgotten(pairs) for name, pairs in seed.items()} for seed in seeds]
             for method, seeds in cut.items()
         }
-        first = next(iter(cut.values()))  # all methods are measured in the same cells
+        first = next(iter(cut.values()))  # all methods are measured in the same cells with a seed
         show("forgotten", lost, {name: sum(len(seed[name]) for seed in first) for name in first[0]})
     if pairs := list(at_end({method: found[0] for method, found in runs.items()})):
         heads = ["at the end", "only the first", "only the second", "p (McNemar)"]
         print("\n".join(table(heads, pairs)), end="\n\n")
     spent = {method: dict(costs(found[0])) for method, found in runs.items()}
+    for method, moments in spent.items():
+        for learned in (m for m in MOMENTS if f"stored, after {m}" in moments):
+            moments[f"windows kept, after {learned}"] = share(stream, method, learned)
     names = list(next(iter(spent.values())))
     print(
         "\n".join(

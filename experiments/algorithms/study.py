@@ -3,18 +3,16 @@
     python experiments/algorithms/study.py list                # each run: done or missing, its cost, its command
     python experiments/algorithms/study.py run --minutes 120   # go on with what is missing, until it is stopped
     python experiments/algorithms/study.py report              # tables and pictures of what is finished
-    python experiments/algorithms/table.py                     # puts the tables into README.md
 
-plan.md has what is to be run; README.md what came of it. A run is a process of its own on one thread. One that was
-stopped goes on where it was; of a finished one the records are kept in records/, compressed. All methods are run with
-one seed before the next, so that what is finished can be compared at any time. Records of another configuration than
-today's count as missing.
+plan.md has what is to be run. A run is a process of its own on one thread. One that was stopped goes on where it was;
+of a finished one the records are kept in records/, compressed. All methods are run with one seed before the next, so
+that what is finished can be compared at any time. Records of another configuration than today's count as missing.
 """
 
 import argparse
+import copy
 import json
 import lzma
-import math
 import os
 import re
 import shlex
@@ -27,12 +25,14 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import chdir
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import yaml
 from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig, OmegaConf
 
 from libero_env.storage import atomic_path
 from lifelong.composition import config_folder
@@ -41,17 +41,26 @@ from lifelong.report.comparison import Plan
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import result_relevant
-from lifelong.results.shifts import shift_scores
 from lifelong.settings import Configuration, plain_data
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[1]
 RECORDS = HERE / "records"
-REFERENCES = ("er", "sequential", "single_task")  # that each other method is compared with
-# an order of the tasks and demonstrations for each seed: what they do is in the differences between seeds
-BY_SEED = ("seed", "benchmark.order_seed", "data.seed")
-SETTINGS = ("threads=1", "eval.sim_threads=1", "progress=false")
-WINDOW = 64 * 64 * 3 * 2 + 4 * (7 + 2 + 3 + 7)  # bytes: two images, readings and the action
+SETTINGS = ("threads=1", "eval.sim_threads=1", "eval.beside=false", "progress=false")
+Draws = tuple[int, int, int]  # seeds of learning, of the order of tasks, and of the demonstrations
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method as a study runs it.
+
+    Args:
+        overrides: What its command has.
+        seeds: Number of seeds, each with an order of the tasks and demonstrations of its own.
+    """
+
+    overrides: str
+    seeds: int = 3
 
 
 @dataclass(frozen=True)
@@ -59,81 +68,150 @@ class Study:
     """Methods that are compared with each other.
 
     Args:
-        name: Its folder beside this file, and the first part of its runs' names.
-        methods: What the command of each has, by its name in tables, in the order in which they are run.
-        seeds: Number of seeds of each.
+        name: The first part of its runs' names.
         overrides: What all its commands have.
-        shifts: Perturbations under which finished runs are evaluated besides, each alone.
-        shifted: The methods of which they are.
+        methods: By their names in tables, in the order in which they are run.
+        draws: Seeds of each run in their order, beside those of the methods.
     """
 
     name: str
-    methods: Mapping[str, tuple[str, ...]]
-    seeds: int
-    overrides: tuple[str, ...]
-    shifts: tuple[str, ...] = ()
-    shifted: tuple[str, ...] = ()
+    overrides: str
+    methods: Mapping[str, Method]
+    draws: tuple[Draws, ...] = ()
 
 
-def _plain(*algorithms: str) -> dict[str, tuple[str, ...]]:
-    return {name: (f"algo={name}",) for name in algorithms}
+WINDOWS = 18_900  # of all ten tasks, about: what a share of them is in windows
+FLAT = 1_063  # bytes of a compressed window, about
 
 
-def _memories(megabytes: float) -> dict[str, tuple[str, ...]]:
-    """Replay of windows as they are and compressed, in as many bytes."""
+def _er(percent: float, seeds: int = 3, batch: int = 32) -> Method:
+    """Replay of a share of all windows; half of a step's windows are replayed."""
+    budget = round(WINDOWS * percent / 100)
+    return Method(f"algo=er algo.memory.budget={budget} train.batch_size={batch}", seeds)
+
+
+def _compressed(percent: float, seeds: int = 3) -> Method:
+    budget = round(WINDOWS * FLAT * percent / 100_000) * 1000
+    return Method(f"algo=compressed_er algo.budget={budget} train.batch_size=32", seeds)
+
+
+def _rank(algorithm: str, rank: int, seeds: int = 3) -> Method:
+    return Method(f"algo={algorithm} algo.rank={rank} algo.alpha={2 * rank}", seeds)
+
+
+GOAL = (
+    "benchmark=libero_goal data.demos=20 train.steps_per_epoch=150 eval.episodes=10 eval.horizon=240 "
+    # a curve's one point has the starts of the matrix, whose rollouts it shares
+    "eval.every=8 eval.curve_episodes=10 eval.selection=reporting eval.cells=sampled eval.cells_share=0.2 "
+    "eval.record_every=0"
+)
+FRONTIER = Study(
+    "frontier",
+    GOAL,
+    {
+        "sequential": Method("algo=sequential"),
+        "er 2": _er(2, 5),
+        "compressed_er 2": _compressed(2, 5),
+        "compressed_er 10": _compressed(10, 5),
+        "packnet": Method("algo=packnet train.epochs=4 eval.every=4", 5),  # as many updates after pruning
+        "lora 16": _rank("lora", 16, 5),
+        "iscil 16": _rank("iscil", 16, 5),
+        "single_task": Method("algo=single_task"),
+        "er 10": _er(10),
+        "er 0.5": _er(0.5),
+        "er 50": _er(50),
+        "compressed_er 0.5": _compressed(0.5),
+        "compressed_er 50": _compressed(50),
+        "lora 1": _rank("lora", 1),
+        "iscil 1": _rank("iscil", 1),
+        "lora 4": _rank("lora", 4),
+        "iscil 4": _rank("iscil", 4),
+        "er 2, whole batch": _er(2, batch=64),
+    },
+)
+CROSSED = tuple((seed, order, data) for order in (1, 2, 3) for data in (1, 2, 3) for seed in (1, 2))
+SEEDS = Study(  # with those of the frontier that have one number for all three
+    "seeds",
+    GOAL,
+    {name: Method(FRONTIER.methods[name].overrides, 0) for name in ("sequential", "er 2")},
+    tuple(draws for draws in CROSSED if len({*draws}) > 1),
+)
+_FROZEN = "policy=bc_transformer_frozen policy.encoder.weights="
+STARTS = Study(
+    "starts",
+    f"{GOAL} augmentation=none",
+    {
+        f"{start}, {name}": Method(f"{replay} {words}")
+        for name, replay in (
+            ("er 0", "algo=sequential"),
+            (
+                "er 2",
+                "algo=er algo.memory.budget=378",
+            ),  # batches as long, so that both begin with the same weights
+        )
+        for start, words in {
+            "scratch": "",
+            "imagenet": f"{_FROZEN}imagenet",
+            "random": f"{_FROZEN}random",
+            "libero_90": "pretrain=libero_90 pretrain.demos=10 pretrain.epochs=1",
+        }.items()
+    },
+)
+STUDIES = (FRONTIER, SEEDS, STARTS)
+
+# the study before this one, whose records README.md is made of
+REFERENCES = ("er", "sequential", "single_task")  # that each other method is compared with
+WINDOW = 64 * 64 * 3 * 2 + 4 * (7 + 2 + 3 + 7)  # bytes: two images, readings and the action
+
+
+def _plain(algorithms: str, seeds: int, more: str = "") -> dict[str, Method]:
+    return {name: Method(f"algo={name} {more}", seeds) for name in algorithms.split()}
+
+
+def _memories(megabytes: float) -> dict[str, Method]:
     size = int(megabytes * 1e6)
     return {
-        f"er {megabytes:g} MB": ("algo=er", f"algo.memory.budget={size // WINDOW}"),
-        f"compressed_er {megabytes:g} MB": ("algo=compressed_er", f"algo.budget={size}"),
+        f"er {megabytes:g} MB": Method(f"algo=er algo.memory.budget={size // WINDOW}"),
+        f"compressed_er {megabytes:g} MB": Method(f"algo=compressed_er algo.budget={size}"),
     }
 
 
-LONG = (
-    *("benchmark=libero_130", "data.demos=10", "train.steps_per_epoch=75", "eval.episodes=1"),
-    *("eval.cells=sampled", "eval.cells_share=0.02", "eval.curve=none", "eval.horizon=300"),
+_SMALL = "train.steps_per_epoch=75 eval.episodes=10"
+_SAMPLED = "eval.every=8 eval.cells=sampled eval.cells_share=0.3"
+_ENDS = "eval.cells=diagonal_and_last_row eval.curve=none"
+_GOAL = f"benchmark=libero_goal data.demos=20 eval.horizon=240 {_SMALL}"
+_LONG = (
+    "benchmark=libero_130 data.demos=10 train.steps_per_epoch=75 eval.episodes=1 eval.cells=sampled "
+    "eval.cells_share=0.02 eval.curve=none eval.horizon=300"
 )
-SMALL = ("train.steps_per_epoch=75", "eval.episodes=10")
-SAMPLED = ("eval.every=8", "eval.cells=sampled", "eval.cells_share=0.3")
-ENDS = ("eval.cells=diagonal_and_last_row", "eval.curve=none")  # just learned and final; neither NBT nor AUC
-BRIEF = (  # of which only costs are read
-    *("benchmark=libero_goal", "benchmark.tasks=3", "data.demos=20"),
-    *("train.epochs=2", "train.steps_per_epoch=75", "eval.episodes=1"),
-    *("eval.cells=diagonal_and_last_row", "eval.curve=none", "eval.horizon=10"),
+_BRIEF = (
+    f"benchmark=libero_goal benchmark.tasks=3 data.demos=20 train.epochs=2 train.steps_per_epoch=75 {_ENDS} "
+    "eval.episodes=1 eval.horizon=10"
 )
-ALL = sorted(file.stem for file in (config_folder() / "algo").glob("*.yaml"))
-GOAL = ("benchmark=libero_goal", "data.demos=20", "eval.horizon=240", *SMALL)
-TEN = ("sequential", "er", "packnet", "lora", "single_task", "ewc", "iscil", "dmpel", "derpp", "multitask")
-STUDIES = (
+_TEN = "sequential er packnet lora single_task ewc iscil dmpel derpp multitask"
+EARLIER = (
+    Study("goal", f"{_GOAL} {_SAMPLED}", _plain(_TEN, 5)),
     Study(
-        "goal",
-        _plain(*TEN),
-        5,
-        (*GOAL, *SAMPLED),
-        shifts=("instruction=0.6", "camera=0.2"),
-        shifted=("er", "lora", "iscil", "dmpel"),
-    ),
-    Study(
-        "memory",
-        {name: words for size in (0.1, 1.0, 10.0) for name, words in _memories(size).items()},
-        3,
-        (*GOAL, *ENDS),
+        "memory", f"{_GOAL} {_ENDS}", {n: m for size in (0.1, 1.0, 10.0) for n, m in _memories(size).items()}
     ),
     Study(
         "ten_demonstrations",
-        _plain("sequential", "er", "packnet", "lora", "single_task", "iscil"),
-        3,
-        ("benchmark=libero_object", "data.demos=10", *SMALL, *SAMPLED),
+        f"benchmark=libero_object data.demos=10 {_SMALL} {_SAMPLED}",
+        _plain("sequential er packnet lora single_task iscil", 3),
     ),
     Study(
         "libero_130",
+        _LONG,
         {
-            **_plain("sequential", "er", "compressed_er", "lora"),
-            "packnet": ("algo=packnet", "algo.prune_perc=0.98"),
+            **_plain("sequential er compressed_er lora", 1),
+            **_plain("packnet", 1, "algo.prune_perc=0.98"),
         },
-        1,
-        LONG,
     ),
-    Study("costs", _plain(*ALL), 1, BRIEF),
+    Study(
+        "costs",
+        _BRIEF,
+        _plain(" ".join(sorted(f.stem for f in (config_folder() / "algo").glob("*.yaml"))), 1),
+    ),
 )
 
 
@@ -143,18 +221,50 @@ class Planned:
 
     study: Study
     method: str
-    seed: int
+    draws: Draws
+
+    @property
+    def seed(self) -> int:
+        """Seed of learning."""
+        return self.draws[0]
 
     @property
     def name(self) -> str:
         """Its name in lists."""
-        return f"{self.study.name}/{self.method.replace(' ', '_')}/seed{self.seed}"
+        seed, order, data = self.draws
+        more = "" if seed == order == data else f"_order{order}_data{data}"
+        return f"{self.study.name}/{re.sub('[ ,]+', '_', self.method)}/seed{seed}{more}"
+
+    @property
+    def seeds(self) -> dict[str, int]:
+        """What tells it from other runs of its method."""
+        seed, order, data = self.draws
+        found = {"seed": seed, "benchmark.order_seed": order, "data.seed": data}
+        if self.draws in self.study.draws:  # a mask of cells of its own
+            found["eval.cells_seed"] = 100 * seed + 10 * order + data
+        return found
+
+    @property
+    def settings(self) -> tuple[str, ...]:
+        """Overrides of its method."""
+        own = self.study.methods[self.method].overrides
+        return tuple(
+            {word.split("=")[0]: word for word in (*self.study.overrides.split(), *own.split())}.values()
+        )
 
     @property
     def overrides(self) -> list[str]:
         """What its command has beyond `python train.py`."""
-        seeds = (f"{key}={self.seed}" for key in BY_SEED)
-        return [*self.study.methods[self.method], *self.study.overrides, *seeds, *SETTINGS]
+        return [*self.settings, *(f"{key}={seed}" for key, seed in self.seeds.items()), *SETTINGS]
+
+    @property
+    def id(self) -> str:
+        """What its directory's name ends with."""
+        return self.name.replace("/", "-")
+
+    def directory(self, folder: Path) -> Path | None:
+        """Return its directory in a folder of runs; None if there is none."""
+        return next((file.parent for file in folder.glob(f"*/*/*_{self.id}/config.yaml")), None)
 
     @property
     def record(self) -> Path:
@@ -164,28 +274,20 @@ class Planned:
     @cached_property
     def config(self) -> dict[str, Any]:
         """Its configuration as it is today."""
-        with initialize_config_dir(str(config_folder()), version_base="1.3"):
-            return plain_data(compose("config", self.overrides))
+        config = copy.deepcopy(_composed(*self.settings, *SETTINGS))  # to compose takes forty times as long
+        for key, seed in self.seeds.items():
+            OmegaConf.update(config, key, seed)
+        return plain_data(config)
 
     def is_done(self) -> bool:
         """Return whether there are records, of today's configuration."""
         if not self.record.exists():
             return False
-        was, now = (  # a saved configuration also names how pictures were drawn
-            {k: v for k, v in result_relevant(config).items() if v is not None and k != "data.drawing"}
-            for config in (yaml.safe_load(_read(self.record)["config"]), self.config)
+        was, now = (
+            {key: value for key, value in result_relevant(config).items() if value is not None}
+            for config in (yaml.load(_read(self.record)["config"], yaml.CSafeLoader), self.config)
         )
-        return was == now
-
-    def missing(self) -> list[str]:
-        """Return the shifts that it was not evaluated under; before them "" if the run itself is missing."""
-        shifts = self.study.shifts if self.method in self.study.shifted else ()
-        if not self.is_done():
-            return ["", *shifts]
-        with tempfile.TemporaryDirectory() as scratch:
-            found = shift_scores(ResultLog(self.unpack(Path(scratch)) / "results.jsonl").read())
-        measured = {score.shift for score in found if not math.isnan(score.success("final_shifted").value)}
-        return [shift for shift in shifts if shift not in measured]
+        return {k: v for k, v in was.items() if k in now or k not in CHOSEN} == now
 
     def keep(self, directory: Path) -> None:
         """Keep the records of a finished run."""
@@ -205,6 +307,13 @@ class Planned:
         return directory
 
 
+@cache
+def _composed(*overrides: str) -> DictConfig:
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        return compose("config", [*overrides])
+
+
+CHOSEN = ("data.drawing", "eval.cells_seed")  # what a run chooses where its command does not
 FILES = {"config": "config.yaml", "records": "results.jsonl", "relearning": "relearning.jsonl"}
 
 
@@ -212,25 +321,26 @@ def _read(record: Path) -> dict[str, str]:
     return json.loads(lzma.decompress(record.read_bytes()))
 
 
-def planned() -> list[Planned]:
+def planned(studies: Sequence[Study] = STUDIES) -> list[Planned]:
     """Return all runs, in the order in which they are made: seed after seed."""
-    return [
-        Planned(study, method, seed)
-        for seed in range(1, max(study.seeds for study in STUDIES) + 1)
-        for study in STUDIES
-        if seed <= study.seeds
-        for method in study.methods
-    ]
+    runs = []
+    for study in studies:
+        draws = [(seed, seed, seed) for seed in range(1, 6)]
+        own = [(m, d) for d in draws for m, method in study.methods.items() if d[0] <= method.seeds]
+        runs += [
+            Planned(study, m, d) for m, d in (*own, *((m, d) for d, m in product(study.draws, study.methods)))
+        ]
+    return runs
 
 
 def show(runs: Sequence[Planned]) -> None:
     """Print each run, and how long the missing ones take if they cost what those of the same algorithm did."""
-    hours: dict[tuple[str, str], list[float]] = {}
+    hours: dict[str, list[float]] = {}
     missing = []
     for run in runs:
         if run.is_done():
             spent = _hours(run)
-            hours.setdefault((run.study.name, run.method), []).append(spent)
+            hours.setdefault(run.method, []).append(spent)
             print(f"done     {60 * spent:4.0f} min  python train.py {shlex.join(run.overrides)}")
         else:
             missing.append(run)
@@ -239,7 +349,7 @@ def show(runs: Sequence[Planned]) -> None:
     known = [h for spent in hours.values() for h in spent]
     if missing and known:
         mean = sum(known) / len(known)
-        left = sum(_mean(hours.get((run.study.name, run.method))) or mean for run in missing)
+        left = sum(_mean(hours.get(run.method)) or mean for run in missing)
         print(
             f"{len(runs) - len(missing)} of {len(runs)} runs are done; the others take about {left:.0f} core hours"
         )
@@ -262,24 +372,22 @@ def make(runs: Sequence[Planned], folder: Path, minutes: float, jobs: int) -> in
     Returns:
         Number of runs that failed.
     """
-    waiting = [(run, parts) for run in runs if (parts := run.missing())]
+    waiting = [run for run in runs if not run.is_done()]
     end, failed = time.monotonic() + 60 * minutes, 0
-    active: dict[subprocess.Popen[bytes], tuple[Planned, list[str]]] = {}
+    active: dict[subprocess.Popen[bytes], Planned] = {}
     try:
         while True:
             while len(active) < jobs and time.monotonic() < end and waiting:
-                run, parts = waiting.pop(0)
-                active[_start(run, parts[0], folder)] = run, parts
+                run = waiting.pop(0)
+                active[_start(run, folder)] = run
             if not active or time.monotonic() > end:
                 return failed
             for process in [p for p in active if p.poll() is not None]:
-                run, (part, *others) = active.pop(process)
-                directory = _directory(run, folder)
+                run = active.pop(process)
+                directory = run.directory(folder)
                 if process.returncode == 0 and directory is not None:
                     run.keep(directory)
-                    print(f"{time.strftime('%H:%M')} done: {run.name} {part}", flush=True)
-                    if others:
-                        waiting.insert(0, (run, others))
+                    print(f"{time.strftime('%H:%M')} done: {run.name}", flush=True)
                 else:
                     failed += 1
                     print(f"{time.strftime('%H:%M')} failed: {_log(run, folder)}", flush=True)
@@ -291,9 +399,9 @@ def make(runs: Sequence[Planned], folder: Path, minutes: float, jobs: int) -> in
             process.wait()
 
 
-def _start(run: Planned, shift: str, folder: Path) -> "subprocess.Popen[bytes]":
+def _start(run: Planned, folder: Path) -> "subprocess.Popen[bytes]":
     _demonstrations(run)
-    words = [*run.overrides, *([f"eval.shift='{shift}'"] if shift else []), f"runs_dir={folder / run.name}"]
+    words = [*run.overrides, f"runs_dir={folder}", f"run_id={run.id}"]  # what is learned before is shared
     command = [sys.executable, str(ROOT / "train.py"), *words]
     log = _log(run, folder)
     log.parent.mkdir(parents=True, exist_ok=True)
@@ -310,17 +418,13 @@ def _demonstrations(run: Planned) -> None:
     find_demos(tasks, [data.demos] * len(tasks), data, progress=False)
 
 
-def _directory(run: Planned, folder: Path) -> Path | None:
-    return next((file.parent for file in (folder / run.name).glob("*/*/*/config.yaml")), None)
-
-
 def _log(run: Planned, folder: Path) -> Path:
-    return folder / "logs" / f"{run.name.replace('/', '_')}.txt"
+    return folder / "logs" / f"{run.id}.txt"
 
 
 def report(runs: Sequence[Planned]) -> None:
-    """Write a comparison of the finished runs of each study beside this file."""
-    for study in STUDIES:
+    """Write a comparison of the finished runs of each earlier study beside this file."""
+    for study in EARLIER:
         found = [run for run in runs if run.study == study and run.is_done()]
         if not found:
             continue
@@ -350,7 +454,11 @@ def main() -> int:
         "--only", nargs="+", default=[], help="words that a run's name contains, such as /er/ or seed1"
     )
     args = parser.parse_args()
-    runs = [run for run in planned() if all(word in f"{run.name}/" for word in args.only)]
+    runs = [
+        run
+        for run in planned(STUDIES if args.what != "report" else EARLIER)
+        if all(word in f"{run.name}/" for word in args.only)
+    ]
     if args.what == "run":
         signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))  # and end what runs
         args.runs.mkdir(parents=True, exist_ok=True)

@@ -4,33 +4,27 @@ python experiments/algorithms/table.py          # reads STUDY/comparison.json, w
 """
 
 import argparse
-import functools
 import json
-import math
 import statistics
-import tempfile
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from study import REFERENCES, Planned, planned
+from along import beside_alone, streams
+from kept import SPENT, by_bytes, equal_bytes, spent
+from reading import by_seed, difference, finished, in_points, measures, paired, table
+from study import REFERENCES
 
 from libero_env.text import duration, quantity
-from lifelong.results.log import ResultLog
-from lifelong.results.records import LossRecord
+from lifelong.results.records import LossRecord, RunEndRecord
 from lifelong.stats.intervals import Estimate, holm
 from lifelong.stats.methods import paired_difference, welch_difference
-from lifelong.stats.metrics import metric_values
 
 HERE = Path(__file__).parent
 COLUMNS = {"just_learned": "just learned", "final_success": "final", "nbt": "NBT", "auc": "AUC"}
 COMPARED = {"final_success": "final success", "auc": "AUC"}
-
-
-def table(heads: list[str], rows: list[list[str]], align: str = "---:|") -> list[str]:
-    """The lines of a Markdown table, whose columns but the first are aligned as given."""
-    lines = ["| " + " | ".join(heads) + " |", "|---|" + align * (len(heads) - 1)]
-    return lines + ["| " + " | ".join(row) + " |" for row in rows]
+CHANGED = "2026-11-26T20:40:46"  # when the plan got final success as an outcome, UTC
 
 
 def metric(cell: dict) -> str:
@@ -51,16 +45,23 @@ def tables(study: str, found: dict) -> Iterator[tuple[str, list[str]]]:
             label,
             str(len(groups[label]["seeds"])),
             "yes" if groups[label]["told_task"] else "no",
+            *spent(study, label, groups[label]["costs"]["stored_bytes"]),
             *(metric(groups[label]["metrics"][name]) for name in COLUMNS),
         ]
         for label in order
     ]
-    yield "metrics", table(["algorithm", "seeds", "told the task", *COLUMNS.values()], rows)
+    yield "metrics", table(["algorithm", "seeds", "told the task", *SPENT, *COLUMNS.values()], rows)
     for name, title in COMPARED.items():
         yield f"pairs of {title}", pairs(order, found["differences"], name, title)
     training = training_seconds(study)
-    rows = [[label, training[label], *costs(groups[label]["costs"])] for label in order]
-    heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "stored", "memory"]
+    rows = [
+        [
+            *(label, training[label], *costs(groups[label]["costs"])),
+            *spent(study, label, groups[label]["costs"]["stored_bytes"])[:-1],
+        ]
+        for label in order
+    ]
+    heads = ["algorithm", "training a task", "between tasks", "a step", "trained", "memory", *SPENT[:-1]]
     yield "costs", table(heads, rows)
     yield from shifts(groups, order)
 
@@ -82,7 +83,13 @@ def pairs(labels: list[str], differences: list[dict], name: str, title: str) -> 
     for label in labels:
         cells = [found.get((label, reference)) for reference in references]
         if any(cell and cell["value"] is not None for cell in cells):
-            rows.append([label, *(_difference(cell) for cell in cells), _by_seed(cells[0])])
+            rows.append(
+                [
+                    label,
+                    *(_difference(cell) for cell in cells),
+                    by_seed(cells[0]["by_seed"] if cells[0] else ()),
+                ]
+            )
     heads = [f"{title} less {reference}" for reference in references]
     return table(["algorithm", *heads, f"less {references[0]}, each seed"], rows)
 
@@ -106,17 +113,12 @@ def _difference(cell: dict | None) -> str:
     return text + (f" ({cell['seeds']})" if cell["seeds"] and not cell["significant"] else "")
 
 
-def _by_seed(cell: dict | None) -> str:
-    return ", ".join(f"{100 * v:+.1f}" for v in cell["by_seed"]) if cell else "–"
-
-
 def costs(values: dict) -> list[str]:
     """Cells of a row of costs, behind the time of training."""
     return [
         duration(values.get("end_task_seconds", 0.0)),
         quantity(values["flops_per_step"], "FLOP"),
         quantity(values["parameters_trained"]),
-        quantity(values["stored_bytes"], "B"),
         quantity(values["peak_memory_bytes"], "B"),
     ]
 
@@ -127,9 +129,9 @@ def training_seconds(study: str) -> dict[str, str]:
     Where all tasks are learned in one stage, it is the time of that stage.
     """
     found: dict[str, dict[int, float]] = {}  # of each task, by algorithm
-    for run, folder in finished(study):
+    for run, results in finished(study):
         epochs: dict[int, list[float]] = {}
-        for record in ResultLog(folder / "results.jsonl").read().of(LossRecord):
+        for record in results.of(LossRecord):
             epochs.setdefault(record.task, []).append(record.seconds)
         seconds = found.setdefault(run.method, {})
         for task, times in epochs.items():
@@ -154,54 +156,45 @@ def shifts(groups: dict[str, dict], order: list[str]) -> Iterator[tuple[str, lis
                     "yes" if groups[label]["told_task"] else "no",
                     f"{found['final']:.2f}",
                     f"{found['final_shifted']:.2f}",
-                    _estimate(Estimate(**found["lost"])),
-                    _estimate(Estimate(**less)) if less else "–",
+                    in_points(Estimate(**found["lost"])),
+                    in_points(Estimate(**less)) if less else "–",
                 ]
             )
         heads = ["algorithm", "seeds", "told the task", "final", f"under `{shift}`", "lost"]
         yield f"under {shift}", table([*heads, f"lost, less {REFERENCES[0]}'s"], rows)
 
 
-def by_bytes() -> Iterator[tuple[str, list[str]]]:
-    """Final success of replay with each memory, compressed and not, in the same bytes; less that with 247 MB.
-
-    P-values of the differences are Holm's over the memories.
-    """
-    by_method, largest = measures("memory", "final_success"), measures("goal", "final_success").get("er", {})
-    sizes = dict.fromkeys(method.partition(" ")[2] for method in by_method)
-    rows, tested = [], []
-    for size in sizes:
-        plain, compressed = (by_method.get(f"{name} {size}", {}) for name in ("er", "compressed_er"))
-        both = sorted(plain.keys() & compressed.keys())
-        less = [compressed[seed] - plain[seed] for seed in both]
-        tested.append(paired_difference(np.array(less)).p_value if less else math.nan)
-        means = (f"{statistics.mean(v.values()):.2f}" if v else "–" for v in (plain, compressed))
-        rows.append(
-            [
-                *(size, str(len(both)), *means, _plain_difference(less)),
-                ", ".join(f"{100 * v:+.1f}" for v in less),
-                *(
-                    _plain_difference([v[s] - largest[s] for s in sorted(v.keys() & largest.keys())])
-                    for v in (plain, compressed)
-                ),
-            ]
-        )
-    for row, p in zip(rows, holm(tested), strict=True):
-        row.insert(6, f"{p:.2g}")
-    heads = [
-        "memory",
-        "seeds",
-        "`er`",
-        "`compressed_er`",
-        "`compressed_er` less `er`",
-        "each seed",
-        "p (Holm)",
+def both_outcomes(differences: list[dict]) -> Iterator[tuple[str, list[str]]]:
+    """Planned pairs of what keeps anything by both outcomes, each p after Holm over its metric, and over both."""
+    tested = [
+        (pair["of"], pair["less"], name, pair["metrics"][name])
+        for name in COMPARED
+        for pair in differences
+        if pair["metrics"][name]["p_value"] is not None
     ]
-    if rows:
-        yield (
-            "memory: by bytes",
-            table([*heads, "`er` less 247 MB", "`compressed_er` less 247 MB of `er`"], rows),
-        )
+    jointly = {
+        key: (cell, p)
+        for (*key, cell), p in zip(tested, holm([cell["p_value"] for *_, cell in tested]), strict=True)
+        for key in [tuple(key)]
+    }
+    first = {run.seed for run, results in finished("goal") if results.of(RunEndRecord)[0].finished < CHANGED}
+    rows = []
+    for of, less, _ in (key for key in jointly if key[2] == "final_success"):
+        if {of, less} & {"sequential", "ewc", "multitask"}:
+            continue
+        row = [f"{of} less {less}"]
+        for name in COMPARED:
+            cell, joint = jointly[of, less, name]
+            row += [f"{100 * cell['value']:+z.1f}", f"{cell['adjusted']:.2g}", f"{joint:.2g}"]
+        found = measures("goal", "final_success")
+        later = [found[of][seed] - found[less][seed] for seed in found[of] if seed not in first]
+        rows.append([*row, by_seed(later), f"{paired_difference(np.array(later)).p_value:.2g}"])
+    heads = ["pair", *(f"{title}{what}" for title in COMPARED.values() for what in _CORRECTED)]
+    heads += [f"final success, seeds {', '.join(str(s) for s in range(1, 6) if s not in first)}", "p"]
+    yield "goal: both outcomes", table(heads, rows)
+
+
+_CORRECTED = ("", ", p (Holm)", ", p (Holm over both)")
 
 
 def together(studies: tuple[str, str]) -> Iterator[tuple[str, list[str]]]:
@@ -213,56 +206,12 @@ def together(studies: tuple[str, str]) -> Iterator[tuple[str, list[str]]]:
         found = [measures(study, name) for study in studies]
         rows = []
         for label in (label for label in found[1] if label != REFERENCES[0] and label in found[0]):
-            effects = [
-                np.array(
-                    [
-                        v - values[REFERENCES[0]][s]
-                        for s, v in values[label].items()
-                        if s in values[REFERENCES[0]]
-                    ]
-                )
-                for values in found
-            ]
+            effects = [np.array(paired(values[label], values[REFERENCES[0]])) for values in found]
             mean = welch_difference(effects[0] / 2, -effects[1] / 2).estimate
-            rows.append([label, *(_plain_difference(list(e)) for e in effects), _estimate(mean)])
+            rows.append([label, *map(difference, effects), in_points(mean)])
         if rows:
             heads = [f"less {REFERENCES[0]}, `{study}`" for study in studies]
             yield f"together: {title}", table(["algorithm", *heads, "mean of both"], rows)
-
-
-def measures(study: str, name: str) -> dict[str, dict[int, float]]:
-    """A metric of each finished run, by method and seed."""
-    return {
-        method: {seed: values[name] for seed, values in runs.items()}
-        for method, runs in _metrics(study).items()
-    }
-
-
-@functools.cache
-def _metrics(study: str) -> dict[str, dict[int, dict[str, float]]]:
-    found: dict[str, dict[int, dict[str, float]]] = {}
-    for run, folder in finished(study):
-        scores = ResultLog(folder / "results.jsonl").read().scores()
-        found.setdefault(run.method, {})[run.seed] = metric_values(scores)
-    return found
-
-
-def _plain_difference(values: list[float]) -> str:
-    """The mean of differences in points, with Student's interval of these alone."""
-    return _estimate(paired_difference(np.array(values)).estimate) if values else "–"
-
-
-def _estimate(found: Estimate) -> str:
-    ends = "" if math.isnan(found.low) else f" [{100 * found.low:z.1f}, {100 * found.high:z.1f}]"
-    return f"{100 * found.value:+.1f}{ends}"
-
-
-def finished(study: str) -> Iterator[tuple[Planned, Path]]:
-    """Yield the finished runs of a study, each with a folder of its records."""
-    for run in planned():
-        if run.study.name == study and run.is_done():
-            with tempfile.TemporaryDirectory() as scratch:
-                yield run, run.unpack(Path(scratch))
 
 
 def insert(text: str, name: str, lines: list[str]) -> str:
@@ -272,21 +221,37 @@ def insert(text: str, name: str, lines: list[str]) -> str:
     return before + start + "\n".join([*lines, end]) + rest.split(end)[1]
 
 
-def main() -> None:
-    argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    ).parse_args()
-    readme = HERE / "README.md"
-    text, found = readme.read_text(encoding="utf-8"), dict[str, list[str]]()
+def written(text: str) -> str:
+    """Return a text with all tables that it has the marks of."""
+    found = dict[str, list[str]]()
     for path in sorted(HERE.glob("*/comparison.json")):
-        for name, lines in tables(path.parent.name, json.loads(path.read_text(encoding="utf-8"))):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        for name, lines in tables(path.parent.name, content):
             found[f"{path.parent.name}: {name}"] = lines
-    found |= {**dict(by_bytes()), **dict(together(("goal", "ten_demonstrations")))}
+        if path.parent.name == "goal":
+            found |= dict(both_outcomes(content["differences"]))
+    found |= {**dict(by_bytes()), **dict(equal_bytes()), **dict(together(("goal", "ten_demonstrations")))}
+    found["goal: beside single_task"] = beside_alone(streams("goal"))
     for name, lines in found.items():
         if f"<!-- {name} -->" in text:  # of costs only the costs
             text = insert(text, name, lines)
-    readme.write_text(text, encoding="utf-8")
+    return text
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--check", action="store_true", help="write nothing; 1 where the README has other numbers"
+    )
+    check, readme = parser.parse_args().check, HERE / "README.md"
+    text = readme.read_text(encoding="utf-8")
+    new = written(text)
+    if not check:
+        readme.write_text(new, encoding="utf-8")
+    return int(check and new != text)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

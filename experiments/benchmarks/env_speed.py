@@ -2,11 +2,14 @@
 
 Every figure is the best of several repeats, because machines are shared; the control step is compared with bare
 `mj_step` calls on the same model from the same moving state, in turn. Pin it to one core with `taskset -c 0` for the
-physics; leave it two for the pictures.
+physics; leave it two for the pictures. `--only facade` compares the original's names with native code, in processor
+time and in turn, and, where TorchRL is installed, says what of its step is ours.
 """
 
 import argparse
+import importlib.util
 import json
+import os
 import subprocess
 import sys
 import time
@@ -117,23 +120,114 @@ def build_seconds(repeats: int) -> dict[str, float]:
     return {"import_s": imports, "build_s": build, "first_reset_s": first_reset}
 
 
+def processor_ms(*functions: Callable[[], object], repeats: int) -> list[float]:
+    """Processor time of the fastest call of each function, called in turn."""
+    times: list[list[float]] = [[] for _ in functions]
+    for _ in range(repeats):
+        for function, found in zip(functions, times, strict=True):
+            start = time.process_time()
+            function()
+            found.append(time.process_time() - start)
+    return [1e3 * min(found) for found in times]
+
+
+def facade_beside_native(task: str, size: int, rounds: int) -> dict[str, object]:
+    """Processor time of the package `libero` and of `LiberoEnv`: step, resets; two pictures, builtin models."""
+    from libero.libero import benchmark
+    from libero.libero.envs import OffScreenRenderEnv
+
+    suite, index = benchmark.get_benchmark(task.split("/")[0])(), int(task.split("/")[1])
+    state, file = suite.get_task_init_states(index)[0], suite.get_task_bddl_file_path(index)
+    facade = OffScreenRenderEnv(bddl_file_name=file, camera_heights=size, camera_widths=size)
+    native = LiberoEnv(task, camera_size=(size, size))
+    seeds = iter(range(10**6))
+    ways: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
+        "to_stored_state": (
+            lambda: facade.set_init_state(state),
+            lambda: native.reset(options={"init_state": 0}),
+        ),
+        "to_new_placement": (facade.reset, lambda: native.reset(seed=next(seeds))),
+    }
+    facade.seed(0), facade.reset(), native.reset(seed=next(seeds))
+    found = {way: processor_ms(*both, repeats=rounds) for way, both in ways.items()}
+    steps = []
+    for _ in range(rounds):
+        rng = np.random.default_rng(0)
+        for start in ways["to_stored_state"]:
+            start()
+        actions = rng.uniform(-0.5, 0.5, (25, 7))
+        pairs = [(lambda a=a: facade.step(a), lambda a=a: native.step(a)) for a in actions]
+        steps.append([processor_ms(*pair, repeats=1) for pair in pairs])
+    found["step"] = np.min(steps, axis=0).mean(axis=0).tolist()
+    drawing = facade.env.drawing
+    facade.close()
+    native.close()
+    table = {way: {"facade_ms": a, "native_ms": b, "ratio": a / b} for way, (a, b) in found.items()}
+    return {"task": task, "size": size, "drawing": drawing, **table}
+
+
+def torchrl_step(size: int, repeats: int) -> dict[str, float]:
+    """Processor time of a step of TorchRL's own `LiberoEnv` with two pictures, and how much of it is ours."""
+    from torchrl.envs import LiberoEnv as TorchRLEnv
+
+    env = TorchRLEnv(
+        *TASK.split("/"), camera_height=size, camera_width=size, wrist_camera="robot0_eye_in_hand"
+    )
+    inner, ours, whole, tensors = env._env, [], [], env.reset()
+    step = inner.step
+
+    def timed(action: object) -> object:
+        start = time.process_time()
+        result = step(action)
+        ours.append(time.process_time() - start)
+        return result
+
+    inner.step = timed
+    for _ in range(repeats):
+        tensors["action"] = env.action_spec.rand()
+        start = time.process_time()
+        tensors = env.step(tensors)["next"]
+        whole.append(time.process_time() - start)
+    env.close()
+    return {"step_ms": 1e3 * float(np.median(whole)), "ours_ms": 1e3 * float(np.median(ours))}
+
+
+def facade(repeats: int) -> dict[str, object]:
+    """The package `libero` beside native code."""
+    os.environ["LIBERO_ASSETS"] = "builtin"  # it would use the original's models where they are installed
+    rows = [
+        facade_beside_native(task, size, max(repeats // 25, 3))
+        for task in (TASK, "libero_goal/3")
+        for size in (64, 128)
+    ]
+    installed = importlib.util.find_spec("torchrl") is not None
+    return {"facade": rows, **({"torchrl": torchrl_step(64, repeats)} if installed else {})}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--repeats", type=int, default=200)
     parser.add_argument("--batch", type=int, default=16)
+    parser.add_argument("--only", choices=["facade"])
     args = parser.parse_args()
-    figures = {
-        "mujoco": mujoco.__version__,
-        "step": step_ratio(args.repeats),
-        "cameras_128": camera_rate(128, max(args.repeats // 25, 3)),
-        "cameras_64": camera_rate(64, max(args.repeats // 25, 3)),
-        f"batch_{args.batch}_steps_per_s": batch_rate(args.batch, 20),
+    figures = facade(args.repeats) if args.only else environment(args.repeats, args.batch)
+    print(
+        json.dumps({"mujoco": mujoco.__version__, **figures}, indent=1, default=lambda x: round(float(x), 4))
+    )
+
+
+def environment(repeats: int, batch: int) -> dict[str, object]:
+    """What native environments cost."""
+    return {
+        "step": step_ratio(repeats),
+        "cameras_128": camera_rate(128, max(repeats // 25, 3)),
+        "cameras_64": camera_rate(64, max(repeats // 25, 3)),
+        f"batch_{batch}_steps_per_s": batch_rate(batch, 20),
         "reset_to_init_state_ms": reset_ms(20),
         "build": build_seconds(3),
     }
-    print(json.dumps(figures, indent=1, default=lambda x: round(float(x), 4)))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 from scipy import stats
 
-from lifelong.stats.episodes import (
+from libero_eval.stats.episodes import (
     Counts,
     Pairs,
     bootstrap_starts,
@@ -21,8 +21,8 @@ from lifelong.stats.episodes import (
     score_interval,
     sign_flip_test,
 )
+from libero_eval.stats.sequential import anytime_interval, log_evidence, rounds, sequential_test, shuffled
 from lifelong.stats.intervals import holm, wilson_interval
-from lifelong.stats.sequential import anytime_interval, log_evidence, rounds, sequential_test
 
 TASKS = 10
 
@@ -156,6 +156,55 @@ def coverage(rng, simulations: int) -> None:
         )
 
 
+def means(rng, simulations: int) -> None:
+    """Intervals of the mean over ten tasks: over all episodes, and combined from single tasks' (MOVER)."""
+    print(
+        "\n| tasks | starts | all episodes: covers | width | combined: covers | width |\n|---|---:|---:|---:|---:|---:|"
+    )
+    for name, rates in (
+        ("all 95 %", np.full(TASKS, 0.95)),
+        ("80 to 100 %", np.linspace(0.8, 1, TASKS)),
+        ("0 to 100 %", np.linspace(0, 1, TASKS)),
+    ):
+        for starts in (5, 10, 20, 50):
+            won = rng.binomial(starts, rates, (simulations, TASKS))
+            low, high = wilson_interval(won, starts)
+            spread = [np.sqrt((side**2).sum(1)) / TASKS for side in (won / starts - low, high - won / starts)]
+            value = won.mean(1) / starts
+            both = wilson_interval(won.sum(1), TASKS * starts), (value - spread[0], value + spread[1])
+            covers = [((low <= rates.mean()) & (rates.mean() <= high)).mean() for low, high in both]
+            widths = [(high - low).mean() for low, high in both]
+            cells = (f"{100 * c:.0f} % | {100 * w:.1f}" for c, w in zip(covers, widths, strict=True))
+            print(f"| {name} | {starts} | {' | '.join(cells)} |")
+
+
+def drift(rng, simulations: int) -> None:
+    """Stopping where difficulty drifts with the start's number: in the order of the starts, and as `--until` looks."""
+    print("\n| better by, from the first start to the last | order | above | below |\n|---|---|---:|---:|")
+    cases = {
+        "none": np.zeros(50),
+        "+20 to -20 points": np.linspace(0.2, -0.2, 50),
+        "+40 to -40 points": np.linspace(0.4, -0.4, 50),
+        "+20, in the second half -20 points": np.repeat([0.2, -0.2], 25),
+    }
+    for name, gap in cases.items():
+        for order, looked in (("of the starts", tuple(range(50))), ("of `--until`", shuffled(range(50)))):
+            found = np.zeros(2)
+            for _ in range(simulations):
+                hard = rng.beta(1.4, 0.6, size=(50, TASKS))
+                first, second = (
+                    rng.random(hard.shape) < np.clip(hard + sign * gap[:, None] / 2, 0, 1) for sign in (1, -1)
+                )
+                d = (first.astype(int) - second)[list(looked)]
+                won, lost = (d > 0).sum(1).cumsum(), (d < 0).sum(1).cumsum()
+                known = log_evidence(won, lost) >= np.log(20)
+                if known.any():
+                    at = int(known.argmax())
+                    found += (won[at] > lost[at], won[at] < lost[at])
+            above, below = found / simulations
+            print(f"| {name} | {order} | {100 * above:.1f} % | {100 * below:.1f} % |")
+
+
 def stopping(rng, simulations: int) -> None:
     """Stop after the round in which an interval is narrow enough, of at most 50 starts of ten tasks."""
     print(
@@ -231,8 +280,10 @@ def main() -> None:
     families(rng, args.simulations)
     several_runs(rng, args.simulations // 4)
     coverage(rng, args.simulations)
+    means(rng, args.simulations)
     stopping(rng, args.simulations)
     decisions(rng, args.simulations // 4)
+    drift(rng, args.simulations)
 
 
 if __name__ == "__main__":

@@ -99,9 +99,9 @@ def kill_and_finish(args: argparse.Namespace, out: Path) -> Counter[str]:
 def holders(out: Path) -> set[int]:
     """Return the processes that hold a unit."""
     found = set()
-    for path in (out / "claims").glob("*.json"):
+    for path in (out / "claims").glob("*.txt"):
         try:
-            found.add(json.loads(path.read_text())["pid"])
+            found.add(int(path.read_text().rpartition(":")[2]))
         except (OSError, ValueError):
             continue  # it was given back, or is being written
     return found
@@ -116,7 +116,7 @@ def start(args: argparse.Namespace, out: Path) -> subprocess.Popen:
     command = [
         sys.executable,
         "-m",
-        "libero_env.cli",
+        "libero_cli",
         "eval",
         args.policy,
         "--suite",

@@ -22,6 +22,7 @@ from tests.harness.kills import assert_same_runs, finish, kill_somewhere, start,
 
 ALGORITHMS = ("er", "ewc", "packnet", "dmpel", "derpp", "lora")
 ATTEMPTS = 10  # of one series
+BESIDE = "eval.beside=true"  # of the runs that are killed; the whole one measures in its own process
 
 
 def main() -> int:
@@ -75,11 +76,11 @@ def kill_series(algo: str, runs: Path, demos: Path, kills: int, seed: int) -> tu
         draws, partial = random.Random(f"{seed} {attempt}"), 0
         shutil.rmtree(runs, ignore_errors=True)
         for _ in range(kills):
-            if not kill_somewhere(start(algo, runs, demos), runs, draws):
+            if not kill_somewhere(start(algo, runs, demos, BESIDE), runs, draws):
                 break  # it had ended
             partial += any(path.suffix == ".part" for path in written(runs))
         else:
-            return partial, finish(start(algo, runs, demos), runs)
+            return partial, finish(start(algo, runs, demos, BESIDE), runs)
     raise SystemExit(f"{algo}: the run ends before {kills} kills; make it longer")
 
 

@@ -13,8 +13,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from libero_eval.plan import plan_evaluation, policy_threads
+from libero_eval.plan import plan_evaluation
 from libero_eval.requests import EvalRequest
+from libero_eval.work.scheduler import policy_threads
 
 
 def main() -> None:

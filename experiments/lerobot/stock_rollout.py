@@ -16,7 +16,8 @@ import numpy as np
 import yaml
 
 from libero_env import LiberoEnv
-from libero_integrations.lerobot_policy import EMBEDDING, FOLDER, IMAGES, lerobot_module
+from libero_integrations.lerobot_modules import lerobot_module
+from libero_integrations.lerobot_policy import EMBEDDING, FOLDER, IMAGES
 from lifelong.language import embed
 
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from libero_env.assets.pack import select_pack
 from libero_env.sim.render import Renderer, RenderTarget
-from libero_env.sim.scene import DRAWINGS, FAITHFUL, Scene, build_scene
+from libero_env.sim.scene import Scene, build_scene
+from libero_env.sim.scene_spec import DRAWINGS, FAITHFUL
 from libero_env.tasks import Task, get_suite
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10", "libero_90")

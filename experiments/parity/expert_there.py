@@ -1,6 +1,6 @@
 """Execute the episodes of `expert_here.py` in the original, and print how many succeed there.
 
-Runs in an environment of the original (hf-libero, robosuite 1.4.0), not in this project's; see README.md.
+Runs in an environment of the original (hf-libero, robosuite 1.4.0), or through this project's facade; see README.md.
 
     python expert_there.py FOLDER [--out results.json]
 
@@ -15,8 +15,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
-import robosuite
-from record import make_env, start_afresh
+from record import make_env, robosuite_version, start_afresh
 
 HOLD_STEPS = 20  # after the last action, in which what was let go may still fall into place
 
@@ -46,7 +45,7 @@ def execute(env, episode: dict[str, np.ndarray]) -> dict[str, object]:
         "object_difference": float(off[9:].max(initial=0.0)),
         "mujoco_here": str(episode["mujoco"]),
         "mujoco_there": mujoco.__version__,
-        "robosuite_there": robosuite.__version__,
+        "robosuite_there": robosuite_version(),
         "robot": str(episode["robot"]),
     }
 

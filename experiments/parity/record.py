@@ -12,11 +12,11 @@ onto the table and what stands on it (`press`), through large rotations (`spin`)
 import argparse
 import json
 import os
+from importlib.util import find_spec
 from pathlib import Path
 
 import mujoco
 import numpy as np
-import robosuite
 
 from libero.libero import benchmark, get_libero_path
 from libero.libero.envs.env_wrapper import ControlEnv
@@ -41,6 +41,15 @@ def make_env(suite: str, task_id: int, seed: int) -> ControlEnv:
     env.seed(seed)
     env.reset()
     return env
+
+
+def robosuite_version() -> str:
+    """Return the version of robosuite; empty where there is none, as with this project's facade."""
+    if find_spec("robosuite") is None:
+        return ""
+    import robosuite
+
+    return robosuite.__version__
 
 
 def fixture_poses(env: ControlEnv) -> dict[str, list[float]]:
@@ -187,7 +196,7 @@ def record(suite: str, task_id: int, kind: str, steps: int, seed: int) -> dict[s
         "suite": np.array(suite),
         "task_id": np.array(task_id),
         "motion": np.array(kind),
-        "robosuite": np.array(robosuite.__version__),
+        "robosuite": np.array(robosuite_version()),
         "mujoco": np.array(mujoco.__version__),
         "fixtures": np.array(json.dumps(poses)),
         "actions": np.round(np.array(actions) * 64).astype(np.int8),
@@ -213,7 +222,7 @@ def main() -> None:
         for kind in args.motions:
             seed = 1000 * args.seed + 10 * SUITES.index(suite) + MOTIONS.index(kind)
             task_id = int(np.random.default_rng(seed).integers(tasks))
-            path = args.out / f"{suite}-{task_id:02d}-{kind}-{robosuite.__version__}.npz"
+            path = args.out / f"{suite}-{task_id:02d}-{kind}-{robosuite_version()}.npz"
             if path.exists():
                 continue
             found = record(suite, task_id, kind, args.steps, seed)

@@ -1,14 +1,16 @@
 """Why episodes failed, told by looking at them, beside what the decision tree says.
 
-    python experiments/robustness/causes.py record eval/er/conditions/object=1@step20:20 ... --out causes   # 20 of them
-    python experiments/robustness/causes.py draw --out causes      # sheets of pictures, without the tree's answers
-    python experiments/robustness/causes.py compare --out causes   # labels.csv beside this file against the tree
+    python experiments/robustness/causes.py choose runs/criteria --count 40   # into causes.npz and labels.csv
+    python experiments/robustness/causes.py draw --out sheets    # those without a label, without the tree's answers
+    python experiments/robustness/causes.py compare                # labels.csv against the tree
 
-`record` runs failed episodes of results again; `draw` shows them in random order, four a sheet.
+`choose` takes the episodes that `experiments/tuning/criteria.py` has kept, and writes the actions of some failed ones
+beside this file, in random order. `draw` and `compare` run these again.
 """
 
 import argparse
 import csv
+import itertools
 import json
 import random
 from collections import Counter
@@ -18,173 +20,158 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw
 
+from libero_env.envs.batch import BatchEnv
 from libero_env.mujoco_compat import mujoco
 from libero_env.sim.causes import CAUSES
 from libero_env.sim.render import Renderer, RenderTarget
-from libero_env.sim.scene import build_scene
-from libero_env.tasks import get_task
-from libero_eval.evaluation_file import EvaluationResult
-from libero_eval.plan import plan_evaluation
-from libero_eval.requests import EvalRequest
-from lifelong.evaluation.rollout import run_episodes
+from lifelong.evaluation.rollout import Episode, run_episodes
+from lifelong.settings import BenchmarkSettings
 
-LABELS = Path(__file__).with_name("labels.csv")
+LABELS, ACTIONS = (Path(__file__).with_name(name) for name in ("labels.csv", "causes.npz"))
 CAMERAS = ("agentview", "robot0_eye_in_hand")
-MOMENTS = (
-    0.1,
-    0.2,
-    0.26,
-    0.32,
-    0.38,
-    0.44,
-    0.5,
-    0.58,
-    0.68,
-    0.84,
-    1.0,
-)  # shares of an episode that are shown
-SIZE, ROWS = 112, 4  # pixels; episodes of a sheet
+FIELDS = ("number", "set", "policy", "task", "start", "label", "of")
+SIZE, ROWS, MOMENTS = 160, 4, 10  # pixels; episodes of a sheet; pictures of an episode
 
 
-def record(folder: Path, count: int, out: Path, draws: random.Random) -> None:
-    """Run some failed episodes of a result again; write their poses, and what the tree says."""
-    result = EvaluationResult.read(folder)
-    failed = [
-        (task.task, start)
-        for task in draws.sample(result.tasks, len(result.tasks))
-        for start, won in zip(task.init_states, task.successes, strict=True)
-        if not won
-    ][:count]
-    request = EvalRequest(policy=str(folder), out=out / "none", threads=1, despite=("source",))
-    evaluation = plan_evaluation(request)
-    starts = result.init_states  # all, for a policy's bits may depend on how many act together
-    for task in dict.fromkeys(name for name, _ in failed):
-        env: Any = evaluation.env(get_task(task), len(starts))
-        poses: list[np.ndarray] = []
-        step = env.step
+class Replay:
+    """An actor that repeats actions, (T, 7)."""
 
-        def keep(actions, env=env, step=step, poses=poses):
-            found = step(actions)
-            poses.append(env.simulations.fields["qpos"].copy())
-            return found
+    action_dim, views, sees_next = 7, (), False
 
-        env.step = keep
-        with evaluation.actor(env.task, starts) as actor:
-            if hasattr(actor, "watch"):
-                actor.watch(env)
-            done = run_episodes(
-                actor,
-                env,
-                starts,
-                horizon=evaluation.protocol.steps(env.task),
-                settle_steps=evaluation.protocol.settle_steps,
-                settle_action=evaluation.protocol.episode.settle_action,
-            )
-        before = next(one for one in result.tasks if one.task == task)
-        for i, (start, one) in enumerate(zip(starts, done.episodes, strict=True)):
-            if (task, start) not in failed:
-                continue
-            name = f"{folder.parents[1].name} {folder.name} {task.replace('/', '-')} {start}"
-            again = one.actions == before.actions[before.init_states.index(start)]
-            about = {
-                "policy": folder.parents[1].name,
-                "condition": folder.name,
-                "task": task,
-                "start": start,
-                "instruction": before.instruction,
-                "cause": one.failure.cause if one.failure else "success",
-                "same actions as in the result": again,
-            }
-            (out / f"{name}.json").write_text(json.dumps(about))
-            simulations, moves = env.simulations, np.array(poses)[-one.length :, i]
-            placed = {"bodies": simulations.fixture_bodies, "fixtures": simulations.fixtures[i]}
-            np.savez_compressed(out / f"{name}.npz", qpos=moves, **placed)
-        env.close()
+    def __init__(self, actions: np.ndarray):
+        self._actions = iter(actions.astype(np.float64))
+
+    def reset(self, num_envs: int) -> None:
+        """There is no history."""
+
+    def act(self, obs: Any) -> np.ndarray:
+        """Return the next action."""
+        return next(self._actions)[None]
+
+
+def replay(task: str, start: int, actions: np.ndarray) -> tuple[Episode, BatchEnv, np.ndarray]:
+    """Run an episode again; return it, its environment, still open, and the positions after each step."""
+    env, poses = BatchEnv(task, 1, cameras=(), horizon=len(actions) + 1, num_threads=1), []
+    step = env.step
+
+    def kept(chosen: np.ndarray) -> Any:
+        found = step(chosen)
+        poses.append(env.simulations.fields["qpos"][0].copy())
+        return found
+
+    env.step = kept
+    done = run_episodes(Replay(actions), env, [start], horizon=len(actions), settle_steps=0)
+    return done.episodes[0], env, np.array(poses)
+
+
+def choose(folder: Path, count: int) -> None:
+    """Write failed episodes of several policies, as many of each algorithm and task as there are, in random order."""
+    tasks, draws = BenchmarkSettings("libero_object").sequence(), random.Random(0)
+    groups: dict[tuple[str, int], list[tuple[str, int, int]]] = {}
+    for path in sorted(folder.glob("*-?.json")):
+        for k, won in enumerate(json.loads(path.read_text())["success"].get("0", {"won": []})["won"]):
+            group = groups.setdefault((path.stem.partition("-")[0], k), [])
+            group += [(path.stem, k, start) for start, yes in enumerate(won) if not yes]
+    for group in groups.values():
+        draws.shuffle(group)
+    old = episodes() if LABELS.is_file() else []
+    kept = {row["number"]: row.pop("actions") for row in old}
+    known = {(row["policy"], row["task"], int(row["start"])) for row in old}
+    number_of_set = 1 + max((int(row["set"]) for row in old), default=0)
+    chosen: list[tuple[str, int, int]] = []
+    while len(chosen) < count and any(groups.values()):
+        found = [group.pop() for group in groups.values() if group]
+        chosen += [one for one in found if (one[0], tasks[one[1]].id, one[2]) not in known]
+    chosen = draws.sample(chosen, min(count, len(chosen)))
+    for number, (policy, k, start) in enumerate(chosen, len(old)):
+        about = {"policy": policy, "task": tasks[k].id, "start": start, "label": "", "of": ""}
+        old.append({"number": number, "set": number_of_set, **about})
+        kept[str(number)] = np.load(folder / f"{policy}-{k}.npz")["actions"][:, start]
+    with open(LABELS, "w", newline="") as file:
+        table = csv.DictWriter(file, FIELDS, lineterminator="\n")
+        table.writeheader()
+        table.writerows(old)
+    np.savez_compressed(ACTIONS, **kept)
+
+
+def episodes() -> list[dict[str, Any]]:
+    """Return the rows of labels.csv with the actions of their episodes."""
+    with open(LABELS, newline="") as file, np.load(ACTIONS) as actions:
+        return [{**row, "actions": actions[row["number"]]} for row in csv.DictReader(file)]
 
 
 def draw(out: Path) -> None:
-    """Write sheets of the recorded episodes, and `index.csv`, where they are to be labelled."""
-    names = sorted(path.stem for path in out.glob("*.npz"))
-    random.Random(0).shuffle(names)
-    rows = [json.loads((out / f"{name}.json").read_text()) for name in names]
-    with open(out / "index.csv", "w", newline="") as file:
-        table = csv.writer(file, lineterminator="\n")
-        table.writerow(("number", "policy", "condition", "task", "start", "label"))
-        for number, row in enumerate(rows):
-            table.writerow((number, *(row[key] for key in ("policy", "condition", "task", "start")), ""))
-    strips = {}
-    for task in sorted({row["task"] for row in rows}):
-        scene = build_scene(get_task(task).problem)
-        with Renderer(scene.model, 3 * SIZE, 3 * SIZE) as renderer:
-            for number, (name, row) in enumerate(zip(names, rows, strict=True)):
-                if row["task"] == task:
-                    strips[number] = _strip(
-                        scene, renderer, np.load(out / f"{name}.npz"), f"{number}: {row['instruction']}"
-                    )
-    for first in range(0, len(names), ROWS):
-        sheet = np.concatenate([strips[n] for n in range(first, min(first + ROWS, len(names)))])
-        Image.fromarray(sheet).save(out / f"sheet{first // ROWS:02d}.png")
+    """Write sheets: ten moments of each episode from two cameras, with the distances of fingertips and objects."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows = [row for row in episodes() if not row["label"]]
+    for first in range(0, len(rows), ROWS):
+        strips = [_strip(row) for row in rows[first : first + ROWS]]
+        Image.fromarray(np.concatenate(strips)).save(out / f"sheet{first // ROWS:02d}.png")
 
 
-def _strip(scene, renderer, episode, caption: str) -> np.ndarray:
-    data, columns = mujoco.MjData(scene.model), []
-    scene.model.body_pos[episode["bodies"]] = episode["fixtures"][:, :3]
-    scene.model.body_quat[episode["bodies"]] = episode["fixtures"][:, 3:]
-    steps = (np.array(MOMENTS) * (len(episode["qpos"]) - 1)).round().astype(int)
-    for step in steps:
-        data.qpos[:] = episode["qpos"][step]
-        mujoco.mj_forward(scene.model, data)
-        views = []
-        for camera in CAMERAS:
-            image = np.empty((3 * SIZE, 3 * SIZE, 3), np.uint8)
-            renderer.render(data, [RenderTarget(renderer.camera_id(camera), rgb=image)])
-            cut = slice(45, -15) if camera == "agentview" else slice(None)  # what is far is left out
-            view = Image.fromarray(np.ascontiguousarray(image[cut, cut]))
-            views.append(np.asarray(view.resize((SIZE, SIZE), Image.Resampling.LANCZOS)))
-        columns.append(np.concatenate(views))
+def _strip(row: dict[str, Any]) -> np.ndarray:
+    _, env, poses = replay(row["task"], int(row["start"]), row["actions"])
+    scene, data, view, columns, texts = env.scene, env.simulations.data(0), env.views[0], [], []
+    wanted = {name for atom in env.goals.atoms for name in map(scene.owner, atom.args)}
+    with env, Renderer(scene.model, 3 * SIZE, 3 * SIZE) as renderer:
+        for step in np.linspace(0.1, 1, MOMENTS) * (len(poses) - 1):
+            data.qpos[:] = poses[round(step)]
+            mujoco.mj_forward(scene.model, data)
+            views = []
+            for camera in CAMERAS:
+                image = np.empty((3 * SIZE, 3 * SIZE, 3), np.uint8)
+                renderer.render(data, [RenderTarget(renderer.camera_id(camera), rgb=image)])
+                cut = slice(60, -20) if camera == "agentview" else slice(None)  # what is far is left out
+                shown = Image.fromarray(np.ascontiguousarray(image[cut, cut]))
+                views.append(np.asarray(shown.resize((SIZE, SIZE), Image.Resampling.LANCZOS)))
+            columns.append(np.concatenate(views))
+            tip, width = data.site_xpos[env.simulations.arm.site], np.abs(view.finger_pos).sum()
+            far = {n: np.linalg.norm(data.body(f"{n}_main").xpos - tip) for n in scene.objects}
+            near = sorted((n for n in far if n not in wanted), key=far.__getitem__)[:2]
+            named = [n for n in far if n in wanted and "basket" not in n] + near
+            texts.append(
+                [f"{round(step)}: fingers {1000 * width:.0f} mm"]
+                + [f"{n[:-2]} {100 * far[n]:.1f}" for n in named]
+            )
     strip = Image.fromarray(
-        np.pad(np.concatenate(columns, axis=1), ((14, 0), (0, 0), (0, 0)), constant_values=255)
+        np.pad(np.concatenate(columns, axis=1), ((66, 0), (0, 0), (0, 0)), constant_values=255)
     )
-    ImageDraw.Draw(strip).text((2, 1), f"{caption}; steps {', '.join(map(str, steps))}", fill=(0, 0, 0))
+    pen = ImageDraw.Draw(strip)
+    pen.text((2, 1), f"{row['number']}: {env.task.language}", fill=(180, 0, 0))
+    for i, lines in enumerate(texts):
+        pen.multiline_text((2 + i * SIZE, 13), "\n".join(lines), fill=(0, 0, 0), spacing=1)
     return np.asarray(strip)
 
 
-def compare(out: Path) -> None:
-    """Print how often the tree says each cause, by what was seen."""
-    with open(LABELS, newline="") as file:
-        labels = {
-            tuple(row[key] for key in ("policy", "condition", "task", "start")): row["label"]
-            for row in csv.DictReader(file)
-        }
-    counts, same = Counter(), 0
-    for path in sorted(out.glob("*.json")):
-        row = json.loads(path.read_text())
-        label = labels.get((row["policy"], row["condition"], row["task"], str(row["start"])), "")
-        if label:
-            counts[label, row["cause"]] += 1
-            same += row["same actions as in the result"]
-    seen = [cause for cause in CAUSES if any(cause in pair for pair in counts)]
-    print("| seen \\ tree |", " | ".join(seen), "|\n|---|" + "---:|" * len(seen))
-    for label in seen:
-        print(f"| {label} |", " | ".join(str(counts[label, cause] or "") for cause in seen), "|")
-    agreed = sum(counts[cause, cause] for cause in seen)
-    print(f"{agreed} of {counts.total()} agree; {same} episodes have the actions of their result")
+def compare() -> None:
+    """Print how often the tree says each cause, by what was seen, and what it says otherwise."""
+    for number, group in itertools.groupby(episodes(), key=lambda row: row["set"]):
+        counts, told = Counter(), []
+        for row in group:
+            episode, env, _ = replay(row["task"], int(row["start"]), row["actions"])
+            env.close()
+            cause = episode.failure.cause if episode.failure else "success"
+            counts[row["label"], cause] += 1
+            if row["label"] != cause:
+                told.append(f"{row['number']}: {row['label']} {row['of']}, tree {cause}")
+        seen = [cause for cause in CAUSES if any(cause in pair for pair in counts)]
+        print(f"\n| set {number}: seen \\ tree |", " | ".join(seen), "|\n|---|" + "---:|" * len(seen))
+        for label in seen:
+            print(f"| {label} |", " | ".join(str(counts[label, cause] or "") for cause in seen), "|")
+        print(f"{sum(counts[cause, cause] for cause in seen)} of {counts.total()} agree", *told, sep="\n")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("record", "draw", "compare"))
-    parser.add_argument("results", nargs="*", help="FOLDER:COUNT of failures")
-    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("what", choices=("choose", "draw", "compare"))
+    parser.add_argument("folder", nargs="?", type=Path)
+    parser.add_argument("--count", type=int, default=40)
+    parser.add_argument("--out", type=Path, default=Path("sheets"))
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    if args.what == "record":
-        draws = random.Random(0)
-        for text in args.results:
-            folder, _, count = text.rpartition(":")
-            record(Path(folder), int(count), args.out, draws)
+    if args.what == "choose":
+        choose(args.folder, args.count)
     else:
-        {"draw": draw, "compare": compare}[args.what](args.out)
+        draw(args.out) if args.what == "draw" else compare()
 
 
 if __name__ == "__main__":

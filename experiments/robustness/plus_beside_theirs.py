@@ -27,8 +27,8 @@ from PIL import Image
 
 from libero_env.assets.arena import workspace_of_problem
 from libero_env.perturbations.corruptions import corrupt
+from libero_env.published.plus import NOISES, POSES, camera_pose, joint_pose, parse_plus_id
 from libero_env.tasks import bddl
-from libero_env.tasks.published.plus import NOISES, POSES, camera_pose, joint_pose, parse_plus_id
 
 SUITES = ("libero_spatial", "libero_object", "libero_goal", "libero_10")
 SIDE = 256

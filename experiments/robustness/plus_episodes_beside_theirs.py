@@ -23,8 +23,8 @@ from liberoplus.liberoplus.envs.env_wrapper import ControlEnv, OffScreenRenderEn
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.init_states.store import load_original_states
+from libero_env.published import PublishedTask, joint_pose
 from libero_env.tasks import get_suite
-from libero_env.tasks.published import PublishedTask, joint_pose
 
 SUITES = ("libero_plus_spatial", "libero_plus_object", "libero_plus_goal", "libero_plus_10")
 SETTLING, MOVING = 10, 30

@@ -17,7 +17,7 @@ import tomllib
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
-PACKAGES = ("libero_env", "lifelong", "libero_eval", "libero", "libero_integrations")
+PACKAGES = ("libero_cli", "libero_env", "lifelong", "libero_eval", "libero", "libero_integrations")
 LONG = 40  # lines of a function
 
 _GRAPH = """
@@ -172,6 +172,13 @@ def exempt_modules(checkout: Path) -> int:
     return sum(len(o["module"]) for o in overrides if o.get("ignore_errors"))
 
 
+def rooms(checkout: Path) -> list[str]:
+    """Return the folders that no core module may import: what the contracts protect."""
+    tool = tomllib.loads((checkout / "pyproject.toml").read_text())["tool"]["importlinter"]
+    named = [name for contract in tool["contracts"] for name in contract.get("protected_modules", ())]
+    return [name.replace(".", "/") for name in named]
+
+
 def measure(checkout: Path) -> dict[str, str]:
     """Return the figures of a checkout."""
     graph, figures = import_graph(checkout), {}
@@ -196,6 +203,16 @@ def measure(checkout: Path) -> dict[str, str]:
     }.items():
         each = {package: sum(count(*file) for file in files) for package, files in read.items()}
         figures[name] = f"{sum(each.values())}: " + ", ".join(f"{k} {v}" for k, v in each.items())
+    apart = {
+        room: sum(code_lines(text, tree) for text, tree in sources(checkout, room))
+        for room in rooms(checkout)
+    }
+    for package in present:
+        own = {k: v for k, v in apart.items() if k.startswith(f"{package}/")}
+        if own:
+            core = sum(code_lines(*file) for file in read[package]) - sum(own.values())
+            each_room = ", ".join(f"{room.rpartition('/')[2]} {lines}" for room, lines in own.items())
+            figures[f"core of {package}"] = f"{core}, and in rooms {sum(own.values())}: {each_room}"
     tests = list((checkout / "tests").rglob("*.py"))
     figures["raw lines of tests"] = str(sum(f.read_text(encoding="utf-8").count("\n") for f in tests))
     guide = [checkout / "README.md", checkout / "CONTRIBUTING.md", *(checkout / "docs").glob("*.md")]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("libero_env", "lifelong", "libero_eval", "libero")
+PACKAGES = ("libero_cli", "libero_env", "lifelong", "libero_eval", "libero")
 
 # argv of the command; then file (its end) and name of the function at which the stack is read
 _RUN = """
@@ -96,7 +96,7 @@ WALKS = {
 
 def stack(walk: Walk, checkout: Path) -> list[str]:
     """Return the frames of the packages, from the command to the function, as `file name`."""
-    entry = "libero_env/cli/__main__.py"
+    entry = "libero_cli/__main__.py"
     script = str(checkout / (walk.script or entry))
     code = _RUN.format(
         ends=walk.ends, names=walk.names, through=walk.through, argv=[script, *walk.words], script=script

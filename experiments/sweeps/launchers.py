@@ -23,6 +23,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 TINY = "preset=smoke benchmark=libero_object benchmark.tasks=1 threads=1 data.demos=2 train.epochs=1 "
+TINY += "train.warmup_steps=0 "
 TINY += "train.steps_per_epoch=2 train.batch_size=4 eval.curve=none eval.select=last eval.horizon=8 eval.episodes=2"
 SWEPT = ("algo=sequential,er", "train.lr=1e-3,-1,1e-4")
 EXPECTED = ["done", "failed", "done"] * 2

@@ -5,16 +5,16 @@ python experiments/tuning/agem.py gradient update --stream 61,62
 
 import argparse
 import json
-from functools import partial
 from pathlib import Path
 
 import torch
+from held_out import errors, open_both
 
 from lifelong.algorithms import AGEM
 from lifelong.composition import compose_run
 from lifelong.data.memory import ReplayMemory
 from lifelong.settings import BenchmarkSettings, plain_data
-from lifelong.tuning.proxy import Trial, measure, open_stream
+from lifelong.tuning.trials import Trial, learn
 
 COSINES: list[float] = []  # of each step's gradient and reference
 
@@ -65,17 +65,16 @@ def main() -> None:
     tasks = BenchmarkSettings("libero_90", tasks=[int(t) for t in args.stream.split(",")]).sequence()
     for projected in args.projected:
         COSINES.clear()
-        config = plain_data(compose_run([*args.set, "algo=sequential"])[0])
+        config = plain_data(compose_run(["data.demos=60", *args.set, "algo=sequential"])[0])
         config["algo"] = {"_target_": f"{Watched.__module__}.Watched", "projected": projected}
-        errors = measure(
-            Trial(config, tasks, 1, 160, 0.25), partial(open_stream, config, tasks, 0.25), args.out / "agem"
-        )
+        data, batches = open_both(config, tasks, config["data"]["demos"] // 3)
+        *_, (algorithm, policy) = learn(Trial(config, tasks, 1, 160), data, args.out / "agem")
         cosines = torch.tensor(COSINES)
         print(
             json.dumps(
                 {
                     "projected": projected,
-                    "errors": [round(e, 4) for e in errors[-1]],
+                    "errors": [round(e, 4) for e in errors(algorithm, policy, batches)],
                     "steps": len(cosines),
                     "opposed": round((cosines < 0).float().mean().item(), 3) if COSINES else None,
                     "mean_cosine": round(cosines.mean().item(), 3) if COSINES else None,

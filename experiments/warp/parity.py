@@ -23,7 +23,7 @@ from libero_env.sim.scene import build_scene
 from libero_env.sim.simulation import Simulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import get_task
-from libero_env.tasks.problem import And, Atom
+from libero_env.tasks.expression import And, Atom
 
 MOTION = ["libero_spatial/0", "libero_object/3", "libero_object/7", "libero_goal/0", "libero_goal/5"]
 MOTION += ["libero_10/3", "libero_10/9", "libero_90/1", "libero_90/20", "libero_90/60"]

@@ -9,7 +9,7 @@ import numpy as np
 from libero_env.assets.original_arena import SCENES
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.init_states.placement import ARM_NOISE
-from libero_env.sim.scene import workspace_of
+from libero_env.sim.scene_spec import workspace_of
 from libero_env.storage import read_yaml
 from libero_env.tasks.problem import Problem
 from libero_env.text import shown

@@ -4,47 +4,30 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from libero._adapters.lookup import Named
-from libero._adapters.sim import Domain
 from libero_env.assets.robot import GRIP_SITE
 from libero_env.errors import InvalidInputError, LiberoError, require_known
 from libero_env.mujoco_compat import MASS_FIELD
 from libero_env.sim.controller import POINTING_DOWN, ControllerState, get_controller
-from libero_env.sim.osc import goals_from_poses, move_gripper, rotate
+from libero_env.sim.osc import goals_from_poses, rotate
+from libero_env.storage import parse_yaml
 from libero_env.text import shown
 
-_GAINS = {
-    "damping_ratio": 1,
-    "impedance_mode": "fixed",
-    "kp_limits": [0, 300],
-    "damping_ratio_limits": [0, 10],
-}
-_POSES = {"orientation_limits": None, "uncouple_pos_ori": True}
-_OSC = {"kp": 150, **_GAINS, "position_limits": None, "control_delta": True}
-
-
-def _ranges(most: Any) -> dict[str, Any]:
-    least = [-x for x in most] if isinstance(most, list) else -most
-    ranges = {"input_max": 1, "input_min": -1, "output_max": most, "output_min": least}
-    return {**ranges, "interpolation": None, "ramp_ratio": 0.2}
-
-
-DEFAULTS: dict[str, dict[str, Any]] = {  # robosuite's controllers/config/*.json; m, rad, rad/s and N m
-    "OSC_POSE": {**_ranges([0.05] * 3 + [0.5] * 3), **_OSC, **_POSES},
-    "OSC_POSITION": {**_ranges([0.05] * 3), **_OSC},
-    "JOINT_POSITION": {**_ranges(0.05), "kp": 50, **_GAINS, "qpos_limits": None},
-    "JOINT_VELOCITY": {**_ranges(0.5), "kp": 3.0, "velocity_limits": [-1, 1]},
-    "JOINT_TORQUE": {**_ranges(0.1), "torque_limits": None},
-}
+# robosuite's controllers/config/*.json; m, rad, rad/s and N m
+DEFAULTS: dict[str, dict[str, Any]] = parse_yaml(
+    Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8")
+)
 _PANDA = {"type": "JOINT_VELOCITY", "kp": 0.03}  # default_panda.json
+_POSES = {"orientation_limits": None, "uncouple_pos_ori": True}
 # Keys that have one value here; the others of robosuite are obeyed, or have no effect with these values.
 _FIXED: dict[str, Any] = {"impedance_mode": "fixed", "interpolation": None, **_POSES}
 _SET_BY_ROBOT = "robot_name sim eef_name eef_rot_offset joint_indexes actuator_range policy_freq ndim".split()  # noqa: SIM905
-_LIMITS = ("position_limits", "qpos_limits", "velocity_limits", "torque_limits")
+_LIMITS = ("position_limits", "qpos_limits", "velocity_limits")
 
 
 def controller_of(configs: Any) -> dict[str, Any]:
@@ -83,13 +66,6 @@ def _jacobian(controller: Any) -> np.ndarray:
     return np.concatenate([np.cross(axes, controller.ee_pos - data.xanchor[:7]), axes], axis=1).T
 
 
-def _at_rest(controller: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return position (3,) and orientation (3, 3) of the grip site in the rest pose."""
-    simulations = controller._env.simulations
-    pos, mat = simulations._grip_site(simulations._rest_fields)
-    return pos[0], mat[0].reshape(3, 3)
-
-
 _INDICES = list(np.arange(7, dtype=np.int32))
 _NAMES: dict[str, Callable[[Any], Any]] = {  # m, rad, N m
     "J_full": _jacobian,
@@ -103,26 +79,18 @@ _NAMES: dict[str, Callable[[Any], Any]] = {  # m, rad, N m
     "joint_vel": lambda c: c._env.arm_seen[1],
     "mass_matrix": lambda c: c._env.simulations.fields[MASS_FIELD][0][c._env.simulations.arm.mass_address],
     "torque_compensation": lambda c: c._env.sim.data.qfrc_bias[:7].copy(),
-    "torques": lambda c: c._env.robots[0].torques,
     "goal_pos": lambda c: c._state.goal[0],
     "goal_ori": lambda c: c._state.memory[0].reshape(3, 3),
-    "initial_ee_pos": lambda c: _at_rest(c)[0],
-    "initial_ee_ori_mat": lambda c: _at_rest(c)[1],
     "actuator_min": lambda c: -c.actuator_max,
     "control_limits": lambda c: (c.input_min, c.input_max),
     "actuator_limits": lambda c: (c.actuator_min, c.actuator_max),
     "action_scale": lambda c: abs(c.output_max - c.output_min) / abs(c.input_max - c.input_min),
     "action_input_transform": lambda c: (c.input_max + c.input_min) / 2.0,
     "action_output_transform": lambda c: (c.output_max + c.output_min) / 2.0,
-    "use_ori": lambda c: c.name == "OSC_POSE",
-    "name_suffix": lambda c: c.name.partition("_")[2],
     "sim": lambda c: c._env.sim,
-    "control_freq": lambda c: c._env.control_freq,
-    "model_timestep": lambda c: c._env.sim.model.opt.timestep,
-    "relative_ori": lambda c: np.zeros(3),
+    **dict.fromkeys(("orientation_limits", "interpolator_pos", "interpolator_ori"), lambda c: None),
     "impedance_mode": lambda c: "fixed",
     "uncoupling": lambda c: True,
-    **dict.fromkeys(("orientation_limits", "interpolator_pos", "interpolator_ori"), lambda c: None),
 }
 
 
@@ -136,13 +104,13 @@ class Controller(Named, names=_NAMES):
         control_dim: Length of an action without the gripper.
         input_min, input_max, output_min, output_max: Ranges of an action, and what they mean, (control_dim,).
         actuator_max: Largest torques of the joints at the last reset, (7,), N m.
-        position_limits, velocity_limits, torque_limits: Bounds of goals, (2, n): m, rad, rad/s or N m; None for none.
+        position_limits, velocity_limits: Bounds of goals, (2, n): m, rad or rad/s; None for none.
     """
 
-    new_update, ori_ref, eef_name, joint_dim = True, None, GRIP_SITE, 7
+    eef_name, joint_dim = GRIP_SITE, 7
     joint_index, qpos_index, qvel_index = list(range(7)), _INDICES, _INDICES
 
-    def __init__(self, env: Domain, config: Mapping[str, Any]):
+    def __init__(self, env: Any, config: Mapping[str, Any]):
         self._env, self.name = env, config["type"]
         self._take_torque_limits()
         self.actuator_max = env.simulations.arm.torque_limit.copy()
@@ -153,13 +121,11 @@ class Controller(Named, names=_NAMES):
                 setattr(self, f"{name}_{end}", self._numbers({name: value}, name, self._law.gains.shape[1]))
         for key in ("input_max", "input_min", "output_max", "output_min"):
             setattr(self, key, self._numbers(config, key, self.control_dim))
-        self.position_limits = self.velocity_limits = self.torque_limits = None
+        self.position_limits = self.velocity_limits = None
         for key in _LIMITS:
             if config.get(key) is not None:
                 setattr(self, key.replace("qpos", "position"), self._bounds(config, key))
         law = replace(self._law, set_goals=self._set_goals, gains=self._gains(config))
-        if self.name == "JOINT_TORQUE":
-            law = replace(law, kernel=_given_torques)
         env.simulations.controller_state = ControllerState(1, law)
         self.reset_goal()
 
@@ -224,8 +190,6 @@ class Controller(Named, names=_NAMES):
         start = 0.0
         if self.name == "JOINT_VELOCITY":
             limits = self.velocity_limits
-        elif self.name == "JOINT_TORQUE":
-            limits = self.actuator_limits if self.torque_limits is None else self.torque_limits
         elif self.use_delta:
             start = site_pos[0] if self.name.startswith("OSC") else qpos[0, :7]
         goal[0] = start + wanted[: goal.shape[1]]
@@ -239,9 +203,7 @@ class Controller(Named, names=_NAMES):
 
     @use_delta.setter
     def use_delta(self, value: bool) -> None:
-        is_torque = self.name == "JOINT_TORQUE"  # absolute neither, as joint velocities
-        name = "joint_position" if is_torque and value else self.name.lower()
-        self._law = get_controller(name, bool(value))
+        self._law = get_controller(self.name.lower(), bool(value))
 
     # State --------------------------------------------------------------------------------------------------
 
@@ -276,7 +238,7 @@ class Controller(Named, names=_NAMES):
         self._env.simulations.rest = self._numbers({"initial_joint": value}, "initial_joint", 7)
 
     def _set_gains(self, row: int, value: Any) -> None:
-        if self.name in ("JOINT_VELOCITY", "JOINT_TORQUE"):
+        if self.name == "JOINT_VELOCITY":
             raise InvalidInputError(f"controller {self.name}: its gains are those of the configuration")
         gains = self._state.controller.gains
         gains[row] = self._numbers({"value": value}, "value", gains.shape[1])
@@ -286,20 +248,8 @@ class Controller(Named, names=_NAMES):
         if force:
             self._env.simulations.update_controller([0])
 
-    def update_base_pose(self, base_pos: Any = None, base_ori: Any = None) -> None:
-        """Do nothing: goals are in the world frame."""
-
     def reset_goal(self) -> None:
         """Set the goal to the present pose; the command of the gripper stays."""
         gripper = self._state.gripper[0].copy()
         self._state.restart(np.zeros(1, np.int64), self.ee_pos[None], self.ee_ori_mat.reshape(1, 9))
         self._state.gripper[0] = gripper
-
-
-def _given_torques(
-    ids, actions, qpos, qvel, xanchor, xaxis, site_pos, site_mat, mass, bias, goal, memory, gripper, ctrl,
-    mass_address, torque_limit, finger_range, rest, gains,
-):  # fmt: skip
-    """Write the torques of the goal plus bias; arguments as in `libero_env.sim.osc.osc_torques`, of one simulation."""
-    ctrl[0, :7] = np.clip(goal[0] + bias[0, :7], -torque_limit, torque_limit)
-    move_gripper(actions[0, 7], gripper[0], ctrl[0], finger_range)

@@ -5,6 +5,7 @@ robosuite expects in the world body of an object an outer body with the sites `b
 files one body is enough; what is missing is derived from its shape.
 """
 
+import os
 from collections.abc import Mapping
 from copy import deepcopy
 from functools import lru_cache
@@ -17,10 +18,11 @@ import numpy as np
 from libero_env.assets.original_mjcf import attachable_xml, read_file, read_spec
 from libero_env.assets.pack import ORIGINAL, Pack, facade_assets, original_folder, pack_of
 from libero_env.assets.robot import DEFAULT_ROBOT
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, require_known
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects import ObjectModel
 from libero_env.paths import read_config
+from libero_env.sim.scene_spec import DRAWINGS, default_drawing
 
 OFFSETS = ("bottom", "top", "horizontal_radius")  # sites, without their suffix
 Offsets = Mapping[str, tuple[float, ...]]
@@ -31,6 +33,19 @@ _DAMPING = 0.0005  # [N s/m and N m s/rad] damping of a free joint, as in robosu
 def facade_pack() -> Pack:
     """Return the pack of the facade; see `libero_env.assets.pack.facade_assets`."""
     return pack_of(facade_assets())
+
+
+def facade_drawing(asked: str | None = None) -> str:
+    """Return how images are drawn: as the caller asks, else as `LIBERO_DRAWING` says, else as natively with this pack.
+
+    Raises:
+        UnknownNameError: There is no such drawing.
+    """
+    for name, value in (("drawing", asked), ("LIBERO_DRAWING", os.environ.get("LIBERO_DRAWING") or None)):
+        if value is not None:
+            require_known(name, value, DRAWINGS)
+            return value
+    return default_drawing(facade_pack())
 
 
 def facade_robot() -> str:

@@ -162,7 +162,7 @@ class Observer:
         return {key: np.ascontiguousarray(value) for key, value in values.items()}
 
 
-_SETTERS = ("sensor", "corrupter", "filter", "delayer", "sampling_rate", "enabled", "active")
+_SETTERS = ("sensor", "corrupter", "filter", "enabled", "active")
 
 
 class Observable:
@@ -209,11 +209,7 @@ class Observable:
         return bool(self._settings["active"])
 
     def set(self, attribute: str, value: Any) -> None:
-        """Set one of the arguments; raise a LiberoError for those that a control step of 50 ms has no place for."""
-        if attribute in ("delayer", "sampling_rate"):
-            raise LiberoError(
-                f"{self.name}: {attribute} cannot be changed; observations are made at each control step"
-            )
+        """Set one of the arguments."""
         self._settings[attribute] = value
 
     def update(self, timestep: float, obs_cache: dict[str, Any], force: bool = False) -> None:

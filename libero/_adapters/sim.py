@@ -7,17 +7,16 @@ The model is the environment's own copy, so clients may write to it; a new pose 
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from libero_env.envs.env import require_display
 from libero_env.errors import LiberoError, RenderError, UnknownNameError
+from libero_env.images import flip_rows
 from libero_env.mujoco_compat import mujoco
+from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.render import Renderer, RenderTarget
-from libero_env.sim.scene import Scene
-from libero_env.sim.simulation import LoopSimulations
-from libero_env.sim.state import StateView
 
 # Kind of element in robosuite -> kind in MuJoCo.
 _NAMES = ("body", "joint", "geom", "site", "light", "camera", "actuator", "sensor", "tendon", "mesh")
@@ -310,7 +309,7 @@ class MjSim:
         renderer.render(self.data._data, [target], sites)
         if segmentation:
             image = self._elements(image)
-        return image[::-1] if buffer is None else (image[::-1], buffer[::-1])
+        return flip_rows(image) if buffer is None else (flip_rows(image), flip_rows(buffer))
 
     def _elements(self, numbers: np.ndarray) -> np.ndarray:
         """Return kind and index (H, W, 2) of the elements whose numbers (H, W) were drawn."""
@@ -349,19 +348,6 @@ class MjSim:
         self._simulations.close()
 
 
-class Domain(Protocol):
-    """One simulation of a task file; see `libero.libero.envs.bddl_base_domain.BDDLBaseDomain`."""
-
-    scene: Scene
-    objects_dict: dict[str, Any]
-    fixtures_dict: dict[str, Any]
-    control_freq: float
-    initialization_noise: Any
-    simulations: ClientSimulations
-    sim: MjSim
-    view: StateView
-
-
 class Window:
     """MuJoCo's viewer of a simulation, opened at the first `show`.
 
@@ -373,24 +359,21 @@ class Window:
 
     def __init__(self, camera: str):
         self.camera = camera
-        self._viewer: Any = None
-        self._tried = False
+        self._viewer: list[Any] = []
 
     def show(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
         """Show the present state; a window that the user closed stays closed."""
-        if self._viewer is None and not self._tried:
-            self._viewer = self._opened(model, data)
-        if self._viewer is not None and self._viewer.is_running():
-            self._viewer.sync()
+        self._viewer = self._viewer or [self._opened(model, data)]
+        if self._viewer[0] is not None and self._viewer[0].is_running():
+            self._viewer[0].sync()
 
     def close(self) -> None:
         """Close the window. Idempotent."""
-        if self._viewer is not None:
-            self._viewer.close()
-            self._viewer = None
+        for viewer in filter(None, self._viewer):
+            viewer.close()
+        self._viewer = [None]
 
     def _opened(self, model: mujoco.MjModel, data: mujoco.MjData) -> Any:
-        self._tried = True
         try:
             require_display()
         except RenderError:

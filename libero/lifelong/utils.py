@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset, default_collate, random_split
+from torch.utils.data import Dataset, default_collate
 
 from libero._adapters.config import Config, assign, plain
 from libero_env.storage import atomic_path
@@ -72,21 +72,6 @@ def torch_load_model(model_path: Any, map_location: Any = None) -> tuple[dict[st
         ) from error
 
 
-def get_train_test_loader(
-    dataset: Dataset,
-    train_ratio: float,
-    train_batch_size: int,
-    test_batch_size: int,
-    num_workers: tuple[int, int] = (0, 0),
-) -> tuple[DataLoader, DataLoader]:
-    """Split a dataset at random, as `control_seed` seeds it, into a shuffled training part and a test part."""
-    size = len(dataset)  # type: ignore[arg-type]
-    first = int(size * train_ratio)
-    parts = random_split(dataset, [first, size - first])
-    train = DataLoader(parts[0], train_batch_size, shuffle=True, num_workers=num_workers[0])
-    return train, DataLoader(parts[1], test_batch_size, num_workers=num_workers[1])
-
-
 def confidence_interval(p: float, n: int) -> float:
     """Return half the width of the original's 95 % interval of a success rate p of n episodes, which is 0 for p = 1.
 
@@ -112,35 +97,20 @@ def create_experiment_dir(cfg: Any) -> str:
     `cfg.experiment_dir` receives it, `cfg.experiment_name` its name on one line. Runs from given weights, of another
     order of tasks, or with other embeddings are in folders such as `experiments_finetune_permute3_clip`.
     """
-    root = experiment_root(cfg)
-    root.mkdir(parents=True, exist_ok=True)
-    last = max((_run_number(path) for path in root.glob("run_*")), default=0)
-    for number in count(last + 1):
+    embedding, order = cfg.task_embedding_format.replace("-", ""), cfg.data.task_order_index
+    marks = ["finetune"] * bool(cfg.get("pretrain_model_path")) + [f"permute{order}"] * bool(order)
+    marks += [embedding] * (embedding in ("onehot", "clip", "gpt2", "roberta"))
+    name = f"{cfg.policy.policy_type}_seed{cfg.seed}"
+    root = Path("_".join(["experiments", *marks]), cfg.benchmark_name, cfg.lifelong.algo, name)
+    numbers = (path.name.rpartition("_")[2] for path in root.glob("run_*"))
+    for number in count(1 + max((int(text) for text in numbers if text.isdigit()), default=0)):
         path = root / f"run_{number:03d}"
         with suppress(FileExistsError):  # another process was first
-            path.mkdir()
+            path.mkdir(parents=True)
             break
     assign(cfg, "experiment_dir", str(path))
     assign(cfg, "experiment_name", "_".join(path.parts[-4:]))
     return str(path)
-
-
-def experiment_root(cfg: Any) -> Path:
-    """Return the folder of all runs of a configuration."""
-    embedding, order = cfg.task_embedding_format.replace("-", ""), cfg.data.task_order_index
-    marks = ["finetune"] * bool(cfg.get("pretrain_model_path")) + [f"permute{order}"] * bool(order)
-    marks += [embedding] * (embedding in ("onehot", "clip", "gpt2", "roberta"))
-    return Path(
-        "_".join(["experiments", *marks]),
-        cfg.benchmark_name,
-        cfg.lifelong.algo,
-        f"{cfg.policy.policy_type}_seed{cfg.seed}",
-    )
-
-
-def latest_run(root: Path) -> Path | None:
-    """Return the newest run in a folder of runs."""
-    return max(root.glob("run_*"), key=_run_number, default=None)
 
 
 def get_task_embs(cfg: Any, descriptions: list[str]) -> Tensor:
@@ -159,8 +129,3 @@ def get_task_embs(cfg: Any, descriptions: list[str]) -> Tensor:
         embs = LanguageEncoder(cfg.task_embedding_format).embed(descriptions)
     assign(cfg.policy.language_encoder.network_kwargs, "input_size", embs.shape[-1])
     return embs
-
-
-def _run_number(path: Path) -> int:
-    text = path.name.rpartition("_")[2]
-    return int(text) if text.isdigit() else 0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from libero_env.assets import furnishing
-from libero_env.assets.own_arena import read_own, read_room
+from libero_env.assets.own_arena import read_own, read_room, require_reach
 from libero_env.assets.robot import load_robosuite
 from libero_env.errors import UnknownNameError
 from libero_env.mujoco_compat import delete, make_directional, mujoco
@@ -20,6 +20,7 @@ SPARE = "spare_"  # prefix of materials that nothing has
 _ROOM = "room"  # file with the parameters that all workspaces share
 _MOUNT_LIFT = 0.01  # [m] height of the mount's origin above the arm's
 _SEEN: Mapping[str, Any] = {"group": 1, "contype": 0, "conaffinity": 0}  # geoms of the room
+_FAR = 2.0  # [m] length of a surface whose size is not known
 _SHARED = ("cameras", "lights", "walls", "floor")
 
 
@@ -77,13 +78,16 @@ def load_workspace(category: str) -> Workspace:
     x, y, z = base.robot_base_pos
     cameras = base.parameters["cameras"].items()
     moved = {name: {**camera, "pos": list(camera["pos"] + shift)} for name, camera in cameras}
+    robot = tuple(given.get("robot", (x + shift[0], y + shift[1], z)))
+    surface = (base.offset[0] + shift[0], base.offset[1] + shift[1], base.surface_height + shift[2])
+    require_reach(directory, robot, surface, given["table"]["size"] if "table" in given else (_FAR, _FAR))
     return replace(
         base,
         name=category,
         problem=_own_problem(category),
         offset=tuple(base.offset + shift),
         zone_origin=tuple(base.zone_origin + shift),
-        robot_base_pos=tuple(given.get("robot", (x + shift[0], y + shift[1], z))),
+        robot_base_pos=robot,
         parameters={**base.parameters, "cameras": moved, **changes},
     )
 

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from libero_env.errors import LiberoError, MissingPackageError
+from libero_env.errors import LiberoError, need
 from libero_env.paths import cache_dir
 from libero_env.storage import write_json
 from libero_env.validation import validate
@@ -25,7 +25,7 @@ from libero_env.validation import validate
 REPO = "lerobot/libero-assets"  # a data set; CC BY 4.0
 REVISION = "0b3ea86be5fe169d0fd036ae63d1070ec09e90f6"
 MANIFEST = "libero-assets.json"  # written when all files are complete and verified
-_MAX_FILES = 100_000  # of a listing or an archive
+_MAX_FILES = 100_000  # of a listing
 _MAX_NAME = 500  # characters
 _MAX_SIZE = 1 << 42  # [bytes]
 _SPARE_BYTES = 64 << 20  # [bytes] to leave free on the disk
@@ -70,7 +70,7 @@ def broken_files(folder: Path, remote: Mapping[str, Remote]) -> list[str]:
 
 
 def check_names(names: Sequence[str], source: str) -> None:
-    """Check that names from a server or an archive are those of different files in one folder or below.
+    """Check that names from a server are those of different files in one folder or below.
 
     Args:
         names: Names with `/` between folders.
@@ -208,15 +208,8 @@ def _list_files(api: Any, repo: str, revision: str) -> dict[str, Remote]:
 @contextmanager
 def _hub(repo: str, folder: Path) -> Iterator[Any]:
     """Yield huggingface_hub with plain HTTP, which resumes and which mirrors support; its errors become ours."""
-    try:
-        import huggingface_hub as hub
-        from huggingface_hub import constants
-        from huggingface_hub.errors import HfHubHTTPError
-    except ImportError as error:
-        raise MissingPackageError(
-            "huggingface_hub, which downloads from the Hub, is not installed", "pip install huggingface_hub"
-        ) from error
-    errors: tuple[type[Exception], ...] = (OSError, HfHubHTTPError.__mro__[1])
+    hub, constants = need("huggingface_hub"), need("huggingface_hub.constants")
+    errors: tuple[type[Exception], ...] = (OSError, need("huggingface_hub.errors").HfHubHTTPError.__mro__[1])
     before = constants.HF_HUB_DISABLE_XET
     constants.HF_HUB_DISABLE_XET = True
     resume = f"what was downloaded is kept in {folder}: run it again to resume"

@@ -1,6 +1,6 @@
 """Workspaces of users: a folder with `workspace.yaml`, in which a table is described or a room in MJCF is named."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Required
 
@@ -19,6 +19,10 @@ from libero_env.workspaces import FILE, BuiltinWorkspace
 FLOOR, TABLE_TOP = "floor", "table_top"
 _HALF_THICKNESS, _LEG_RADIUS = 0.025, 0.025  # [m] of a table
 _SMALLEST = 0.3  # [m] length of a table, whose legs stand 0.1 m from its edges
+_SHOULDER, _REACH = (
+    0.333,
+    1.0,
+)  # [m] of the Panda: height above its base, and from there to the fingertips at most
 _SEEN_GROUP = 1  # as `libero_env.sim.render.Renderer` draws
 
 
@@ -69,6 +73,26 @@ def read_own(directory: Path) -> tuple[OwnWorkspace, np.ndarray | None, dict[str
             )
         return given, origin, {**parameters, "table": _table(origin, given["table"]["size"])}
     return given, None, parameters
+
+
+def require_reach(
+    directory: Path, robot: Sequence[float], surface: Sequence[float], size: Sequence[float]
+) -> None:
+    """Raise an InvalidInputError where an arm on its base reaches no part of the surface, whatever the task is.
+
+    Args:
+        robot: Position of its base, (3,) [m].
+        surface: Middle of the surface, (3,) [m].
+        size: Lengths of the surface along x and y, [m].
+    """
+    away = np.abs(np.subtract(surface, (*robot[:2], robot[2] + _SHOULDER)))
+    away[:2] = np.maximum(away[:2] - np.array(size) / 2, 0)
+    if (distance := float(np.linalg.norm(away))) > _REACH:
+        raise InvalidInputError(
+            f"{directory / FILE}: the arm, with its base (robot) at {[round(float(v), 3) for v in robot]}, reaches "
+            f"nothing on the table at {[round(float(v), 3) for v in surface]}: it is {distance:.2f} m from its "
+            f"shoulder; expected at most {_REACH:g} m"
+        )
 
 
 def read_room(path: Path) -> tuple[mujoco.MjSpec, np.ndarray]:

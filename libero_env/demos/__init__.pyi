@@ -1,7 +1,6 @@
 from .config import DemoConfig, RenderConfig, Variation
 from .generate import RecordingJob, ensure_demos, make_demos
 from .read import DemoOrigin, Episode, demo_lengths, demo_origin, iter_demos, read_demos
-from .rendering import rerender
 from .write import DemoWriter
 
 __all__ = [
@@ -18,5 +17,4 @@ __all__ = [
     "iter_demos",
     "make_demos",
     "read_demos",
-    "rerender",
 ]

@@ -26,6 +26,7 @@ from types import MappingProxyType
 import numpy as np
 
 from libero_env.assets.pack import Pack
+from libero_env.demos.agreement import require_default_control
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import Episode
@@ -53,13 +54,14 @@ class ActionConverter:
 
     Raises:
         UnknownNameError: No such kind of action is known.
-        DemoError: It is not a demonstration file, or names no task.
+        DemoError: It is not a demonstration file, names no task, or has actions of another controller.
     """
 
     def __init__(
         self, file: Path, kind: str, task: Task | None = None, assets: Pack | str | Path | None = None
     ):
         require_known("kind of actions", kind, KINDS)
+        require_default_control(file, "a replay or a conversion", any_frequency=True)
         self.kind, self._file = kind, file
         is_needed = kind != "delta" or task is not None  # which the states have to be of
         self._renderer = (

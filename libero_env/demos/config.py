@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from functools import cached_property
 from importlib import metadata
@@ -15,13 +15,12 @@ from libero_env.assets.pack import select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.contents import Pairing
 from libero_env.demos.write import make_header
+from libero_env.doors import enter
 from libero_env.envs.config import Cameras, Drawing, Names, Robot, Size
-from libero_env.errors import InvalidInputError
-from libero_env.perturbations.episodes import checked_perturbations
-from libero_env.perturbations.perturbation import KINDS, Perturbation, format_perturbations
 from libero_env.sim.backend import Backend
 from libero_env.sim.observations import DEFAULT_CAMERAS, segmentation_labels
-from libero_env.sim.scene import FAST, Scene, build_scene, default_drawing
+from libero_env.sim.scene import Scene, build_scene
+from libero_env.sim.scene_spec import FAST, default_drawing
 from libero_env.storage import read_yaml
 from libero_env.tasks import Task, get_task
 from libero_env.tasks.cameras import camera_name
@@ -43,22 +42,8 @@ def changed_options(config: Any) -> dict[str, Any]:
     return {name: value for name, (value, default) in values.items() if value != default}
 
 
-def rendered_perturbations(perturb: str | Sequence[Perturbation]) -> tuple[Perturbation, ...]:
-    """Return perturbations under which recorded states can be rendered, those of severity 0 left out.
-
-    Raises:
-        UnknownNameError: A kind of perturbation does not exist.
-        InvalidInputError: A perturbation is not valid, or changes what happens and not only what is seen or said.
-    """
-    rendered = []
-    for one in checked_perturbations(perturb):
-        if not isinstance(one, Perturbation) or one.trigger or not one.definition.is_rendered:
-            valid = ", ".join(kind.name for kind in KINDS.values() if kind.is_rendered)
-            raise InvalidInputError(
-                f"{one} changes what happens, and recorded demonstrations show what happened without it; valid: {valid}"
-            )
-        rendered.append(one)
-    return tuple(rendered)
+def _rendered(value: Any) -> tuple[Any, ...]:
+    return enter("perturbations", "read_rendered")(value) if value else ()
 
 
 @checked
@@ -100,7 +85,7 @@ class RenderConfig:
     size: Size = (128, 128)
     modalities: Names = ("rgb",)
     drawing: Drawing | None = None
-    perturb: Annotated[tuple[Perturbation, ...], PlainValidator(rendered_perturbations)] = ()
+    perturb: Annotated[tuple[Any, ...], PlainValidator(_rendered)] = ()
 
     def header(self) -> dict[str, Any]:
         """Return the attributes of a file; the default cameras and modalities, and `fast`, are left out."""
@@ -112,7 +97,7 @@ class RenderConfig:
         if self.drawing not in (None, FAST):
             attributes["drawing"] = self.drawing
         if self.perturb:
-            text = format_perturbations(self.perturb)
+            text = ",".join(map(str, self.perturb))
             attributes |= zip(PERTURBED_HEADER, (text, PERTURB_DRAWS), strict=True)
         return attributes
 
@@ -168,8 +153,8 @@ class DemoConfig:
 
     @property
     def batch(self) -> int:
-        """Number of demonstrations that are simulated together, and written before the next ones."""
-        return 50 if self.backend.is_warp else 5
+        """Largest number of demonstrations that are simulated together, and written before the next ones."""
+        return 50 if self.backend.is_warp else 10
 
     @cached_property
     def task(self) -> Task:

@@ -21,6 +21,7 @@ from libero_env.demos.hdf5 import (
     read_attributes,
 )
 from libero_env.errors import DemoError
+from libero_env.images import flip_rows
 from libero_env.validation import validate
 
 Pairing = Literal["aligned", "libero"]
@@ -316,7 +317,7 @@ def read_values(group: h5py.Group, key: str, where: str, *, check: bool = True) 
     if check and (fault := value_fault(name, values)):
         raise BrokenDemoError(f"{where} {fault}")
     if is_image(name):
-        return np.ascontiguousarray(values[:, ::-1])  # the file has OpenGL rows
+        return np.ascontiguousarray(flip_rows(values, 1))
     return values
 
 

@@ -5,15 +5,17 @@ recorded before, or on how often the recording was interrupted.
 """
 
 import json
+import os
 import sys
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from filelock import FileLock, Timeout
 from tqdm import tqdm
@@ -24,10 +26,14 @@ from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.record import RecordingReport, record_chunk, recorders
 from libero_env.demos.write import REMEDY, DemoWriter, OtherRecordingError
 from libero_env.errors import DemoError, InvalidInputError
-from libero_env.parallel import check_main_guard, cpu_count, progress_bar, run_each, tell_progress
+from libero_env.parallel import check_main_guard, cpu_count, run_each, spawn_pool
 from libero_env.paths import demos_dir
+from libero_env.progress import progress_bar, tell_progress
+from libero_env.storage import own_folder
 from libero_env.tasks import Task, get_suite
+from libero_env.text import counted
 
+_NICE = 10  # of a process that records while another learns
 _WAIT_SECONDS = 600.0  # between two lines about the process that is waited for
 
 
@@ -152,14 +158,72 @@ def ensure_demos(
         DemoError: A file cannot be written, or the expert cannot do a task.
     """
     tasks = get_suite(tasks).tasks if isinstance(tasks, str) else tuple(tasks)
-    root = demos_dir() if root is None else Path(root)
-    size = (camera_size[0], camera_size[1])
-    configs = [DemoConfig(task, size, seed, drawing=drawing, robot=robot) for task in tasks]
-    jobs = [RecordingJob(config, demo_path(root, config)) for config in configs]
+    here = demos_dir() if root is None else Path(root)
+    jobs = [_job(task, here, camera_size, seed, drawing, robot) for task in tasks]
+    for job in jobs if root is not None else ():  # which may be somebody else's
+        own_folder(here, str(job.path.parent.relative_to(here)), error=DemoError)
     reports = make_demos(jobs, n, workers=workers, progress=progress, replace=True)
     if failed := [f"{path.name}: {report.error}" for path, report in reports.items() if report.error]:
         raise DemoError(f"{len(failed)} of {len(reports)} files are not complete. {'; '.join(failed)}")
     return [job.path for job in jobs]
+
+
+def _job(
+    task: Task, root: Path, camera_size: tuple[int, int], seed: int, drawing: str | None, robot: str
+) -> RecordingJob:
+    config = DemoConfig(task, (camera_size[0], camera_size[1]), seed, drawing=drawing, robot=robot)
+    return RecordingJob(config, demo_path(root, config))
+
+
+class LaterDemos:
+    """Records demonstrations of later tasks in a process of its own, task after task, while others are learned from.
+
+    It gives way to other processes. As a context manager it is waited for, and killed where this one is interrupted.
+
+    Args:
+        first: Tasks of which demonstrations are needed at once.
+    """
+
+    def __init__(self, first: Iterable[Task]):
+        self._first = {task.id for task in first}
+        self._pool = spawn_pool(1)
+        self._recorded: dict[Path, Future[list[Path]]] = {}
+
+    def ensure(self, tasks: Sequence[Task], n: int, *, progress: bool | None, **options: Any) -> list[Path]:
+        """Return demonstration files as `ensure_demos` does; those of later tasks may not be there yet."""
+        ensure_demos([task for task in tasks if task.id in self._first], n, progress=progress, **options)
+        root = demos_dir() if options["root"] is None else Path(options["root"])
+        jobs = [_job(task, **{**options, "root": root}) for task in tasks]
+        later = [job for job in jobs if job.config.task.id not in self._first and not job.is_complete(n)]
+        if later and progress is not False:
+            tell_progress(
+                f"recording demonstrations of {counted(len(later), 'task')} while others are learned"
+            )
+        for job in later:
+            self._recorded[job.path] = self._pool.submit(_ensure_slowly, job.config.task, n, options)
+        return [job.path for job in jobs]
+
+    @property
+    def done(self) -> bool:
+        """Whether all files are there."""
+        return all(one.done() and not one.exception() for one in self._recorded.values())
+
+    def wait(self, path: Path) -> None:
+        """Wait until a file is there; raise a DemoError where it cannot be recorded."""
+        if path in self._recorded:
+            self._recorded[path].result()
+
+    def __enter__(self) -> "LaterDemos":
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._pool.__exit__(*error)
+
+
+def _ensure_slowly(task: Task, n: int, options: dict[str, Any]) -> list[Path]:
+    if hasattr(os, "nice"):
+        os.nice(max(0, _NICE - os.nice(0)))
+    return ensure_demos([task], n, workers=1, progress=False, **options)
 
 
 def make_demos(
@@ -215,23 +279,31 @@ def _record(
     """Record as `make_demos` does, while no other process records in the same folders."""
     missing = [sorted(job.missing(n)) for job in jobs]
     reports = {job.path: RecordingReport(n - len(m)) for job, m in zip(jobs, missing, strict=True)}
+    count = sum(map(len, missing))
+    share = -(-count // workers)  # what one process would record
     chunks = [
-        (job, numbers[i : i + job.config.batch])
+        (job, numbers[i : i + size])
         for job, numbers in zip(jobs, missing, strict=True)
-        for i in range(0, len(numbers), job.config.batch)
+        for size in [max(1, min(job.config.batch, share))]
+        for i in range(0, len(numbers), size)
     ]
     if progress is not False:
-        count = sum(map(len, missing))
         folders = ", ".join(sorted({str(job.path.parent.parent) for job in jobs}))
-        tell_progress(f"recording {count} demonstrations of {len(jobs)} tasks in {folders}")
+        tell_progress(
+            f"recording {counted(count, 'demonstration')} of {counted(len(jobs), 'task')} in {folders}"
+        )
     bar = progress_bar(
         total=n * len(jobs),
         initial=sum(report.recorded for report in reports.values()),
         desc="demonstrations",
         unit="demo",
-        smoothing=0.1,
         progress=progress,
     )
+
+    def show(work: float, done: int) -> None:
+        bar.add_work(work)
+        bar.update(done)
+
     for job, numbers in zip(jobs, missing, strict=True):
         if not numbers:  # a process was killed after the last part
             job.writer.finish()
@@ -240,13 +312,13 @@ def _record(
         [(job.config, job.writer, numbers) for job, numbers in chunks],
         min(workers, len(chunks)),
         lambda i: not reports[chunks[i][0].path].error,  # a job ends at its first error
+        on_work=show,
     )
     with bar, closing(recorders), closing(results):
         for i, done in results:
             job = chunks[i][0]
             report = reports[job.path]
             report.add(done)
-            bar.update(done.recorded)
             bar.set_postfix(failed=sum(r.failure_reasons.total() for r in reports.values()), refresh=False)
             if report.recorded == n:
                 job.writer.finish()

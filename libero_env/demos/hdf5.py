@@ -34,7 +34,7 @@ _TEXT = {h5t.STRING: "text", h5t.INTEGER: "integer", h5t.FLOAT: "float", h5t.ENU
 _HEAP = b"GCOL\x01\x00\x00\x00"  # signature of a global heap, where texts are stored
 _SETTLED = 2.0  # [s] age from which a file's modification time tells whether it has changed
 _NOT_DAMAGE = {errno.EACCES, errno.EPERM, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.EIO, errno.ENOMEM}
-_ERRORS = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, NotImplementedError)
+_ERRORS = (OSError, RuntimeError, LookupError, ValueError, TypeError, OverflowError, NotImplementedError)
 
 _checked: set[tuple[int, ...]] = set()  # files of this process that have passed
 
@@ -51,7 +51,8 @@ def open_demo_file(file: Path) -> h5py.File:
         DemoError: It does not exist, or cannot be opened now.
     """
     if not file.is_file():
-        raise DemoError(f"{file}: no such file; record it with `libero demos generate`")
+        wrong = "it is a folder, a pipe or a device" if file.exists() else "no such file"
+        raise DemoError(f"{file}: {wrong}; record it with `libero demos generate`")
     try:
         handle = h5py.File(file, "r")
     except _ERRORS as error:

@@ -11,22 +11,23 @@ import numpy as np
 
 from libero_env.assets.pack import Pack
 from libero_env.assets.robot import DEFAULT_ROBOT
+from libero_env.demos.agreement import recorded_frequency
 from libero_env.demos.config import RenderConfig
-from libero_env.demos.contents import json_attribute, picture_size, read_header
+from libero_env.demos.contents import picture_size, read_header
 from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
 from libero_env.demos.read import Episode, read_episodes
 from libero_env.demos.stored_model import model_xml, read_fixture_poses, spec_without_textures
+from libero_env.envs.checks import check_range
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError, LiberoError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import ROOT_BODY
-from libero_env.sim.scene import FAST, Scene
+from libero_env.sim.scene import Scene
+from libero_env.sim.scene_spec import FAST
 from libero_env.tasks import Task, bddl, get_suite
-from libero_env.tasks.builder import language_from_name
+from libero_env.tasks.benchmark import task_of_file
 from libero_env.tasks.problem import same_meaning
-from libero_env.tasks.task import FILE
-from libero_env.text import shown
-from libero_env.timing import CONTROL_HZ, FREQUENCIES
+from libero_env.timing import CONTROL_HZ
 
 _OPEN_FILE = "<_io."  # begins what `str(open(file))` returns
 _NO_HORIZON = 10**9  # [steps] a recording ends where it ended
@@ -42,28 +43,6 @@ def recorded_robot(file: Path) -> str:
     """
     header = read_header(file)
     return str(header.get("robot", "robosuite-1.4.1" if "generator" in header else "libero"))
-
-
-def recorded_frequency(file: Path) -> int:
-    """Return the control steps per second that were recorded, [Hz]; files that do not state it have 20.
-
-    Raises:
-        DemoError: It is not a demonstration file, or was recorded at a frequency that no environment has.
-    """
-    made_with = json_attribute(read_header(file), "env_args", file).get("env_kwargs")
-    stated = made_with.get("control_freq", CONTROL_HZ) if isinstance(made_with, dict) else CONTROL_HZ
-    if stated not in FREQUENCIES:
-        valid = ", ".join(map(str, FREQUENCIES))
-        raise DemoError(
-            f"{file}: attribute env_args: control_freq is {shown(stated)}; expected one of {valid}"
-        )
-    return int(stated)
-
-
-def require_default_frequency(file: Path, use: str) -> None:
-    """Raise a DemoError unless a file was recorded at 20 Hz; `use` names what needs it."""
-    if (hz := recorded_frequency(file)) != CONTROL_HZ:
-        raise DemoError(f"{file} was recorded at {hz} Hz; {use} is for {CONTROL_HZ} Hz")
 
 
 def recorded_task(file: Path) -> Task:
@@ -94,7 +73,7 @@ def recorded_task(file: Path) -> Task:
         raise DemoError(f"{error}; name its task file with --bddl") from error
     if named is not None and same_meaning(named.problem, problem):
         return named
-    return Task(FILE, 0, name.stem, language_from_name(name.stem), problem.language, problem)
+    return task_of_file(name.stem, problem)
 
 
 def task_header(file: Path, task: Task | None) -> dict[str, Any]:
@@ -169,6 +148,7 @@ class StateRenderer:
             observations=(*config.modalities, "proprioception", "ee_quat"),
             perturb=config.perturb,
         )
+        self._xml: tuple[np.ndarray, str] | None = None  # poses of fixtures, and the scene with them
 
     @classmethod
     def of_file(
@@ -238,28 +218,24 @@ class StateRenderer:
         Returns:
             Observations, name to (T, ...), and robot states, (T, 9), which no perturbation changes.
         """
-        self.env.simulations.fixtures[0] = fixtures
+        check_range(states, self.task)
+        batch, simulations = self.env.batch, self.env.simulations
+        simulations.fixtures[0] = fixtures
+        if (perturbed := batch.perturbed) is not None:
+            perturbed.open(0, name)
+            batch.observer.set_appearance(0, perturbed.appearance(0))
         frames, robot_states = [], []
-        for frame in self._frames(states, name):
-            frames.append(frame)
-            true = {key: rows[0] for key, rows in self.env.observer.state().items()}
-            quat_xyzw = true["ee_quat"][[1, 2, 3, 0]]
-            robot_states.append(np.concatenate([true["gripper_states"], true["ee_pos"], quat_xyzw]))
-        obs = {key: np.stack([frame[key] for frame in frames]) for key in frames[0] if key != "ee_quat"}
-        return obs, np.stack(robot_states)
-
-    def _frames(self, states: np.ndarray, name: str) -> Iterator[dict[str, np.ndarray]]:
-        """Yield the observation of each state; filters with a memory see them in this order."""
-        batch = self.env.batch
-        if (perturbed := batch.perturbed) is None:
-            yield from map(self.env.set_state, states)
-            return
-        perturbed.open(0, name)
-        batch.observer.set_appearance(0, perturbed.appearance(0))
-        for step, state in enumerate(states):
-            self.env.simulations.set_physics_state(0, state)
-            perturbed.steps[0] = step
-            yield {**self.env.render_cameras(), **{k: rows[0] for k, rows in batch.proprioception().items()}}
+        for step, state in enumerate(states):  # filters with a memory see them in this order
+            simulations.show_state(0, state)
+            true = batch.observer.state()
+            if perturbed is not None:
+                perturbed.steps[0] = step
+            images = batch.render_cameras()
+            frames.append({**images, **(true if perturbed is None else batch.proprioception())})
+            parts = true["gripper_states"], true["ee_pos"], true["ee_quat"][:, [1, 2, 3, 0]]
+            robot_states.append(np.concatenate(parts, axis=1))
+        obs = {key: np.concatenate([f[key] for f in frames]) for key in frames[0] if key != "ee_quat"}
+        return obs, np.concatenate(robot_states)
 
     def model_xml(self, fixtures: np.ndarray) -> str:
         """Return the scene as MJCF, complete but for its textures; the robot's meshes are named by their path.
@@ -267,8 +243,10 @@ class StateRenderer:
         Args:
             fixtures: Poses of the fixtures, (nfixtures, 7) pos and quat wxyz.
         """
-        xml = model_xml(self._spec, dict(zip(self.scene.fixtures, fixtures, strict=True)))
-        return re.sub(r'file="[^"]*?(robosuite/models/assets/)', r'file="\1', xml)
+        if self._xml is None or not np.array_equal(self._xml[0], fixtures):
+            xml = model_xml(self._spec, dict(zip(self.scene.fixtures, fixtures, strict=True)))
+            self._xml = fixtures.copy(), re.sub(r'file="[^"]*?(robosuite/models/assets/)', r'file="\1', xml)
+        return self._xml[1]
 
     @cached_property
     def _spec(self) -> mujoco.MjSpec:

@@ -14,9 +14,11 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.errors import PlacementError
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes
 from libero_env.expert.expert import MAX_STEPS, Attempt, run_experts
-from libero_env.init_states.store import NUM_INIT_STATES
+from libero_env.parallel import tell_work
+from libero_env.tasks.task import NUM_INIT_STATES
 
 MAX_ATTEMPTS = 10  # attempts at one demonstration
+_ATTEMPT_SHARE = 0.5  # of the time of a demonstration, for the progress
 
 
 @dataclass
@@ -169,11 +171,14 @@ def record_chunk(config: DemoConfig, writer: DemoWriter, numbers: list[int]) -> 
     report, recorder = RecordingReport(), recorders.recorder(config)
     failures = dict.fromkeys(numbers, 0)  # of the demonstrations still to be recorded
     while failures:
-        for k, attempt in recorder.attempt(list(failures.items())):
+        attempts = recorder.attempt(list(failures.items()))
+        tell_work(_ATTEMPT_SHARE * sum(attempt.success for _, attempt in attempts))
+        for k, attempt in attempts:
             report.attempts += 1
             if attempt.success:
                 writer.write(k, recorder.episode(attempt, failed_attempts=failures.pop(k)))
                 report.recorded += 1
+                tell_work(1 - _ATTEMPT_SHARE, 1)
                 continue
             report.failure_reasons[attempt.reason] += 1
             failures[k] += 1

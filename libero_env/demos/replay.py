@@ -9,6 +9,7 @@ import numpy as np
 
 from libero_env.assets.pack import Pack
 from libero_env.demos.actions import KINDS, ActionConverter
+from libero_env.demos.agreement import require_default_control
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import demo_number, read_header
 from libero_env.demos.observe import StateRenderer, recorded_rendering
@@ -16,7 +17,7 @@ from libero_env.demos.read import Episode
 from libero_env.demos.write import DemoWriter, require_absent
 from libero_env.errors import DemoError
 from libero_env.mujoco_compat import mujoco
-from libero_env.parallel import progress_bar
+from libero_env.progress import progress_bar
 from libero_env.sim.observations import image_name
 from libero_env.tasks import Task
 
@@ -137,6 +138,7 @@ def rerun_actions(file: Path, target: Path) -> Path:
         DemoError: The file is broken or does not fit its task's scene, or the target exists.
     """
     require_absent(target)
+    require_default_control(file, "running it again", any_frequency=True)
     writer = DemoWriter(target, read_header(file))
     writer.discard_parts()  # of an interrupted call, perhaps with another file
     with closing(StateRenderer.of_file(file, RenderConfig(()))) as renderer:

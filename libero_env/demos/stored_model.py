@@ -12,7 +12,8 @@ from libero_env.errors import DemoError, InvalidInputError
 from libero_env.mujoco_compat import delete, mujoco
 from libero_env.objects.model import ROOT_BODY
 from libero_env.objects.xml_file import Node, parse_xml_text
-from libero_env.sim.scene import Scene, scene_spec
+from libero_env.sim.scene import Scene
+from libero_env.sim.scene_spec import scene_spec
 from libero_env.tasks.problem import Problem
 
 _TEXTURE_FIELDS = (

@@ -5,15 +5,18 @@ the disk. `DemoWriter.finish` joins the parts into the one file and removes them
 any other: `read_demos` reads it, or the whole folder.
 """
 
+import io
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from textwrap import shorten
 from typing import Any
 
 import h5py
 import numpy as np
+from typing_extensions import Buffer
 
 from libero_env.demos.contents import (
     LOW_DIM_KEYS,
@@ -28,7 +31,8 @@ from libero_env.demos.contents import (
 from libero_env.demos.hdf5 import BrokenDemoError, open_demo_file
 from libero_env.demos.read import Episode, demo_files
 from libero_env.errors import DemoError
-from libero_env.storage import atomic_path, require_own_folders
+from libero_env.images import flip_rows
+from libero_env.storage import atomic_path, own_folder
 
 TAG = "libero-v1"
 FRAMES_PER_CHUNK = 8
@@ -77,7 +81,7 @@ class DemoWriter:
 
     def discard_parts(self) -> None:
         """Remove the parts that an interrupted recording left."""
-        require_own_folders(self.path.parent, self.parts.name, error=DemoError)
+        own_folder(self.path.parent, self.parts.name, error=DemoError)
         if self.parts.is_dir():
             shutil.rmtree(self.parts)
 
@@ -89,10 +93,10 @@ class DemoWriter:
                 earlier demonstrations are intact.
         """
         _check_values(episode, f"{self.path}: demo_{index}")
-        require_own_folders(self.path.parent, self.parts.name, error=DemoError)
+        own_folder(self.path.parent, self.parts.name, error=DemoError)
         target = self.parts / f"demo_{index:05d}.hdf5"
         try:
-            with atomic_path(target, fsync=True) as temporary, h5py.File(temporary, "w") as handle:
+            with _new_file(target) as handle:
                 data = handle.create_group("data")
                 data.attrs.update(self.header)
                 self._write_demo(data.create_group(f"demo_{index}"), episode)
@@ -114,15 +118,13 @@ class DemoWriter:
         if not sources:
             raise DemoError(f"{self.path}: no demonstrations were recorded; nothing to write")
         try:
-            with atomic_path(self.path, fsync=True) as temporary, h5py.File(temporary, "w") as handle:
+            with _new_file(self.path) as handle:
                 data = handle.create_group("data")
                 data.attrs.update(self.header)
                 for file, name in sorted(sources, key=lambda source: demo_number(source[1])):
                     with h5py.File(file, "r") as part:
                         part.copy(f"data/{name}", data)  # copies compressed bytes as they are
                 _write_counts(data)
-                if self.path.exists():
-                    shutil.copymode(self.path, temporary)
         except (OSError, RuntimeError) as error:
             raise DemoError(
                 f"{self.path}: cannot be written ({error}); all demonstrations are still in {self.parts}"
@@ -135,7 +137,7 @@ class DemoWriter:
 
         A broken part is removed, to be recorded again; a broken file or one of another configuration is refused.
         """
-        require_own_folders(self.path.parent, self.parts.name, error=DemoError)
+        own_folder(self.path.parent, self.parts.name, error=DemoError)
         seen: set[str] = set()
         if self.path.is_file():
             yield from self._demos_in(self.path, seen)
@@ -192,7 +194,7 @@ class DemoWriter:
             if is_image(key):
                 group.create_dataset(
                     key,
-                    data=values[:, ::-1],
+                    data=flip_rows(values, 1),
                     chunks=(min(FRAMES_PER_CHUNK, steps), *values.shape[1:]),
                     compression="gzip",  # every reader of HDF5 has it
                     compression_opts=1,
@@ -200,6 +202,46 @@ class DemoWriter:
                 )
             elif key in LOW_DIM_KEYS:
                 group.create_dataset(key, data=np.asarray(values, np.float64))
+
+
+@contextmanager
+def _new_file(target: Path) -> Iterator[h5py.File]:
+    """Yield a new HDF5 file, which replaces `target` when it is complete and on the disk; see `atomic_path`.
+
+    Raises:
+        OSError: It cannot be written, such as to a full disk.
+    """
+    with atomic_path(target, fsync=True) as temporary, _Disk(temporary, "w+") as disk:
+        try:
+            with h5py.File(disk, "w") as handle:
+                yield handle
+        finally:
+            if disk.error is not None:
+                raise disk.error
+        if target.exists():
+            shutil.copymode(target, temporary)
+
+
+class _Disk(io.FileIO):
+    """A file for HDF5, which ends the process where a write fails: the first error is kept, what follows is dropped."""
+
+    error: OSError | None = None
+
+    def write(self, content: Buffer) -> int:
+        left = memoryview(content)
+        while left and self.error is None:
+            try:
+                left = left[super().write(left) :]
+            except OSError as error:
+                self.error = error
+        return memoryview(content).nbytes
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return super().truncate(size) if self.error is None else 0
+        except OSError as error:
+            self.error = error
+            return 0
 
 
 def make_header(

@@ -22,7 +22,8 @@ from libero_env.errors import LiberoError, MissingPackageError, PlacementError
 from libero_env.expert import ActionNoise, Expert, Shapes
 from libero_env.expert.expert import run_experts
 from libero_env.mujoco_compat import mujoco
-from libero_env.parallel import progress_bar, run_each
+from libero_env.parallel import run_each
+from libero_env.progress import progress_bar
 from libero_env.sim.scene import build_scene
 from libero_env.storage import read_json, write_json
 from libero_env.tasks import Task
@@ -32,8 +33,6 @@ from libero_env.validation import validate
 C = TypeVar("C")
 
 BATCH = 16  # initial states simulated together
-_COLOURS = ("#f4f6ec", "#8fcfc3", "#2379ab", "#14265e")  # from few steps to many; distinct in greyscale too
-_FAILED = "#b03024"
 NO_HORIZON = 1_000_000  # [steps] `run_experts` ends the attempts
 
 
@@ -189,7 +188,7 @@ def markdown_table(certificates: Sequence[Certificate]) -> str:
 def write_results(
     certificates: Sequence[Certificate], out: Path, *, assets: str | None = None, disturb: bool = False
 ) -> None:
-    """Write `results.json`, `results.md` and, where matplotlib is installed, a figure of each suite; print their paths.
+    """Write `results.json` and `results.md`, and print their paths.
 
     Args:
         certificates: Results of the tasks.
@@ -200,48 +199,7 @@ def write_results(
     written = [out / f"results{ending}.json", out / f"results{ending}.md"]
     write_json(written[0], results(certificates, assets=assets, disturb=disturb))
     written[1].write_text(markdown_table(certificates))
-    suites: dict[str, list[Certificate]] = {}
-    for certificate in certificates:
-        suites.setdefault(certificate.task.partition("/")[0], []).append(certificate)
-    for suite, own in suites.items():
-        path = out / f"{suite}{ending}.png"
-        try:
-            draw_figure(own, path, f"{suite}: steps of the expert from each start")
-        except ModuleNotFoundError as error:
-            print(f"no figure of {suite}: {error.name} is not installed (it is in the extra `train`)")
-        else:
-            written.append(path)
     print("\n".join(map(str, written)))
-
-
-def draw_figure(certificates: Sequence[Certificate], path: Path, title: str) -> None:
-    """Draw the figure of a suite: a row per task, a column per initial state, coloured by length; failures red.
-
-    Raises:
-        ModuleNotFoundError: matplotlib is not installed.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.colors import LinearSegmentedColormap
-    from matplotlib.figure import Figure
-
-    states = max(len(c.outcomes) for c in certificates)
-    steps = np.full((len(certificates), states), np.nan)
-    for row, certificate in zip(steps, certificates, strict=True):
-        row[: len(certificate.outcomes)] = [o.steps if o.success else np.nan for o in certificate.outcomes]
-    figure = Figure(figsize=(8.5, 1.2 + 0.2 * len(certificates)), dpi=120, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    colours = LinearSegmentedColormap.from_list("steps", _COLOURS).with_extremes(bad=_FAILED)
-    image = axes.imshow(
-        np.ma.masked_invalid(steps), cmap=colours, aspect="auto", interpolation="nearest", vmin=0
-    )
-    labels = [f"{_label(c)}  {100 * c.rate:.0f} %" for c in certificates]
-    axes.set_yticks(range(len(labels)), labels, fontsize=6, parse_math=False)  # names are texts of users
-    axes.set_xlabel("initial state; red where the goal was not reached", fontsize=7)
-    axes.tick_params(axis="x", labelsize=6)
-    axes.set_title(title, fontsize=8, parse_math=False)
-    figure.colorbar(image, ax=axes, shrink=min(1.0, 20 / len(certificates))).ax.tick_params(labelsize=6)
-    figure.savefig(path)
 
 
 def _missing(certificate: Certificate, states: int) -> Iterator[list[int]]:
@@ -319,8 +277,3 @@ def read_certificate(kind: type[C], path: Path, digest: str) -> C | None:
     except LiberoError as error:
         raise LiberoError(f"{path} is not a certificate ({error}); remove it, or run with --again") from error
     return found if found.digest == digest else None
-
-
-def _label(certificate: Certificate) -> str:
-    words = certificate.name.replace("_", " ")
-    return f"{certificate.task.rpartition('/')[2]}  {words if len(words) <= 64 else words[:63] + '…'}"

@@ -20,9 +20,10 @@ from libero_env.errors import InvalidInputError, LiberoError, PlacementError
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.expert import run_experts
 from libero_env.mujoco_compat import mujoco
-from libero_env.parallel import progress_bar, run_each
+from libero_env.parallel import run_each
 from libero_env.perturbations.kinds import trying
 from libero_env.perturbations.perturbation import Perturbation
+from libero_env.progress import progress_bar
 from libero_env.storage import write_json
 from libero_env.tasks import Task
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw
 
-from libero_env.demos.video import write_video
+from libero_env.curating.video import write_video
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import LiberoError
 from libero_env.expert import Expert
@@ -24,7 +24,7 @@ _BAND = 14  # [pixels] height of the caption above a picture
 
 
 def contact_sheet(
-    task: Task, path: Path, *, starts: int = 3, cameras: Sequence[str] = CAMERAS, size: int = 256
+    task: Task, path: Path, *, starts: int = 3, cameras: Sequence[str] = (), size: int = 256
 ) -> Path:
     """Write a PNG of the first initial states of a task, a row for each, a column for each camera.
 
@@ -32,6 +32,7 @@ def contact_sheet(
         task: Task of a suite, whose initial states are stored, or of a file, whose initial state i is that of seed i.
         path: File to write; its folder is created.
         starts: Number of initial states.
+        cameras: Names of cameras; by default `CAMERAS` and the task's own.
         size: Height and width of a picture, [pixels].
 
     Returns:
@@ -42,6 +43,7 @@ def contact_sheet(
         UnknownNameError: A camera does not exist.
     """
     check_picture(path)
+    cameras = cameras or (*CAMERAS, *(camera.name for camera in task.problem.cameras))
     with LiberoEnv(task, cameras=tuple(cameras), camera_size=(size, size)) as env:
         rows = [
             np.concatenate([_reset(env, i)[image_name(c, "rgb")] for c in cameras], axis=1)

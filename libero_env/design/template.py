@@ -9,7 +9,8 @@ import yaml
 
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.storage import parse_yaml_text
-from libero_env.tasks.builder import EMPTY, load_scene, make_task, model_regions, scene_names
+from libero_env.tasks.builder import make_task
+from libero_env.tasks.merging import EMPTY, load_scene, model_regions, scene_names
 from libero_env.tasks.task import Task
 from libero_env.workspaces import WORKSPACES
 

@@ -1,84 +1,46 @@
-"""Simulations of one task in one process, as a `gymnasium.vector.VectorEnv`."""
+"""Simulations of one task in one process, as a `gymnasium.vector.VectorEnv`.
+
+`BatchEnv.reset` and `step` check what callers pass; `start` and `advance` run the hooks of `libero_env.envs.hooks`:
+those of `goals`, `watching`, and `libero_env.perturbations`.
+"""
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Annotated, Any, NoReturn, Self
+from typing import Annotated, Any
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from pydantic import Field
 
 from libero_env.envs.checks import (
-    ClosedGymEnvironmentError,
     ResetRequest,
+    check_range,
     checked_actions,
     checked_index,
     checked_indices,
     checked_numbers,
 )
-from libero_env.envs.config import AFTER, EnvConfig, show_options
-from libero_env.envs.scenes import open_scenes
-from libero_env.errors import InvalidInputError, PlacementError, SimulationError
+from libero_env.envs.config import EnvConfig, show_options
+from libero_env.envs.goals import GoalHooks
+from libero_env.envs.hooks import Entries, Hooks, overridden
+from libero_env.envs.observing import Observing
+from libero_env.envs.scenes import check_memory, open_scenes
+from libero_env.envs.vector import LiberoVectorEnv
+from libero_env.envs.watching import WatchHooks
+from libero_env.errors import InvalidInputError, SimulationError
 from libero_env.init_states.placement import sample_states
 from libero_env.init_states.store import load_init_states
-from libero_env.memory import require_memory
-from libero_env.mujoco_compat import mujoco
-from libero_env.perturbations.episodes import TRIES
-from libero_env.perturbations.events import NEVER, PHASES, has_begun, require_moment
-from libero_env.perturbations.kinds import start_name
 from libero_env.sim.engine import Goals, make_observer, make_simulations
-from libero_env.sim.observations import is_of_joints
-from libero_env.sim.rewards import Reward
-from libero_env.sim.scene import BUFFER_SIDE, InitialStates, ground
-from libero_env.sim.simulation import Indices
+from libero_env.sim.scene import InitialStates
 from libero_env.sim.watch import EpisodeWatch
 from libero_env.tasks import Task
-from libero_env.tasks.problem import And, Atom, Expression, Or
-from libero_env.timing import CONTROL_HZ, PHYSICS_HZ
+from libero_env.tasks.expression import Expression
+from libero_env.timing import PHYSICS_HZ
 from libero_env.validation import validate
 
-Count = Annotated[int, Field(ge=1)]
-Threads = Annotated[int, Field(ge=0, le=4096)]
-Images = dict[str, np.ndarray]  # (num_envs, height, width, ...) by name
-
-
-class LiberoVectorEnv(gymnasium.vector.VectorEnv):
-    """A vector environment without autoreset, which `with` closes; after `close` every use is an error."""
-
-    metadata = {"render_modes": [], "render_fps": CONTROL_HZ, "autoreset_mode": AutoresetMode.DISABLED}
-
-    _running: np.ndarray
-
-    @property
-    def running(self) -> np.ndarray:
-        """Whether each environment is in an episode, (num_envs,) bool."""
-        return self._running.copy()
-
-    def render(self) -> NoReturn:
-        """Raise: `render_cameras` or `call` return images of vector environments."""
-        self.require_open()
-        raise InvalidInputError("a vector environment has no render(); its observations have the images")
-
-    def require_open(self) -> None:
-        """Raise a `ClosedEnvironmentError` after `close`."""
-        if self.closed:
-            raise ClosedGymEnvironmentError("this environment is closed; make another")
-
-    def __enter__(self) -> Self:
-        """Return the environments; they are closed at the end of the block."""
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __getstate__(self) -> dict[str, Any]:
-        raise InvalidInputError(
-            "an environment cannot be copied or pickled: it holds simulations, processes or an OpenGL context. Make "
-            "another with the same task and config=, and pass it the state: set_state(get_state())"
-        )
+Count, Threads = Annotated[int, Field(ge=1)], Annotated[int, Field(ge=0, le=4096)]
+Outcome = tuple[Entries, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]
 
 
 class BatchEnv(LiberoVectorEnv):
@@ -95,7 +57,6 @@ class BatchEnv(LiberoVectorEnv):
         **options: Fields of `EnvConfig`, such as `camera_size=(64, 64)`, which replace those of `config`.
 
     Attributes:
-        config: Configuration of all simulations.
         task: Task of the simulations, as the perturbations of the configuration change it.
         scene: Compiled scene of the task.
         later: Task that an event changes it into; None without one.
@@ -105,18 +66,19 @@ class BatchEnv(LiberoVectorEnv):
         simulations: Physics and controllers.
         views: State view of each simulation.
         observer: Observer of the simulations.
-        goals: The goal and its atoms in the simulations.
+        goal: Which simulations have reached their goal.
+        steps: Number of control steps of each episode, (num_envs,).
+        errors: Why simulations have failed, by index.
         generators: Random generator of each simulation.
-        event_states: States just after events have begun, by simulation and event, of the present episodes.
         render_images: Whether images are rendered in each step. If False, observations have the images that were
-            rendered last (black before the first); `render_cameras` renders those of the current state.
+            rendered last (black before the first); `render_cameras` renders those of the current state. May be set.
 
     Raises:
         UnknownNameError: The task, a camera, an option or a value of an option does not exist.
         InvalidInputError: A value is of another kind or outside of its range, or the memory does not suffice.
         ClosedEnvironmentError: By every method, after `close`.
 
-    Example:
+    Examples:
         >>> envs = BatchEnv("libero_object/3", num_envs=4, cameras=("agentview",), camera_size=(64, 64))
         >>> observations, infos = envs.reset(options={"init_state": [0, 1, 2, 3]})
         >>> observations["agentview_rgb"].shape
@@ -140,18 +102,20 @@ class BatchEnv(LiberoVectorEnv):
         self.config = config = EnvConfig.from_options(config, options)
         self.num_envs = num = validate(Count, num_envs, prefix=("num_envs",))
         threads = validate(Threads, num_threads, prefix=("num_threads",))
-        self.render_mode, self.render_images = None, True
-        self.metadata = {**self.metadata, "render_fps": config.control_freq}
-        self.reward = Reward(config.reward, config.reward_scale)
+        self.render_mode, self.metadata = None, {**self.metadata, "render_fps": config.control_freq}
         scenes = open_scenes(task, config, num)
-        self.task, self.scene, self.perturbed = scenes.task, scenes.scene, scenes.perturbed
-        self.base_task, self.base_scene = scenes.base_task, scenes.base_scene
-        self._check_memory()
+        self.task, self.scene, self.later = scenes.task, scenes.scene, scenes.later
+        self.base_task, self.base_scene, self.perturbed = (
+            scenes.base_task,
+            scenes.base_scene,
+            scenes.perturbed,
+        )
+        check_memory(self.scene, config, num)
         self.simulations = make_simulations(
             self.scene.model, num, threads, self.scene.fixture_bodies, config.backend
         )
         self.simulations.substeps = PHYSICS_HZ // config.control_freq
-        self.simulations.set_controller(config.controller, config.control_delta, scenes.rest)
+        self.simulations.set_controller(config.controller, config.control_delta, self.base_task.rest)
         self.observer = make_observer(
             self.scene,
             self.simulations,
@@ -159,17 +123,7 @@ class BatchEnv(LiberoVectorEnv):
             cameras=config.cameras,
             camera_size=config.camera_size,
         )
-        self.views = self.observer.views
-        goal = self.scene.problem.goal
-        self.later, atoms = scenes.later, self.scene.goal_atoms
-        later = None if scenes.later is None else scenes.later.problem.goal
-        every = tuple(dict.fromkeys([*atoms, *(later.atoms() if later else ())]))
-        self.goals = Goals(goal, every, self.views, config.semantics)
-        self._later_goals = None if later is None else Goals(later, every, self.views, config.semantics)
-        self._histories = [one.history for one in (self.goals, self._later_goals) if one is not None]
-        if self.reward.kind == "staged":
-            _require_stages(goal if later is None else later, changes=later is not None)
-        controller = self.simulations.controller_state.controller
+        self.views, controller = self.observer.views, self.simulations.controller_state.controller
         self.single_observation_space = self.observer.space()
         self.single_action_space = spaces.Box(
             controller.low.astype(np.float32), controller.high.astype(np.float32)
@@ -177,33 +131,56 @@ class BatchEnv(LiberoVectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num)
         self.action_space = batch_space(self.single_action_space, num)
         self.generators = [np.random.default_rng() for _ in range(num)]
-        self._images = self.observer.empty_images()
-        self._steps, self._errors = np.zeros(num, np.int64), dict[int, str]()
-        self._running, self._success = np.zeros(num, bool), np.zeros(num, bool)
-        self._progress = np.zeros((num, len(self.atoms)), bool)
-        triggers = [one.trigger for one in self.perturbed.perturbations] if self.perturbed is not None else []
-        self._watched = any(triggers)
-        self._has_phases = not {*triggers}.isdisjoint(PHASES)
-        for trigger in triggers:
-            require_moment(trigger, config.horizon)
-        self._moved = np.zeros(num, bool)
-        self.event_states: dict[tuple[int, int], np.ndarray] = {}
+        self.steps, self._running, self.errors = (
+            np.zeros(num, np.int64),
+            np.zeros(num, bool),
+            dict[int, str](),
+        )
+        self.observing = Observing(self.observer, config)
+        others = [] if self.later is None else [self.later.problem.goal]
+        self.goal = GoalHooks([self.scene.problem.goal, *others], self.views, config)
+        self._parts: list[Hooks] = []
+        self.plug(*scenes.hooks, self.goal)
+
+    def plug(self, *parts: Hooks) -> None:
+        """Let parts take part in episodes, after those that do; none of them may be running."""
+        self._parts.extend(parts)
+        for part in parts:
+            part.attach(self)
+        self._hooks = overridden(self._parts)
+        self.observing.arrives = self._hooks["observe"]
+        self.observing.has_memory = any(part.has_memory for part in self._parts)
+
+    @property
+    def render_images(self) -> bool:
+        """Whether images are rendered in each step; may be set."""
+        return self.observing.render_images
+
+    @render_images.setter
+    def render_images(self, wanted: bool) -> None:
+        self.observing.render_images = wanted
+
+    @property
+    def goals(self) -> Goals:
+        """The goal of the task, and its atoms, in the simulations."""
+        return self.goal.goals[0]
 
     @property
     def atoms(self) -> tuple[str, ...]:
-        """Atoms of the goal, in the order of `progress` in infos, such as `(On plate_1 stove_1)`.
-
-        Where an event changes the goal, those of the other one follow.
-        """
+        """Atoms of the goal, as `progress` has them; then those of the other that an event makes the goal."""
         return tuple(map(str, self.goals.atoms))
 
     @cached_property
-    def watch(self) -> EpisodeWatch:
-        """Traces of the episodes; simulations are watched from when it is first asked for, or if there are events."""
-        self._watched, found = True, EpisodeWatch(self.views, self.goals.atoms)
-        for i in range(self.num_envs):
-            found.goals[i] = self._goal_atoms(i)
+    def watching(self) -> WatchHooks:
+        """What watches episodes from when it is first asked for."""
+        found = WatchHooks(self.views, self.goal)
+        self.plug(found)
         return found
+
+    @property
+    def watch(self) -> EpisodeWatch:
+        """Traces of the episodes, see `watching`."""
+        return self.watching.watch
 
     @cached_property
     def init_states(self) -> InitialStates:
@@ -212,7 +189,7 @@ class BatchEnv(LiberoVectorEnv):
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    ) -> tuple[Entries, dict[str, Any]]:
         """Start episodes.
 
         Args:
@@ -224,6 +201,9 @@ class BatchEnv(LiberoVectorEnv):
                 the original, see `libero_env.sim.simulation.Simulations.outdate_controller`.
                 `reset_mask`: which simulations to reset, (num_envs,) bool; by default all.
 
+        Returns:
+            Observations and infos, see `step`.
+
         Raises:
             UnknownNameError: An option does not exist; nothing has changed.
             InvalidInputError: An initial state does not exist, or seeds, mask or starts have the wrong length or are of
@@ -231,35 +211,31 @@ class BatchEnv(LiberoVectorEnv):
             PlacementError: The objects do not fit; none of these simulations is in an episode.
         """
         self.require_open()
-        request = ResetRequest.from_arguments(self.num_envs, seed, options)
-        ids, states = request.ids, None
-        if request.starts is not None:
-            states = self._checked_starts(request.starts[ids])
-        elif request.init_states is not None:
-            states = self._stored_states(request.init_states[ids])
+        return self.start(ResetRequest.from_arguments(self.num_envs, seed, options))
+
+    def start(self, request: ResetRequest) -> tuple[Entries, dict[str, Any]]:
+        """Start episodes as a request says whose arguments have been checked; see `reset`."""
+        ids, states, names = request.ids, self._given_states(request), request.names
         if ids.size:
             self._running[ids] = False  # until it is done: an error or an interruption ends the episodes
-            self._errors = {i: reason for i, reason in self._errors.items() if i not in ids}
-            for i in ids:
+            for i in map(int, ids):
+                self.errors.pop(i, None)
                 if (new_seed := request.seeds[i]) is not None:
                     self.generators[i] = np.random.Generator(np.random.PCG64(new_seed))
             if states is None:
                 states = sample_states(self.base_scene, [self.generators[i] for i in ids])
-            self._start(ids, states, None if request.init_states is None else request.init_states[ids])
+            for before_reset in self._hooks["before_reset"]:
+                states = before_reset(ids, states, names)
+            self.place(ids, states)
             if request.outdated_controller:
                 self.simulations.outdate_controller(ids)
-            self._steps[ids], self._running[ids], self._moved[ids] = 0, True, False
-            self._forget(ids)
-            for i in map(int, ids) if self._watched else ():
-                self.event_states = {key: state for key, state in self.event_states.items() if key[0] != i}
-                self.watch.goals[i] = self._goal_atoms(i)
-                self.watch.begin(i)
-            self._success[ids] = self._check_goals(ids)[0]
-        return self._with_images(self._observe(ids)), self._info()
+            self.steps[ids] = 0
+            for after_reset in self._hooks["after_reset"]:
+                after_reset(ids)
+            self._running[ids] = True
+        return self.observing.with_images(self.observing.look(ids)), self._info()
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: np.ndarray) -> Outcome:
         """Apply actions for a control step, by default 50 ms, in every simulation that is in an episode.
 
         Args:
@@ -279,39 +255,38 @@ class BatchEnv(LiberoVectorEnv):
         self.require_open()
         return self.advance(checked_actions(actions, self.action_space.shape))
 
-    def advance(
-        self, actions: np.ndarray
-    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def advance(self, actions: np.ndarray) -> Outcome:
         """Step with actions that have been checked, (num_envs, action_dim) float64; see `step`."""
         running, ids = self._running.copy(), np.flatnonzero(self._running)
         self._running[:] = False  # until it is done: a step that is interrupted has moved some substeps
-        reached, rewards = np.zeros(self.num_envs, bool), np.zeros(self.num_envs)
-        entries = {} if ids.size else self.proprioception()
-        if ids.size:
-            self._begin_events(ids)
-            entries = self._step_and_observe(ids, actions)
-            reached[ids], rewards[ids] = self._check_goals(ids)
-            self._steps[ids] += 1
-            for i in map(int, ids) if self._watched else ():
-                self.watch.look(i)
-        failed = np.isin(np.arange(self.num_envs), list(self._errors))
-        reached, rewards = reached & ~failed, np.where(failed, 0.0, rewards)
-        truncated = running & ~reached & (failed | (self._steps >= self.config.horizon))
-        self._success[ids] = reached[ids]
+        self.goal.rewards[:] = 0.0
+        if not ids.size:
+            entries = self.observing.state()
+        else:
+            for before_step in self._hooks["before_step"]:
+                actions = before_step(ids, actions)
+            watch = self.observing.before_step()
+            try:
+                self.simulations.step(ids, actions, watch=watch)
+            except SimulationError as error:
+                self.errors |= error.failed
+            entries = self.observing.after_step(ids)
+            self.steps[ids] += 1
+            for after_step in self._hooks["after_step"]:
+                after_step(ids)
+        failed = np.isin(np.arange(self.num_envs), list(self.errors))
+        reached = running & self.goal.success
+        truncated = running & ~reached & (failed | (self.steps >= self.config.horizon))
         self._running = running & ~(reached | truncated)
-        return self._with_images(entries), rewards, reached, truncated, self._info()
+        seen = self.observing.with_images(entries)
+        return seen, self.goal.rewards.copy(), reached, truncated, self._info()
 
     def get_state(self, i: int) -> np.ndarray:
         """Return all that the rest of the episode in simulation i depends on, see `LiberoEnv.get_state`."""
         self.require_open()
         i = checked_index(i, self.num_envs)
-        seen = [self.watch.memory(i)] if self._has_phases else []
-        return np.concatenate([self.simulations.get_state(i), *self._kept(i), *seen])
-
-    def _kept(self, i: int) -> list[np.ndarray]:
-        """Return views of the whole numbers that belong to an episode beside its simulation."""
-        perturbed = [] if self.perturbed is None else self.perturbed.kept(i)
-        return [self._steps[i : i + 1], *perturbed, *(one.memory[i].ravel() for one in self._histories)]
+        own = self.simulations.get_state(i), self.steps[i : i + 1]
+        return np.concatenate([*own, *(part.state(i) for part in self._parts)])
 
     def set_state(self, i: int, state: np.ndarray) -> None:
         """Restore a state in simulation i; see `LiberoEnv.set_state`.
@@ -320,43 +295,29 @@ class BatchEnv(LiberoVectorEnv):
             InvalidInputError: There is no such simulation, or the state is not valid; nothing has changed.
         """
         self.require_open()
-        i, state = checked_index(i, self.num_envs), self._checked_state(state)
-        self._running[i] = self._moved[i] = False
-        self._errors.pop(i, None)
-        self._forget(np.array([i]))
-        kept, is_whole = self._kept(i), state.size > self.simulations.state_size
-        sizes = np.cumsum([self.simulations.state_size, *(part.size for part in kept)])
-        simulation, *values, seen = np.split(state, sizes)
-        if is_whole:
-            self.simulations.set_state(i, simulation)
-            for part, value in zip(kept, values, strict=True):
-                part[:] = value
+        i, (simulation, steps, parts) = checked_index(i, self.num_envs), self._checked_state(state)
+        self._running[i] = False
+        self.errors.pop(i, None)
+        if steps is None:
+            self.simulations.set_physics_state(i, simulation)
         else:
-            self.simulations.set_physics_state(i, state)
-            self._steps[i] = 0
-        if self.perturbed is not None:
-            self.perturbed.resume(i, int(self._steps[i]), begins=not is_whole)
-            self.observer.set_appearance(i, self.perturbed.appearance(i))
-        if self._watched:
-            self.watch.goals[i] = self._goal_atoms(i)
-            self.watch.begin(i)
-        if is_whole and self._has_phases:
-            self.watch.recall(i, seen)
-        if not is_whole and any(history.memory.size for history in self._histories):
-            self._goals_reached(np.array([i]))  # the first moment
-        self._running[i], self._success[i] = True, False
+            self.simulations.set_state(i, simulation)
+        self.steps[i] = steps or 0
+        for part, values in zip(self._parts, parts, strict=True):
+            part.restore(i, values)
+        self._running[i] = True
 
-    def observe(self, i: int) -> dict[str, np.ndarray]:
-        """Return the observation of simulation i in its present state, with a leading axis of one."""
+    def observe(self, i: int) -> Entries:
+        """Return the observation of simulation i in its present state: name -> (1, ...)."""
         self.require_open()
-        return {name: rows[[i]] for name, rows in self._with_images(self._observe([i])).items()}
+        seen = self.observing.with_images(self.observing.look([i])).items()
+        return {name: rows[[i]] for name, rows in seen}
 
-    def proprioception(self) -> dict[str, np.ndarray]:
+    def proprioception(self) -> Entries:
         """Return all observations except images: name -> (num_envs, length) float64."""
-        entries = self.observer.state()
-        return entries if self.perturbed is None else self.perturbed.see_state(entries)
+        return self.observing.state()
 
-    def render_cameras(self, ids: Sequence[int] | None = None) -> Images:
+    def render_cameras(self, ids: Sequence[int] | None = None) -> Entries:
         """Render the observed images of the current states: name -> (n, H, W, ...).
 
         Args:
@@ -364,241 +325,76 @@ class BatchEnv(LiberoVectorEnv):
         """
         self.require_open()
         rows = checked_indices(ids, self.num_envs)
-        self._render(rows, self._images)
-        return {key: images[rows] for key, images in self._images.items()}
+        self.observing.render(rows)
+        return {key: images[rows] for key, images in self.observing.images.items()}
 
     def check_goal(self, i: int) -> tuple[bool, dict[str, bool]]:
         """Return whether the goal is reached in simulation i, and whether each of its atoms holds, by its text."""
-        reached, held = self._goals_reached(np.array([i]))
+        reached, held = self.goal.check(np.array([i]))
         return bool(reached[0]), dict(zip(self.atoms, map(bool, held[0]), strict=True))
+
+    def missing(self, i: int) -> list[Expression]:
+        """Return what the episode in simulation i lacks now, see `libero_env.sim.history.History.missing`."""
+        return self.goal.of(i).missing(i)
+
+    def task_of(self, i: int) -> Task:
+        """Return the task of simulation i, whose goal an event may have changed."""
+        return self.later if self.later is not None and self.goal.which[i] else self.task
+
+    def place(self, ids: np.ndarray, states: InitialStates) -> None:
+        """Start the simulations ids, (k,), from states, [time, qpos, qvel, fixtures], (k, size); no episode begins."""
+        qpos, qvel, fixtures = self.scene.split_states(states)
+        self.simulations.reset(ids, qpos, qvel, fixtures=fixtures)
 
     def close_extras(self, **kwargs: Any) -> None:
         """Free the simulations and the OpenGL context."""
         self.observer.close()
         self.simulations.close()
 
-    def _start(self, ids: np.ndarray, states: InitialStates, init_states: np.ndarray | None) -> None:
-        """Start simulations from states of `base_task`, or from those that the perturbations make of them.
-
-        Args:
-            ids: Indices of the simulations, (k,).
-            states: State of each.
-            init_states: Indices of the states, (k,), which name the samples of perturbations; by default the states
-                themselves do.
-
-        Raises:
-            PlacementError: Perturbations make no valid start of a state.
-        """
-        if self.perturbed is None:
-            qpos, qvel, fixtures = self.scene.split_states(states)
-            self.simulations.reset(ids, qpos, qvel, fixtures=fixtures)
-            return
-        names = map(start_name, states) if init_states is None else map(int, init_states)
-        for i, name, state in zip(ids, names, states, strict=True):
-            self._start_perturbed(int(i), name, state)
-
-    def _start_perturbed(self, i: int, name: object, state: np.ndarray) -> None:
-        """Start a simulation from what the perturbations make of a state; the goal does not hold there."""
-        perturbed = self.perturbed
-        assert perturbed is not None
-        paired = perturbed.paired(i, name, state)
-        for again in range(TRIES if perturbed.samples_starts else 1):
-            start = perturbed.begin(i, name, paired, again)
-            qpos, qvel, fixtures = self.scene.split_states(start[None])
-            self.simulations.reset([i], qpos, qvel, fixtures=fixtures)
-            self._forget(np.array([i]))
-            if not perturbed.is_physical or not self.goals.check([i])[0][0]:
-                break
-        else:
-            raise PlacementError(f"{self.base_task.id}, start {name}: the perturbed goal holds at the start")
-        self.observer.set_appearance(i, perturbed.appearance(i))
-
-    def _stored_states(self, indices: np.ndarray) -> InitialStates:
-        """Return stored initial states by index, (k,)."""
-        stored = self.init_states
+    def _given_states(self, request: ResetRequest) -> InitialStates | None:
+        """Return the states of `base_task` that are asked for, (k, size); None for new placements."""
+        if request.starts is not None:
+            states, scene = request.starts[request.ids], self.base_scene
+            if states.shape[1] != scene.state_size:
+                raise InvalidInputError(
+                    f"{self.task.id}: a start has {scene.state_size} numbers, [time, qpos, qvel] and the poses of "
+                    f"{len(scene.fixtures)} fixtures; got {states.shape[1]}. Is it one of another task?"
+                )
+            check_range(states, self.task)
+            return states
+        if request.init_states is None:
+            return None
+        indices, stored = request.init_states[request.ids], self.init_states
         if ((indices < 0) | (indices >= len(stored))).any():
             raise InvalidInputError(
                 f"init_state {indices.tolist()}: {self.task.id} has 0 to {len(stored) - 1}"
             )
         return stored[indices]
 
-    def _checked_starts(self, states: np.ndarray) -> InitialStates:
-        size, fixtures = self.base_scene.state_size, len(self.base_scene.fixtures)
-        if states.shape[1] != size:
-            raise InvalidInputError(
-                f"{self.task.id}: a start has {size} numbers, [time, qpos, qvel] and the poses of {fixtures} fixtures; "
-                f"got {states.shape[1]}. Is it one of another task?"
-            )
-        _check_range(states, self.task)
-        return states
+    def _checked_state(self, state: object) -> tuple[np.ndarray, int | None, list[np.ndarray | None]]:
+        """Return the parts of a vector of `get_state`, or [time, qpos, qvel], as float64.
 
-    def _checked_state(self, state: object) -> np.ndarray:
-        """Return a vector of `get_state`, or [time, qpos, qvel], as float64."""
-        model, first = self.scene.model, self.simulations.state_size
-        last = first + sum(part.size for part in self._kept(0))
-        size = last + (self.watch.memory(0).size if self._has_phases else 0)
+        Returns:
+            State of the simulation, number of steps, and what belongs to each part of the environment; None for both
+            in a state of the simulation alone.
+        """
+        model, own = self.scene.model, [part.state(0).size for part in self._parts]
+        ends = np.cumsum([self.simulations.state_size, 1, *own])
         name = f"state of {self.task.id} (get_state, or [time, qpos, qvel])"
-        array = checked_numbers(state, name, ((size,), (1 + model.nq + model.nv,)))
-        _check_range(array, self.task)
-        counts = array[first:last] if array.size == size else np.zeros(1)
-        if not (counts[0] >= 0 and (counts >= NEVER).all() and (counts % 1 == 0).all()):
+        array = checked_numbers(state, name, ((int(ends[-1]),), (1 + model.nq + model.nv,)))
+        check_range(array, self.task)
+        if array.size != ends[-1]:
+            return array, None, [None] * len(own)
+        simulation, steps, *parts = np.split(array, ends[:-1])
+        whole = [values for part, values in zip(self._parts, parts, strict=True) if part.is_counted]
+        counts = np.concatenate([steps, *whole])
+        if not (counts[0] >= 0 and (counts >= -1).all() and (counts % 1 == 0).all()):
             raise InvalidInputError(
                 "a state ends with its number of steps, those before each event, and what the goal remembers; got "
                 f"{counts.tolist()}"
             )
-        return array
-
-    def _check_memory(self) -> None:
-        """Raise if the simulations and their images do not fit into memory."""
-        if self.num_envs == 1 and max(self.config.camera_size) <= BUFFER_SIDE:
-            return
-        height, width = self.config.camera_size
-        images = 16 * height * width * len(self.config.cameras)
-        model = self.scene.model
-        state = 0 if self.config.backend.is_warp else model.narena + model.nbuffer // 8  # on the device
-        require_memory(
-            self.num_envs * (state + images),
-            f"num_envs={self.num_envs}" if self.num_envs > 1 else f"camera_size={height}x{width}",
-            "take fewer simulations or smaller images",
-        )
-
-    def _check_goals(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return whether the goal is reached in each of the simulations, and its reward; note which atoms hold."""
-        reached, held = self._goals_reached(ids)
-        self._progress[ids] = held
-        rewards = [
-            self.reward(self.views[i], bool(won), self.goals.atoms, list(row))
-            for i, won, row in zip(ids, reached, held, strict=True)
-        ]
-        return reached, np.array(rewards, np.float64)
-
-    def _goals_reached(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return whether each simulation has reached its goal, (k,) bool, and which atoms hold, (k, natoms)."""
-        reached, held = self.goals.check(ids)
-        changed = np.array([self.task_of(i) is not self.task for i in ids], bool)
-        if self._later_goals is not None and changed.any():
-            reached[changed] = self._later_goals.check(ids[changed])[0]
-        return reached, held
-
-    def missing(self, i: int) -> list[Expression]:
-        """Return what the episode in simulation i lacks now, see `libero_env.sim.history.History.missing`."""
-        later = self._later_goals if self.task_of(i) is not self.task else None
-        return (later or self.goals).missing(i)
-
-    def _forget(self, ids: np.ndarray) -> None:
-        """Begin the conditions over time of the goals anew."""
-        for history in self._histories:
-            history.begin(ids)
-
-    def task_of(self, i: int) -> Task:
-        """Return the task of simulation i, whose goal an event may have changed."""
-        if self.later is not None and self.perturbed is not None and self.perturbed.has_new_goal(i):
-            return self.later
-        return self.task
-
-    def _goal_atoms(self, i: int) -> tuple[Atom, ...]:
-        return ground(self.task_of(i).problem.goal, self.scene).wanted()
-
-    def _begin_events(self, ids: np.ndarray) -> None:
-        """Let the events begin whose moment has come, before a control step."""
-        perturbed, self._moved[:] = self.perturbed, False
-        if perturbed is None or not perturbed.events:
-            return
-        for i in map(int, ids):
-            for event, k in enumerate(perturbed.events):
-                trigger, steps = perturbed.perturbations[k].trigger, int(perturbed.steps[i])
-                waits = perturbed.began[i, event] == NEVER and perturbed.attempts[i, k] < TRIES
-                if waits and has_begun(trigger, steps, self.config.horizon, self.watch, i):
-                    self._begin_event(i, event)
-
-    def _begin_event(self, i: int, event: int) -> None:
-        """Let an event begin in simulation i; one that finds no valid place does not happen."""
-        perturbed, simulations = self.perturbed, self.simulations
-        assert perturbed is not None
-        state, size = simulations.get_state(i), self.scene.state_size
-        try:
-            row = perturbed.begin_event(i, event, state[:size])
-        except PlacementError:
-            return
-        if not np.array_equal(row, state[:size]):
-            simulations.set_state(i, np.concatenate([row, state[size:]]))
-            self.watch.measure_from_here(i)
-        self.observer.set_appearance(i, perturbed.appearance(i))
-        self.watch.goals[i] = self._goal_atoms(i)
-        self._moved[i] |= perturbed.perturbations[perturbed.events[event]].definition.physical
-        self.event_states[i, event] = self.get_state(i)
-
-    def _step_and_observe(self, ids: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
-        """Advance simulations by one control period, and observe them when `config.observed` says."""
-        if self.perturbed is not None:
-            controller = self.simulations.controller_state.controller
-            actions = self.perturbed.act(ids, np.clip(actions, controller.low, controller.high))
-        is_after, (first, second) = self.config.observed == AFTER, self.simulations.watched
-        seen = {} if is_after else self.proprioception()
-
-        def watch(done: int, rows: np.ndarray) -> None:
-            if done not in (first, second):
-                return
-            now = self.proprioception()
-            if done == first:
-                self._render_observed(rows)
-            for name, values in now.items():
-                if (done == second) == is_of_joints(name):
-                    seen[name][rows] = values[rows]
-
-        try:
-            self.simulations.step(ids, actions, watch=None if is_after else watch)
-        except SimulationError as error:
-            self._errors |= error.failed
-        return self._observe(ids) if is_after else seen
-
-    def _observe(self, ids: Indices) -> dict[str, np.ndarray]:
-        """Render the images of simulations, and return all observations except images."""
-        self._render_observed(ids)
-        return self.proprioception()
-
-    def _render_observed(self, ids: Indices) -> None:
-        """Render images where they are observed; unseen ones where a perturbation remembers them."""
-        if self.render_images:
-            self._render(ids, self._images)
-        elif self.perturbed is not None and self.perturbed.has_memory:
-            self._render(ids, self._unseen)
-
-    @cached_property
-    def _unseen(self) -> Images:
-        return self.observer.empty_images()
-
-    def _render(self, ids: Indices, images: Images) -> None:
-        self.observer.render_cameras(ids, images)
-        if self.perturbed is not None:
-            self.perturbed.see_images(ids, images)
-
-    def _with_images(self, entries: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Return copies of the images, with the given observations of the state."""
-        return {name: values.copy() for name, values in self._images.items()} | entries
+        return simulation, int(steps[0]), list(parts)
 
     def _info(self) -> dict[str, Any]:
-        info = {"success": self._success.copy(), "progress": self._progress.copy()}
-        if self.perturbed is not None:
-            info["attempts"] = self.perturbed.attempts.copy()
-            info["began"] = self.perturbed.began.copy()
-            info["moved"] = self._moved.copy()
-        return {**info, "errors": dict(self._errors)} if self._errors else info
-
-
-def _require_stages(goal: Expression, changes: bool) -> None:
-    """Raise unless the atoms of a goal that hold are stages on the way to it."""
-    staged = goal.fold(lambda node, parts: isinstance(node, Atom | And | Or) and all(parts))
-    if changes or not staged:
-        what = f"an event makes {goal} the goal" if changes else f"{goal} is more than atoms, And and Or"
-        raise InvalidInputError(
-            f"reward=staged counts the atoms of one goal that hold, but {what}; leave reward=sparse"
-        )
-
-
-def _check_range(states: np.ndarray, task: Task) -> None:
-    """Raise unless MuJoCo takes the numbers: it resets a simulation with larger ones, without an error."""
-    if not (np.abs(states) <= mujoco.mjMAXVAL).all():
-        raise InvalidInputError(
-            f"{task.id}: a state has a number beyond {mujoco.mjMAXVAL:g}, or not a number"
-        )
+        info = {key: value for hook in self._hooks["info"] for key, value in hook().items()}
+        return {**info, "errors": dict(self.errors)} if self.errors else info

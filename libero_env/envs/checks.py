@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Annotated, Any
+from typing import Annotated
 
 import gymnasium
 import numpy as np
@@ -14,8 +14,10 @@ from libero_env.errors import (
     ClosedEnvironmentError,
     InvalidInputError,
     LiberoError,
-    UnknownNameError,
+    require_known,
 )
+from libero_env.mujoco_compat import mujoco
+from libero_env.tasks import Task
 from libero_env.text import shown
 from libero_env.validation import validate
 
@@ -108,37 +110,6 @@ def checked_indices(ids: Sequence[int] | None, count: int) -> np.ndarray:
     return np.array([checked_index(i, count) for i in indices], np.int64)
 
 
-def checked_seed(seed: object) -> int | None:
-    """Return a seed as int; None stands for none.
-
-    Raises:
-        InvalidInputError: It is not a whole number from 0.
-    """
-    value: int | None = validate(Whole | None, seed, prefix=("seed",))
-    return value
-
-
-def checked_options(options: object, valid: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return reset options, after a check of their names; None stands for none.
-
-    Args:
-        options: What the caller passed.
-        valid: Names of options; None for any.
-
-    Raises:
-        InvalidInputError: They are not a dictionary.
-        UnknownNameError: An option does not exist.
-    """
-    if options is None:
-        return {}
-    if not isinstance(options, Mapping):
-        raise InvalidInputError(f"options={shown(options)}: expected a dictionary")
-    for name in options:
-        if valid is not None and name not in valid:
-            raise UnknownNameError("reset option", name if isinstance(name, str) else shown(name), valid)
-    return dict(options)
-
-
 @dataclass(frozen=True)
 class ResetRequest:
     """Arguments of `reset` of a vector environment, checked.
@@ -157,9 +128,14 @@ class ResetRequest:
     starts: np.ndarray | None
     outdated_controller: bool
 
+    @property
+    def names(self) -> list[int]:
+        """Index of the initial state of each environment of `ids`; empty for new placements and other states."""
+        return [] if self.init_states is None else self.init_states[self.ids].tolist()
+
     @classmethod
     def from_arguments(
-        cls, num_envs: int, seed: object, options: object, valid: Sequence[str] | None = RESET_OPTIONS
+        cls, num_envs: int, seed: object, options: object, valid: Sequence[str] = RESET_OPTIONS
     ) -> "ResetRequest":
         """Check the arguments of `reset`.
 
@@ -167,13 +143,17 @@ class ResetRequest:
             num_envs: Number of environments.
             seed: One seed for each environment, or one number from which they count up.
             options: Reset options.
-            valid: Names of options; None for any.
+            valid: Names of options.
 
         Raises:
             InvalidInputError: Seeds, mask, initial states or starts have the wrong length or are of another kind.
             UnknownNameError: An option does not exist.
         """
-        values = checked_options(options, valid)
+        if not isinstance(options, Mapping | None):
+            raise InvalidInputError(f"options={shown(options)}: expected a dictionary")
+        values = dict(options or {})
+        for name in values:
+            require_known("reset option", name if isinstance(name, str) else shown(name), valid)
         mask = np.ones(num_envs, bool)
         if "reset_mask" in values:
             chosen = values["reset_mask"]
@@ -204,6 +184,14 @@ def _seeds(num_envs: int, seed: object) -> list[int | None]:
     if isinstance(seed, list | tuple) or (isinstance(seed, np.ndarray) and seed.ndim):
         if len(seed) != num_envs:
             raise InvalidInputError(f"seed: expected one or {num_envs} seeds, got {len(seed)}")
-        return [checked_seed(one) for one in seed]
-    first = checked_seed(seed)
+        return [validate(Whole | None, one, prefix=("seed",)) for one in seed]
+    first = validate(Whole | None, seed, prefix=("seed",))
     return [None if first is None else first + i for i in range(num_envs)]
+
+
+def check_range(states: np.ndarray, task: Task) -> None:
+    """Raise unless MuJoCo takes the numbers: it resets a simulation with larger ones, without an error."""
+    if not (np.abs(states) <= mujoco.mjMAXVAL).all():
+        raise InvalidInputError(
+            f"{task.id}: a state has a number beyond {mujoco.mjMAXVAL:g}, or not a number"
+        )

@@ -11,16 +11,13 @@ from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator
 
 from libero_env.assets.pack import Pack, select_pack
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
+from libero_env.doors import enter
 from libero_env.errors import InvalidInputError, require_known
-from libero_env.perturbations.appearance import CAMERA
-from libero_env.perturbations.episodes import checked_perturbations
-from libero_env.perturbations.filters import ActionDelay, ActionGain, ActionNoise, StateBias
-from libero_env.perturbations.perturbation import Perturbation
 from libero_env.sim.backend import Backend
-from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS, IMAGES
+from libero_env.sim.observations import DEFAULT_CAMERAS, DEFAULT_OBSERVATIONS
 from libero_env.sim.predicates import SEMANTICS
-from libero_env.sim.scene import DRAWINGS
-from libero_env.tasks.cameras import camera_name, camera_text, distinct_cameras
+from libero_env.sim.scene_spec import DRAWINGS
+from libero_env.tasks.cameras import camera_text, distinct_cameras
 from libero_env.text import shown
 from libero_env.timing import CONTROL_HZ, PHYSICS_HZ, ControlFreq
 from libero_env.validation import checked
@@ -52,6 +49,10 @@ def _assets(value: Any) -> Any:
     if value is None or isinstance(value, str | Path) or hasattr(value, "add_arena"):
         return value
     raise InvalidInputError(f"assets is {shown(value)}; expected builtin, original, a folder, or a Pack")
+
+
+def _perturbations(value: Any) -> tuple[Any, ...]:
+    return enter("perturbations", "read")(value) if value or value is None else ()
 
 
 def _known(kind: str, names: Collection[str]) -> AfterValidator:
@@ -124,7 +125,7 @@ class EnvConfig:
     robot: Robot = DEFAULT_ROBOT
     observed: Annotated[str, _known("time of observation", OBSERVED)] = AFTER
     backend: Annotated[Backend, PlainValidator(Backend.read)] = Backend()
-    perturb: Annotated[tuple[Any, ...], PlainValidator(checked_perturbations)] = ()
+    perturb: Annotated[tuple[Any, ...], PlainValidator(_perturbations)] = ()
 
     def __post_init__(self) -> None:
         if self.observed == SUBSTEP and self.control_freq > _LARGEST_OBSERVED_WITHIN:
@@ -133,33 +134,8 @@ class EnvConfig:
                 f"control_freq {self.control_freq} there are not as many: expected at most "
                 f"{_LARGEST_OBSERVED_WITHIN}, or observed={AFTER}"
             )
-        is_seen = not self.cameras or CAMERA in map(camera_name, self.cameras)
-        images = {*self.observations} & {*IMAGES} if self.cameras else set()
-        unfelt = {*self.observations}.isdisjoint(("proprioception", *StateBias.entries))
-        for one in self.perturb:
-            kind = one.definition if isinstance(one, Perturbation) else one
-            if images and "rgb" not in images and getattr(kind, "only_rgb", False):
-                raise InvalidInputError(
-                    f"perturb={one} changes colours only, and observations={', '.join(self.observations)} have none: "
-                    "add rgb, or leave the perturbation out"
-                )
-            is_bias = isinstance(one, StateBias) or getattr(one, "kind", "") == "proprio_bias"
-            if is_bias and self.observations and unfelt:
-                raise InvalidInputError(
-                    f"perturb={one} changes what the robot feels, which is not in observations="
-                    f"{', '.join(self.observations)}; add proprioception, or leave the perturbation out"
-                )
-            if getattr(one, "kind", "") in ("camera", "fov") and not is_seen:
-                raise InvalidInputError(
-                    f"perturb={one} changes the camera {CAMERA}, which is not among cameras={', '.join(self.cameras)}; "
-                    "add it, or leave the perturbation out"
-                )
-            own = isinstance(one, Perturbation | ActionDelay | ActionGain | ActionNoise)
-            if own and one.layer == "action" and not self.control_delta:
-                raise InvalidInputError(
-                    f"perturb={one} changes how far relative actions move the arm; with control_delta=False they are "
-                    "goals: leave control_delta=True"
-                )
+        if self.perturb:
+            enter("perturbations", "check")(self)
 
     @property
     def pack(self) -> Pack:

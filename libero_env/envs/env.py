@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 
 from libero_env.envs.batch import BatchEnv
-from libero_env.envs.checks import checked_actions, checked_options, checked_seed
+from libero_env.envs.checks import ResetRequest, checked_actions
 from libero_env.envs.config import EnvConfig, show_options
 from libero_env.errors import LiberoError, RenderError, SimulationError, UnknownNameError
 from libero_env.tasks import Task
@@ -44,9 +44,10 @@ class LiberoEnv(gymnasium.Env):
     Raises:
         UnknownNameError: The task, a camera, an option or a value of an option does not exist.
         InvalidInputError: A value of an option is of another kind or outside of its range.
+        RenderError: `render_mode` is `human`, without a display or with backend `warp`.
         ClosedEnvironmentError: By every method, after `close`.
 
-    Example:
+    Examples:
         >>> env = LiberoEnv("libero_object/3", camera_size=(64, 64))
         >>> observation, info = env.reset(options={"init_state": 0})
         >>> observation["agentview_rgb"].shape, observation["ee_pos"].shape
@@ -95,7 +96,7 @@ class LiberoEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode.
+        """Start an episode, and return the observation, name -> (length,) or (H, W, C), and `info`.
 
         Args:
             seed: Seed of the placement of objects; the same seed gives the same state.
@@ -108,11 +109,11 @@ class LiberoEnv(gymnasium.Env):
             PlacementError: The objects do not fit; no episode is running.
         """
         self.batch.require_open()
-        seed, options = checked_seed(seed), checked_options(options, valid=("init_state",))
+        request = ResetRequest.from_arguments(1, [seed], options, valid=("init_state",))
         self.batch.generators[0] = self.np_random
-        observations, infos = self.batch.reset(seed=[seed], options=options)
-        if seed is not None:
-            self._np_random, self._np_random_seed = self.batch.generators[0], seed
+        observations, infos = self.batch.start(request)
+        if request.seeds[0] is not None:
+            self._np_random, self._np_random_seed = self.batch.generators[0], request.seeds[0]
         self._show()
         return _first(observations), self._info(infos)
 
@@ -139,7 +140,7 @@ class LiberoEnv(gymnasium.Env):
         return _first(observations), float(rewards[0]), end, cut, self._info(infos)
 
     def get_state(self) -> np.ndarray:
-        """Return all that the rest of the episode depends on: simulation, controller and number of steps."""
+        """Return all that the rest of the episode depends on, (N,) float64: simulation, controller, number of steps."""
         return self.batch.get_state(0)
 
     def set_state(self, state: np.ndarray) -> dict[str, np.ndarray]:

@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from libero_env.compilation import compiled
 from libero_env.expert.arm import GRIPPER
-from libero_env.parallel import compiled
 
 _CELL, _COARSE_CELL = 0.006, 0.012  # [m] voxels for objects, and for the hand
 _WALL_HEIGHT = 0.01  # [m] above a limit, up to which the lowest point of a column is a wall and no overhang

@@ -47,7 +47,7 @@ class Expert:
     Attributes:
         skill: Skill that acts now; None before the first action and where nothing is left to do.
 
-    Example:
+    Examples:
         >>> import numpy as np
         >>> from libero_env import Expert, LiberoEnv
         >>> env = LiberoEnv("libero_object/0", cameras=())
@@ -164,7 +164,8 @@ def solved_from_events(env: BatchEnv) -> np.ndarray:
         (num_envs, events): 1 where it does, 0 where it does not, -1 where the event has not begun.
     """
     count = 0 if env.perturbed is None else len(env.perturbed.events)
-    found, states, shapes = np.full((env.num_envs, count), -1), dict(env.event_states), Shapes(env.scene)
+    found, shapes = np.full((env.num_envs, count), -1), Shapes(env.scene)
+    states = dict(env.perturbed.event_states) if count else {}
     env.render_images = False
     for event in range(count):
         ids = [i for i in range(env.num_envs) if (i, event) in states]

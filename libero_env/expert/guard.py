@@ -11,7 +11,7 @@ from libero_env.sim.predicates import ground
 from libero_env.sim.scene import ROBOT
 from libero_env.sim.state import StateView
 from libero_env.sim.watch import ancestors
-from libero_env.tasks.problem import Expression
+from libero_env.tasks.expression import Expression
 from libero_env.timing import CONTROL_HZ
 
 MARGIN, TOUCH = 0.008, 0.001  # [m] that the hand keeps, and from a fixture whose part it moves

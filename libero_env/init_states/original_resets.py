@@ -19,7 +19,9 @@ from libero_env.geometry import quat_to_mat
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES, ObjectModel, rest_quat
 from libero_env.sim.scene import Scene
-from libero_env.tasks.problem import BUILTIN_PREDICATES, Atom, Region
+from libero_env.tasks.expression import Atom
+from libero_env.tasks.problem import Region
+from libero_env.tasks.rules import BUILTIN_PREDICATES
 
 _ARM_JOINTS = 7
 _MAX_TRIES = 5000  # of one object, as in the original
@@ -52,6 +54,7 @@ class OriginalResets:
             if atom.predicate.lower() in OPPOSITE_STATES
         ]
         self._items = _items(scene)
+        self._at_rest: dict[str, np.ndarray] = {}  # sites, where nothing moves them
 
     def reset(self) -> np.ndarray:
         """Return the poses of the fixtures after the next reset, (nfixtures, 7): position, quaternion wxyz.
@@ -116,16 +119,19 @@ class OriginalResets:
 
     def _sites(self, joints: Mapping[str, float]) -> dict[str, np.ndarray]:
         """Return the positions of the sites that objects are placed on, with all fixtures at the origin."""
-        scene, names = self.scene, {item.site for item in self._items if item.site}
-        if not names:
-            return {}
-        model = scene.model_with(np.tile((0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), (len(scene.fixtures), 1)))
-        data = mujoco.MjData(model)
-        for name, value in joints.items():
-            for joint in scene.joints.get(name, ()):
-                data.qpos[model.jnt_qposadr[joint]] = value
-        mujoco.mj_kinematics(model, data)
-        return {name: data.site_xpos[model.site(name).id].copy() for name in names}
+        names = {item.site for item in self._items if item.site}
+        if not names or (self._at_rest and not joints):
+            return self._at_rest
+        scene = self.scene
+        origin = np.tile((0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), (len(scene.fixtures), 1))
+        with scene.posed(origin) as model:
+            data = mujoco.MjData(model)
+            for name, value in joints.items():
+                for joint in scene.joints.get(name, ()):
+                    data.qpos[model.jnt_qposadr[joint]] = value
+            mujoco.mj_kinematics(model, data)
+            self._at_rest = {name: data.site_xpos[model.site(name).id].copy() for name in names}
+        return self._at_rest
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
 """Initial states in the original's files: one array in a pickle, which is in a zip; nothing is executed.
 
-What is read, and no more: a zip as `torch.save` writes it, or a bare pickle; in it one array of NumPy or one tensor of
-torch, of two dimensions or of one for a single state, with finite numbers of 4 or 8 bytes, at most 10,000 states of at
-most 10,000 numbers and 16 million numbers in all. Sizes are compared with the file before memory is asked for.
+What is read, and no more: a zip as `torch.save` writes it, or a bare pickle; in it one array of NumPy, of two
+dimensions or of one for a single state, with finite numbers of 4 or 8 bytes, at most 10,000 states of at most 10,000
+numbers and 16 million numbers in all. Sizes are compared with the file before memory is asked for.
 """
 
 import io
@@ -18,7 +18,7 @@ from libero_env.errors import LiberoError
 from libero_env.storage import atomic_path, read_bounded
 from libero_env.text import shown
 
-_MAX_OPERATIONS = 2000  # an array takes 60, a tensor 40
+_MAX_OPERATIONS = 2000  # an array takes 60
 _MAX_BYTES = 1 << 28  # of a file, and of a part of it
 _MAX_PARTS = 1000  # of a zip
 _MAX_EDGE = 10_000  # states, and numbers of a state
@@ -27,21 +27,13 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # date of all parts, so that equal states give e
 _OPERATION_NAMES = (
     "PROTO FRAME STOP NONE NEWTRUE NEWFALSE EMPTY_TUPLE INT BININT BININT1 BININT2 LONG LONG1 UNICODE BINUNICODE "
     "SHORT_BINUNICODE BINUNICODE8 SHORT_BINBYTES BINBYTES BINBYTES8 BYTEARRAY8 PUT BINPUT LONG_BINPUT MEMOIZE GET "
-    "BINGET LONG_BINGET MARK TUPLE TUPLE1 TUPLE2 TUPLE3 GLOBAL STACK_GLOBAL BINPERSID REDUCE BUILD"
+    "BINGET LONG_BINGET MARK TUPLE TUPLE1 TUPLE2 TUPLE3 GLOBAL STACK_GLOBAL REDUCE BUILD"
 )
 _OPERATIONS = frozenset(_OPERATION_NAMES.split())
 _CODES = ("f8", "f4", "i8", "i4")
-_STORAGES: dict[str, np.dtype] = {
-    "torch.DoubleStorage": np.dtype("<f8"),
-    "torch.FloatStorage": np.dtype("<f4"),
-}
 _RECONSTRUCT = ("numpy.core.multiarray._reconstruct", "numpy._core.multiarray._reconstruct")
 _FROM_BUFFER = ("numpy.core.numeric._frombuffer", "numpy._core.numeric._frombuffer")
-_TENSOR = "torch._utils._rebuild_tensor_v2"
-_NAMES = frozenset(
-    (*_RECONSTRUCT, *_FROM_BUFFER, *_STORAGES, _TENSOR)
-    + ("numpy.ndarray", "numpy.dtype", "_codecs.encode", "collections.OrderedDict")
-)
+_NAMES = frozenset((*_RECONSTRUCT, *_FROM_BUFFER, "numpy.ndarray", "numpy.dtype", "_codecs.encode"))
 
 
 class StateFileError(LiberoError, ValueError):
@@ -57,13 +49,6 @@ class Name:
     def __call__(self, *args: object) -> "Call":
         """Return the call that the pickle describes."""
         return Call(self.text, args)
-
-
-@dataclass(frozen=True)
-class External:
-    """A reference to data outside of the pickle, with its identifier there."""
-
-    key: object
 
 
 @dataclass(eq=False)
@@ -89,9 +74,6 @@ class _Reader(pickle.Unpickler):
                 f"the pickle names {shown(text)}; only arrays of numbers are read, nothing is executed"
             )
         return Name(text)
-
-    def persistent_load(self, key: object) -> External:
-        return External(key)
 
 
 def _read_pickle(content: bytes) -> object:
@@ -134,7 +116,7 @@ def read_states(path: str | Path) -> np.ndarray:
         if content.startswith(b"PK"):
             array = _read_zip(content)
         else:
-            array = _to_array(_read_pickle(content), None)
+            array = _to_array(_read_pickle(content))
         if not np.isfinite(array).all():
             raise StateFileError("a state has numbers that are not finite")
     except StateFileError as error:
@@ -170,29 +152,6 @@ def states_content(rows: np.ndarray, name: str) -> bytes:
     return stream.getvalue()
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """The parts of a zip; `root` is the beginning of their names."""
-
-    archive: zipfile.ZipFile
-    root: str
-
-    def read(self, name: str) -> bytes:
-        """Return the content of a part, after a check that it can be read."""
-        try:
-            info = self.archive.getinfo(self.root + name)
-        except KeyError:
-            raise StateFileError(f"the part {shown(name)} is missing") from None
-        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
-            raise StateFileError(f"{shown(name)} is encrypted or compressed in an unusual way")
-        if info.file_size > _MAX_BYTES:
-            raise StateFileError(f"{shown(name)} is larger than {_MAX_BYTES >> 20} MiB")
-        content = self.archive.read(info)
-        if len(content) != info.file_size:
-            raise StateFileError(f"{shown(name)} is incomplete")
-        return content
-
-
 def _read_zip(content: bytes) -> np.ndarray:
     if content.count(b"PK\x01\x02") > _MAX_PARTS:
         raise StateFileError(f"a zip of more than {_MAX_PARTS} parts; expected what torch.save writes")
@@ -202,49 +161,47 @@ def _read_zip(content: bytes) -> np.ndarray:
             pickles = [name for name in names if name.rpartition("/")[2] == "data.pkl"]
             if len(pickles) != 1 or len(set(names)) < len(names):
                 raise StateFileError("a zip without one data.pkl; expected what torch.save writes")
-            parts = _Parts(archive, pickles[0].removesuffix("data.pkl"))
-            return _to_array(_read_pickle(parts.read("data.pkl")), parts)
+            info = archive.getinfo(pickles[0])
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
+                raise StateFileError("data.pkl is encrypted or compressed in an unusual way")
+            if info.file_size > _MAX_BYTES:
+                raise StateFileError(f"data.pkl is larger than {_MAX_BYTES >> 20} MiB")
+            return _to_array(_read_pickle(archive.read(info)))
     except StateFileError:
         raise
     except Exception as error:  # noqa: BLE001 - as for a pickle
         raise StateFileError(f"the zip is broken ({shown(error)})") from None
 
 
-def _to_array(found: object, parts: _Parts | None) -> np.ndarray:
+def _to_array(found: object) -> np.ndarray:
     """Return the array that a pickle describes."""
     match found:
         case Call(name, _, (_, shape, dtype, order, raw)) if name in _RECONSTRUCT:
             return _from_bytes(shape, dtype, raw, fortran=order is True)
         case Call(name, (raw, dtype, shape, ("C" | "F") as order), None) if name in _FROM_BUFFER:
             return _from_bytes(shape, dtype, raw, fortran=order == "F")
-        case Call(name, (External(key), int(offset), shape, strides, *_), None) if name == _TENSOR:
-            if parts is None:
-                raise StateFileError("a tensor without the zip that has its numbers")
-            return _from_storage(_storage(key, parts), offset, _pair(shape), _pair(strides, "steps"))
     raise StateFileError("expected an array (states, size) of numbers")
 
 
-def _pair(found: object, what: str = "(states, size)") -> tuple[int, int]:
+def _shape(found: object) -> tuple[int, int]:
     match found:
         case (int(rows), int(columns)):
-            return rows, columns
+            pass
         case (int(columns),):
-            return 1, columns
-    raise StateFileError(f"expected an array (states, size) of numbers; {what} are not two numbers")
-
-
-def _check_shape(shape: tuple[int, int]) -> None:
-    if min(shape) < 1:
+            rows = 1
+        case _:
+            raise StateFileError("expected an array (states, size) of numbers")
+    if min(rows, columns) < 1:
         raise StateFileError("an array without numbers")
-    if max(shape) > _MAX_EDGE or shape[0] * shape[1] > _MAX_NUMBERS:
+    if max(rows, columns) > _MAX_EDGE or rows * columns > _MAX_NUMBERS:
         raise StateFileError(
             f"an array with an edge over {_MAX_EDGE:,}, or of more than {_MAX_NUMBERS:,} numbers in all"
         )
+    return rows, columns
 
 
 def _from_bytes(shape: object, dtype: object, raw: object, *, fortran: bool) -> np.ndarray:
-    rows, columns = _pair(shape)
-    _check_shape((rows, columns))
+    rows, columns = _shape(shape)
     kind = _dtype(dtype)
     content = _bytes(raw)
     if len(content) != rows * columns * kind.itemsize:
@@ -272,30 +229,3 @@ def _bytes(found: object) -> bytes | bytearray:
             except UnicodeEncodeError:
                 raise StateFileError("numbers that are not bytes") from None
     raise StateFileError("an array of other values than numbers")
-
-
-def _storage(key: object, parts: _Parts) -> np.ndarray:
-    """Return the numbers that a tensor refers to, from another part of the zip."""
-    match key:
-        case ("storage", Name(kind), str(part), *_) if kind in _STORAGES and part.isdecimal():
-            if f"{parts.root}byteorder" in parts.archive.namelist() and parts.read("byteorder") != b"little":
-                raise StateFileError("a tensor of a big-endian machine; save it again as a NumPy array")
-            content = parts.read(f"data/{part}")
-            if len(content) % _STORAGES[kind].itemsize:
-                raise StateFileError(f"{len(content)} bytes are not numbers of {kind}")
-            return np.frombuffer(content, _STORAGES[kind])
-    raise StateFileError("a tensor of other values than numbers, or outside of the file")
-
-
-def _from_storage(
-    storage: np.ndarray, offset: int, shape: tuple[int, int], strides: tuple[int, int]
-) -> np.ndarray:
-    """Return a tensor of a storage as an array, after a check of its bounds."""
-    _check_shape(shape)
-    if offset < 0 or min(strides) < 0:
-        raise StateFileError("a tensor with negative steps")
-    last = offset + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
-    if last >= storage.size:
-        raise StateFileError("a tensor that is larger than its storage")
-    rows, columns = (np.arange(n) * (step if n > 1 else 0) for n, step in zip(shape, strides, strict=True))
-    return storage[offset + rows[:, None] + columns]

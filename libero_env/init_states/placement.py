@@ -13,11 +13,15 @@ from libero_env.errors import PlacementError
 from libero_env.geometry import quat_from_axis_angle, quat_to_mat
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY
+from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.predicates import evaluate
-from libero_env.sim.scene import ROBOT, InitialStates, Scene, fixture_pose, initial_qpos
-from libero_env.sim.simulation import LoopSimulations, Simulations
+from libero_env.sim.scene import ROBOT, InitialStates, Scene, initial_qpos
+from libero_env.sim.scene_spec import fixture_pose
+from libero_env.sim.simulation import Simulations
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import BUILTIN_PREDICATES, Atom, Region
+from libero_env.tasks.expression import Atom
+from libero_env.tasks.problem import Region
+from libero_env.tasks.rules import BUILTIN_PREDICATES
 
 ARM_NOISE = 0.02  # [rad] standard deviation of the arm's joints around the rest pose, as in the original
 _CLEARANCE = 0.001  # [m] above the surface
@@ -45,13 +49,19 @@ class Start:
     fixtures: np.ndarray
 
 
-def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | None = None) -> Start:
+def sample_start(
+    scene: Scene,
+    rng: np.random.Generator,
+    fixtures: np.ndarray | None = None,
+    model: mujoco.MjModel | None = None,
+) -> Start:
     """Sample a start: entities in the regions of their init atoms, joints as in the atoms, no contact.
 
     Objects hover by a millimetre and are not at rest; see `libero_env.init_states.placement`.
 
     Args:
         fixtures: Poses of the fixtures, (nfixtures, 7); None samples them.
+        model: Model of a simulation, which is faster; by default a copy of the scene's.
 
     Raises:
         PlacementError: No placement without contact was found in 500 tries, or an init atom cannot be placed. Scenes of
@@ -63,25 +73,25 @@ def sample_start(scene: Scene, rng: np.random.Generator, fixtures: np.ndarray | 
         problem, name, workspace = scene.problem, scene.workspace_name, scene.workspace
         poses = [fixture_pose(problem, name, workspace, *item, rng) for item in scene.fixtures.items()]
         fixtures = np.array(poses).reshape(-1, 7)
-    model = scene.model_with(fixtures)
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    for atom in scene.problem.init:
-        if atom.predicate.lower() in OPPOSITE_STATES:
-            make_true(scene, data, atom, rng)
     touching: set[str] = set()
     solid = sum(len(geoms) for geoms in scene.collision_geoms.values())
     tries = fewer(_MAX_TRIES, solid, _USUAL_GEOMS)
-    for _ in range(tries):
-        for name, place in places.items():
-            if not place.flat:
-                mujoco.mj_kinematics(model, data)  # its carrier has been placed
-            _place(scene, data, name, place, rng)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        touching = _touching_entities(scene, data)
-        if not touching:
-            return Start(data.qpos.copy(), fixtures)
+    with scene.posed(fixtures, model) as posed:
+        data = mujoco.MjData(posed)
+        data.qpos[:] = qpos
+        for atom in scene.problem.init:
+            if atom.predicate.lower() in OPPOSITE_STATES:
+                make_true(scene, data, atom, rng)
+        for _ in range(tries):
+            for name, place in places.items():
+                if not place.flat:
+                    mujoco.mj_kinematics(posed, data)  # its carrier has been placed
+                _place(scene, data, name, place, rng)
+            mujoco.mj_kinematics(posed, data)
+            mujoco.mj_collision(posed, data)
+            touching = _touching_entities(scene, data)
+            if not touching:
+                return Start(data.qpos.copy(), fixtures)
     raise PlacementError(
         f"{scene.problem.language!r}: {', '.join(sorted(touching))} still collide after {tries} tries. "
         "(1) make their regions larger, (2) move the regions apart, (3) use fewer or smaller objects"
@@ -310,7 +320,7 @@ def sample_settled(
     view, reason = StateView(scene, simulations, i), ""
     samples = fewer(_MAX_SAMPLES, scene.model.nv, _USUAL_FREEDOMS)
     for _ in range(samples):
-        start = sample_start(scene, rng, fixtures)
+        start = sample_start(scene, rng, fixtures, simulations.model)
         try:
             qpos = settle(simulations, i, start.qpos, scene.nq_robot, start.fixtures)
         except PlacementError as error:

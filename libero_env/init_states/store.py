@@ -14,15 +14,14 @@ from libero_env.errors import BrokenFileError, LiberoError, PlacementError
 from libero_env.init_states.original_resets import drawn_fixtures
 from libero_env.init_states.pickles import StateFileError, read_states
 from libero_env.init_states.placement import sample_states
-from libero_env.parallel import as_finished, progress_bar, spawn_pool
+from libero_env.parallel import as_finished, spawn_pool
 from libero_env.paths import cache_dir, read_config
+from libero_env.progress import progress_bar
 from libero_env.sim.scene import InitialStates, Scene, build_scene
 from libero_env.storage import atomic_write_npz, cached_arrays, read_npz, read_packaged_npz
 from libero_env.tasks import bddl
-from libero_env.tasks.published.suites import PublishedTask
-from libero_env.tasks.task import Task
+from libero_env.tasks.task import NUM_INIT_STATES, Task
 
-NUM_INIT_STATES = 50
 _FIXTURE_SEED = 0  # of the poses of fixtures beside published states
 _SEED = 0x1B3E0  # keeps the seeds of these states apart from those of `reset(seed=...)`
 
@@ -75,7 +74,7 @@ def _own_states(task: Task, scene: Scene) -> np.ndarray:
     try:
         return generate_init_states(task, scene, task.num_starts)
     except PlacementError:
-        published = load_original_states(task, scene) if isinstance(task, PublishedTask) else None
+        published = load_original_states(task, scene) if task.start_file else None
         if published is None:
             raise
     size = 1 + scene.model.nq + scene.model.nv
@@ -95,8 +94,8 @@ def load_original_states(task: Task, scene: Scene | None = None) -> np.ndarray |
         StateFileError: The task's file is broken.
         LiberoError: The states are of another model than the scene's.
     """
-    if isinstance(task, PublishedTask):
-        path = task.states_file
+    if task.start_file:
+        path = task.start_file
     elif folder := read_config().get("init_states"):
         path = Path(str(folder)).expanduser() / task.suite / f"{task.name}.pruned_init"
     else:

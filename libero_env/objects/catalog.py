@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable
 
+from libero_env.doors import doors, enter
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects import builtin, folder
 from libero_env.objects.model import ROOT_BODY, ObjectModel
@@ -30,6 +31,8 @@ def get_object(category: str) -> ObjectModel:
     """
     if category in _registered:
         model = _registered[category]()
+    elif category in doors("objects"):
+        model = enter("objects", category)()
     elif category in builtin.builtin_names():
         if (directory := folder.find(category)) is not None:
             raise LiberoError(
@@ -58,8 +61,8 @@ def object_names() -> tuple[str, ...]:
 
 
 def user_defined_names() -> frozenset[str]:
-    """Return the user-defined categories: registered in this process, or in the user's folder of objects."""
-    return frozenset({*_registered, *folder.names()})
+    """Return the user-defined categories: registered, of installed packages, or in the user's folder."""
+    return frozenset({*_registered, *doors("objects"), *folder.names()})
 
 
 def register_object(category: str, builder: Builder) -> None:
@@ -72,7 +75,7 @@ def register_object(category: str, builder: Builder) -> None:
     Raises:
         LiberoError: The name cannot be used in a task file.
 
-    Example:
+    Examples:
         >>> def red_cube() -> ObjectModel:
         ...     spec = mujoco.MjSpec()
         ...     body = spec.worldbody.add_body(name="main")

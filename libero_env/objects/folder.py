@@ -17,10 +17,10 @@ from typing_extensions import TypedDict
 
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.mujoco_compat import mujoco
-from libero_env.objects.mjcf import Mjcf, read_mjcf
+from libero_env.objects.mjcf import MAX_FILE_BYTES, Mjcf, read_mjcf
 from libero_env.objects.model import ObjectModel, ObjectProperties
 from libero_env.paths import objects_dir
-from libero_env.storage import read_yaml_file
+from libero_env.storage import read_bounded, read_yaml_file
 from libero_env.validation import validate
 
 MODEL, PROPERTIES, PREVIEW = "object.xml", "object.yaml", "preview.png"
@@ -176,12 +176,20 @@ def spec_of(file: Mjcf) -> mujoco.MjSpec:
 
 
 def digest(directory: Path) -> str:
-    """Return a digest of the files that a scene is built from, 16 hexadecimal digits."""
+    """Return a digest of the files that a scene is built from, 16 hexadecimal digits.
+
+    Raises:
+        InvalidInputError: A file cannot be read, or is too large.
+    """
     hashed = hashlib.sha256()
     for path in sorted(directory.rglob("*")):
         if path.is_file() and path.name != PREVIEW:
             name = path.relative_to(directory).as_posix()
-            hashed.update(name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+            try:
+                content = read_bounded(path, MAX_FILE_BYTES)
+            except OSError as error:
+                raise InvalidInputError(f"{path}: {error.strerror or error}") from error
+            hashed.update(name.encode() + b"\0" + hashlib.sha256(content).digest())
     return hashed.hexdigest()[:16]
 
 

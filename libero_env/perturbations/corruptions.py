@@ -16,8 +16,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from libero_env.compilation import compiled
 from libero_env.errors import InvalidInputError, require_known
-from libero_env.parallel import compiled
+from libero_env.images import flip_rows
 from libero_env.perturbations.kinds import Episode, ObservationFilter
 
 CAMERA = "agentview"  # the only camera that LIBERO-Plus changes
@@ -220,5 +221,4 @@ class Corruption(ObservationFilter):
         if name != _PICTURE:
             return image
         rng = episode.key.generator(episode.step)
-        upside_down = corrupt(image[::-1], self.kind, self.severity, rng)  # as theirs are
-        return upside_down[::-1]
+        return flip_rows(corrupt(flip_rows(image), self.kind, self.severity, rng))  # theirs are upside down

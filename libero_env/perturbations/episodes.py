@@ -9,9 +9,16 @@ import numpy as np
 from libero_env.errors import InvalidInputError, PlacementError
 from libero_env.perturbations.appearance import CAMERA
 from libero_env.perturbations.events import NEVER
-from libero_env.perturbations.kinds import Change, Episode, Layer, layer_of, sample_key
+from libero_env.perturbations.kinds import (
+    ActionFilter,
+    Episode,
+    Layer,
+    ObservationFilter,
+    StartChange,
+    sample_key,
+)
 from libero_env.perturbations.pairing import Pairing
-from libero_env.perturbations.perturbation import Perturbation, in_order, parse_perturbations
+from libero_env.perturbations.perturbation import KINDS, Perturbation, in_order, parse_perturbations
 from libero_env.sim.appearance import Appearance, CameraView, joined
 from libero_env.sim.scene import Scene
 from libero_env.tasks import Task
@@ -21,6 +28,7 @@ from libero_env.text import shown
 TRIES = 200  # samples of a start until one is valid
 _NAME_BYTES = 32  # of an index, a digest or a demonstration
 _NEEDS_SCENE = ("appearance", "start")
+Change = Appearance | StartChange | ObservationFilter | ActionFilter
 
 
 def checked_perturbations(value: object) -> tuple[Perturbation | Change, ...]:
@@ -49,6 +57,24 @@ def checked_perturbations(value: object) -> tuple[Perturbation | Change, ...]:
     )
 
 
+def rendered_perturbations(perturb: object) -> tuple[Perturbation, ...]:
+    """Return perturbations under which recorded states can be rendered, those of severity 0 left out.
+
+    Raises:
+        UnknownNameError: A kind of perturbation does not exist.
+        InvalidInputError: A perturbation is not valid, or changes what happens and not only what is seen or said.
+    """
+    rendered = []
+    for one in checked_perturbations(perturb):
+        if not isinstance(one, Perturbation) or one.trigger or not one.definition.is_rendered:
+            valid = ", ".join(kind.name for kind in KINDS.values() if kind.is_rendered)
+            raise InvalidInputError(
+                f"{one} changes what happens, and recorded demonstrations show what happened without it; valid: {valid}"
+            )
+        rendered.append(one)
+    return tuple(rendered)
+
+
 def needs_materials(changes: Iterable[Perturbation | Change]) -> bool:
     """Return whether scenes need spare materials."""
     return any(
@@ -75,6 +101,8 @@ class PerturbedEpisodes:
         steps: Number of control steps of each episode, (num,).
         events: Positions of the perturbations that begin during an episode.
         began: Number of control steps before each of them, (num, events); `NEVER` until then.
+        moved: Whether one has just changed what is to be done, (num,).
+        event_states: States just after events have begun, by simulation and event, of the present episodes.
     """
 
     def __init__(
@@ -87,6 +115,7 @@ class PerturbedEpisodes:
         self.steps = np.zeros(num, np.int64)
         self.events = [k for k, one in enumerate(self.perturbations) if one.trigger]
         self.began = np.full((num, len(self.events)), NEVER)
+        self.moved, self.event_states = np.zeros(num, bool), dict[tuple[int, int], np.ndarray]()
         self._filters: dict[Layer, list[list[tuple[Any, Episode]]]] = {
             "observation": [[] for _ in range(num)],
             "action": [[] for _ in range(num)],
@@ -264,7 +293,7 @@ class PerturbedEpisodes:
 
     def _fixed_of(self, layer: Layer) -> list[Any]:
         """Return the absolute changes of a layer."""
-        return [one for one in self._fixed if layer_of(one) == layer]
+        return [one for one in self._fixed if one.layer == layer]
 
     def _first(self, k: int, start: object) -> int:
         """Return the number of the first sample of a perturbation that may be used for a start."""

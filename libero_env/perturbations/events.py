@@ -5,9 +5,12 @@ object that the goal is about: `touched`, `lifted` or `over_goal`. Before it, no
 """
 
 import re
+from typing import TYPE_CHECKING
 
 from libero_env.errors import InvalidInputError, UnknownNameError
-from libero_env.sim.watch import EpisodeWatch, over
+
+if TYPE_CHECKING:
+    from libero_env.sim.watch import EpisodeWatch
 
 PHASES = ("touched", "lifted", "over_goal")
 NEVER = -1  # step of an event that has not happened
@@ -33,7 +36,7 @@ def require_moment(trigger: str, horizon: int) -> None:
         )
 
 
-def has_begun(trigger: str, steps: int, horizon: int, watch: EpisodeWatch, i: int) -> bool:
+def has_begun(trigger: str, steps: int, horizon: int, watch: "EpisodeWatch", i: int) -> bool:
     """Return whether the moment of a trigger has come in simulation i.
 
     Args:
@@ -49,6 +52,8 @@ def has_begun(trigger: str, steps: int, horizon: int, watch: EpisodeWatch, i: in
         return 100 * steps >= int(trigger.removesuffix("%")) * horizon
     trace = watch.traces[i]
     if trigger == "over_goal":
+        from libero_env.sim.watch import over  # with MuJoCo
+
         return any(atom.args[0] == trace.in_hand and over(watch.views[i], atom) for atom in watch.goals[i])
     names = trace.touched if trigger == "touched" else trace.lifted
     return any(name in names for name in watch.wanted(i))

@@ -17,13 +17,14 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from libero_env.sim.appearance import Appearance
-from libero_env.sim.scene import Scene
 from libero_env.storage import read_json
+
+if TYPE_CHECKING:
+    from libero_env.sim.scene import Scene
 
 _overlay: dict[str, int] = {}
 
@@ -127,7 +128,7 @@ class StartChange(ABC):
     layer: Layer = "start"
 
     @abstractmethod
-    def apply(self, scene: Scene, row: np.ndarray) -> np.ndarray | None:
+    def apply(self, scene: "Scene", row: np.ndarray) -> np.ndarray | None:
         """Return the changed state, or None where it is not possible, such as with a collision.
 
         Args:
@@ -175,14 +176,6 @@ class ActionFilter(ABC):
                 the gripper's.
             episode: Episode that it belongs to; its step is the number of those before.
         """
-
-
-Change = Appearance | StartChange | ObservationFilter | ActionFilter
-
-
-def layer_of(change: Change) -> Layer:
-    """Return the layer that a change belongs to."""
-    return "appearance" if isinstance(change, Appearance) else change.layer
 
 
 @dataclass(frozen=True)

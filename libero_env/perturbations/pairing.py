@@ -13,8 +13,9 @@ from libero_env.init_states.placement import collision_boxes, lowest_point, sett
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import SampleKey
 from libero_env.perturbations.starts import carried, contacts, posed
-from libero_env.sim.scene import Scene, zone_boxes
-from libero_env.sim.simulation import LoopSimulations
+from libero_env.sim.back_ends import LoopSimulations
+from libero_env.sim.scene import Scene
+from libero_env.sim.scene_spec import zone_boxes
 from libero_env.tasks.problem import Problem, Region
 
 _GAP = 0.02  # [m] between a new object and what is there, seen from above

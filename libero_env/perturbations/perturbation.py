@@ -1,33 +1,43 @@
 """The dataclass `Perturbation`, its text (`camera=0.3,light=0.5`), and tasks as perturbations change them."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Iterable, Mapping
-from typing import Annotated, Any
+from collections.abc import Iterable, Mapping
+from functools import partial
+from importlib import import_module
+from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import AfterValidator, Field
 
+from libero_env.doors import doors, enter
 from libero_env.errors import InvalidInputError, require_known
-from libero_env.perturbations import appearance, filters, problem, starts
 from libero_env.perturbations.events import PHASES, checked_trigger
-from libero_env.perturbations.instructions import reword
 from libero_env.perturbations.kinds import Kind, Layer, SampleKey, first_attempt, sample_key
-from libero_env.sim.scene import Scene
 from libero_env.storage import read_yaml
 from libero_env.tasks.task import Task
 from libero_env.text import shown
 from libero_env.validation import checked
 
-_SAMPLERS: Mapping[str, Callable[..., Any]] = {
-    **problem.SAMPLERS,
-    **appearance.SAMPLERS,
-    **starts.SAMPLERS,
-    **filters.SAMPLERS,
-}
+if TYPE_CHECKING:
+    from libero_env.sim.scene import Scene
+
+_MODULES = {
+    "start": "starts",
+    "observation": "filters",
+    "action": "filters",
+}  # of others than the layer's own name
+
+
+def _sample(layer: Layer, name: str, *args: Any) -> Any:
+    """Sample a change by the module of its layer, which needs MuJoCo."""
+    module = import_module(f"libero_env.perturbations.{_MODULES.get(layer, layer)}")
+    return module.SAMPLERS[name](*args)
+
+
 KINDS: Mapping[str, Kind] = {
-    name: Kind(name, sample=_SAMPLERS[name], **keys)
+    name: Kind(name, sample=partial(_sample, keys["layer"], name), **keys)
     for name, keys in read_yaml("perturbations/data/kinds.yaml").items()
-}
-"""All kinds by name, in the order in which they are applied."""
+} | {name: enter("kinds", name) for name in doors("kinds")}
+"""All kinds by name, in the order in which they are applied; those of installed packages are the last."""
 
 EXPECTED = (
     "expected KIND=SEVERITY, or several with commas between: camera=0.3,light=0.5; severities are from 0 to 1"
@@ -188,7 +198,7 @@ def _check_event(kind: str, trigger: str) -> None:
         )
 
 
-def perturb_task(task: Task, perturbations: Iterable[Perturbation], scene: Scene) -> Task:
+def perturb_task(task: Task, perturbations: Iterable[Perturbation], scene: "Scene") -> Task:
     """Return a task as perturbations change it; those of other layers, and events, are ignored.
 
     Suite, index and name stay, so that its results can be paired with those of the task without perturbations.
@@ -221,5 +231,5 @@ def reword_task(task: Task, perturbations: Iterable[Perturbation]) -> Task:
     for one in perturbations:
         if one.kind == "instruction" and one.severity:
             rng = one.key(task.id, attempt=one.first_attempt(task.id)).generator()
-            return problem.with_instruction(task, reword(task.language, one.amount, rng))
+            return one.definition.sample(one.amount, rng, task, None)
     return task

@@ -16,7 +16,8 @@ from libero_env.perturbations.starts import carried, contacts, shifted
 from libero_env.sim.scene import Scene
 from libero_env.storage import read_yaml
 from libero_env.tasks.builder import entities_in_goal
-from libero_env.tasks.problem import And, Atom, Problem, Region
+from libero_env.tasks.expression import And, Atom
+from libero_env.tasks.problem import Problem, Region
 from libero_env.tasks.suites import get_suite, suite_names
 from libero_env.tasks.task import Task
 from libero_env.workspaces import WORKSPACES
@@ -159,11 +160,7 @@ def _objects(share: float, rng: np.random.Generator, task: Task, scene: Scene) -
 
 def _instruction(distance: float, rng: np.random.Generator, task: Task, scene: Scene) -> Task:
     """Return the task with other words for the same; both of its instructions are reworded in the same way."""
-    return with_instruction(task, reword(task.language, distance, rng))
-
-
-def with_instruction(task: Task, instruction: str) -> Task:
-    """Return a task with another instruction."""
+    instruction = reword(task.language, distance, rng)
     return _with_words(task, (instruction, instruction))
 
 

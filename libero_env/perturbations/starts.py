@@ -12,11 +12,12 @@ from libero_env.geometry import quat_from_axis_angle, quat_multiply
 from libero_env.init_states.placement import make_true, settle
 from libero_env.mujoco_compat import mujoco
 from libero_env.perturbations.kinds import StartChange, direction, sign
+from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import ROBOT, Scene
-from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import And, Atom, Problem
+from libero_env.tasks.expression import And, Atom
+from libero_env.tasks.problem import Problem
 from libero_env.workspaces import WORKSPACES
 
 _DIRECTIONS = 60  # tries for each object

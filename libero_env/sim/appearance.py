@@ -68,6 +68,8 @@ class Appearance:
             replaces.
     """
 
+    layer = "appearance"  # of a perturbation
+
     cameras: Mapping[str, CameraView] = field(default_factory=dict)
     lights: Mapping[str, Light] = field(default_factory=dict)
     materials: Mapping[str, str] = field(default_factory=dict)

@@ -6,16 +6,17 @@ A backend is named in a line of text: `mujoco`, `warp`, or with settings `warp,d
 import importlib.util
 from dataclasses import dataclass
 
-from libero_env.errors import InvalidInputError, LiberoError, require_known
+from libero_env.doors import doors
+from libero_env.errors import InvalidInputError, LiberoError, install_command, require_known
 from libero_env.text import shown
 
-MUJOCO, WARP = BACKENDS = ("mujoco", "warp")
+MUJOCO, WARP = "mujoco", "warp"
 DEFAULT_CONTACTS = 192  # of a simulation; scenes rest on 24 to 90, and a hand that works adds up to 60
 MOST_CONTACTS = 4096
 _SETTINGS = ("device", "contacts")
 MISSING = (
-    "backend=warp needs MuJoCo Warp, which is not installed: pip install 'libero-lifelong[warp]'; backend=mujoco runs "
-    "without it"
+    f"backend=warp needs MuJoCo Warp, which is not installed: {install_command('warp')}; "
+    "backend=mujoco runs without it"
 )
 
 
@@ -49,7 +50,7 @@ class Backend:
         if not isinstance(value, str):
             raise InvalidInputError(f"backend is {shown(value)}; expected a text such as mujoco or warp")
         name, *settings = value.split(",")
-        require_known("backend", name, BACKENDS)
+        require_known("backend", name, (MUJOCO, *doors("backends")))
         found: dict[str, str] = {}
         for setting in settings:
             key, _, text = setting.partition("=")

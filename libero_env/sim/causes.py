@@ -35,8 +35,8 @@ class Failure:
     Attributes:
         cause: One of `CAUSES`.
         of: Object or fixture of the goal that it is about; empty where no atom of the goal is missing.
-        what: What the robot collided with, which object it lifted instead, where the object is, or the condition over
-            time that was broken; otherwise empty.
+        what: What the robot collided with, what it lifted, moved or closed its fingers at instead, where the object is,
+            or the condition over time that was broken; otherwise empty.
         newtons: Largest normal force of a collision; otherwise 0.
         handled: Objects that were lifted, and fixtures whose joints were moved.
         instead: Atoms about these that held at the end, and are no part of the goal.
@@ -62,6 +62,7 @@ class Trace:
         held: Last step in which each object was in both fingers.
         lifted: Objects that were raised in the fingers.
         slipped: Of the lifted objects that left the fingers: whether these had not opened.
+        shut_at: Objects that were nearest to the fingertips, and within 6 cm, while the fingers shut on nothing.
         impacts: Collisions: step, with what, and the normal force [N].
     """
 
@@ -72,6 +73,7 @@ class Trace:
     held: dict[str, int] = field(default_factory=dict)
     lifted: dict[str, None] = field(default_factory=dict)
     slipped: dict[str, bool] = field(default_factory=dict)
+    shut_at: dict[str, None] = field(default_factory=dict)
     impacts: list[tuple[int, str, float]] = field(default_factory=list)
 
 
@@ -92,26 +94,30 @@ class Missing:
     place: str = ""
 
 
-def explain(trace: Trace, missing: Sequence[Missing], wanted: Sequence[str]) -> Failure:
+def explain(
+    trace: Trace, missing: Sequence[Missing], wanted: Sequence[str], astray: Sequence[str] = ()
+) -> Failure:
     """Return why an episode failed.
 
     Of each missing atom the first that is true: the atom held before (undone); the object is in the hand, over its
     place (not released) or elsewhere (out of time); it was lifted, and still falls into its place (out of time), or has
     left fingers that had not opened (dropped) or had (wrong place); the gripper still touches the object, or moves the
     fixture (out of time); the robot has hit something else since it last held the object (collided); it has lifted an
-    object that the goal is not about (wrong object); it has touched the object (missed grasp); or it has not (never
-    reached). Of several missing atoms, the one whose cause is first in `CAUSES` is named.
+    object that the goal is not about (wrong object); it has touched the object, or its fingers have shut beside it
+    (missed grasp); it has gone astray (wrong object); or none of these (never reached). Of several missing atoms, the
+    one whose cause is first in `CAUSES` is named.
 
     Args:
         trace: What the episode has shown.
         missing: Atoms of the goal that do not hold at its end.
         wanted: Objects and fixtures of all atoms of the goal.
+        astray: What no atom names and the gripper has moved, held, or closed at; the most telling last.
     """
-    found = [_explain(trace, one, wanted) for one in missing] or [Failure("out of time")]
+    found = [_explain(trace, one, wanted, astray) for one in missing] or [Failure("out of time")]
     return min(found, key=lambda one: CAUSES.index(one.cause))
 
 
-def _explain(trace: Trace, one: Missing, wanted: Sequence[str]) -> Failure:
+def _explain(trace: Trace, one: Missing, wanted: Sequence[str], astray: Sequence[str]) -> Failure:
     of, since = one.of, trace.held.get(one.of, -1)
     hits = [(newtons, what) for step, what, newtons in trace.impacts if step > since and what != of]
     others = [name for name in trace.lifted if name not in wanted]
@@ -128,6 +134,8 @@ def _explain(trace: Trace, one: Missing, wanted: Sequence[str]) -> Failure:
     if hits:
         newtons, what = max(hits)
         return Failure("collided", of, what, newtons)
-    if others:
-        return Failure("wrong object", of, others[-1])
-    return Failure("missed grasp" if of in trace.touched else "never reached", of)
+    if not others and (of in trace.touched or of in trace.shut_at):
+        return Failure("missed grasp", of)
+    if others or astray:
+        return Failure("wrong object", of, [*astray, *others][-1])
+    return Failure("never reached", of)

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from libero_env.compilation import compiled
 from libero_env.errors import LiberoError, require_known
-from libero_env.parallel import compiled
 from libero_env.sim.osc import (
     GAINS,
     POSITION_SCALE,

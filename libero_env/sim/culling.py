@@ -7,12 +7,13 @@ face z+.
 """
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from libero_env.compilation import compiled
 from libero_env.mujoco_compat import mujoco
-from libero_env.parallel import compiled
 
 _MARGIN = 1e-3  # [m] far more than the rounding of positions in single precision
 _BOX, _PLANE, _MESH, _SPHERE, _CAPSULE, _CYLINDER, _ELLIPSOID = (
@@ -46,6 +47,10 @@ class Culling:
         self._is_flat = ((kinds == _BOX) | (kinds == _PLANE)).tolist()
         self._is_large = ((kinds == _BOX) & (4 * model.geom_size[:, :2].prod(axis=1) > _LARGE)).tolist()
         self._near = float(model.vis.map.znear * model.stat.extent)
+        projection = getattr(
+            model, "cam_projection", getattr(model, "cam_orthographic", np.zeros(model.ncam))
+        )
+        self._is_other = ((projection != 0) | model.cam_sensorsize.any(axis=1)).tolist()
 
     def apply(
         self,
@@ -99,15 +104,9 @@ class Culling:
 
     def _view(self, data: mujoco.MjData, camera: int, aspect: float, fovy: float | None) -> "_View | None":
         """Return what a camera shows, None for cameras of other kinds."""
-        model = self._model
-        projection = getattr(model, "cam_projection", getattr(model, "cam_orthographic", None))
-        if (projection is not None and projection[camera]) or model.cam_sensorsize[camera].any():
+        if self._is_other[camera]:
             return None
-        y = float(np.tan(np.deg2rad(model.cam_fovy[camera] if fovy is None else fovy) / 2))
-        x = y * aspect
-        local = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, -1]])
-        normals = local / np.linalg.norm(local, axis=1, keepdims=True)
-        rays = np.array([[x, y, -1], [x, -y, -1], [-x, y, -1], [-x, -y, -1]])
+        normals, rays = _frustum(float(self._model.cam_fovy[camera] if fovy is None else fovy), aspect)
         to_world = data.cam_xmat[camera].reshape(3, 3).T
         return _View(data.cam_xpos[camera], normals @ to_world, rays @ to_world)
 
@@ -190,6 +189,16 @@ class _Face(NamedTuple):
     near: float
 
 
+@lru_cache(maxsize=64)
+def _frustum(fovy: float, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normals (5, 3) and rays (4, 3) of a `_View` in the frame of its camera."""
+    y = float(np.tan(np.deg2rad(fovy) / 2))
+    x = y * aspect
+    local = np.array([[1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y], [0, 0, -1]])
+    rays = np.array([[x, y, -1], [x, -y, -1], [-x, y, -1], [-x, -y, -1]])
+    return local / np.linalg.norm(local, axis=1, keepdims=True), rays
+
+
 @compiled
 def _dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
@@ -203,16 +212,14 @@ def _bound(boxes, kinds, sizes, bounds, positions, rotations):
     for n in range(len(ids)):
         g = ids[n]
         kind = kinds[g]
-        half[:] = sizes[g]
-        centres[n] = positions[g]
-        if kind == _SPHERE:
-            half[:] = sizes[g, 0]
-        elif kind in (_CYLINDER, _CAPSULE):
+        for r in range(3):
+            half[r], centres[n, r] = sizes[g, 0 if kind == _SPHERE else r], positions[g, r]
+        if kind in (_CYLINDER, _CAPSULE):
             half[1] = sizes[g, 0]
             half[2] = sizes[g, 1] + (sizes[g, 0] if kind == _CAPSULE else 0.0)
         elif kind == _MESH:
-            half[:] = bounds[g, 3:]
             for r in range(3):
+                half[r] = bounds[g, 3 + r]
                 centres[n, r] += _dot(rotations[g, 3 * r : 3 * r + 3], bounds[g])
         for r in range(3):
             for c in range(3):
@@ -260,9 +267,8 @@ def _is_behind(centre, axes, normals, face):
     """
     corners, depths, hidden = np.empty((8, 3)), np.empty((8, 4)), np.empty(8, np.bool_)
     for k in range(8):
-        corners[k] = centre
         for r in range(3):
-            corners[k, r] += _dot(_SIGNS[k], axes[r])
+            corners[k, r] = centre[r] + _dot(_SIGNS[k], axes[r])
         hidden[k] = _is_hidden(corners[k], face, normals[4])
         for j in range(4):
             depths[k, j] = _MARGIN + _dot(corners[k], normals[j])

@@ -5,15 +5,17 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.doors import doors, enter
 from libero_env.mujoco_compat import mujoco
-from libero_env.sim.backend import Backend
+from libero_env.sim.back_ends import BatchSimulations, LoopSimulations
+from libero_env.sim.backend import MUJOCO, Backend
 from libero_env.sim.history import History
 from libero_env.sim.observations import Observer
-from libero_env.sim.predicates import OF_ALL, SEMANTICS, evaluate, ground
+from libero_env.sim.predicates import OF_ALL, SEMANTICS, evaluate, find_predicate, ground
 from libero_env.sim.scene import Scene
-from libero_env.sim.simulation import Batch, BatchSimulations, Indices, LoopSimulations, Simulations
+from libero_env.sim.simulation import Batch, Indices, Simulations
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom, Expression
+from libero_env.tasks.expression import Atom, Expression
 
 
 class Goals:
@@ -38,8 +40,9 @@ class Goals:
         self._semantics, self._all = semantics, StateView(scene, self._simulations, slice(None))
         self._needed = tuple(dict.fromkeys([*atoms, *self.history.goal.atoms()]))
         of_all = OF_ALL if self._simulations.backend.is_warp else ()
-        table = SEMANTICS[semantics]
-        self.one_by_one = tuple(atom for atom in self._needed if table.get(atom.predicate) not in of_all)
+        self.one_by_one = tuple(
+            atom for atom in self._needed if find_predicate(atom.predicate, semantics) not in of_all
+        )
 
     def check(self, ids: Sequence[int] | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return whether the goal is reached in simulations, (k,) bool, and which atoms hold, (k, natoms).
@@ -86,11 +89,9 @@ def make_simulations(
     Raises:
         LiberoError: The backend is not installed, has no such device, or cannot simulate the model.
     """
-    if backend is not None and backend.is_warp:
+    if backend is not None and backend.name != MUJOCO:
         backend.require_installed()
-        from libero_env.sim.mjwarp.simulations import WarpSimulations  # with the extra `warp` only
-
-        return WarpSimulations(model, num, fixture_bodies, backend)
+        return enter("backends", backend.name)(model, num, fixture_bodies, backend)
     if num > 1 and Batch is not None:
         return BatchSimulations(model, num, threads, fixture_bodies)
     return LoopSimulations(model, num, fixture_bodies)
@@ -108,7 +109,6 @@ def make_observer(scene: Scene, simulations: Simulations, **options: Any) -> Obs
         UnknownNameError: An observation or a camera does not exist.
         LiberoError: The backend does not offer an observation.
     """
-    kind = Observer
-    if simulations.backend.is_warp:
-        from libero_env.sim.mjwarp.pictures import WarpObserver as kind  # with the extra `warp` only
+    name = simulations.backend.name
+    kind = enter("observers", name) if name in doors("observers") else Observer
     return kind(scene, simulations, **options)

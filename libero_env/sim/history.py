@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from libero_env.tasks.problem import Atom, Count, Expression, Never, Not, Or, Then
+from libero_env.tasks.expression import Atom, Count, Expression, Never, Not, Or, Then
 
 # of the second part of a Then that holds: whether the first had held before it began to
 _LATE, _IN_ORDER = 1, 2

@@ -34,7 +34,8 @@ from libero_env.objects.model import ROOT_BODY
 from libero_env.sim.appearance import Appearance, SceneAppearance
 from libero_env.sim.predicates import glowing_sites
 from libero_env.sim.render import Renderer, RenderTarget
-from libero_env.sim.scene import FAITHFUL, Scene
+from libero_env.sim.scene import Scene
+from libero_env.sim.scene_spec import FAITHFUL
 from libero_env.sim.simulation import Indices, Simulations
 from libero_env.sim.state import StateView
 from libero_env.tasks.cameras import camera_name, image_stem

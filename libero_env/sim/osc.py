@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from libero_env.assets.robot import ARM_JOINTS, FINGER_JOINTS, GRIP_SITE, REST_QPOS
+from libero_env.compilation import compiled
 from libero_env.mujoco_compat import MASS_FIELD, mujoco
-from libero_env.parallel import compiled
 
 POSITION_SCALE = 0.05  # [m] at full action
 ROTATION_SCALE = 0.5  # [rad] at full action
@@ -97,11 +97,13 @@ def goals_from_poses(ids, poses, goal_pos, goal_mat):
     identity = np.eye(3).ravel()
     for k in range(ids.shape[0]):
         i = ids[k]
-        goal_pos[i] = poses[i, :3]
-        if (poses[i, 3:] != 0.0).any():
+        for j in range(3):
+            goal_pos[i, j] = poses[i, j]
+        if poses[i, 3] != 0.0 or poses[i, 4] != 0.0 or poses[i, 5] != 0.0:
             rotate(poses[i, 3:], identity, goal_mat[i])
         else:
-            goal_mat[i] = identity
+            for j in range(9):
+                goal_mat[i, j] = identity[j]
 
 
 @compiled
@@ -134,8 +136,9 @@ def rotate(w, current, out):
 
 
 @compiled
-def _solve(a, b, n):
+def _solve(a, b):
     """Solve a x = b by Cholesky decomposition; x replaces b, the factor replaces a (n, n), symmetric positive definite."""
+    n = len(b)
     for j in range(n):
         for k in range(j):
             a[j, j] -= a[j, k] * a[j, k]
@@ -144,12 +147,13 @@ def _solve(a, b, n):
             for k in range(j):
                 a[i, j] -= a[i, k] * a[j, k]
             a[i, j] /= a[j, j]
-    _substitute(a, b, n)
+    _substitute(a, b)
 
 
 @compiled
-def _substitute(a, b, n):
+def _substitute(a, b):
     """Solve l l^T x = b for the lower triangle l of a; x replaces b (n,)."""
+    n = len(b)
     for i in range(n):
         for k in range(i):
             b[i] -= a[i, k] * b[k]
@@ -196,9 +200,9 @@ def osc_torques(
         for r in range(6):
             for j in range(7):
                 mass_inv_jac[r, j] = jac[r, j]
-        _solve(m, mass_inv_jac[0], 7)
+        _solve(m, mass_inv_jac[0])
         for r in range(1, 6):
-            _substitute(m, mass_inv_jac[r], 7)
+            _substitute(m, mass_inv_jac[r])
         for r in range(6):
             task_pull[r] = 0.0
             for j in range(7):
@@ -226,9 +230,9 @@ def osc_torques(
                     - site_mat[i, 3 * b + c] * goal_mat[i, 3 * a + c]
                 )
             torque[r] = gains[0, 3 + r] * 0.5 * error - gains[1, 3 + r] * w
-        _solve(linear, force, 3)
-        _solve(angular, torque, 3)
-        _solve(full, task_pull, 6)
+        _solve(linear, force)
+        _solve(angular, torque)
+        _solve(full, task_pull)
         for j in range(7):
             tau = bias[i, j]
             for l in range(7):

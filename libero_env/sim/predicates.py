@@ -12,14 +12,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.doors import doors, enter
+from libero_env.errors import LiberoError, UnknownNameError, require_known
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import GLOW_GROUP, OPPOSITE_STATES, ObjectModel
 from libero_env.parallel import send_to_workers
 from libero_env.sim.history import History
-from libero_env.sim.scene import ROBOT, ground, zone_boxes
+from libero_env.sim.scene import ROBOT, ground
+from libero_env.sim.scene_spec import zone_boxes
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import OPERATORS, Atom, Expression, Region, declare_predicate
+from libero_env.tasks.expression import OPERATORS, Atom, Expression
+from libero_env.tasks.problem import Region
+from libero_env.tasks.rules import declare_predicate
 
 BOX_BELOW = 0.01  # [m] depth below its box in which a region still contains a point
 ON_BELOW, ON_ABOVE = 0.005, 0.10  # [m] range of heights around the top of a box that are on the region
@@ -251,6 +255,19 @@ def register_predicate(name: str, predicate: Predicate) -> None:
         table[name.capitalize()] = predicate
 
 
+def find_predicate(name: str, semantics: str) -> Predicate:
+    """Return a predicate, also of an installed package, see `libero_env.doors`.
+
+    Raises:
+        UnknownNameError: It does not exist.
+    """
+    table = SEMANTICS[semantics]
+    if name not in table and name in doors("predicates"):
+        register_predicate(name, enter("predicates", name))
+    require_known("predicate", name, table)
+    return table[name]
+
+
 def _with_numbers(predicate: Predicate, numbers: tuple[int, ...], view: StateView, *args: str) -> bool:
     """Return what a predicate says of arguments, some of which are numbers."""
     return predicate(view, *(float(arg) if i in numbers else arg for i, arg in enumerate(args)))
@@ -268,10 +285,7 @@ def evaluate(expression: Expression, view: StateView, semantics: str = "original
         LiberoError: A predicate does not apply to the entity, such as opening a plate.
     """
     if isinstance(expression, Atom):
-        table = SEMANTICS[semantics]
-        if expression.predicate not in table:
-            raise UnknownNameError("predicate", expression.predicate, table)
-        return bool(table[expression.predicate](view, *expression.args))
+        return bool(find_predicate(expression.predicate, semantics)(view, *expression.args))
     goal = ground(expression, view.scene)
     held = {atom: np.array([evaluate(atom, view, semantics)]) for atom in goal.atoms()}
     return bool(History(goal, 1).look(np.zeros(1, np.int64), held)[0])

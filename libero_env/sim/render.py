@@ -18,6 +18,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from libero_env.errors import RenderError
+from libero_env.images import flip_rows
 from libero_env.mujoco_compat import forget_opengl, mujoco
 from libero_env.parallel import after_forks, first_picture
 from libero_env.sim.appearance import SceneAppearance, element_index
@@ -36,6 +37,7 @@ FORKED = (
 HEADLIGHT_CAMERA = "agentview"  # so that a picture does not depend on which others are drawn with it
 _opened_in: set[int] = set()  # processes, this one or those it was forked from, that have opened a context
 _unreachable: list[Any] = []  # contexts of other threads and processes: to free them here would free others
+_abandoned: list[Any] = []  # process, thread and contexts of renderers that were not closed
 
 
 class GLContext(Protocol):
@@ -218,6 +220,8 @@ class Renderer:
         Raises:
             RenderError: No OpenGL backend works here, or the context belongs to another thread or process.
         """
+        if _abandoned:
+            _free_abandoned()
         if self._gl is None:
             self._gl, self._owner = self._open(), (os.getpid(), threading.current_thread())
             after_forks(_keep_contexts)
@@ -257,13 +261,13 @@ class Renderer:
         depth = None if target.depth is None and target.depth_buffer is None else self._depth
         mujoco.mjr_readPixels(pixels, depth, self._viewport, self._context)
         if target.rgb is not None:
-            target.rgb[:] = self._pixels[::-1]  # OpenGL's first row is the lowest
+            target.rgb[:] = flip_rows(self._pixels)
         if target.depth_buffer is not None:
-            target.depth_buffer[:] = 1.0 - self._depth[::-1]
+            target.depth_buffer[:] = 1.0 - flip_rows(self._depth)
         if target.depth is not None:
             # The buffer holds 1 at the near plane and 0 at the far plane, hyperbolic between them.
             near, far = (getattr(self._model.vis.map, n) * self._model.stat.extent for n in ("znear", "zfar"))
-            target.depth[:] = near * far / (near + self._depth[::-1].astype(np.float64) * (far - near))
+            target.depth[:] = near * far / (near + flip_rows(self._depth).astype(np.float64) * (far - near))
 
     def _render_segmentation(self, out: np.ndarray) -> None:
         flags, scene = self._scene.flags, self._scene
@@ -278,7 +282,7 @@ class Renderer:
         for geom in scene.geoms[: scene.ngeom]:
             if geom.objtype in kinds:
                 elements[geom.segid + 1] = kinds[geom.objtype] + geom.objid
-        red, green, blue = np.moveaxis(self._pixels[::-1].astype(np.int32), 2, 0)
+        red, green, blue = np.moveaxis(flip_rows(self._pixels).astype(np.int32), 2, 0)
         out[:] = elements[red + (green << 8) + (blue << 16)]
 
     def _add_site(self, data: mujoco.MjData, site: int) -> None:
@@ -324,6 +328,11 @@ class Renderer:
             _unreachable.append((self._gl, self._context))
         self._gl = None
 
+    def __del__(self) -> None:
+        """Leave the context to the next picture of its thread: MuJoCo would free it in the one that is current."""
+        if getattr(self, "_gl", None) is not None:
+            _abandoned.append((self._owner, self._gl, self._context))
+
     def _owner_text(self) -> str:
         """Return why this thread cannot use the context."""
         pid, thread = self._owner
@@ -352,6 +361,7 @@ class Renderer:
         try:
             mujoco.mjr_resizeOffscreen(self._width, self._height, self._context)
         except mujoco.FatalError as error:
+            self._context.free()
             gl.free()
             size = f"{self._height}x{self._width}"
             raise RenderError(f"OpenGL cannot draw an image of {size} pixels here: {error}") from error
@@ -369,6 +379,16 @@ class Renderer:
         self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
         self._viewport = mujoco.MjrRect(0, 0, self._width, self._height)
         return gl
+
+
+def _free_abandoned() -> None:
+    """Free the contexts of this thread whose renderers are gone."""
+    here = os.getpid(), threading.current_thread()
+    for entry in [entry for entry in _abandoned if entry[0] == here]:
+        _abandoned.remove(entry)
+        entry[1].make_current()
+        entry[2].free()
+        entry[1].free()
 
 
 _renderers: "weakref.WeakSet[Renderer]" = weakref.WeakSet()  # that have had a context

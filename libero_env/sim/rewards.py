@@ -19,7 +19,7 @@ from libero_env.errors import require_known
 from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.predicates import region_boxes
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 REWARDS = ("sparse", "staged")
 _REACH_WEIGHT, _MOVE_WEIGHT = 0.3, 0.6

@@ -7,7 +7,8 @@ that states of the original have the same layout. The poses of fixtures belong t
 
 import hashlib
 from collections import OrderedDict
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,27 +18,23 @@ from typing import Any
 
 import numpy as np
 
-from libero_env.assets.arena import Workspace, add_mount, add_spare_materials, load_workspace
-from libero_env.assets.original import OriginalPack
+from libero_env.assets.arena import Workspace, add_spare_materials
 from libero_env.assets.pack import Pack, select_pack
-from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS, add_panda
-from libero_env.errors import LiberoError, UnknownNameError
-from libero_env.mujoco_compat import log_warnings, mujoco, set_damping
+from libero_env.assets.robot import DEFAULT_ROBOT, OPEN_FINGERS, REST_QPOS
+from libero_env.errors import LiberoError
+from libero_env.mujoco_compat import log_warnings, mujoco
 from libero_env.objects.catalog import version_of
 from libero_env.objects.model import OPPOSITE_STATES, ROOT_BODY, ObjectModel
-from libero_env.tasks.cameras import Camera, require_own_names
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Problem, ProblemError, Region, Violation
+from libero_env.sim.scene_spec import default_drawing, scene_spec, workspace_of
+from libero_env.tasks.cameras import Camera
+from libero_env.tasks.expression import And, Atom, Expression, ForAll
+from libero_env.tasks.problem import Problem, ProblemError, Region
+from libero_env.tasks.rules import Violation
 from libero_env.text import suggest
-from libero_env.timing import TIMESTEP
-from libero_env.workspaces import WORKSPACES
 
 # (k, state_size) rows [time, qpos, qvel, position and quaternion (wxyz) of each fixture]
 InitialStates = np.ndarray
-FAST, FAITHFUL = DRAWINGS = ("fast", "faithful")
 ROBOT = "robot"  # name of arm and gripper in contacts
-BUFFER_SIDE = 1024  # [pixels] size of the offscreen buffer, which larger images enlarge
-_FIXTURE_LIFT = 0.01  # [m] height of fixtures over the underside of the table top, as in the original
-_ZONE_HEIGHT = 0.014  # [m] of the box over a flat region
 
 
 @dataclass(frozen=True)
@@ -124,14 +121,23 @@ class Scene:
         """Return the index in qpos of the pose of a movable object: position and quaternion wxyz, (7,)."""
         return int(self.model.joint(f"{name}_joint0").qposadr[0])
 
-    def model_with(self, fixtures: np.ndarray) -> mujoco.MjModel:
-        """Return a copy of the model with poses of the fixtures, (nfixtures, 7); without any, the model itself."""
-        if not self.fixtures:
-            return self.model
-        model = copy(self.model)
-        model.body_pos[self.fixture_bodies] = fixtures[:, :3]
-        model.body_quat[self.fixture_bodies] = fixtures[:, 3:]
-        return model
+    @contextmanager
+    def posed(self, fixtures: np.ndarray, model: mujoco.MjModel | None = None) -> Iterator[mujoco.MjModel]:
+        """Give fixtures poses, (nfixtures, 7), in a model of the scene, which has its own again afterwards.
+
+        Args:
+            model: Model of a simulation; by default a copy of the scene's, which takes as long as it is large.
+        """
+        bodies = self.fixture_bodies
+        model = copy(self.model) if model is None and bodies.size else model or self.model
+        own = model.body_pos[bodies], model.body_quat[bodies]
+        try:
+            if bodies.size:
+                model.body_pos[bodies], model.body_quat[bodies] = fixtures[:, :3], fixtures[:, 3:]
+            yield model
+        finally:
+            if bodies.size:
+                model.body_pos[bodies], model.body_quat[bodies] = own
 
     @cached_property
     def digest(self) -> str:
@@ -251,11 +257,6 @@ def build_scene(
     return _build_scene(problem, pack, drawing, robot, spare_materials, tuple(cameras))
 
 
-def default_drawing(pack: Pack) -> str:
-    """Return how images of a pack's scenes are drawn by default: the original's faithfully, all others fast."""
-    return FAITHFUL if isinstance(pack, OriginalPack) and pack.lod is None else FAST
-
-
 def _compile_scene(
     problem: Problem,
     pack: Pack,
@@ -318,10 +319,13 @@ def _check_states(scene: Scene) -> None:
 
 
 class _SceneCache:
-    """Compiled scenes, the least recently used of which are dropped beyond a size: one of the original has 300 MB."""
+    """Compiled scenes, the least recently used of which are dropped beyond a size, but for some.
 
-    def __init__(self, max_bytes: int = 1 << 30):
-        self._max_bytes, self._bytes = max_bytes, 0
+    One of the builtin models has 6 MB, and 9 in memory, one of the original's 300.
+    """
+
+    def __init__(self, max_bytes: int = 1 << 28, kept: int = 3):
+        self._max_bytes, self._kept, self._bytes = max_bytes, kept, 0
         self._scenes: OrderedDict[Hashable, Scene] = OrderedDict()
         self._lock = RLock()
 
@@ -335,7 +339,7 @@ class _SceneCache:
                 self._scenes[key] = scene = _compile_scene(*arguments)
                 self._bytes += mujoco.mj_sizeModel(scene.model)
             self._scenes.move_to_end(key)
-            while self._bytes > self._max_bytes and len(self._scenes) > 1:
+            while self._bytes > self._max_bytes and len(self._scenes) > self._kept:
                 self._bytes -= mujoco.mj_sizeModel(self._scenes.popitem(last=False)[1].model)
             return self._scenes[key]
 
@@ -343,159 +347,8 @@ class _SceneCache:
 _build_scene = _SceneCache()
 
 
-def scene_spec(
-    problem: Problem,
-    pack: Pack | None = None,
-    entities: Mapping[str, ObjectModel] | None = None,
-    *,
-    drawing: str | None = None,
-    robot: str = DEFAULT_ROBOT,
-    cameras: Sequence[Camera] = (),
-) -> mujoco.MjSpec:
-    """Return a new, editable model of a problem's scene.
-
-    Args:
-        problem: Problem to build.
-        pack: Asset pack of the models; by default that of `select_pack`.
-        entities: Models of objects and fixtures by name; by default those of the pack.
-        drawing: One of `DRAWINGS`; by default that of `default_drawing`.
-        robot: One of `libero_env.assets.robot.ROBOTS`.
-        cameras: Cameras that are added, besides those of the problem.
-
-    Raises:
-        UnknownNameError: A category of objects or fixtures has no model, or the body of a camera does not exist.
-        InvalidInputError: An added camera has the name of another.
-    """
-    pack = pack or select_pack()
-    name, workspace = workspace_of(problem)
-    spec = mujoco.MjSpec()
-    spec.modelname = "libero"
-    faithful = (drawing or default_drawing(pack)) == FAITHFUL
-    _set_options(spec, samples=4 if faithful else 0)
-    pack.add_arena(spec, workspace, problem.scene_properties)
-    add_panda(spec, workspace.robot_base_pos, robot, detailed=faithful)
-    add_mount(spec, workspace, detailed=faithful)
-    _add_zones(spec, problem, name, workspace)
-    for entity, category in problem.objects.items():
-        item = pack.build(category) if entities is None else entities[entity]
-        joint = item.spec.body(ROOT_BODY).add_joint(name="joint0", type=mujoco.mjtJoint.mjJNT_FREE)
-        set_damping(joint, item.joint_damping)
-        spec.attach(item.spec, prefix=f"{entity}_", frame=spec.worldbody.add_frame())
-    for entity, category in problem.fixtures.items():
-        if entity != name:
-            item = pack.build(category) if entities is None else entities[entity]
-            body, pose = item.spec.body(ROOT_BODY), fixture_pose(problem, name, workspace, entity, item)
-            body.pos, body.quat = pose[:3], pose[3:]
-            spec.attach(item.spec, prefix=f"{entity}_", frame=spec.worldbody.add_frame())
-    if faithful and isinstance(pack, OriginalPack):
-        pack.restore_drawing(spec, workspace, problem.scene_properties)
-    _add_cameras(spec, (*problem.cameras, *cameras))
-    return spec
-
-
-def workspace_of(problem: Problem) -> tuple[str, Workspace]:
-    """Return the name of the fixture that is the workspace of a problem, and the workspace.
-
-    Raises:
-        UnknownNameError: None of the fixtures is a workspace.
-    """
-    for name, category in problem.fixtures.items():
-        if category in WORKSPACES:
-            return name, load_workspace(category)
-    raise UnknownNameError("workspace among the fixtures", list(problem.fixtures.values()), WORKSPACES)
-
-
-def fixture_pose(
-    problem: Problem,
-    workspace_name: str,
-    workspace: Workspace,
-    name: str,
-    item: ObjectModel,
-    rng: np.random.Generator | None = None,
-) -> np.ndarray:
-    """Return the pose of a fixture in the region of its init atom.
-
-    Args:
-        problem: Problem that has the fixture.
-        workspace: Table or floor.
-        rng: Generator to sample the region with; without it the middle of the region is taken.
-
-    Returns:
-        Position and quaternion wxyz, (7,).
-    """
-    region = problem.region(problem.places.get(name, ""))
-    height = _FIXTURE_LIFT - workspace.parameters.get("table_thickness", 0.05) - item.bottom_offset[2]
-    if region is None or not region.ranges or region.target != workspace_name:
-        x, y, yaw = 0.0, 0.0, 0.0
-    elif rng is None:
-        x0, y0, x1, y1 = region.ranges[0]
-        x, y, yaw = (x0 + x1) / 2, (y0 + y1) / 2, float(np.mean(region.yaw[0])) if region.yaw else 0.0
-    else:
-        x0, y0, x1, y1 = region.ranges[rng.integers(len(region.ranges))]
-        x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)
-        yaw = rng.uniform(*region.yaw[0]) if region.yaw else 0.0
-    pos = np.add(workspace.offset, (x, y, height))
-    return np.array([*pos, np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-
-
-def zone_boxes(region: Region, workspace: Workspace) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the flat box over each rectangle of a region: centre (3,) and half size (3,), world frame, m."""
-    origin = np.array(workspace.zone_origin)
-    return [
-        (origin + ((x0 + x1) / 2, (y0 + y1) / 2, 0.0), np.array([x1 - x0, y1 - y0, _ZONE_HEIGHT]) / 2)
-        for x0, y0, x1, y1 in region.ranges
-    ]
-
-
 def initial_qpos(scene: Scene) -> np.ndarray:
     """Return positions (nq,) with the arm at rest, the gripper open and all objects at the origin of their models."""
     qpos = scene.model.qpos0.copy()
     qpos[: scene.nq_robot] = REST_QPOS + OPEN_FINGERS
     return qpos
-
-
-def _set_options(spec: mujoco.MjSpec, samples: int) -> None:
-    spec.compiler.degree = False
-    option = spec.option
-    option.timestep = TIMESTEP
-    option.impratio = 20.0
-    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.density, option.viscosity = 1.2, 2e-5
-    visual = spec.visual
-    visual.map.znear = 0.001
-    visual.quality.offsamples = samples  # four double the cost of an image
-    visual.quality.shadowsize = 0  # no light casts a shadow, in the original neither
-    visual.global_.offwidth = visual.global_.offheight = BUFFER_SIDE
-    visual.headlight.ambient, visual.headlight.diffuse = [0.1] * 3, [0.4] * 3
-    visual.headlight.specular = [0.5] * 3
-
-
-def _add_cameras(spec: mujoco.MjSpec, cameras: Sequence[Camera]) -> None:
-    """Add cameras to a complete scene; they come last, and change nothing for the others."""
-    require_own_names(cameras, [camera.name for camera in spec.cameras])
-    bodies = {body.name: body for body in spec.bodies}
-    for camera in cameras:
-        body = bodies.get(camera.body) or bodies.get(f"{camera.body}_{ROOT_BODY}")
-        if body is None:
-            valid = [name.removesuffix(f"_{ROOT_BODY}") for name in bodies]
-            raise UnknownNameError(f"body of camera {camera.name}", camera.body, valid)
-        added = body.add_camera(name=camera.name, pos=camera.pos, fovy=camera.fovy)
-        if camera.quat is not None:
-            added.quat = np.array(camera.quat) / np.linalg.norm(camera.quat)
-        else:
-            added.alt.type, added.alt.xyaxes = mujoco.mjtOrientation.mjORIENTATION_XYAXES, camera.axes()
-
-
-def _add_zones(spec: mujoco.MjSpec, problem: Problem, name: str, workspace: Workspace) -> None:
-    """Add a hidden site for each region on the workspace, so that it can be found by its address."""
-    for region in problem.regions:
-        if region.target == name and region.ranges:
-            centre, half = zone_boxes(region, workspace)[0]
-            spec.worldbody.add_site(
-                name=region.address,
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                pos=centre,
-                size=np.maximum(half, 1e-4),
-                rgba=(0.0, 0.0, 0.0, 0.0),
-                group=3,
-            )

@@ -16,11 +16,14 @@ from libero_env.sim.costs import LIMITS, Costs
 from libero_env.sim.predicates import PREDICATES, contains, ground, is_over, region_boxes
 from libero_env.sim.scene import ROBOT
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom, Expression, Never
+from libero_env.tasks.expression import Atom, Expression, Never
 from libero_env.timing import TIMESTEP
 
 LIFTED = 0.02  # [m] above the height at the start
 OVER = 0.30  # [m] above its place, an object is over it
+NEAR = 0.06  # [m] from the fingertips to an object's box while they close on nothing: a grasp that missed
+SHUT = 0.01  # [m] between fingers that have nothing between them
+_CLOSING = 0.0002  # [m] by which they come nearer to each other in a step, at least
 _CONJUGATE = (1.0, -1.0, -1.0, -1.0)  # of a quaternion, wxyz
 _MOVED = 0.02  # [rad] or [m] that a joint of a fixture was moved
 _LEFT, _RIGHT, _HAND, _ARM = "left finger", "right finger", "hand", "arm"
@@ -71,7 +74,10 @@ class EpisodeWatch:
         self.traces, self.costs = [Trace() for _ in views], [Costs() for _ in views]
         self._heights: list[dict[str, float]] = [{} for _ in views]
         self._rest = np.zeros((len(views), len(self._joints)))
-        self._widths = np.zeros(len(views))
+        self._widths, self._apart = np.zeros(len(views)), np.zeros(len(views))
+        self._nearest: list[tuple[float, str]] = [
+            (np.inf, "") for _ in views
+        ]  # since the fingers began to close
         for i in range(len(views)):
             self.begin(i)
 
@@ -81,6 +87,7 @@ class EpisodeWatch:
         self.traces[i], self.costs[i] = Trace(), Costs(zone=0.0 if self._scene.problem.zones else None)
         self._heights[i] = {name: float(view.body_pos(name)[2]) for name in self._scene.objects}
         self._rest[i] = view.simulations.fields["qpos"][i, self._joints]
+        self._apart[i], self._nearest[i] = np.abs(view.finger_pos).sum(), (np.inf, "")
         self.measure_from_here(i)
 
     def measure_from_here(self, i: int) -> None:
@@ -129,6 +136,7 @@ class EpisodeWatch:
                 if view.body_pos(name)[2] > self._heights[i][name] + LIFTED:
                     trace.lifted[name] = None
                     trace.slipped.pop(name, None)
+        self._note_closing(i, width)
         hits = any(b not in self._scene.objects or a in (_HAND, _ARM) for a, b in touching)
         needless: dict[str, float] = {}
         if hits or not trace.touching.isdisjoint(self._idle) or self._bears(pairs, trace.in_hand):
@@ -158,12 +166,30 @@ class EpisodeWatch:
             for one in lacking
             if not isinstance(one, Atom)
         ]
-        found = broken[0] if broken else explain(trace, missing, self.wanted(i))
+        moved = (name for name in self.costs[i].moved if name in trace.touched)
+        astray = [name for name in (*moved, *trace.shut_at, *trace.held) if name not in self._named]
+        found = broken[0] if broken else explain(trace, missing, self.wanted(i), astray)
         moved = np.abs(view.simulations.fields["qpos"][i, self._joints] - self._rest[i]) > _MOVED
         opened = [name for name, far in zip(self._owned.values(), moved, strict=True) if far]
         handled = tuple(dict.fromkeys([*trace.lifted, *(name for name in opened if name in trace.touched)]))
         instead = tuple(str(atom) for atom in self._possible(i, handled) if _holds(view, atom))
         return Failure(found.cause, found.of, found.what, round(found.newtons, 1), handled, instead)
+
+    def _note_closing(self, i: int, width: float) -> None:
+        """Take note of the object to which fingers that have shut on nothing were nearest while they closed."""
+        if width < self._apart[i] - _CLOSING:
+            here = ((self._distance(i, name), name) for name in self._scene.objects)
+            self._nearest[i] = min(self._nearest[i], *here)
+        else:
+            self._nearest[i] = (np.inf, "")
+        if width < SHUT <= self._apart[i] and self._nearest[i][0] <= NEAR:
+            self.traces[i].shut_at[self._nearest[i][1]] = None
+        self._apart[i] = width
+
+    def _distance(self, i: int, name: str) -> float:
+        """Return the distance of the fingertips from an object's box along the world axes, [m]."""
+        point, (low, high) = self.views[i].eef_pos, self.views[i].bounds(name)
+        return float(np.linalg.norm(np.maximum(0.0, np.maximum(low - point, point - high))))
 
     def _pairs(self, geoms: np.ndarray) -> np.ndarray:
         """Return the indices of the names of what touches each other, (n, 2), parts of the robot last."""

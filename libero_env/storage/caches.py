@@ -103,7 +103,7 @@ def _remove_parts(path: Path) -> None:
                 part.unlink()
 
 
-def cached_folder(directory: Path, make: Callable[[], object]) -> None:
+def cached_folder(directory: Path, make: Callable[[], object], made_from: str = "") -> None:
     """Make a folder of the cache, unless it is there with all files as they were when it was made.
 
     Of several processes one makes it and the others wait; the lock of a process that is killed is free.
@@ -111,6 +111,7 @@ def cached_folder(directory: Path, make: Callable[[], object]) -> None:
     Args:
         directory: Folder, two levels below the cache folder.
         make: Function that makes it, in one step; a folder that is there has been removed.
+        made_from: What it is made from; where that is another, it is made again.
 
     Raises:
         LiberoError: Other users can write there, it cannot be written, or another process takes longer than 15 minutes.
@@ -119,21 +120,20 @@ def cached_folder(directory: Path, make: Callable[[], object]) -> None:
 
     check_trusted(directory.parent.parent)
     record = directory.with_name(f"{directory.name}.json")
-    if _is_intact(directory, record):
+    if _is_intact(directory, record, made_from):
         return
     try:
         make_cache_folder(directory.parent)
         with FileLock(directory.with_name(f".{directory.name}.lock"), timeout=_MAKING_SECONDS):
-            if _is_intact(directory, record):
+            if _is_intact(directory, record, made_from):
                 return
             if directory.exists():
-                _log.warning("%s has other files than when it was made; it is made again", directory)
+                _log.warning("%s is not as it was made, or of something else; it is made again", directory)
                 shutil.rmtree(directory)
             make()
             files = sorted(file for file in directory.rglob("*") if file.is_file())
-            write_record(
-                record, {file.relative_to(directory).as_posix(): _file_digest(file) for file in files}
-            )
+            digests = {file.relative_to(directory).as_posix(): _file_digest(file) for file in files}
+            write_record(record, digests | ({"": made_from} if made_from else {}))
     except Timeout:
         raise LiberoError(
             f"{directory}: another process makes it and does not end; end that process"
@@ -144,8 +144,10 @@ def cached_folder(directory: Path, make: Callable[[], object]) -> None:
         ) from error
 
 
-def _is_intact(directory: Path, record: Path) -> bool:
+def _is_intact(directory: Path, record: Path, made_from: str) -> bool:
     digests = read_record(record) or {}
+    if digests.pop("", "") != made_from:
+        return False
     try:
         return bool(digests) and all(_file_digest(directory / name) == sha for name, sha in digests.items())
     except OSError:

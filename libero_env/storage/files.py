@@ -1,5 +1,6 @@
 """Files and folders that are replaced in one step."""
 
+import fnmatch
 import json
 import os
 import secrets
@@ -33,6 +34,11 @@ def atomic_path(target: Path, *, fsync: bool = False) -> Iterator[Path]:
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}{PART_SUFFIX}")
     try:
         yield temporary
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            error.filename = str(target)  # such as of a full disk
+        raise
+    else:
         if fsync:
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
@@ -88,28 +94,40 @@ def read_bounded(path: Path, most: int, *, within: Path | None = None) -> bytes:
     Raises:
         OSError: It cannot be read, is a folder, a pipe or a device, is too large, or lies outside of the folder.
     """
-    if within is not None and _leads_out(path, within):
+    if within is not None and leads_out(path, within):
         raise OSError(f"it is a link that leads out of {within}")
     with open(path, "rb", opener=regular_file(most)) as file:
         return file.read(min(most, os.fstat(file.fileno()).st_size))  # a buffer of that size is made before
 
 
-def require_own_folders(folder: Path, *names: str, error: type[LiberoError] = InvalidInputError) -> None:
-    """Check that parts of a folder that may be somebody else's are no links to folders elsewhere, before writing there.
+def own_folder(root: Path, *parts: str, error: type[LiberoError] = InvalidInputError) -> Path:
+    """Return a folder in one that may be somebody else's, into which something is to be written.
+
+    Nothing is written behind a link there: this is the one place that decides it.
 
     Args:
-        folder: The folder; it may be a link itself.
-        names: Relative paths of folders in it, which need not exist.
+        root: Folder that the user has named; it may be a link itself.
+        parts: Relative path of the folder in it, which need not exist.
 
     Raises:
-        LiberoError: One leads out of the folder, or is not a folder; of the type `error`.
+        LiberoError: A part of the path is a link, or is not a folder; of the type `error`.
     """
-    for path in (folder / name for name in names):
-        if os.path.lexists(path) and (_leads_out(path, folder) or not path.is_dir()):
-            raise error(f"{path} is not a folder, or is a link that leads out of {folder}; remove it")
+    folder = root
+    for name in Path(*parts).parts:
+        folder /= name
+        if name in ("..", folder.anchor) or folder.is_symlink() or (folder.exists() and not folder.is_dir()):
+            raise error(f"{folder} is a link, or is not a folder, and nothing is written there; remove it")
+    return folder
 
 
-def _leads_out(path: Path, folder: Path) -> bool:
+def files_below(folder: Path, pattern: str) -> Iterator[Path]:
+    """Yield files whose names match, in a folder and all below, such as `*.hdf5`; what vanishes meanwhile is none."""
+    for root, _, names in os.walk(folder):
+        yield from (Path(root, name) for name in fnmatch.filter(names, pattern))
+
+
+def leads_out(path: Path, folder: Path) -> bool:
+    """Return whether a path ends outside of a folder, by links."""
     try:
         return not path.resolve().is_relative_to(folder.resolve())
     except (OSError, RuntimeError):  # links in a circle

@@ -16,14 +16,23 @@ from libero_env.storage.files import read_bounded
 MAX_YAML_BYTES = 4 << 20
 _MAX_NODES = 200_000  # of a document, each alias counted as often as it is used
 _MAX_DEPTH = 60
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # eight times as fast, where PyYAML has it
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc] # C is eight times as fast
+    """Booleans are those of YAML 1.2: `On`, `off`, `yes` and `No` are words."""
+
+    yaml_implicit_resolvers = {
+        first: [(tag, pattern) for tag, pattern in resolvers if not tag.endswith(":bool") or first in "tTfF"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
 
 Key = str | int
 
 
 def parse_yaml(text: str) -> Any:
     """Return the content of a YAML text of this package."""
-    loader = _LOADER(text)
+    loader = _Loader(text)
     try:
         return loader.get_single_data()
     finally:
@@ -91,7 +100,7 @@ def parse_yaml_text(text: str, source: str = "<string>") -> YamlFile:
         InvalidInputError: The text is not valid YAML, has a key twice, is nested too deeply, or grows too large by its
             aliases; the message starts with file:line.
     """
-    loader = _LOADER(text)
+    loader = _Loader(text)
     try:
         _check_depth(text, source)
         node = loader.get_single_node()
@@ -116,7 +125,7 @@ def parse_yaml_text(text: str, source: str = "<string>") -> YamlFile:
 def _check_depth(text: str, source: str) -> None:
     """Check the nesting of a text before its content is built: loaders in C have no limit of their own."""
     depth = 0
-    for event in yaml.parse(text, Loader=_LOADER):
+    for event in yaml.parse(text, Loader=_Loader):
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _MAX_DEPTH:
             raise InvalidInputError(f"{source}: lists within lists, more than {_MAX_DEPTH} deep")

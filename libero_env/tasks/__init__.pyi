@@ -1,6 +1,7 @@
 from .benchmark import suite_names
 from .builder import make_task
-from .problem import And, Atom, Count, ForAll, Never, Not, Or, Problem, Region, Then
+from .expression import And, Atom, Count, ForAll, Never, Not, Or, Then
+from .problem import Problem, Region
 from .suites import find_tasks, get_suite, get_task, is_suite, read_suite, read_task, write_task
 from .task import Suite, Task
 

@@ -17,8 +17,10 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from libero_env.errors import BDDLError, InvalidInputError
+from libero_env.storage import read_bounded
 from libero_env.tasks.cameras import Camera
-from libero_env.tasks.problem import OPERATORS, Atom, Expression, Problem, ProblemError, Region
+from libero_env.tasks.expression import OPERATORS, Atom, Expression
+from libero_env.tasks.problem import Problem, ProblemError, Region
 from libero_env.tasks.sexpr import MAX_CHARACTERS, List, Word, number, parse_tree, show, text_of
 
 _HEADS = (
@@ -72,9 +74,14 @@ def read(path: str | Path) -> Problem:
 
 
 def read_text(path: str | Path) -> str:
-    """Return the text of a task file, of one that is too long the beginning; errors as of `read`."""
-    with open(path, "rb") as file:
-        content = file.read(4 * MAX_CHARACTERS)
+    """Return the text of a task file; errors as of `read`."""
+    try:
+        content = read_bounded(Path(path), 4 * MAX_CHARACTERS)
+    except OSError as error:
+        if error.errno is None:  # it is none that may be read
+            expected = f"a task file of at most {MAX_CHARACTERS} characters"
+            raise BDDLError(str(error), expected, str(path), 1) from None
+        raise OSError(error.errno, error.strerror, str(path)) from error
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -171,7 +178,7 @@ class Reader:
         self.unknown: list[str] = []
 
     def line(self, section: str, part: int | str | None = None) -> int:
-        """Return the line of a part of a section; see `libero_env.tasks.problem.Violation`."""
+        """Return the line of a part of a section; see `libero_env.tasks.rules.Violation`."""
         lines: Any = dict(enumerate({":init": self.init, ":goal": self.goal}.get(section, ())))
         if isinstance(part, str):
             lines = {**self.regions, **self.entities}

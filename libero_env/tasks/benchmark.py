@@ -5,7 +5,8 @@ from functools import cache
 from libero_env.errors import require_known
 from libero_env.storage import read_yaml
 from libero_env.tasks.builder import build_problem, language_from_name
-from libero_env.tasks.task import Suite, Task
+from libero_env.tasks.problem import Problem, same_meaning
+from libero_env.tasks.task import FILE, Suite, Task
 
 
 def suite_names() -> tuple[str, ...]:
@@ -19,6 +20,31 @@ def _parts() -> dict[str, list[str]]:
     for entry in read_yaml("tasks/data/suites.yaml"):
         parts |= entry if isinstance(entry, dict) else {entry: []}
     return parts
+
+
+@cache
+def task_names() -> dict[str, str]:
+    """Return the suite of each task of the benchmark, by its name."""
+    suites = [name for name, parts in _parts().items() if not parts]
+    return {own["name"]: name for name in suites for own in read_yaml(f"tasks/data/{name}.yaml")["tasks"]}
+
+
+def benchmark_task(name: str) -> Task:
+    """Return the task of the benchmark with a name of `task_names`."""
+    return next(task for task in benchmark_suite(task_names()[name]).tasks if task.name == name)
+
+
+def task_of_file(name: str, problem: Problem) -> Task:
+    """Return the task of a BDDL file on its own, whose instruction is its `:language`.
+
+    Only that of a file that is the benchmark's, by name and content, is derived from its name, as in the original.
+
+    Args:
+        name: Name of the file, without its ending.
+    """
+    published = name in task_names() and same_meaning(benchmark_task(name).problem, problem)
+    language = language_from_name(name) if published else problem.language
+    return Task(FILE, 0, name, language, problem.language, problem)
 
 
 @cache

@@ -17,7 +17,8 @@ from typing_extensions import TypedDict
 from libero_env.errors import BDDLError, InvalidInputError
 from libero_env.storage import read_yaml_file
 from libero_env.tasks.bddl import parse_atom, parse_expression
-from libero_env.tasks.problem import MAX_ENTITIES, MAX_PARTS, Expression
+from libero_env.tasks.expression import MAX_PARTS, Expression
+from libero_env.tasks.rules import MAX_ENTITIES
 from libero_env.tasks.sexpr import number
 from libero_env.tasks.task import MAX_NAME_BYTES, check_name
 from libero_env.tasks.values import Language, Name, Words, check_corners, check_order
@@ -36,6 +37,7 @@ class Source:
         root: Folder that it must lie in; None for any, in a call from Python.
         files: Files that led here, each the scene of the one before.
         line_of: Function that returns the line of a path of keys; None where there are no lines.
+        places: Atom, object, region, camera or zone of its task -> `file:line` that it comes from.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Source:
     root: Path | None = None
     files: tuple[Path, ...] = ()
     line_of: LineOf | None = None
+    places: dict[str, str] = field(default_factory=dict, compare=False)
 
     def at(self, *path: Key) -> str:
         """Return `file:line` of a path of keys; the name where there are no lines."""
@@ -132,7 +135,7 @@ def _listed(value: Any) -> Any:
 
 def _words(atom: Any) -> Any:
     """Return the words of an atom as one text."""
-    if isinstance(atom, list) and atom and all(isinstance(word, str | int | float) for word in atom):
+    if isinstance(atom, list) and atom and all(type(word) in (str, int, float) for word in atom):
         return " ".join(map(str, atom))
     return atom
 
@@ -174,7 +177,7 @@ _Category = Annotated[
     Annotated[Name, Tag("text")]
     | Annotated[dict[Name, Annotated[int, Field(ge=0, le=MAX_ENTITIES)]], Tag("fields")],
     Discriminator(
-        _form, custom_error_type="category", custom_error_message="a category, or {category: number}"
+        _form, custom_error_type="category", custom_error_message="expected a category, or {category: number}"
     ),
 ]
 _Categories = Annotated[list[_Category], Field(max_length=MAX_ENTITIES), BeforeValidator(_listed)]
@@ -212,7 +215,7 @@ _Place = Annotated[
     Discriminator(
         _form,
         custom_error_type="place",
-        custom_error_message="[x, y], {at: [x, y], half: h}, or the name of what it is on",
+        custom_error_message="expected [x, y], {at: [x, y], half: h}, or the name of what it is on",
     ),
     BeforeValidator(lambda value: {"at": value} if isinstance(value, list) else value),
 ]

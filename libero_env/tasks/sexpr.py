@@ -5,7 +5,7 @@ import re
 from dataclasses import dataclass
 
 from libero_env.errors import BDDLError
-from libero_env.tasks.problem import MAX_DEPTH
+from libero_env.tasks.expression import MAX_DEPTH
 from libero_env.text import shorten
 
 MAX_CHARACTERS = 1 << 20  # of a task file; the original's have 4,000

@@ -1,15 +1,16 @@
 """Suites and tasks by name, and from user-defined files: one task, several, or a suite of files."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from libero_env.doors import doors, enter
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl
-from libero_env.tasks.benchmark import benchmark_suite, suite_names
-from libero_env.tasks.builder import check_keys, language_from_name, task_from_definition
-from libero_env.tasks.schema import read_definition
+from libero_env.tasks.benchmark import benchmark_suite, benchmark_task, suite_names, task_names, task_of_file
+from libero_env.tasks.builder import check_keys, task_from_definition
+from libero_env.tasks.schema import Source, read_definition
 from libero_env.tasks.task import FILE, Suite, Task
 from libero_env.text import closest
 
@@ -20,7 +21,7 @@ ENDINGS = (".bddl", ".yaml", ".yml")  # of the names of task files
 
 def is_published(name: str) -> bool:
     """Return whether a name is that of a suite by others or of a part of it, whether its files are here or not."""
-    return name.startswith(("libero_plus_", "libero_pro_"))
+    return name.startswith(tuple(doors("suites")))
 
 
 def is_suite(name: str) -> bool:
@@ -33,7 +34,7 @@ def get_suite(name: str) -> Suite:
 
     Args:
         name: Name such as `libero_object`; `suite_names()` lists them. Those of others, such as `libero_plus_goal`, are
-            in `libero_env.tasks.published.suites`.
+            in `libero_env.published.suites`.
 
     Returns:
         The suite with its tasks in their published order; the same object at each call.
@@ -42,15 +43,19 @@ def get_suite(name: str) -> Suite:
         UnknownNameError: No suite has this name; the message lists them.
         MissingPackageError: The suite is one of others, and its files are not here.
     """
-    if not is_published(name):
-        return benchmark_suite(name)
-    from libero_env.tasks.published.suites import published_suite  # which needs models of objects
-
-    return published_suite(name)
+    for beginning in doors("suites"):
+        if name.startswith(beginning):
+            return enter("suites", beginning)(name)
+    return benchmark_suite(name)
 
 
 def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
-    """Return the tasks of a YAML file: one, or the list below `tasks`, which share the other keys of the file.
+    """Return the tasks of a YAML file: one, or the list below `tasks`; see `iter_yaml_tasks`."""
+    return tuple(task for task, _ in iter_yaml_tasks(path))
+
+
+def iter_yaml_tasks(path: str | Path) -> Iterator[tuple[Task, Source]]:
+    """Yield the tasks of a YAML file, which share its keys beside `tasks`, and where each stands.
 
     Raises:
         LiberoError: The file is not valid YAML, or a task is not valid (see `make_task`); the message names the file.
@@ -59,22 +64,24 @@ def read_yaml_tasks(path: str | Path) -> tuple[Task, ...]:
     definition, source = read_definition(path)
     check_keys(definition, source, "tasks")
     if "tasks" not in definition:
-        return (task_from_definition({"name": path.stem, **definition}, source),)
+        yield task_from_definition({"name": path.stem, **definition}, source), source
+        return
     shared = {key: value for key, value in definition.items() if key != "tasks"}
     tasks = definition["tasks"]
     if not isinstance(tasks, list) or len(tasks) > MAX_TASKS:
         raise InvalidInputError(f"{source.at('tasks')}: expected a list of at most {MAX_TASKS} tasks")
-    made = []
+    names = set[str]()
     for i, own in enumerate(tasks):
         if not isinstance(own, dict) or not all(isinstance(key, str) for key in own):
             raise InvalidInputError(f"{source.at('tasks', i)}: expected keys such as name, goal and language")
-        place = replace(source, line_of=source.shared_with(list(own), i))
-        made.append(task_from_definition({**shared, **own}, place, shares_with="with" not in own))
-        if made[-1].name in [task.name for task in made[:-1]]:
+        place = replace(source, line_of=source.shared_with(list(own), i), places={})
+        task = task_from_definition({**shared, **own}, place, shares_with="with" not in own)
+        if task.name in names:
             raise InvalidInputError(
-                f"{source.at('tasks', i)}: two tasks are named {made[-1].name}; give each a name or language of its own"
+                f"{source.at('tasks', i)}: two tasks are named {task.name}; give each a name or language of its own"
             )
-    return tuple(made)
+        names.add(task.name)
+        yield task, place
 
 
 def find_tasks(names: Iterable[str]) -> list[Task]:
@@ -119,7 +126,7 @@ def read_suite(files: Iterable[str | Path], name: str = OWN) -> Suite:
 
 
 def write_task(task: Task, path: str | Path) -> Path:
-    """Write a task as a BDDL file. Readers derive the instruction from the name of the file, as in the original.
+    """Write a task as a BDDL file. Readers take the instruction from its text; the original's from its name.
 
     Args:
         path: File to write, whose name ends in .bddl; its folder is created.
@@ -169,20 +176,18 @@ def get_task(key: str) -> Task:
             if not index.isdecimal() or len(index) > 9 or int(index) >= len(suite):
                 raise UnknownNameError(f"index of {suite_name}", index, range(len(suite)))
             return suite.tasks[int(index)]
-    named = {task.name: task for name in suite_names() for task in get_suite(name).tasks}
-    if key in named:
-        return named[key]
+    if key in task_names():
+        return benchmark_task(key)
     if closest(key, suite_names()):
         raise UnknownNameError("suite", key, suite_names())
     indices = [f"{name}/0 to {name}/{len(get_suite(name)) - 1}" for name in suite_names()]
-    raise UnknownNameError("task", key, indices, unlisted=named)
+    raise UnknownNameError("task", key, indices, unlisted=task_names())
 
 
 def read_task(path: str | Path) -> Task:
     """Return the user-defined task of a BDDL or YAML file.
 
-    The instruction of a BDDL file is derived from its name, as in the original; that of a YAML file is its `language`
-    (see `libero_env.tasks.builder`).
+    The instruction is that of the file, see `libero_env.tasks.benchmark.task_of_file` and `libero_env.tasks.builder`.
 
     Args:
         path: File to read. Without `name` in a YAML file, its stem is the name of the task.
@@ -201,5 +206,4 @@ def read_task(path: str | Path) -> Task:
                 f"{path} contains {len(tasks)} tasks, expected one; put each in a separate file"
             )
         return tasks[0]
-    problem, name = bddl.read(path), Path(path).stem
-    return Task(FILE, 0, name, language_from_name(name), problem.language, problem)
+    return task_of_file(Path(path).stem, bddl.read(path))

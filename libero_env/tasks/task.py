@@ -2,15 +2,19 @@
 
 import hashlib
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from libero_env.errors import InvalidInputError, require_known
-from libero_env.objects import folder
 from libero_env.storage import read_yaml
 from libero_env.tasks import bddl
 from libero_env.tasks.problem import Problem
 from libero_env.workspaces import find_workspace
 
 FILE = "file"  # suite of a task that was read from a file on its own
+NUM_INIT_STATES = 50  # that are stored of a task
 MAX_NAME_BYTES = 200  # of a task or suite; names of files made of them are a little longer
 
 
@@ -41,8 +45,7 @@ class Task:
         suite: Name of its suite, such as `libero_object`; `file` for a task that was read from a file on its own.
         index: Position in the suite, from 0.
         name: Name that is unique in the benchmark, such as `pick_up_the_milk_and_place_it_in_the_basket`.
-        language: Default instruction. In tasks of the benchmark and of BDDL files it is derived from the name, as in
-            the original.
+        language: Default instruction. In tasks of the benchmark it is derived from the name, as in the original.
         bddl_language: Instruction in `:language` of the task file.
         problem: Scene, initial conditions and goal.
 
@@ -79,7 +82,26 @@ class Task:
     @property
     def num_starts(self) -> int:
         """Number of stored initial states."""
-        return 50
+        return NUM_INIT_STATES
+
+    @property
+    def start_file(self) -> Path | None:
+        """File with the initial states that others publish of it; None unless it is a variant by others."""
+        return None
+
+    @property
+    def rest(self) -> np.ndarray:
+        """Joints that the controller takes for the arm's rest pose, (7,) [rad]."""
+        from libero_env.assets.robot import REST_QPOS  # with MuJoCo
+
+        return np.array(REST_QPOS)
+
+    def changes(self) -> tuple[Any, ...]:
+        """Return what its environment changes beside the problem, as `EnvConfig.perturb` may name it."""
+        return ()
+
+    def require_available(self) -> None:
+        """Raise a `LiberoError` where its scene cannot be built, as some files cannot be had."""
 
     @property
     def bddl_text(self) -> str:
@@ -89,6 +111,8 @@ class Task:
     @property
     def digest(self) -> str:
         """Digest, 16 hex digits, of its text and of the user's objects and workspaces in it."""
+        from libero_env.objects import folder  # with MuJoCo
+
         categories = sorted({*self.problem.fixtures.values(), *self.problem.objects.values()})
         found = (folder.find(name) or find_workspace(name) for name in categories)
         parts = [self.bddl_text, *(folder.digest(directory) for directory in found if directory)]

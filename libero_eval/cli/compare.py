@@ -2,8 +2,7 @@
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from importlib import import_module
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,6 +10,8 @@ import tyro
 
 from libero_env.cli.ending import UNDECIDED
 from libero_env.cli.options import Answer, Field, FilePath, Positional, Probability, Share, arg
+from libero_env.doors import enter
+from libero_env.storage import files_below
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ def compare(
     alpha: Probability = 0.05,
     tasks: bool = False,
     gate: Share | None = None,
+    published: str | None = None,
     out: FilePath | None = None,
 ) -> Answer:
     """Say whether evaluated policies differ, start by start, and what chance alone makes.
@@ -42,14 +44,22 @@ def compare(
         tasks: Show every task in the terminal.
         gate: Say whether the second result is worse than the first by more than this difference in success, such as
             0.05. The exit status is 1 for a regression, 3 where these episodes do not decide it.
+        published: Compare one result with the success that is published of this policy, such as pi05 (all of them are
+            in docs/known-answers.md), by counts instead of starts. The exit status is 1 where they contradict it.
         out: Folder for compare.html and compare.json.
     """
+    if published is not None:
+        if len(results) != 1 or group or control or allow or tasks or gate is not None or out:
+            raise ConfigError(
+                "--published is of one result; besides, only --alpha, --json and --open can be given"
+            )
+        return _against_published(results[0], published, alpha)
+    groups = [*_single_groups(results), *(_group(words) for words in group)]
+    first_twice = _single_groups(control) if control else None
     from libero_eval.judging.comparison import compare_groups, write_comparison
     from libero_eval.judging.comparison import gate as judge
     from libero_eval.judging.page import gate_text, render, write_page
 
-    groups = [*_single_groups(results), *(_group(words) for words in group)]
-    first_twice = _single_groups(control) if control else None
     pair = (first_twice[0], first_twice[1]) if first_twice else None
     comparison = compare_groups(groups, control=pair, allow=allow, alpha=alpha)
     lines, status, page = [render(comparison, tasks=tasks)], 0, None
@@ -61,6 +71,16 @@ def compare(
         lines += ["", str(write_comparison(comparison, out / "compare.json", found))]
         page = write_page(comparison, out / "compare.html")
     return Answer("\n".join(lines), comparison.to_plain(found), page, status)
+
+
+def _against_published(word: str, name: str, alpha: float) -> Answer:
+    from libero_eval.evaluation_file import EvaluationResult
+    from libero_eval.judging.published import agreement, render
+
+    found, notes = agreement(EvaluationResult.read(named(word)[1]), name)
+    data = {"published": name, "suites": [asdict(row) for row in found], "conditions": notes}
+    status = int(any(row.adjusted <= alpha for row in found))
+    return Answer(render(found, notes, name, alpha), data, status=status)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,9 +112,6 @@ class PowerOptions:
 
 def power(options: PowerOptions) -> None:
     """Print how many episodes a difference needs, a table of them, or the difference that can be shown."""
-    from libero_eval.judging import power_text
-    from lifelong.stats.power import Question, discordance_of
-
     if options.discordance is not None and options.correlation is not None:
         raise ConfigError("--correlation stands for --discordance; give one of them")
     if options.episodes and options.difference is not None:
@@ -105,6 +122,9 @@ def power(options: PowerOptions) -> None:
             "--discordance and --correlation are of one case; name it with --difference or --episodes"
         )
     base, gap, discordance = _observed(options.results) if options.results else (0.9, None, None)
+    from libero_eval.judging import power_text
+    from libero_eval.stats.power import Question, discordance_of
+
     base = base if options.base is None else options.base
     gap = gap if options.difference is None else options.difference
     discordance = discordance if options.discordance is None else options.discordance
@@ -136,17 +156,21 @@ def board(
     """Rank evaluated policies on a page: success with intervals, tiers by paired tests, commands that run them again.
 
     Args:
-        results: Files eval.json, or folders, for all such files in them; NAME=RESULT names one. Results of one policy
-            on other tasks make one row.
+        results: Files eval.json, or folders, for all such files in them that can be compared (those of robustness left
+            out); NAME=RESULT names one. Results of one policy on other tasks make one row.
         allow: Rank although this setting differs, such as protocol.horizon or environment.robot; starts: rank by the
             episodes that all have.
         alpha: Probability of a false difference among all pairs.
         out: The page, or a folder for it.
     """
-    from libero_eval.judging.board import make_board, render_board, write_board
+    words = [(word, given) for given in results for word in _results_in(given)]
+    entries = _single_groups([word for word, _ in words], by_name=True)
+    searched = [word != given and not Path(named(given)[1], "eval.json").is_file() for word, given in words]
+    from libero_eval.judging.board import alike, make_board, render_board, write_board
 
-    entries = _single_groups([word for given in results for word in _results_in(given)], by_name=True)
+    entries, notes = alike(entries, searched, allow)
     found = make_board(entries, allow, alpha)
+    found = replace(found, notes=(*found.notes, *notes))
     return Answer(render_board(found), asdict(found), write_board(found, entries, out))
 
 
@@ -155,7 +179,9 @@ def _results_in(word: str) -> list[str]:
     name, path = named(word)
     if not Path(path).is_dir():
         return [word]
-    files = sorted(Path(path).rglob("eval.json"))
+    files = sorted(
+        file for file in files_below(Path(path), "eval.json") if "conditions" not in file.parts[:-1]
+    )
     if not files:
         raise ConfigError(
             f"{path} holds no evaluation: there is no eval.json in it; `libero eval` writes one"
@@ -171,6 +197,7 @@ def export(
     ],
     dataset: str = "",
     source: str = "",
+    partial: bool = False,
     out: FilePath | None = None,
 ) -> None:
     """Write an evaluation as another tool's result file, or runs as a table, and print the files.
@@ -182,12 +209,13 @@ def export(
             with metrics, costs and configuration; latex: a row a method, means over seeds with 95 % intervals.
         dataset: With eval-results: the benchmark's data set on the Hub, ORG/NAME.
         source: With eval-results: address of where the result is from, such as a repository with eval.json.
+        partial: With eval-results: write a part of a suite, or of a protocol's episodes, too; its notes say so.
         out: Folder of the files (default: the evaluation's, or the working directory).
     """
     from libero_eval.evaluation_file import EvaluationResult
 
-    if (dataset or source) and format != "eval-results":
-        raise ConfigError(f"--dataset and --source are of --as eval-results, not of --as {format}")
+    if (dataset or source or partial) and format != "eval-results":
+        raise ConfigError(f"--dataset, --source and --partial are of --as eval-results, not of --as {format}")
     if format in ("csv", "latex", "parquet"):
         from lifelong.report.export import export_runs
 
@@ -199,20 +227,18 @@ def export(
         raise ConfigError(f"--as {format} takes one evaluation, not {len(results)}")
     content, path = EvaluationResult.read(results[0]), Path(results[0])
     folder = out or (path if path.is_dir() else path.parent)
-    written = import_module("libero_integrations.exports.results").export(
-        content, folder, format, dataset, source
-    )
+    written = enter("exports", "results")(content, folder, format, dataset, source, partial=partial)
     print(*written, sep="\n")
 
 
 def _observed(words: Sequence[str]) -> tuple[float, float | None, float | None]:
     """Return the success of the first of two results, the second's minus it, and their discordance."""
-    from libero_eval.judging.comparability import check_comparable, match
-    from lifelong.stats.episodes import count
-
     if len(words) != 2:
         raise ConfigError(f"libero power takes two results, not {len(words)}")
     groups = _single_groups(words)
+    from libero_eval.judging.comparability import check_comparable, match
+    from libero_eval.stats.episodes import count
+
     for note in check_comparable(groups, allow=("protocol", "environment", "tasks")):
         print(f"note: {note}")
     pairs = match(*groups).pairs
@@ -233,13 +259,14 @@ def _single_groups(words: Sequence[str], *, by_name: bool = False) -> "list[Grou
         by_name: Whether the name that its evaluation gave to the policy goes before the path.
     """
     from libero_eval.evaluation_file import EvaluationResult
-    from libero_eval.judging.comparability import Group
 
     split = [named(w) for w in words]
     labels = _labels([path for _, path in split])
+    read = [EvaluationResult.read(path) for _, path in split]
+    from libero_eval.judging.comparability import Group
+
     groups = []
-    for (name, path), label in zip(split, labels, strict=True):
-        result = EvaluationResult.read(path)
+    for (name, path), label, result in zip(split, labels, read, strict=True):
         stated = result.evaluated.get("name") if by_name else None
         groups.append(Group(str(name or stated or label), (result,), (path,)))
     return groups

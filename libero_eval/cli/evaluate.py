@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from libero_env.cli.ending import NOT_BEGUN, told_if_interrupted
 from libero_env.cli.options import Answer, FilePath
 from libero_env.storage import read_json
 from libero_eval.cli.compare import named
@@ -33,17 +34,22 @@ class EvalOptions(EvalRequest):
 
 def evaluate(options: EvalOptions) -> Answer:
     """Evaluate a policy; print a row for each task, the mean, the file of the results, and their page."""
-    from libero_env.parallel import tell_progress
-    from libero_eval.evaluation_file import FILE_NAME
-    from libero_eval.judging.evaluation_page import write_evaluation_page
-    from libero_eval.plan import evaluate as run
-    from libero_eval.plan import plan_evaluation
-    from libero_eval.work.progress import HEADER, describe_status, table_row, total_rows
+    with told_if_interrupted(NOT_BEGUN):
+        from libero_eval.words import check_words
 
-    if options.status:
-        text, progress = describe_status(options.status)
-        return Answer(text, {**asdict(progress), "seconds_left": progress.seconds_left})
-    evaluation = plan_evaluation(options)
+        if not options.status:
+            check_words(options)
+        from libero_env.progress import tell_progress
+        from libero_eval.evaluation_file import FILE_NAME
+        from libero_eval.judging.evaluation_page import write_evaluation_page
+        from libero_eval.plan import evaluate as run
+        from libero_eval.plan import plan_evaluation
+        from libero_eval.work.progress import HEADER, describe_status, table_row, total_rows
+
+        if options.status:
+            text, progress = describe_status(options.status)
+            return Answer(text, {**asdict(progress), "seconds_left": progress.seconds_left})
+        evaluation = plan_evaluation(options)
     heads = [HEADER]
 
     def print_row(result: "TaskResult") -> None:
@@ -99,6 +105,10 @@ class RobustnessOptions(RobustnessRequest):
 
 def robustness(options: RobustnessOptions) -> Answer:
     """Evaluate all conditions, print the table, and write the page."""
+    from libero_eval.words import check_words
+
+    if not options.report:
+        check_words(options)
     from libero_eval.robustness.study import conditions_of, read_study, study_robustness
 
     if options.report:
@@ -116,12 +126,11 @@ def robustness(options: RobustnessOptions) -> Answer:
 
 
 def _print_condition(condition: str, result: "EvaluationResult", done: int, count: int) -> None:
-    e = result.success
-    print(
-        f"{time.strftime('%H:%M')} {done:>3}/{count}  {condition or 'without perturbations':<28} "
-        f"{100 * e.value:5.1f} % [{100 * e.low:.1f}, {100 * e.high:.1f}]",
-        flush=True,
-    )
+    from libero_eval.judging.page import interval_text
+
+    e, name = result.success, condition or "without perturbations"
+    line = f"{time.strftime('%H:%M')} {done:>3}/{count}  {name:<28} {100 * e.value:5.1f} % {interval_text(e)}"
+    print(line.rstrip(), flush=True)
 
 
 def _read(word: str) -> "Robustness":

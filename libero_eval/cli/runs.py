@@ -5,10 +5,17 @@ import contextlib
 import socket
 from dataclasses import asdict
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated
 
 from libero_env.cli.options import Answer, Device, Field, FilePath, Natural, Positional, Processes, Seed
-from libero_eval.requests import DiagnoseRequest, RelearnRequest, SaliencyRequest, ViewRequest
+from libero_eval.requests import (
+    DiagnoseRequest,
+    RelearnRequest,
+    SaliencyRequest,
+    ViewRequest,
+)
+from lifelong.errors import require_run
 
 
 def serve(
@@ -35,6 +42,7 @@ def serve(
             executed).
         policy_threads: Threads of a policy on the CPU, as of `libero eval`.
     """
+    require_run(run)
     import torch
 
     from libero_eval.servers.serving import PolicyServer, ServedPolicy
@@ -55,18 +63,21 @@ def serve(
 
 def relearn(request: RelearnRequest) -> Answer:
     """Relearn tasks of a run; print the savings, and the page."""
+    require_run(request.run)
     from libero_eval.relearning import relearn as measure
     from lifelong.pretraining import initial_policy
     from lifelong.report.page import write_report
-    from lifelong.results.relearning import by_measure, savings, savings_tables
+    from lifelong.results.relearning import by_measure, savings, savings_table
 
     records = measure(request, initial_policy(request.run, weights=request.initial, allow=request.allow))
     rows = [{**asdict(row), "share": row.share} for part in by_measure(records) for row in savings(part)]
-    return Answer(savings_tables(records), rows, write_report([request.run]))
+    tables = "\n\n".join(str(savings_table(part)) for part in by_measure(records))
+    return Answer(tables, rows, write_report([request.run]))
 
 
 def diagnose(request: DiagnoseRequest) -> Answer:
     """Tell why a run forgets, a line for each finding; print the page."""
+    require_run(request.run)
     from libero_eval.diagnosis.measure import diagnose as measure
     from libero_eval.diagnosis.page import findings, write_diagnosis
 
@@ -76,6 +87,7 @@ def diagnose(request: DiagnoseRequest) -> Answer:
 
 def saliency(request: SaliencyRequest) -> Answer:
     """Draw the saliency of an episode of a run; print the sheet, and the page."""
+    require_run(request.run)
     from libero_eval.saliency import draw_saliency
     from lifelong.report.page import write_report
 
@@ -94,6 +106,8 @@ def check(
     Args:
         runs: Run directories, or folders of them.
     """
+    for run in runs:
+        require_run(run)
     from libero_eval.check import examine, find_runs
 
     examined = [examine(run) for run in dict.fromkeys(run for path in runs for run in find_runs(path))]
@@ -108,8 +122,12 @@ def check(
 
 def view(request: ViewRequest) -> None:
     """Show a scene in the browser until interrupted; print its address."""
-    module = import_module("libero_integrations.viewer")
-    viewer = module.Viewer(module.Stage(request), request.host, request.port)
+    if not Path(request.what).exists() and not request.what.endswith(".hdf5"):
+        from libero_env.tasks import find_tasks
+
+        find_tasks([request.what])
+    stage = import_module("libero_integrations.stage").Stage(request)
+    viewer = import_module("libero_integrations.viewer").Viewer(stage, request.host, request.port)
     try:
         viewer.open(viewer.stage.initial)
         port = viewer.port

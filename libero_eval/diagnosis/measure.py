@@ -12,12 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from libero_eval.relearning import Measure, measured_on, task_windows
+from libero_eval.relearning import CHUNK, Measure, measured_on, task_windows, with_demos
 from libero_eval.requests import DiagnoseRequest
 from lifelong.algorithms.base import Algorithm, acting_with
 from lifelong.algorithms.importance import SampleFisher
 from lifelong.errors import LifelongError
 from lifelong.evaluation.restore import LoadedRun, read_config, restore
+from lifelong.nn import GMMHead
 from lifelong.policies.base import copy_weights, device_of, in_mode
 from lifelong.policies.history import HistoryPolicy, with_features
 from lifelong.seeding import generator
@@ -28,11 +29,11 @@ from lifelong.stats.representations import (
     relative_distance,
     stable_rank,
 )
-from lifelong.tuning.proxy import CHUNK
 from lifelong.types import Batch
 
 PARTS = ("encoder", "temporal", "head")
 FISHER_WINDOWS = 256  # of a task
+SAMPLES = 64  # actions drawn at a frame
 Weights = Mapping[str, Tensor]
 
 
@@ -79,6 +80,18 @@ class Drift:
 
 
 @dataclass(frozen=True)
+class Moved:
+    """How far learning a task moved the policy on held-out frames of that task.
+
+    Attributes:
+        kl: Kullback-Leibler divergence of the policy after the task from that before it, [nats] an action.
+    """
+
+    task: int
+    kl: float
+
+
+@dataclass(frozen=True)
 class Swap:
     """An old task under the last policy, and with one part of it put back; errors or shares of failed rollouts.
 
@@ -119,6 +132,7 @@ class Diagnosis:
     learned: int
     notes: tuple[str, ...]
     updates: tuple[Update, ...]
+    moved: tuple[Moved, ...]
     overlaps: tuple[Overlap, ...]
     drifts: tuple[Drift, ...]
     swaps: tuple[Swap, ...]
@@ -132,7 +146,7 @@ def diagnose(request: DiagnoseRequest) -> Diagnosis:
             algorithm acts by more than the policy's weights.
         PolicyError: The policy has no `encode`, `over_time` and `head`.
     """
-    run = restore(request.run, device=request.device, allow=request.allow)
+    run = with_demos(restore(request.run, device=request.device, allow=request.allow), request.demos)
     config, algorithm = read_config(run.path / "config.yaml", request.allow), type(run.algorithm).__name__
     policy, plain = with_features(run.policy), type(run.algorithm).policy_for is Algorithm.policy_for
     if not plain and not run.algorithm.acts_by_weights:
@@ -147,14 +161,18 @@ def diagnose(request: DiagnoseRequest) -> Diagnosis:
             f"{run.path} has learned its {len(stages)} tasks in one stage; a diagnosis needs two or more stages"
         )
     just = {end: _just_after(run, end, request) for end in ends}
-    swaps, drifts, fishers = [], [], {}
+    before = dict(zip(ends[1:], ends, strict=False))
+    swaps, drifts, moved, fishers = [], [], [], {}
     for task, end in stages.items():
-        training, held_out = task_windows(run, task, request.held_out, config)
+        training, held_out = task_windows(run, task, request.held_out, config, request.demos)
         assert held_out is not None  # at least one demonstration is held out
         parts = parts_of(policy, held_out.rows(slice(1)).to(run.device))
         with acting_with(policy, just[end]):
             estimator = SampleFisher(windows=FISHER_WINDOWS)
             fishers[task] = estimator.estimate(training, policy, generator(run.seed, task))
+        if end in before and isinstance(policy.head, GMMHead):
+            draws = generator(run.seed, task)
+            moved.append(Moved(task, divergence(policy, just[before[end]], just[end], held_out, draws)))
         if end == ends[-1]:
             continue
         with run.acting(task) as acting:
@@ -174,6 +192,7 @@ def diagnose(request: DiagnoseRequest) -> Diagnosis:
         learned=len(stages),
         notes=tuple(_notes(run, len(stages), separate)),
         updates=tuple(found for a, b in steps for found in updates(b, just[a], just[b], parts)),
+        moved=() if separate else tuple(moved),
         overlaps=tuple(overlap(pair, fishers[pair[0]], fishers[pair[1]], parts) for pair in later),
         drifts=tuple(drifts),
         swaps=tuple(swaps),
@@ -296,6 +315,28 @@ def _places(policy: HistoryPolicy, batch: Batch) -> dict[str, Any]:
             for name, values in zip(rows, (features, latents, actions), strict=True):
                 rows[name].append(values[:, -1].flatten(1).double().cpu())
     return {name: torch.cat(values).numpy() for name, values in rows.items()}
+
+
+@torch.no_grad()
+def divergence(
+    policy: HistoryPolicy, before: Weights, after: Weights, batch: Batch, draws: torch.Generator
+) -> float:
+    """Return KL(before || after) of a mixture, [nats], mean over the actions of windows, from `SAMPLES` draws of each.
+
+    Learning a task in fewer nats forgets less (Shenfeld et al. 2025, "RL's Razor", arXiv:2509.04259).
+    """
+    assert isinstance(policy.head, GMMHead)
+    found = []
+    for weights in (before, after):
+        with acting_with(policy, weights), in_mode(policy, training=False):
+            chunks = [batch.rows(chosen) for chosen in torch.arange(len(batch)).split(CHUNK)]
+            observed = (chunk.to(device_of(policy)).observation for chunk in chunks)
+            params = [policy.head(policy.over_time(policy.encode(one))) for one in observed]
+        found.append({name: torch.cat([one[name] for one in params]).cpu() for name in params[0]})
+    with in_mode(policy, training=True):  # else a paper's head draws with its least deviation
+        actions = [policy.head.sample(found[0], draws) for _ in range(SAMPLES)]
+    ratios = [policy.head.log_prob(found[0], a) - policy.head.log_prob(found[1], a) for a in actions]
+    return float(torch.stack(ratios).double().mean())
 
 
 def swap(

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from libero_env.storage import write_json
+from libero_env.text import Cell, Table
 from libero_eval.diagnosis.measure import PARTS, Diagnosis, Swap
 from lifelong.errors import writing
 from lifelong.report.figures import LINE_COLOURS, STYLE, as_svg, legend_below
@@ -34,6 +35,12 @@ def findings(found: Diagnosis) -> list[str]:
                 f"Later tasks change the {part} by {percent(_mean(own, 'relative'), 0)} % of its norm, effective rank "
                 f"{percent(_mean(own, 'effective'), 0)} % of the largest, stable rank {number(_mean(own, 'stable'))}."
             )
+    if found.moved:
+        worst = max(found.moved, key=lambda one: one.kl)
+        mean, largest = number(_mean(found.moved, "kl")), number(worst.kl)
+        lines.append(
+            f"A task moves the policy by {mean} nats on its frames, task {worst.task + 1} most ({largest})."
+        )
     if overlaps := [pair for pair in found.overlaps if not math.isnan(pair.all)]:
         most = max(overlaps, key=lambda pair: pair.all)
         lines.append(
@@ -77,19 +84,51 @@ def write_diagnosis(found: Diagnosis, folder: Path) -> Path:
     page = save_page(
         folder / "diagnosis.html",
         "libero_eval.diagnosis",
-        title=f"Why {found.algorithm} forgets",
+        title=f"What {found.algorithm} loses, and where",
         facts=[("run", found.run), ("tasks learned", str(found.learned))],
         notes=found.notes,
         findings=findings(found)[len(found.notes) :],
-        found=found,
         figure=as_svg(swap_figure(found)),
-        measures=MEASURES,
-        parts=[part for part in PARTS if part in found.swaps[0].swapped],
-        number=number,
+        tables=_tables(found),
     )
     with writing(folder, "the numbers"):
         write_json(folder / "diagnosis.json", asdict(found))
     return page
+
+
+def _tables(found: Diagnosis) -> dict[str, Table]:
+    parts = [part for part in PARTS if part in found.swaps[0].swapped]
+    swaps, overlaps = [], []
+    for swap in found.swaps:
+        back = [
+            Cell(number(swap.swapped[p]), f"{percent(swap.restored(p), 0)} %", strong=True) for p in parts
+        ]
+        name = f"{swap.task + 1}  {found.instructions[swap.task]}"
+        swaps.append([name, MEASURES[swap.measure], number(swap.learned), *back, number(swap.final)])
+    for pair in found.overlaps:
+        shares = map(number, (pair.all, *(pair.parts[part] for part in parts)))
+        overlaps.append([f"{pair.tasks[0] + 1} and {pair.tasks[1] + 1}", *shares])
+    drifts = [[d.task + 1, d.place, number(d.cka), number(d.relative)] for d in found.drifts]
+    updates = [
+        [
+            u.task + 1,
+            u.part,
+            *map(number, (u.relative, u.nuclear)),
+            f"{percent(u.effective, 0)} %",
+            number(u.stable),
+        ]
+        for u in found.updates
+    ]
+    ranks = ("relative norm", "nuclear norm", "effective rank", "stable rank")
+    return {
+        "swaps": Table(
+            ["task", "measure", "just learned", *(f"{part} back" for part in parts), "at the end"], swaps, 2
+        ),
+        "drifts": Table(("task", "place", "CKA", "change"), drifts, 2),
+        "updates": Table(("task", "part", *ranks), updates, 2),
+        "moved": Table(("task", "KL"), [[one.task + 1, number(one.kl)] for one in found.moved]),
+        "overlaps": Table(("tasks", "all weights", *parts), overlaps),
+    }
 
 
 @matplotlib.rc_context(STYLE)

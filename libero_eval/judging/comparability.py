@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from libero_env.text import flatten, plain, shorten
-from libero_eval.evaluation_file import WORLD, EvaluationResult, by_start
+from libero_eval.evaluation_file import WORLD, EvaluationResult, by_start, known_by
+from libero_eval.protocols.naming import compared, horizon_text, protocol_label, section_of
+from libero_eval.stats.episodes import Pairs
 from lifelong.errors import ComparisonError
 from lifelong.report.comparison import check_same_back_end
-from lifelong.stats.episodes import Pairs
+from lifelong.results.provenance import few_of
 
 PASSING = ("instruction_set", "policy_threads")  # entries in which every machine differs
 UNKNOWN = "not recorded"
@@ -68,6 +70,7 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
     check_same_back_end({label: result.backend for label, result in rows})
     expected = {key: (base_label, value) for key, value in settings(base).items()}
     refused, notes = dict[str, str](), list[str]()
+    undescribed = dict[str, None]()  # tasks whose digest one of two lacks
     for label, result in rows[1:]:
         others = settings(result)
         for key in sorted(expected.keys() | others.keys()):
@@ -75,6 +78,9 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
                 continue  # a task of one of them only: its episodes have no partner
             first_label, value = expected.get(key, (base_label, UNKNOWN))
             values = value, others.get(key, UNKNOWN)
+            if UNKNOWN in values and key.endswith(".digest"):
+                undescribed[key.removeprefix("tasks.").removesuffix(".digest")] = None
+                continue
             if values[0] == values[1]:
                 continue
             one, other = (shorten(str(value), 60) for value in values)
@@ -98,6 +104,9 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
             f"these results cannot be compared, as they were made differently:\n  {lines}\n"
             f"evaluate again with the same settings, or compare nevertheless with {names}"
         )
+    if undescribed:
+        notes.append(f"digest of {few_of([*undescribed])}: {UNKNOWN}; taken to be the same task")
+    notes += [f"{label}: protocol {text}" for label, text in protocol_labels(rows).items()]
     remarks = [f"{label}, {t.task}: {t.error_note}" for label, r in rows for t in r.tasks if t.error_note]
     remarks += [
         f"{label}: {result.stop_note}; of all tests and intervals here only the sequential test allows for that"
@@ -107,14 +116,49 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
     return [*dict.fromkeys(notes), *remarks]
 
 
+def protocol_labels(rows: Iterable[tuple[str, EvaluationResult]]) -> dict[str, str]:
+    """Return what the protocols of results that changed theirs are called, by labels; one for all if they agree."""
+    labels: dict[str, list[str]] = {}
+    for label, result in rows:
+        labels.setdefault(protocol_label(result.protocol, result.suites), []).append(label)
+    changed = {text: of for text, of in labels.items() if ", changed: " in text}
+    return {"all" if len(labels) == 1 else ", ".join(dict.fromkeys(of)): text for text, of in changed.items()}
+
+
 def settings(result: EvaluationResult) -> dict[str, Any]:
     """Return everything that must be equal, flat, by dotted name: protocol, environment, instructions of the tasks."""
     tasks = {
-        r.task: {"name": r.name, "instruction": r.instruction} | ({"digest": r.digest} if r.digest else {})
+        r.task: {"name": r.name, "instruction": r.instruction, "digest": r.digest or UNKNOWN}
         for r in result.tasks
     }
-    protocol = {k: v for k, v in result.protocol.items() if k != "digest"}  # it follows from the others
-    return flatten(plain({"protocol": protocol, "environment": result.world, "tasks": tasks}))
+    return flatten(
+        plain({"protocol": compared(result.protocol), "environment": result.world, "tasks": tasks})
+    )
+
+
+def facts(result: EvaluationResult) -> list[tuple[str, str]]:
+    """Return what a reader needs to know of how the episodes were run, by name."""
+    protocol, environment = result.protocol, result.environment
+    models = (environment.get("models"), environment.get("models_digest"))
+    world, horizon = section_of(protocol, "world"), section_of(protocol, "episode").get("horizon")
+    found = {
+        "tasks": ", ".join(result.suite_labels.values()),
+        "protocol": protocol_label(protocol, result.suites),
+        "digest": protocol.get("digest"),
+        "models": " ".join(str(value) for value in models if value),
+        "initial states": {"builtin": "this package's", "original": "LIBERO's"}.get(
+            str(world.get("init_states"))
+        ),
+        "robot": environment.get("robot"),
+        "perturbed by": world.get("perturb"),
+        "control rate": f"{rate} Hz" if (rate := world.get("control_freq")) else "",
+        "horizon": f"{horizon_text(horizon, result.suites)} steps" if horizon else "",
+        "clock": section_of(protocol, "action").get("clock"),
+        "MuJoCo": result.versions.get("mujoco"),
+        "episodes": sum(len(task.init_states) for task in result.tasks),
+        "finished": str(result.times.get("finished", "")).replace("T", " ").replace("+00:00", " UTC"),
+    }
+    return [(name, str(value)) for name, value in found.items() if value]
 
 
 def match(first: Group, second: Group) -> Matched:
@@ -147,7 +191,7 @@ def same_policy(first: EvaluationResult, second: EvaluationResult) -> bool:
     """Return whether two results are of the same policy, apart from the seed: the same weights where they are known."""
     known = all(r.evaluated.get("weights") for r in (first, second))
     other = ("seed", *(("run", "after") if known else ()))
-    a, b = ({k: v for k, v in r.evaluated.items() if k not in other} for r in (first, second))
+    a, b = ({k: v for k, v in known_by(r.evaluated).items() if k not in other} for r in (first, second))
     return a == b
 
 

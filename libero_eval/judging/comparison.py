@@ -12,15 +12,15 @@ import numpy as np
 from libero_env.sim.backend import MUJOCO
 from libero_env.storage import write_json
 from libero_env.text import json_safe
-from libero_eval.evaluation_file import by_start
-from libero_eval.judging.comparability import Group, check_comparable, match, same_policy, settings
+from libero_eval.evaluation_file import by_start, overall
+from libero_eval.judging.comparability import Group, check_comparable, facts, match, same_policy, settings
 from libero_eval.judging.group_scores import GroupScores, group_scores
+from libero_eval.stats.episodes import PairedDifference, difference, score_interval
+from libero_eval.stats.power import Question, shown_difference
+from libero_eval.stats.sequential import SequentialTest, sequential_test
 from lifelong.errors import ConfigError, writing
 from lifelong.results.failures import count_causes, count_quadrants
-from lifelong.stats.episodes import Difference, difference, score_interval
-from lifelong.stats.intervals import ALPHA, Estimate, holm, wilson_interval
-from lifelong.stats.power import Question, shown_difference
-from lifelong.stats.sequential import SequentialTest, sequential_test
+from lifelong.stats.intervals import ALPHA, LEAST_EPISODES, Estimate, holm
 
 FORMAT = "libero-comparison/1"
 
@@ -38,7 +38,7 @@ class Row:
 
     name: str
     title: str
-    difference: Difference
+    difference: PairedDifference
     adjusted: float | None = None
 
 
@@ -70,7 +70,7 @@ class Contrast:
 
 @dataclass(frozen=True)
 class Rate:
-    """A policy in a table: its runs, episodes, success with Wilson's interval, causes of failures, and safety."""
+    """A policy in a table: its runs, episodes, mean success over tasks, causes of failures, and safety."""
 
     label: str
     paths: tuple[str, ...]
@@ -111,7 +111,8 @@ def gate(comparison: "Comparison", margin: float) -> Gate:
     """Decide whether the second policy of a comparison is worse than the first by more than a margin.
 
     Raises:
-        ConfigError: The comparison is not one of two policies with a result each.
+        ConfigError: The comparison is not one of two policies with a result each, of five starts or more, which
+            `--until` did not stop.
     """
     labels = [rate.label for rate in comparison.rates]
     found = [c for c in (*comparison.comparisons, *comparison.controls) if [c.first, c.second] == labels]
@@ -119,6 +120,15 @@ def gate(comparison: "Comparison", margin: float) -> Gate:
     if counts is None:
         raise ConfigError(
             "--gate judges two results: first the one to keep up with, then the one that is judged"
+        )
+    if comparison.stopped:
+        raise ConfigError(
+            f"--gate does not judge results that --until stopped ({', '.join(comparison.stopped)}): its interval holds "
+            "for a number of starts that was fixed before; the same libero eval without --until goes on to all of them"
+        )
+    if counts.pairs < LEAST_EPISODES:
+        raise ConfigError(
+            f"--gate needs {LEAST_EPISODES} starts that both have, and there are {counts.pairs}"
         )
     loss = score_interval(counts, 1 - comparison.alpha)
     away = abs(loss.value - margin)
@@ -137,8 +147,10 @@ class Comparison:
         controls: The same policy twice, if there is such a pair: what arises by chance alone.
         groups: Aggregates over runs; None unless each policy has at least two, and all have starts in common.
         notes: Remarks for the reader.
+        facts: How the episodes of the first result were run, by name.
         backend: Backend that simulated all of it.
         alpha: Probability of a false difference in a family.
+        stopped: Labels of the policies with a result that `--until` stopped.
     """
 
     rates: tuple[Rate, ...]
@@ -146,8 +158,10 @@ class Comparison:
     controls: tuple[Contrast, ...]
     groups: GroupScores | None
     notes: tuple[str, ...]
+    facts: tuple[tuple[str, str], ...] = ()
     alpha: float = ALPHA
     backend: str = MUJOCO
+    stopped: tuple[str, ...] = ()
 
     def to_plain(self, gate: Gate | None = None) -> dict[str, Any]:
         """Return everything as plain data for JSON, with what a gate says."""
@@ -213,7 +227,8 @@ def compare_groups(
     scores = _group_scores(groups)
     if scores is None and groups and all(len(s.results) > 1 for s in groups):
         notes.append("no start is common to all runs of all policies: there are no aggregates over runs")
-    backend = (groups or control)[0].results[0].backend  # type: ignore[index]  # there is one of them
+    first = (groups or control)[0].results[0]  # type: ignore[index]  # there is one of them
+    backend = first.backend
     if backend != MUJOCO:
         notes.append(f"simulated by backend={backend}; not to be compared with results of others")
     return Comparison(
@@ -222,8 +237,10 @@ def compare_groups(
         controls=tuple(_compare(a, b, alpha) for a, b in controls),
         groups=scores,
         notes=tuple(notes),
+        facts=tuple(facts(first)),
         alpha=alpha,
         backend=backend,
+        stopped=tuple(s.label for s in groups if any(result.stopped for result in s.results)),
     )
 
 
@@ -285,7 +302,7 @@ def _family(rows: Sequence[Row]) -> list[Row]:
     return [replace(row, adjusted=value) for row, value in zip(rows, adjusted, strict=True)]
 
 
-def _shown(total: Difference, alpha: float, tests: int) -> float:
+def _shown(total: PairedDifference, alpha: float, tests: int) -> float:
     """Return the difference that as many pairs show in four of five cases; NaN where it cannot be computed."""
     if total.counts is None:
         return math.nan
@@ -299,15 +316,13 @@ def _shown(total: Difference, alpha: float, tests: int) -> float:
 
 def _rate(group: Group) -> Rate:
     tasks = [task for result in group.results for task in result.tasks]
-    won = [one for task in tasks for one in task.successes]
-    low, high = wilson_interval(sum(won), len(won))
     return Rate(
         label=group.label,
         paths=group.paths,
         runs=len(group.results),
-        episodes=len(won),
+        episodes=sum(len(task.successes) for task in tasks),
         errors=sum(error is not None for task in tasks for error in task.errors),
-        success=Estimate(sum(won) / len(won), float(low), float(high)),
+        success=overall(tasks, stopped=any(result.stopped for result in group.results)),
         causes=count_causes(tasks),
         safety=count_quadrants(tasks),
     )

@@ -6,10 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from libero_env.text import flatten
-from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, again, overall
+from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult, overall
+from libero_eval.judging.comparability import facts
 from libero_eval.judging.page import interval_text
+from libero_eval.repeating import again
 from libero_eval.work.store import PAGE_NAME
-from lifelong.report.page import media
+from lifelong.report.media import media
 from lifelong.report.tables import save_page
 from lifelong.results.failures import causes_text, safety_text
 
@@ -20,18 +22,18 @@ def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
     Raises:
         ResultsError: The page cannot be written.
     """
-    suites = result.by_suite
+    suites, labels = result.by_suite, result.suite_labels
     means = {"mean over tasks": result.tasks, **(suites if len(suites) > 1 else {})}
     return save_page(
         folder / PAGE_NAME,
         "libero_eval.judging",
         "evaluation.html",
-        title=f"{name_of(result)} on {', '.join(suites)}",
+        title=f"{name_of(result)} on {', '.join(labels.values())}",
         facts=facts(result),
         notes=[f"{task.task}: {task.error_note}" for task in result.tasks if task.error_note]
         + ([f"{result.stop_note}. The intervals of the means are always valid."] if result.stopped else []),
         means=[
-            _row(name, tasks) | {"success": result.suites.get(name, result.success)}
+            _row(labels.get(name, name), tasks) | {"success": result.suites.get(name, result.success)}
             for name, tasks in means.items()
         ],
         tasks=[_row(task.task, [task], task.instruction) for task in result.tasks],
@@ -45,23 +47,6 @@ def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
 def name_of(result: EvaluationResult) -> str:
     """Return the name of the policy: what its user called it, or the word that it was evaluated by."""
     return str(result.evaluated.get("name") or result.policy or "policy")
-
-
-def facts(result: EvaluationResult) -> list[tuple[str, str]]:
-    """Return what a reader needs to know of how the episodes were run, by name."""
-    protocol, environment = result.protocol, result.environment
-    models = (environment.get("models"), environment.get("models_digest"))
-    found = {
-        "protocol": " ".join(str(protocol[key]) for key in ("name", "digest") if key in protocol),
-        "models": " ".join(str(value) for value in models if value),
-        "robot": environment.get("robot"),
-        "perturbed by": protocol.get("world", {}).get("perturb"),
-        "clock": protocol.get("action", {}).get("clock"),
-        "MuJoCo": result.versions.get("mujoco"),
-        "episodes": sum(len(task.init_states) for task in result.tasks),
-        "finished": str(result.times.get("finished", "")).replace("T", " ").replace("+00:00", " UTC"),
-    }
-    return [(name, str(value)) for name, value in found.items() if value]
 
 
 def _row(name: str, tasks: Sequence[TaskResult], text: str = "") -> dict[str, Any]:

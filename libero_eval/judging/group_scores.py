@@ -67,7 +67,7 @@ def group_scores(scores: Mapping[str, Floats]) -> GroupScores:
     Raises:
         MissingPackageError: rliable is not installed.
     """
-    require_package("rliable", "judge")
+    require_package("rliable")
     from rliable import library, metrics
 
     with _seeded():

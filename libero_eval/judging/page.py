@@ -10,18 +10,21 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from libero_env.sim.causes import CAUSES
-from libero_env.text import text_table
+from libero_env.text import Cell, Table
 from libero_eval.judging.comparison import Comparison, Contrast, Gate, Row
-from libero_eval.judging.group_scores import Profile
+from libero_eval.judging.group_scores import GroupScores, Profile
+from libero_eval.stats.sequential import SequentialTest
 from lifelong.report.figures import INK, LINE_COLOURS, STYLE, as_svg, legend_below, shorten
-from lifelong.report.tables import save_page
+from lifelong.report.tables import percent, save_page
 from lifelong.results.failures import NOT_SEEN, QUADRANTS, anything_seen
-from lifelong.stats.episodes import Difference
 from lifelong.stats.intervals import Estimate
-from lifelong.stats.sequential import SequentialTest
 
 WORST = 5  # tasks in the table of a terminal
 MOST_ROWS = 60  # of a forest plot
+OVER_RUNS = (
+    "over runs, of the starts that all have (rliable; intervals draw runs anew, too narrow for less than 5)"
+)
+OF_ONE = ("tasks", "episodes", "finished")  # facts that are not of all results of a page
 
 
 def render(comparison: Comparison, *, tasks: bool = False) -> str:
@@ -30,12 +33,15 @@ def render(comparison: Comparison, *, tasks: bool = False) -> str:
     Args:
         tasks: Whether to show every task instead of those that differ most.
     """
-    blocks = [_rates(comparison)]
+    blocks = [str(_rates(comparison)) if comparison.rates else "control arm only"]
+    blocks += map(str, _tallies(comparison).values())
     blocks += [_contrast_text(c, comparison.alpha, tasks) for c in comparison.comparisons]
     for c in comparison.controls:
         head = f"control arm: {c.first} − {c.second}, one policy twice"
-        blocks.append("\n".join([head, chance_text(c), "", _table(c, (c.total, *c.suites))]))
-    blocks += [_groups(comparison)] if comparison.groups else []
+        blocks.append("\n".join([head, chance_text(c), "", str(_table(c, (c.total, *c.suites)))]))
+    if comparison.groups:
+        table, lines = _groups(comparison.groups)
+        blocks.append("\n".join([OVER_RUNS, str(table), *lines]))
     blocks += ["\n".join(f"note: {note}" for note in comparison.notes)] if comparison.notes else []
     return "\n\n".join(blocks)
 
@@ -118,88 +124,99 @@ def p_equation(p: float) -> str:
     return f"p = {p_text(p)}" if p >= 0.001 else f"p {p_text(p)}"
 
 
-def _rates(comparison: Comparison) -> str:
-    if not comparison.rates:
-        return "control arm only"
-    rows: list[list[object]] = [["policy", "runs", "episodes", "errors", "success %", "95 %"]]
-    rows += [
-        [r.label, r.runs, r.episodes, r.errors, f"{100 * r.success.value:.1f}", interval_text(r.success)]
-        for r in comparison.rates
-    ]
-    blocks = [text_table([[head, *outcomes], *counts]) for head, outcomes, counts in _tallies(comparison)]
-    return "\n\n".join([text_table(rows), *blocks])
+def _rates(comparison: Comparison) -> Table:
+    """Return the table of the policies."""
+    return Table(
+        ("policy", "runs", "episodes", "errors", "success %", "95 %"),
+        [
+            [
+                Cell(r.label, ", ".join(r.paths)),
+                *(r.runs, r.episodes, r.errors),
+                Cell(percent(r.success.value), strong=True),
+                interval_text(r.success),
+            ]
+            for r in comparison.rates
+        ],
+    )
 
 
-def _tallies(comparison: Comparison) -> list[tuple[str, list[str], list[list[object]]]]:
-    """Return tables of episodes by outcome: a word, the outcomes that occur, and a row for each policy."""
+def _tallies(comparison: Comparison) -> dict[str, Table]:
+    """Return tables of episodes by outcome, with a row for each policy."""
     kinds = (
         ("failed because", CAUSES, [r.causes for r in comparison.rates]),
         ("safety", QUADRANTS, [r.safety for r in comparison.rates]),
     )
-    tables = []
+    tables = {}
     for head, names, found in kinds:
         outcomes = [name for name in (*names, NOT_SEEN) if any(name in counts for counts in found)]
         if anything_seen(*found):
             rows = zip(comparison.rates, found, strict=True)
             cells = [[r.label, *(counts.get(name, 0) for name in outcomes)] for r, counts in rows]
-            tables.append((head, outcomes, cells))
+            tables[head] = Table((head, *outcomes), cells)
     return tables
 
 
 def _contrast_text(c: Contrast, alpha: float, all_tasks: bool) -> str:
     lines = [verdict(c, alpha)]
     lines += [sequential_text(c)] if c.sequential else []
-    lines += ["", _table(c, (c.total, *c.suites))]
+    lines += ["", str(_table(c, (c.total, *c.suites), alpha))]
     moved = [p for p in c.tasks if p.difference.value != 0]
     shown = c.tasks if all_tasks else sorted(moved, key=lambda p: -abs(p.difference.value))[:WORST]
     if shown and len(c.tasks) > 1:
         head = "every task" if all_tasks else f"tasks that differ most (of {len(c.tasks)})"
-        lines += ["", f"{head}; Holm over the tasks", _table(c, shown)]
+        lines += ["", f"{head}; Holm over the tasks", str(_table(c, shown, alpha))]
     return "\n".join(lines)
 
 
-def _table(c: Contrast, rows: Sequence[Row]) -> str:
-    first, second = _short(c.first), _short(c.second)
-    heads = [f"{first} %", f"{second} %", "difference", "95 %", f"only {first}", f"only {second}"]
-    cells = [[row.name, *_cells(row.difference, row.adjusted)] for row in rows]
-    return text_table([["", "pairs", *heads, "p", "Holm"], *cells])
+def _table(c: Contrast, rows: Sequence[Row], alpha: float = 0.0) -> Table:
+    """Return the table of differences; bold where they remain after Holm's adjustment."""
+    first, second = (name if len(name) <= 16 else f"…{name[-15:]}" for name in (c.first, c.second))
+    heads = [Cell(f"{first} %"), Cell(f"{second} %"), "difference", "95 %", f"only {first}", f"only {second}"]
+    return Table(["", "pairs", *heads, Cell("p"), "Holm"], [_cells(row, alpha) for row in rows])
 
 
-def _cells(d: Difference, adjusted: float | None) -> list[str]:
-    only = [str(d.counts.only_first), str(d.counts.only_second)] if d.counts else ["–", "–"]
+def _cells(row: Row, alpha: float) -> list[object]:
+    d, adjusted = row.difference, row.adjusted
     return [
-        str(d.pairs),
-        f"{100 * d.first:.1f}",
-        f"{100 * d.second:.1f}",
-        f"{100 * d.value:+.1f}".replace("-", "−"),
+        Cell(row.name, row.title),
+        d.pairs,
+        percent(d.first),
+        percent(d.second),
+        Cell(f"{100 * d.value:+.1f}".replace("-", "−"), strong=adjusted is not None and adjusted <= alpha),
         interval_text(d.interval),
-        *only,
+        *([d.counts.only_first, d.counts.only_second] if d.counts else ["–", "–"]),
         p_text(d.p_value),
         "–" if adjusted is None else p_text(adjusted),
     ]
 
 
-def _groups(comparison: Comparison) -> str:
-    assert comparison.groups is not None
-    g = comparison.groups
-    rows = [["", "runs", "mean %", "95 %", "IQM %", "95 %"]]
-    for name, runs in g.runs.items():
-        cells = [(f"{100 * e.value:.1f}", interval_text(e)) for e in (g.mean[name], g.iqm[name])]
-        rows.append([name, str(runs), *cells[0], *cells[1]])
-    return "\n".join(
+def _discordant(c: Contrast) -> Table | None:
+    """Return the table of starts by outcome; None where a policy has several runs."""
+    if (n := c.total.difference.counts) is None:
+        return None
+    return Table(
+        ("", Cell(f"{c.second} succeeds"), Cell(f"{c.second} fails")),
         [
-            "over runs, of the starts that all have (rliable; intervals draw runs anew, too narrow for less than 5)",
-            text_table(rows),
-            *(
-                f"a run of {a} beats one of {b} on a task with probability {e.value:.2f} [{e.low:.2f}, {e.high:.2f}]"
-                for (a, b), e in g.improvement.items()
-            ),
-        ]
+            [f"{c.first} succeeds", n.both, Cell(n.only_first, strong=True)],
+            [f"{c.first} fails", Cell(n.only_second, strong=True), n.neither],
+        ],
     )
 
 
-def _short(label: str) -> str:
-    return label if len(label) <= 16 else f"…{label[-15:]}"
+def _groups(g: GroupScores) -> tuple[Table, list[str]]:
+    """Return the table of aggregates over runs, and a line for each pair of methods."""
+    rows = [
+        [
+            name,
+            count,
+            *(text for e in (g.mean[name], g.iqm[name]) for text in (percent(e.value), interval_text(e))),
+        ]
+        for name, count in g.runs.items()
+    ]
+    return Table(("", "runs", "mean %", "95 %", "IQM %", "95 %"), rows), [
+        f"a run of {a} beats one of {b} on a task with probability {e.value:.2f} [{e.low:.2f}, {e.high:.2f}]"
+        for (a, b), e in g.improvement.items()
+    ]
 
 
 def write_page(comparison: Comparison, path: Path) -> Path:
@@ -213,19 +230,16 @@ def write_page(comparison: Comparison, path: Path) -> Path:
         path,
         "libero_eval.judging",
         title=_title(comparison),
-        rates=comparison.rates,
+        rates=_rates(comparison),
         tallies=_tallies(comparison),
         comparisons=[_contrast_content(c, comparison) for c in comparison.comparisons],
-        controls=[
-            {"comparison": c, "rows": (c.total, *c.suites), "verdict": chance_text(c)}
-            for c in comparison.controls
-        ],
+        controls=[(chance_text(c), _table(c, (c.total, *c.suites))) for c in comparison.controls],
         notes=comparison.notes,
-        groups=comparison.groups,
+        facts=[fact for fact in comparison.facts if fact[0] not in OF_ONE],
+        groups=_groups(comparison.groups) if comparison.groups else None,
         alpha=comparison.alpha,
         sequential=as_svg(sequential_figure(tests)) if tests else None,
         profiles=as_svg(profile_figure(comparison.groups.profiles)) if comparison.groups else None,
-        p_text=p_text,
         interval_text=interval_text,
     )
 
@@ -241,7 +255,9 @@ def _title(comparison: Comparison) -> str:
 def _contrast_content(c: Contrast, comparison: Comparison) -> dict[str, Any]:
     return {
         "comparison": c,
-        "rows": (c.total, *c.suites),
+        "table": _table(c, (c.total, *c.suites), comparison.alpha),
+        "tasks": _table(c, c.tasks, comparison.alpha),
+        "discordant": _discordant(c),
         "verdict": verdict(c, comparison.alpha),
         "sequential": sequential_text(c) if c.sequential else None,
         "forest": as_svg(forest_figure(c, comparison.alpha, *comparison.controls[:1])),

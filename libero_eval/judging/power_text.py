@@ -3,15 +3,15 @@
 import math
 from dataclasses import replace
 
-from libero_env.text import text_table
-from lifelong.errors import ConfigError
-from lifelong.stats.power import (
+from libero_env.text import Table
+from libero_eval.stats.power import (
     Question,
     paired_episodes,
     sequential_stopping,
     shown_difference,
     unpaired_episodes,
 )
+from lifelong.errors import ConfigError
 
 DIFFERENCES = (0.01, 0.02, 0.03, 0.05, 0.10)
 DISCORDANCES = (0.05, 0.10, 0.20)
@@ -75,7 +75,7 @@ def table(question: Question) -> str:
         f"episodes of each policy, success {100 * question.base:g} %, power {100 * question.power:.0f} %, "
         f"alpha {question.alpha:g}{_tests(question)}\n"
         "in the same starts, by the share of starts in which exactly one of the two succeeds; in other starts\n\n"
-        f"{text_table(rows, left=0)}\n\n"
+        f"{Table(rows[0], rows[1:], 0)}\n\n"
         "a suite of ten tasks has 500 starts, four suites have 2000; --difference and --discordance ask for one case"
     )
 

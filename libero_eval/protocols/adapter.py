@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from libero_env.geometry import quat_multiply
+from libero_env.images import flip_rows, rotate_180
 from libero_env.sim.observations import image_name
 from libero_env.tasks import Task
 from libero_eval.protocols.preprocessing import preprocess
 from libero_eval.protocols.protocol import EvalProtocol
-from lifelong.evaluation.environments import Obs
+from lifelong.evaluation.actors import Obs
 
 ACTION_DIM = 7
 _HAND_TO_GRIP = np.array([[np.sqrt(0.5), 0.0, 0.0, -np.sqrt(0.5)]])  # wxyz
@@ -80,9 +81,9 @@ class ProtocolAdapter:
         for camera in pixels.cameras:
             image = np.asarray(obs[view_of(camera)][i])
             if pixels.orientation == "bottom_up":
-                image = image[::-1]
-            elif pixels.orientation == "rotated":  # the original's rows, bottom first, turned by 180 degrees
-                image = image[:, ::-1]
+                image = flip_rows(image)
+            elif pixels.orientation == "rotated":
+                image = rotate_180(flip_rows(image))
             crop = 1.0 if pixels.crop is None else pixels.crop
             images[camera] = preprocess(image, pixels.resize or "none", pixels.resize_size, crop)
         return images

@@ -16,13 +16,12 @@ import numpy as np
 from pydantic import Field
 
 from libero_env.errors import UnknownNameError
-from libero_env.geometry import rotation_between
+from libero_env.storage import regular_file
 from libero_env.text import shown
 from libero_env.timing import CONTROL_HZ
 from libero_env.validation import validate_arguments
 from lifelong.errors import ConfigError
-from lifelong.evaluation.actors import Hears, TakesNote, WatchesWorld
-from lifelong.evaluation.environments import Obs
+from lifelong.evaluation.actors import Hears, Obs, TakesNote, WatchesWorld
 from lifelong.seeding import LATENCY
 
 DISTRIBUTIONS = ("normal", "lognormal", "uniform")  # of two numbers
@@ -31,7 +30,7 @@ EXPECTED = (
     "expected 120ms, 0.12s or 3steps, normal:120/20ms (mean, deviation), lognormal:120/0.4ms (median, deviation of the "
     "logarithm), uniform:50/150ms, or trace:FILE"
 )
-MOST_MEASURED, MOST_LETTERS = 10_000, 1_000_000  # latencies of a trace, and what is read of its file
+MOST_MEASURED, MOST_LETTERS = 10_000, 1 << 20  # latencies of a trace, and what is read of its file
 LONGEST = 1e9  # of a latency, ms or steps
 ENSEMBLE_M = 0.01  # of ACT
 _REMEMBERED = 10  # latencies from which the next one is expected
@@ -75,10 +74,10 @@ class Latency:
     @classmethod
     def _measured(cls, path: Path) -> "Latency":
         try:
-            with open(path, encoding="utf-8") as file:
+            with open(path, encoding="utf-8", opener=regular_file(MOST_LETTERS)) as file:
                 unit, *lines = file.read(MOST_LETTERS).split() or [""]
         except (OSError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or "it is not text"
+            reason = "it is not text" if isinstance(error, ValueError) else error.strerror or str(error)
             raise ConfigError(f"clock: latency=trace:{path}: {reason}") from None
         if unit not in UNITS or not 1 <= len(lines) <= MOST_MEASURED:
             raise ConfigError(
@@ -402,6 +401,8 @@ class ClockedActor:
         for i in self._running:
             if not (self._relative or self._episodes[i].now or self._env is None):  # the pose is held
                 arm = self._env.views[i]
+                from libero_env.geometry import rotation_between  # with MuJoCo
+
                 pose = (arm.eef_pos, rotation_between(np.eye(3), arm.eef_mat))
                 self._episodes[i].still = np.concatenate([*pose, self._still[-1:]])
             actions[i] = self._episodes[i].step()

@@ -11,7 +11,8 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.init_states.original_resets import OriginalResets, drawn_fixtures
 from libero_env.init_states.store import load_original_states
 from libero_env.sim.controller import get_controller
-from libero_env.sim.scene import Scene, default_drawing
+from libero_env.sim.scene import Scene
+from libero_env.sim.scene_spec import default_drawing
 from libero_env.tasks import Task
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol

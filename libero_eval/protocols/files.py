@@ -1,6 +1,5 @@
 """Files of protocols: the package's `data/NAME.yaml`, and a user's own, which may extend another."""
 
-from collections.abc import Mapping
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.storage import read_yaml_file
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
-from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.protocols.protocol import CHANGED, SECTIONS, EvalProtocol
 from lifelong.errors import EvaluationFileError, ProtocolError
 
 _FOLDER = Path(str(resources.files("libero_eval"))) / "protocols" / "data"
@@ -74,11 +73,20 @@ def _content(path: Path, seen: tuple[Path, ...]) -> dict[str, Any]:
         raise ProtocolError(str(error)) from error
     if not isinstance(content, dict):
         raise ProtocolError(f"{path} is not a protocol: expected sections such as `world:` and `episode:`")
+    if "changes" in content:
+        raise ProtocolError(f"{path}: changes is a key of results; write the values into their sections")
     if "extends" not in content:
         return content
     base = _content(_extended(path, content["extends"]), (*seen, path))
+    own = [
+        f"{name}.{key}" for name in SECTIONS if isinstance(part := content.get(name), dict) for key in part
+    ]
     if isinstance(sources := base.get("sources"), dict):  # not those of fields that have another value here
-        base["sources"] = {key: text for key, text in sources.items() if not _replaces(content, str(key))}
+        here = told if isinstance(told := content.get("sources"), dict) else {}
+        marks = {key: f"{path.name}'s own" for key in own if key.partition(".")[0] not in here}
+        base["sources"] = {key: text for key, text in sources.items() if key not in own} | marks
+    if own and "title" not in content and isinstance(base.get("title"), str):
+        base["title"] = base["title"].removesuffix(CHANGED) + CHANGED
     merged = dict(base)
     for key, value in content.items():
         inherited = base.get(key)
@@ -101,9 +109,3 @@ def _extended(path: Path, name: Any) -> Path:
             f"{path}: extends: {name} is not in its folder; put a copy there, and give its name"
         )
     return extended
-
-
-def _replaces(content: Mapping[str, Any], source: str) -> bool:
-    """Return whether a file has a value for the field that a source is about."""
-    section, _, field = source.partition(".")
-    return bool(field) and isinstance(content.get(section), Mapping) and field in content[section]

@@ -79,7 +79,7 @@ def jpeg_round_trip(image: np.ndarray) -> np.ndarray:
     Raises:
         MissingPackageError: simplejpeg is not installed.
     """
-    require_package("simplejpeg", "servers")
+    require_package("simplejpeg")
     import simplejpeg
 
     file = io.BytesIO()
@@ -191,7 +191,7 @@ def torch_bilinear(image: np.ndarray, size: Size) -> np.ndarray:
         image: (H, W, 3) uint8.
         size: Height and width of the result.
     """
-    require_package("torch", "train")
+    require_package("torch")
     import torch
 
     tensor = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()

@@ -13,9 +13,10 @@ from matplotlib.figure import Figure
 
 from libero_env.perturbations import KINDS
 from libero_env.storage import write_json
-from libero_env.text import text_table
+from libero_env.text import Cell, Table
+from libero_eval.evaluation_file import suite_label
 from libero_eval.judging.page import interval_text, p_text
-from libero_eval.robustness.results import Axis, EventRow, Outcomes, Robustness, differences, name_of
+from libero_eval.robustness.results import Axis, Outcomes, Robustness, differences, name_of
 from lifelong.errors import writing
 from lifelong.report.figures import (
     LINE_COLOURS,
@@ -26,7 +27,7 @@ from lifelong.report.figures import (
     shorten,
 )
 from lifelong.report.tables import percent, save_page
-from lifelong.stats.intervals import ALPHA, Estimate
+from lifelong.stats.intervals import ALPHA
 
 COLUMNS = 4
 EVENTS_TEXT = (
@@ -54,38 +55,14 @@ def verdict(policy: Robustness) -> str:
 
 def render(policy: Robustness) -> str:
     """Return the tables as plain text for a terminal."""
-    severities = policy.severities
-    rows: list[list[object]] = [
-        ["kind", *(f"{s:g}" for s in severities), "area", "95 %", "kept", "half at", "Holm"]
-    ]
-    for axis in policy.outcomes.axes:
-        successes = [axis.at(s) for s in severities]
-        rows.append(
-            [
-                axis.kind,
-                *("–" if e is None else f"{100 * e.value:.0f}" for e in successes),
-                f"{100 * axis.area.value:.0f}",
-                interval_text(axis.area),
-                "–" if math.isnan(axis.kept.value) else f"{100 * axis.kept.value:.0f}",
-                severity_text(axis.half.value),
-                p_text(policy.adjusted[axis.kind]),
-            ]
-        )
-    events: list[list[object]] = [
-        ["event", "began", "solvable", "without", "with", "difference", "95 %", "lost"]
-    ]
-    for row in policy.event_rows:
-        events.append([row.name, f"{row.began} of {row.episodes}", row.solved, *_event_cells(row)])
+    outcomes = policy.outcomes
+    events, pairs = event_table(policy), pair_table(policy)
     lines = [
         f"{policy.label}: success in percent by severity, 0 is without perturbation",
-        text_table(rows),
-        *([f"starts: {len(policy.outcomes.starts)}{lost}"] if (lost := _lost_text(policy.outcomes)) else []),
-        *(["", EVENTS_TEXT, text_table(events)] if len(events) > 1 else []),
-        *(
-            f"{name_of(pair.condition)}: {percent(pair.success.value, 0)}, expected {percent(pair.expected, 0)}, "
-            f"excess {percent(pair.excess.value, 0)} {interval_text(pair.excess)}".rstrip()
-            for pair in policy.outcomes.interactions
-        ),
+        str(kind_table(policy)),
+        *([f"starts: {len(outcomes.starts)}{lost}"] if (lost := _lost_text(outcomes)) else []),
+        *(["", EVENTS_TEXT, str(events)] if events else []),
+        *(["", str(pairs)] if pairs else []),
     ]
     return "\n".join([*lines, "", verdict(policy)])
 
@@ -107,14 +84,18 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
     outcomes = first.outcomes
     kinds = {axis.kind: KINDS.get(axis.kind.partition("@")[0]) for axis in outcomes.axes}
     units = {name: f"{kind.at_one:g} {kind.unit}" if kind else "1 s" for name, kind in kinds.items()}
-    suites = ", ".join(dict.fromkeys(task.partition("/")[0] for task in outcomes.tasks))
+    suites: dict[str, list[str]] = {}
+    for task in outcomes.tasks:
+        suites.setdefault(task.partition("/")[0], []).append(task)
     episodes = len(outcomes.tasks) * len(outcomes.starts)
+    paths = (os.path.relpath(path, folder) for policy in policies for path in policy.paths)
     page = save_page(
         folder / "robustness.html",
         "libero_eval.robustness",
         title=f"Robustness of {first.label}",
         facts=[
-            ("tasks", f"{len(outcomes.tasks)} of {suites}"),
+            ("tasks", ", ".join(suite_label(suite, tasks) for suite, tasks in suites.items())),
+            ("protocol", ", ".join(dict.fromkeys(policy.protocol for policy in policies))),
             ("starts", f"{len(outcomes.starts)} a task" + _lost_text(outcomes)),
             ("conditions", str(len(outcomes.conditions))),
             ("episodes", str(outcomes.successes.size)),
@@ -122,38 +103,83 @@ def write_robustness(policies: Sequence[Robustness], folder: Path) -> Path:
         ],
         verdict=verdict(first),
         differences=differences(policies),
-        policies=policies,
-        units=units,
-        curves=as_svg(curves_figure(axes, units)),
-        radar=as_svg(radar_figure(axes)) if len(outcomes.axes) > 2 else "",
-        interactions=[
-            {"label": policy.label, "name": name_of(pair.condition), "pair": pair}
+        kinds=[
+            (
+                f"{policy.label}, {percent(policy.outcomes.success(()).value)} % without perturbation",
+                kind_table(policy, units),
+            )
             for policy in policies
-            for pair in policy.outcomes.interactions
         ],
-        event_cells=_event_cells,
+        curves=as_svg(curves_figure(axes, units)),
+        events=[(policy.label, found) for policy in policies if (found := event_table(policy))],
+        pairs=[(policy.label, found) for policy in policies if (found := pair_table(policy))],
         events_text=EVENTS_TEXT,
-        redrawn=[(name, count, episodes) for name, count in first.redrawn.items() if count],
-        paths=[os.path.relpath(path, folder) for policy in policies for path in policy.paths],
-        interval=interval_text,
-        p_text=p_text,
-        severity=severity_text,
-        severities=_severities_text,
+        redrawn=Table(
+            ("perturbation", "drawn again", "episodes"),
+            [[name, count, episodes] for name, count in first.redrawn.items() if count],
+        ),
+        paths=[path for path in paths if path != "."],
     )
     with writing(folder, "the numbers"):
         write_json(folder / "robustness.json", {"policies": [_content(policy) for policy in policies]})
     return page
 
 
-def _event_cells(row: EventRow) -> list[str]:
-    """Return success without and with an event, their difference and its interval, and the share lost: in percent."""
-    counts = row.counts
-    if not counts.pairs:
-        return ["–"] * 5
-    rates = [100 * (counts.both + only) / counts.pairs for only in (counts.only_first, counts.only_second)]
-    lost = "–" if math.isnan(counts.lost) else f"{100 * counts.lost:.1f}"
-    value = f"{100 * row.difference.value:+.1f}".replace("-", "−")
-    return [f"{rates[0]:.1f}", f"{rates[1]:.1f}", value, interval_text(row.difference), lost]
+def kind_table(policy: Robustness, units: Mapping[str, str] | None = None) -> Table:
+    """Return the table of success by kind and severity.
+
+    Args:
+        units: What severity 1 is, by kind.
+    """
+    heads = ["kind", *(f"{s:g}" for s in policy.severities), "area", "95 %", "kept", "half at"]
+    rows = []
+    for axis in policy.outcomes.axes:
+        successes = [axis.at(s) for s in policy.severities]
+        half = (
+            f"[{axis.half.low:.2f}, {severity_text(axis.half.high)}]" if math.isfinite(axis.half.low) else ""
+        )
+        rows.append(
+            [
+                Cell(axis.kind, (units or {}).get(axis.kind, "")),
+                *("–" if e is None else percent(e.value, 0) for e in successes),
+                Cell(percent(axis.area.value, 0), strong=True),
+                interval_text(axis.area),
+                Cell(percent(axis.kept.value, 0), interval_text(axis.kept)),
+                Cell(severity_text(axis.half.value), half),
+                p_text(policy.adjusted[axis.kind]),
+            ]
+        )
+    return Table(
+        [*heads, Cell("Holm", title="p of no effect at all, adjusted for the number of kinds")], rows
+    )
+
+
+def event_table(policy: Robustness) -> Table:
+    """Return the table of what events take, success in percent; without rows where there were none."""
+    rows = []
+    for row in policy.event_rows:
+        counts, cells = row.counts, ["–"] * 5
+        if counts.pairs:
+            rates = [(counts.both + only) / counts.pairs for only in (counts.only_first, counts.only_second)]
+            value = f"{100 * row.difference.value:+.1f}".replace("-", "−")
+            cells = [*map(percent, rates), value, interval_text(row.difference), percent(counts.lost)]
+        rows.append([row.name, f"{row.began} of {row.episodes}", row.solved, *cells, p_text(row.p_value)])
+    p = Cell("p", title="McNemar's, of no effect")
+    return Table(("event", "began", "solvable", "without", "with", "difference", "95 %", "lost", p), rows)
+
+
+def pair_table(policy: Robustness) -> Table:
+    """Return the table of what two perturbations take together; without rows where none were run."""
+    rows = [
+        [
+            name_of(pair.condition),
+            *(percent(value, 0) for value in (pair.success.value, pair.expected)),
+            Cell(percent(pair.excess.value, 0), strong=True),
+            interval_text(pair.excess),
+        ]
+        for pair in policy.outcomes.interactions
+    ]
+    return Table(("two at once", "success", "expected", "excess", "95 %"), rows)
 
 
 def severity_text(severity: float) -> str:
@@ -179,12 +205,6 @@ def _horizon_text(policy: Robustness) -> str:
     values = policy.horizon.values()  # variants have those of their base task's suite
     steps = {suite: policy.horizon.get(suite, f"{min(values)} to {max(values)}") for suite in suites}
     return " / ".join(f"{count} {suite}" if len(steps) > 1 else str(count) for suite, count in steps.items())
-
-
-def _severities_text(e: Estimate) -> str:
-    if not math.isfinite(e.low):
-        return ""
-    return f"[{e.low:.2f}, {severity_text(e.high)}]"
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -246,41 +266,6 @@ def curves_figure(policies: Mapping[str, Sequence[Axis]], units: Mapping[str, st
             axes.set_ylabel("success (%)")
         if place + columns >= len(first):
             axes.set_xlabel("severity")
-    legend_below(figure)
-    return figure
-
-
-@matplotlib.rc_context(STYLE)
-def radar_figure(policies: Mapping[str, Sequence[Axis]]) -> Figure:
-    """Draw the success that is to be expected along each kind, its area, as a radar picture.
-
-    Args:
-        policies: Label of each policy and its axes; kinds are in the order of the first, by name.
-    """
-    kinds = sorted(axis.kind for axis in next(iter(policies.values())))
-    angles = np.linspace(0, 2 * np.pi, len(kinds), endpoint=False)
-    figure = Figure(figsize=(4.4, 4.2), layout="constrained")
-    axes = figure.add_subplot(projection="polar")
-    axes.set_theta_offset(np.pi / 2)  # type: ignore[attr-defined]  # of polar axes
-    axes.set_theta_direction(-1)  # type: ignore[attr-defined]
-    for number, (label, curves) in enumerate(policies.items()):
-        areas = {axis.kind: 100 * axis.area.value for axis in curves}
-        values = [areas.get(kind, np.nan) for kind in kinds]
-        look = _look(number, shorten(label, 60))
-        closed = [*angles, angles[0]], [*values, values[0]]
-        axes.plot(*closed, lw=1.5, ms=2.5, **look)
-        if number == 0:
-            axes.fill(*closed, color=look["color"], alpha=0.15, lw=0)
-    axes.set_ylim(0, 100)
-    axes.set_yticks((25, 50, 75, 100), ("25", "50", "75", "100 %"), fontsize=6.5)
-    axes.set_xticks(angles, kinds)
-    axes.tick_params(axis="x", pad=2)
-    for text, angle in zip(axes.get_xticklabels(), angles, strict=True):
-        side = round(np.sin(angle), 3)  # labels grow away from the circle
-        text.set_horizontalalignment("left" if side > 0 else "right" if side < 0 else "center")
-    axes.set_rlabel_position(180 / len(kinds))  # type: ignore[attr-defined]  # between two kinds
-    axes.grid(alpha=0.4)
-    axes.spines["polar"].set_linewidth(0.5)
     legend_below(figure)
     return figure
 

@@ -3,7 +3,7 @@
 All conditions are run from the same starts, so a (task, start) is one cluster of outcomes. Intervals draw starts anew
 within each task, the same for all conditions (a stratified bootstrap of clusters); tasks, kinds and severities are
 fixed, and so is the policy. Where all episodes of a cell end alike, the bootstrap has nothing to vary, so success rates
-have Wilson's intervals instead, and to other variances that of one start is added.
+have Wilson's intervals instead, and to other variances that of one start is added. Fewer than five starts have none.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,17 +19,9 @@ from libero_env.text import flatten, plain, shorten
 from libero_eval.evaluation_file import EvaluationResult, by_start
 from libero_eval.judging.comparability import settings
 from libero_eval.protocols.clock import Clock, Latency
+from libero_eval.stats.episodes import Counts, mcnemar_exact, score_interval
 from lifelong.errors import ResultsError
-from lifelong.stats.episodes import Counts, mcnemar_exact, score_interval
-from lifelong.stats.intervals import (
-    CONFIDENCE,
-    UNKNOWN,
-    Estimate,
-    Floats,
-    combine_intervals,
-    holm,
-    wilson_interval,
-)
+from lifelong.stats.intervals import CONFIDENCE, LEAST_EPISODES, Estimate, Floats, holm, mean_success
 
 DRAWS, SEED = 2000, 2023
 ENDS = ((1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2)  # quantiles
@@ -48,7 +40,7 @@ class Axis:
         success: V success rates, means over tasks.
         area: Area under the line through these, over the measured severities and divided by their range: the success
             that is to be expected at a severity between 0 and the largest.
-        kept: That area as a share of the base's success; 1 if nothing is lost.
+        kept: That area as a share of the base's success; 1 if nothing is lost, or success even rises.
         half: Least severity at which the line has fallen to half of the base's success; infinite where it has not.
         p_value: Two-sided p-value of no effect at all: then the outcomes of a start are exchangeable over severities,
             and are permuted.
@@ -159,16 +151,13 @@ class Outcomes:
 
     @property
     def _least(self) -> float:
-        """Variance that one start adds: nothing is certain because all episodes ended alike."""
-        return ONE_EPISODE / (len(self.tasks) * len(self.starts)) ** 2
+        """Variance that one start adds: nothing is certain because all episodes ended alike. NaN of fewer than five."""
+        count = len(self.tasks) * len(self.starts)
+        return ONE_EPISODE / count**2 if count >= LEAST_EPISODES else np.nan
 
     def success(self, condition: Condition) -> Estimate:
-        """Return the success rate of a condition, with the interval of Wilson's of its tasks."""
-        wins = self.successes[self.conditions.index(condition)].sum(1)
-        count = np.full(len(self.tasks), len(self.starts))
-        low, high = wilson_interval(wins, count)
-        mean = combine_intervals(np.full(len(wins), 1 / len(wins)), wins / count, low, high)
-        return Estimate(mean.value, max(0.0, mean.low), min(1.0, mean.high))
+        """Return the success rate of a condition, see `mean_success`."""
+        return mean_success(self.successes[self.conditions.index(condition)].sum(1), len(self.starts))
 
     @cached_property
     def axes(self) -> tuple[Axis, ...]:
@@ -193,9 +182,11 @@ class Outcomes:
         mean, drawn = float(rates @ weights), draws @ weights
         area = _estimate(mean, drawn, self._least, 0.0, 1.0)
         shares = _share(mean, float(rates[0])), _shares(drawn, draws[:, 0])
-        kept = _estimate(*shares, self._least, 0.0, np.inf)
+        kept = _estimate(*shares, self._least, 0.0, 1.0)
         halves = np.array([half_severity(severities, row) for row in draws])
-        low, high = np.quantile(halves, ENDS, method="nearest")
+        low, high = (
+            np.quantile(halves, ENDS, method="nearest") if np.isfinite(self._least) else (np.nan, np.nan)
+        )
         half = Estimate(half_severity(severities, rates), float(low), float(high))
         p_value = _exchange_test(self.successes[columns].reshape(len(columns), -1).T, weights)
         return Axis(kind, severities, tuple(map(self.success, conditions)), area, kept, half, p_value)
@@ -206,7 +197,7 @@ class Outcomes:
         rates, draws = self.rates[columns], self.draws[:, columns]
         expected = _share(float(rates[1] * rates[2]), float(rates[3]))
         drawn = draws[:, 0] - _shares(draws[:, 1] * draws[:, 2], draws[:, 3])
-        excess = _estimate(float(rates[0]) - expected, drawn, self._least, -np.inf, np.inf)
+        excess = _estimate(float(rates[0]) - expected, drawn, self._least, -1.0, 1.0)
         return Interaction(condition, self.success(condition), expected, excess)
 
 
@@ -231,7 +222,7 @@ class EventRow:
     @property
     def difference(self) -> Estimate:
         """Success with the event minus that without, with Tango's interval; NaN without episodes."""
-        found = score_interval(self.counts) if self.counts.pairs else UNKNOWN
+        found = score_interval(self.counts)
         return Estimate(0.0 - found.value, 0.0 - found.high, 0.0 - found.low)
 
     @property
@@ -260,6 +251,7 @@ class Robustness:
         redrawn: Number of draws that were given up, by condition.
         events: By condition with an event, whether it began in each episode, and whether the expert solves the rest.
         horizon: Control steps after which an episode ends, or these by suite.
+        protocol: What the protocol without perturbations is called.
         settings: Everything else that policies beside each other should have in common, flat, by dotted name.
     """
 
@@ -269,6 +261,7 @@ class Robustness:
     redrawn: Mapping[str, int] = field(default_factory=dict)
     events: Mapping[Condition, Mapping[tuple[str, int], tuple[bool, bool]]] = field(default_factory=dict)
     horizon: int | Mapping[str, int] = 0
+    protocol: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
@@ -331,7 +324,7 @@ def _odd_settings(base: EvaluationResult, result: EvaluationResult, condition: C
     """Return where a condition's policy and settings are not the base's, apart from what the condition changes."""
     more = ({"evaluated": r.evaluated, "versions.mujoco": r.versions.get("mujoco")} for r in (base, result))
     a, b = (settings(one) | flatten(plain(its)) for one, its in zip((base, result), more, strict=True))
-    changed, clock = ("tasks.", "protocol.sources.", "protocol.world.perturb"), "protocol.action.clock"
+    changed, clock = ("tasks.", "protocol.world.perturb"), "protocol.action.clock"
     if LATENCY in dict(condition):
         for values in (a, b):
             values[clock] = str(replace(Clock.read(values.get(clock, "")), latency=Latency()))
@@ -379,17 +372,19 @@ def _exchange_test(outcomes: NDArray[np.bool_], weights: Floats) -> float:
 
 
 def _share(part: float, whole: float) -> float:
-    return float(part / whole) if whole > 0 else float("nan")
+    """Return a share, at most 1; NaN of nothing."""
+    return min(1.0, float(part / whole)) if whole > 0 else float("nan")
 
 
 def _shares(parts: Floats, wholes: Floats) -> Floats:
-    return np.divide(parts, wholes, out=np.zeros_like(parts, dtype=float), where=np.asarray(wholes) > 0)
+    shares = np.divide(parts, wholes, out=np.zeros_like(parts, dtype=float), where=np.asarray(wholes) > 0)
+    return np.minimum(shares, 1.0)
 
 
 def _estimate(value: float, draws: Floats, least: float, low: float, high: float) -> Estimate:
     """Return a value with the quantiles of its draws, to whose distances the variance `least` is added."""
-    if np.isnan(value):
-        return UNKNOWN
+    if np.isnan(value + least):
+        return Estimate(value, np.nan, np.nan)
     ends = np.quantile(draws, ENDS)
     down, up = np.hypot(np.maximum([value - ends[0], ends[1] - value], 0), 1.96 * np.sqrt(least))
     return Estimate(value, max(low, float(value - down)), min(high, float(value + up)))

@@ -2,18 +2,19 @@
 
 import io
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stderr
 from dataclasses import replace
 from pathlib import Path
 
 from libero_env.perturbations import format_perturbations, parse_perturbations
-from libero_env.storage import require_own_folders
+from libero_env.storage import own_folder
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult
 from libero_eval.judging.comparability import settings
-from libero_eval.plan import further_process, load_policy, plan_evaluation, policy_threads
+from libero_eval.plan import load_policy, plan_evaluation, setting
 from libero_eval.policies import PolicyUnderTest
 from libero_eval.protocols.files import load_protocol
+from libero_eval.protocols.naming import protocol_label
 from libero_eval.requests import (
     CLOCK,
     EVENT_SEVERITIES,
@@ -25,11 +26,10 @@ from libero_eval.requests import (
 )
 from libero_eval.robustness.results import LATENCY, Condition, Outcomes, Robustness, events_of, name_of
 from libero_eval.work.evaluation import Evaluation
-from libero_eval.work.worker import Worker, Workers
+from libero_eval.work.scheduler import Told, carry_out
 from lifelong.errors import ConfigError
 
 CONDITIONS = "conditions"  # folder of the evaluations
-Told = Callable[[str, EvaluationResult, int, int], None]
 
 
 def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_: None) -> tuple[str, Path]:
@@ -49,71 +49,26 @@ def study_robustness(request: RobustnessRequest, on_condition: Told = lambda *_:
             "protocol without world.perturb"
         )
     policy = load_policy(request)
-    if request.out is None:
-        require_own_folders(policy.out, "robustness", error=ConfigError)
-    out = request.out or policy.out / "robustness"
-    require_own_folders(
-        out, CONDITIONS, *(f"{CONDITIONS}/{one or 'none'}" for one in conditions), error=ConfigError
-    )
+    out = request.out or policy.folder(*setting(request), "robustness")
+    for one in conditions:
+        own_folder(out, CONDITIONS, one or "none", error=ConfigError)
     request = replace(request, out=out)
-    evaluations = _plan(request, policy, conditions)
+    evaluations = _plan(request, policy)
     clock = evaluations[""].protocol.action.clock
     if clock and request.clock is None and any(one.startswith(CLOCK) for one in conditions):
         raise ConfigError(
             f"--kinds clock: protocol {request.protocol} has the clock {clock}; say with --clock what of it holds for "
             "all latencies, such as wait=hold"
         )
-    if request.again:
-        for evaluation in evaluations.values():
-            evaluation.store.clear()
-        request = replace(request, again=False)
-    try:
-        with Workers(min(request.workers, len(conditions)) - 1, _help, request) as workers:
-            _work(evaluations, workers, on_condition)
-    except KeyboardInterrupt as error:
-        error.add_note(f"{out} keeps what is done; the same command goes on")
-        raise
+    carry_out(_plan, request, evaluations, on_done=on_condition)
     return _name(policy), out
 
 
-@further_process()
-def _help(request: RobustnessRequest) -> None:
-    """Work on the conditions of another process; errors go to the standard error."""
-    with redirect_stderr(io.StringIO()):  # the other process says the same
-        evaluations = _plan(request, load_policy(request), conditions_of(request))
-    _work(evaluations)
-
-
-def _work(
-    evaluations: Mapping[str, Evaluation],
-    workers: Workers | None = None,
-    on_condition: Told = lambda *_: None,
-) -> None:
-    """Take units of all conditions until none is free; the first process waits for those of others at the end."""
-    units: dict[str, int] = {}  # of the conditions that are done
-    for wait in (False, True) if workers else (False,):
-        for condition, evaluation in evaluations.items():
-            if condition in units:
-                continue
-
-            def supervise(done: int, before: int = sum(units.values())) -> None:
-                if workers:
-                    workers.supervise(before + done)
-
-            with policy_threads(evaluation):
-                result = Worker(evaluation, on_wait=supervise).run(wait=wait)
-            if result is not None:
-                units[condition] = len(evaluation.units)
-                on_condition(condition, result, len(units), len(evaluations))
-
-
-def _plan(
-    request: RobustnessRequest, policy: PolicyUnderTest, conditions: Sequence[str]
-) -> dict[str, Evaluation]:
+def _plan(request: RobustnessRequest, policy: PolicyUnderTest | None = None) -> dict[str, Evaluation]:
     """Return the evaluation of each condition; notes are said once."""
     assert request.out is not None
-    planned: dict[str, Evaluation] = {}
-    for condition in conditions:
+    policy, planned = policy or load_policy(request), dict[str, Evaluation]()
+    for condition in conditions_of(request):
         with redirect_stderr(io.StringIO() if planned else sys.stderr):
             out = request.out / CONDITIONS / (condition or "none")
             planned[condition] = plan_evaluation(request.condition(condition, out), policy)
@@ -209,12 +164,12 @@ def read_study(folder: Path, name: str = "", conditions: Sequence[str] | None = 
             f"{folder} holds no finished conditions; `libero robustness POLICY --out {folder}` makes them"
         )
     outcomes, base = Outcomes.of(results), results[()]
-    words = ("protocol.sources.", "protocol.title")
-    common = {k: v for k, v in settings(base).items() if not k.startswith(words)}
+    common = settings(base)
     common["versions.mujoco"] = base.versions.get("mujoco")
     common["seeds of perturbations"] = ", ".join(map(str, sorted(seeds)))
     horizon = base.protocol["episode"]["horizon"]
-    return Robustness(name or folder.name, outcomes, (str(folder),), redrawn, events, horizon, common)
+    label = protocol_label(base.protocol, base.suites)
+    return Robustness(name or folder.name, outcomes, (str(folder),), redrawn, events, horizon, label, common)
 
 
 def _name(policy: PolicyUnderTest) -> str:

@@ -1,18 +1,15 @@
-"""Planners whose actions come from a policy server: in chunks under a protocol, or as of a run in process."""
+"""Planners whose actions come from a policy server, in chunks under a protocol."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from libero_env.envs.checks import checked_numbers
-from libero_env.tasks import get_task
 from libero_eval.protocols.adapter import ACTION_DIM, ProtocolAdapter
-from libero_eval.servers.openpi import OpenpiClient
-from libero_eval.servers.serving import PREFIX
 from libero_eval.servers.transport import EpisodeStart, PolicyClient
 from lifelong.errors import ServerError
-from lifelong.evaluation.environments import Obs
+from lifelong.evaluation.actors import Obs
 
 
 class RemoteActor:
@@ -93,62 +90,3 @@ def checked_actions(answer: Any, replan: int | None, where: str) -> np.ndarray:
     if len(chunk) < (replan or 1):
         raise ServerError(f"{where} sent {len(chunk)} actions; the protocol executes {replan} of each answer")
     return chunk
-
-
-class ServedActor:
-    """Actions of a run that `libero serve` serves: it is sent what the policy would see in process, to the bit.
-
-    All simulations of a task are one request, so that they are computed as in process. The server has the history, so
-    it is sent every observation, and in `plan` which simulations ask.
-
-    Args:
-        client: The server.
-        announced: Its metadata.
-        episodes: Episode of each simulation; all of one task.
-        seeds: Words from which the generator of each episode is made, for stochastic policies.
-    """
-
-    observes = "always"
-
-    def __init__(
-        self,
-        client: OpenpiClient,
-        announced: Mapping[str, Any],
-        episodes: Sequence[EpisodeStart],
-        seeds: Sequence[Sequence[int]],
-    ):
-        self._client, self._episodes = client, episodes
-        self._names = [key.removeprefix(PREFIX) for key in announced["observation"]]
-        self.views = tuple(name for name in self._names if name.endswith("_rgb"))
-        self.action_dim = int(announced["actions"]["shape"][-1])
-        self.replan = int(announced["replan"])
-        task = episodes[0].task
-        self._first = {"reset": True, "seed": [list(words) for words in seeds]}
-        if task.suite != "file":  # the server does not have those
-            self._first["task"] = task.id
-        reworded = task.suite != "file" and task.language != get_task(task.id).language
-        self._first["instruction" if reworded else "prompt"] = task.language
-        self._begun = self._connected = False
-
-    def reset(self, num_envs: int) -> None:
-        """Let the next request begin the episodes; see `lifelong.evaluation.actors.Actor`."""
-        if not self._connected:
-            self._client.open(self._episodes[:1])
-        self._connected, self._begun = True, False
-
-    def plan(self, obs: Obs, rows: Sequence[int]) -> np.ndarray:
-        """Return the chunks of some simulations, (len(rows), H, 7) float64.
-
-        Raises:
-            ServerError: The server fails, is too late, or its actions are not valid.
-            ConnectionLost: The connection breaks.
-        """
-        request: dict[str, Any] = {PREFIX + name: np.asarray(obs[name]) for name in self._names}
-        request["plan"] = list(rows)
-        actions = self._client.request(request if self._begun else request | self._first).get("actions")
-        self._begun = True
-        name, wanted = f"the actions of {self._client.address}", f"({len(rows)}, H, {self.action_dim})"
-        chunks = checked_numbers(actions, name, (wanted,), ServerError)
-        if chunks.ndim != 3 or chunks.shape[::2] != (len(rows), self.action_dim):
-            raise ServerError(f"{name}: expected shape {wanted}, got {chunks.shape}")
-        return chunks

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from libero_eval.protocols.adapter import PolicyInput
-from libero_eval.servers.transport import Codec, Connection, WebSocketClient, array_of, refuse
+from libero_eval.servers.codec import Codec, array_of, refuse
+from libero_eval.servers.transport import Connection, WebSocketClient
 
 
 def _encode(value: np.ndarray | np.generic) -> dict:
@@ -63,14 +64,3 @@ class OpenpiClient(WebSocketClient):
     def receive(self, connection: Connection) -> Mapping[str, Any]:
         """Return the server's answer to an observation."""
         return connection.receive_map("actions")
-
-    def request(self, observation: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the server's answer to an observation of the first simulation, as it is.
-
-        Raises:
-            ServerError: The server fails, is too late, or answers something else than a map.
-            ConnectionLost: The connection breaks.
-        """
-        connection = self._connections[0]
-        connection.send(observation)
-        return self.receive(connection)

@@ -14,14 +14,10 @@ from libero_env.tasks import Task, get_task
 from libero_eval.policies import PROBE_TOLERANCE, PolicyUnderTest
 from libero_eval.protocols.adapter import ProtocolAdapter, view_of
 from libero_eval.protocols.clock import Planner
-from libero_eval.protocols.environment import run_protocol
 from libero_eval.protocols.protocol import EvalProtocol
 from libero_eval.requests import Request
-from libero_eval.servers.actors import RemoteActor, ServedActor, checked_actions
-from libero_eval.servers.openpi import OpenpiClient
-from libero_eval.servers.serving import PREFIX, SERVER, announced_run
+from libero_eval.servers.actors import RemoteActor, checked_actions
 from libero_eval.servers.transport import EpisodeStart, Limits, PolicyClient
-from lifelong.data.settings import CAMERAS
 from lifelong.errors import ConfigError, ProtocolError, ServerError
 
 # scheme of an address -> module and class of its client, scheme of its transport
@@ -31,6 +27,7 @@ CLIENTS = {
     "vla-eval": ("libero_integrations.servers.vla_eval", "VlaEvalClient", "ws"),
     "gr00t": ("libero_integrations.servers.groot", "GrootClient", "tcp"),
 }
+SERVER = "libero-lifelong"  # what `libero serve` announces
 PROBED = {"ee_pos": 3, "gripper_states": 2}  # of the fixed observation: name -> size
 
 
@@ -57,7 +54,7 @@ def checked_address(url: str, given: str) -> str:
 
 
 class ServerPolicy(PolicyUnderTest):
-    """A policy on a server: openpi's (`ws://`), vla-eval's (`vla-eval://`), GR00T's (`gr00t://`), or `libero serve`'s.
+    """A policy on a server: openpi's (`ws://`), vla-eval's (`vla-eval://`) or GR00T's (`gr00t://`).
 
     What the server announces is part of the policy's identity, and is compared with the protocol before anything runs.
     A server that announces neither `weights` nor `checkpoint` does not say which policy it serves: that must be named.
@@ -65,7 +62,7 @@ class ServerPolicy(PolicyUnderTest):
     Raises:
         UnknownNameError: The address is of no kind of server.
         ServerError: The server is not there, or is of another kind.
-        ConfigError: Nothing says which policy it serves.
+        ConfigError: Nothing says which policy it serves, or it is a run of this package.
     """
 
     def __init__(self, request: Request):
@@ -74,48 +71,31 @@ class ServerPolicy(PolicyUnderTest):
         with self._client() as client:
             self.announced, self._kind = client.announced, type(client)
         about = self.announced
-        self.is_run = self.relative = about.get("server") == SERVER  # a policy of this package
         self.identity = {"server": given, "announced": about}
-        self.out = Path("eval") / re.sub(r"\W+", "_", given).strip("_")
+        self.place = Path(re.sub(r"\W+", "_", given).strip("_"))
         self._answer: np.ndarray | None = None
-        if self.is_run:
-            run = announced_run(about, given)
-            self.selection = run["selection"]
-            self.tasks = tuple(get_task(name) for name in run["tasks"] if not name.startswith("file/"))
-            names = [key.removeprefix(PREFIX) for key in run["observation"]]
-            self._views = [name for name in names if name in CAMERAS]
-            self.cameras = tuple(CAMERAS[view] for view in self._views)
-        elif not (request.name or about.get("weights") or about.get("checkpoint")):
+        if about.get("server") == SERVER:
+            raise ConfigError(f"{given} serves a run of this package: libero eval RUN evaluates it as it is")
+        if not (request.name or about.get("weights") or about.get("checkpoint")):
             raise ConfigError(
                 f"{given} does not say which policy it serves, so another one there would go unnoticed: "
                 "name it, such as --name pi0_step30000 (or let it announce `checkpoint`)"
             )
 
     def protocol(self, base: EvalProtocol) -> EvalProtocol:
-        """Return the protocol; see `PolicyUnderTest`. Of a served run it is the one that the run has in process.
+        """Return the protocol; see `PolicyUnderTest`.
 
         Raises:
             ProtocolMismatchError: The server announces something else; the message names both values.
             ProtocolError: The protocol does not state how many actions are executed, and the server needs it.
         """
-        about = self.announced
-        if self.is_run:
-            return run_protocol(
-                base,
-                tuple(about["observation"][PREFIX + self._views[0]]["shape"][:2]),
-                about["horizon"],
-                about["settle_steps"],
-                about["robot"],
-                drawing=about["drawing"],
-                assets=self.request.assets,
-            )
         clock = base.action.clock if self.request.clock is None else self.request.clock
         if self.request.seed and not clock:  # whose latencies it draws
             raise ConfigError(
                 f"--seed {self.request.seed}: {self.given} draws by itself, and is sent no seed; leave it out, and "
                 "evaluate again with another --out"
             )
-        base.check(self._kind.stated(about))
+        base.check(self._kind.stated(self.announced))
         if base.action.replan is None and self._kind.needs_replan:
             raise ProtocolError(
                 f"protocol {base.name} does not state action.replan, the number of actions that are executed of each "
@@ -124,12 +104,7 @@ class ServerPolicy(PolicyUnderTest):
         return base
 
     def probe(self, protocol: EvalProtocol) -> tuple[float, ...] | None:
-        """Return what the server answers to a fixed observation, if it answers so twice; see `PolicyUnderTest`.
-
-        That of a served run has a digest of its weights.
-        """
-        if self.is_run:
-            return None
+        """Return what the server answers to a fixed observation, if it answers so twice; see `PolicyUnderTest`."""
         if self._answer is None:
             with self._client() as client:
                 first, second = self._ask(client, protocol), self._ask(client, protocol)
@@ -160,10 +135,6 @@ class ServerPolicy(PolicyUnderTest):
         episodes = [EpisodeStart(task, state) for state in states]
         with self._client() as client:
             client.check_same(client.announced, self.announced)
-            if self.is_run:
-                assert isinstance(client, OpenpiClient)
-                yield ServedActor(client, self.announced, episodes, self.seeds(task, states))
-                return
             if self._answer is not None and self._answer.size:
                 off = np.abs(self._ask(client, protocol) - self._answer).max()
                 if off > PROBE_TOLERANCE:

@@ -23,96 +23,31 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from http import HTTPStatus
 from itertools import count
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
-from typing_extensions import TypedDict
 
 from libero_env.errors import LiberoError, require_known
-from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.tasks import Task, get_suite, suite_names
 from libero_env.text import printable, shorten, shown
-from libero_env.validation import validate
 from libero_eval.servers.openpi import OPENPI
+from libero_eval.servers.policy import SERVER
 from libero_eval.servers.transport import API_KEY, need
 from lifelong.algorithms.base import Algorithm
-from lifelong.data.settings import CAMERAS, LOW_DIM_KEYS
 from lifelong.errors import PolicyError, ServerError
 from lifelong.evaluation.actors import PolicyActor
 from lifelong.evaluation.restore import LoadedRun
 from lifelong.results.provenance import installed_versions
-from lifelong.seeding import EVALUATION, generator
+from lifelong.seeding import generator
 
-SERVER, FORMAT = "libero-lifelong", 1  # the first entries of what is announced
+FORMAT = 1  # of what is announced
 PREFIX = "observation/"
 _SERVED = 5  # first word of the seeds of episodes whose client sends none
 # names of openpi's LIBERO observations, and what of a policy's inputs follows from them
 _OPENPI_IMAGES = {"agentview_rgb": "image", "eye_in_hand_rgb": "wrist_image"}
 _OPENPI_STATE = {"ee_pos": slice(0, 3), "gripper_states": slice(6, 8)}
-MAX_ROWS = 100  # of a request; a task has fifty initial states
 MAX_WORDS = 1000  # characters of an instruction
-_KEYS = ("prompt", "task", "instruction", "reset", "seed", "plan")  # of a request, beside the observation
-
-
-class _Array(TypedDict):
-    dtype: str
-    shape: Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(min_length=1, max_length=3)]
-
-
-class _Actions(_Array):
-    chunk: Literal[1]
-    replan: Literal[1]
-
-
-class Announced(TypedDict):
-    """What `libero serve` announces to every client."""
-
-    server: str
-    format: int
-    versions: dict[str, str]
-    run: str
-    after: Annotated[int, Field(ge=0)]
-    weights: Annotated[str, Field(min_length=1)]
-    protocol: str
-    horizon: int
-    settle_steps: int
-    drawing: str | None
-    robot: str
-    selection: tuple[Annotated[int, Field(ge=0, lt=NUM_INIT_STATES)], ...]
-    observation: dict[str, _Array]
-    images: Literal["upright: first row on top, not mirrored"]
-    actions: _Actions
-    replan: Annotated[int, Field(ge=1)]
-    gripper: Literal["opens at -1, closes at +1"]
-    openpi_names: bool
-    tasks: dict[str, str]
-    reset: str
-
-
-def announced_run(about: Mapping[str, Any], address: str) -> Announced:
-    """Return the metadata of `libero serve`, checked.
-
-    Raises:
-        ServerError: They are of another format, or something is missing or of another kind.
-    """
-    if about.get("format") != FORMAT:
-        raise ServerError(
-            f"{address} is of format {shown(about.get('format'))}; this version reads {FORMAT}: "
-            "serve the run with the version that evaluates it"
-        )
-    run: Announced = validate(Announced, about, source=f"the metadata of {address}", error=ServerError)
-    views = [key for key, one in run["observation"].items() if key.removeprefix(PREFIX) in CAMERAS]
-    known = {PREFIX + name for name in (*CAMERAS, *LOW_DIM_KEYS)}
-    if (
-        run["observation"].keys() - known
-        or not views
-        or any(len(run["observation"][v]["shape"]) != 3 for v in views)
-    ):
-        raise ServerError(
-            f"the metadata of {address}: observation must have images, and only {', '.join(sorted(known))}"
-        )
-    return run
+_KEYS = ("prompt", "task", "instruction", "reset", "seed")  # of a request, beside the observation
 
 
 @dataclass(frozen=True)
@@ -120,20 +55,16 @@ class Request:
     """A client's observation.
 
     Attributes:
-        obs: (B, ...) arrays under the names of `libero_env.envs.batch.BatchEnv`.
-        rows: Whether the client sent a leading axis B; otherwise B is 1.
+        obs: (1, ...) arrays under the names of `libero_env.envs.batch.BatchEnv`.
         task: Task that is acted on.
         reset: Whether an episode begins with this request.
-        seeds: Words from which the generator of each row is made, if the client sent them.
-        plan: Rows of which chunks are asked for; None for the next action of each.
+        seed: Words from which the episode's generator is made, if the client sent them.
     """
 
     obs: Mapping[str, np.ndarray]
-    rows: bool
     task: Task
     reset: bool
-    seeds: Sequence[Sequence[int]] | None
-    plan: Sequence[int] | None
+    seed: Sequence[int] | None
 
 
 class ServedPolicy:
@@ -171,7 +102,6 @@ class ServedPolicy:
             "observation": {PREFIX + name: about for name, about in (images | readings).items()},
             "images": "upright: first row on top, not mirrored",
             "actions": {"dtype": "float64", "shape": [1, spec.action_dim], "chunk": 1, "replan": 1},
-            "replan": run.policy.execute,
             "gripper": "opens at -1, closes at +1",
             "openpi_names": not self._lacking(),
             "tasks": {task.id: task.language for task in run.tasks},
@@ -181,11 +111,6 @@ class ServedPolicy:
     def session(self) -> "Session":
         """Return the episodes of a new client."""
         return Session(self, next(self._sessions))
-
-    def beginning(self, task: Task, init_state: int) -> dict[str, Any]:
-        """Return the entries of a request with which an episode begins that has the random numbers of `libero eval`."""
-        words = [self.seed, EVALUATION, task.index, init_state]
-        return {"reset": True, "task": task.id, "prompt": task.language, "seed": words}
 
     def own_copy(self) -> LoadedRun:
         """Return the run with a policy that acts by itself; weights are shared where the algorithm changes none."""
@@ -216,24 +141,12 @@ class ServedPolicy:
         spec = self.run.policy.spec
         shapes: dict[str, tuple[int, ...]] = dict.fromkeys(spec.views, (*spec.image_size, 3))
         shapes |= {name: (size,) for name, size in spec.proprio.items()}
-        rows = _array(message.get(PREFIX + spec.views[0], 0), PREFIX + spec.views[0]).ndim == 4
-        obs = {name: _checked(message, name, shape, rows) for name, shape in shapes.items()}
-        if len({len(value) for value in obs.values()}) > 1:
-            raise PolicyError(
-                f"numbers of rows differ: { {name: len(value) for name, value in obs.items()} }"
-            )
-        task = self._task(message, before)
-        seeds, reset = message.get("seed"), message.get("reset", False)
-        if seeds is not None:
-            seeds = _seeds(seeds, len(next(iter(obs.values()))), rows)
+        obs = {name: _checked(message, name, shape) for name, shape in shapes.items()}
+        seed, reset = message.get("seed"), message.get("reset", False)
         if not isinstance(reset, bool | np.bool_):
             raise PolicyError("reset is neither true nor false")
-        plan, places = message.get("plan"), range(len(next(iter(obs.values()))))
-        if plan is not None and not (
-            isinstance(plan, list) and all(type(i) is int and i in places for i in plan)
-        ):
-            raise PolicyError(f"plan is {shown(plan)}; valid: a list of rows, from 0 to {len(places) - 1}")
-        return Request(obs, rows, task, bool(reset), seeds, plan)
+        words = None if seed is None else _seed(seed)
+        return Request(obs, self._task(message, before), bool(reset), words)
 
     def _task(self, message: Mapping[str, Any], before: Task | None) -> Task:
         """Return the task that a request names by `task`, `suite/index`, or by its instruction, `prompt`.
@@ -280,10 +193,10 @@ class ServedPolicy:
             )
         request = {k: v for k, v in message.items() if not str(k).startswith(PREFIX)}
         for view in spec.views:
-            image = _checked(message, _OPENPI_IMAGES[view], (*spec.image_size, 3), False)[0]
+            image = _checked(message, _OPENPI_IMAGES[view], (*spec.image_size, 3))[0]
             request[PREFIX + view] = image[:, ::-1]
         if spec.proprio:
-            state = _checked(message, "state", (8,), False)[0]
+            state = _checked(message, "state", (8,))[0]
             request |= {PREFIX + name: state[_OPENPI_STATE[name]] for name in spec.proprio}
         return request
 
@@ -301,48 +214,37 @@ class Session:
         self._stack, self._episodes = ExitStack(), 0
         self._actor: PolicyActor | None = None
         self._task: Task | None = None
-        self._rows = 0
 
     def infer(self, message: Any) -> dict[str, Any]:
-        """Return the answer to a request: `actions` (1, 7) float64, or (B, 1, 7) for B rows; with `plan`, their chunks.
+        """Return the answer to a request: `actions` (1, 7) float64.
 
         Raises:
             PolicyError: The request is not valid, or its actions are not finite.
         """
         request = self._served.read(message, self._task)
-        rows = len(next(iter(request.obs.values())))
         if self._actor is None or request.reset or self._task != request.task:
-            self._begin(request, rows)
-        elif rows != self._rows:
-            raise PolicyError(
-                f"{rows} rows in an episode that began with {self._rows}; begin another with reset: true"
-            )
+            self._begin(request)
         assert self._actor is not None
-        if request.plan is not None:
-            actions = self._actor.plan(request.obs, request.plan)
-        else:
-            actions = self._actor.act(request.obs)[:, None]
+        actions = self._actor.act(request.obs)
         if not np.isfinite(actions).all():
             raise PolicyError("the policy answers this observation with actions that are not finite")
-        return {"actions": actions if request.rows or request.plan is not None else actions[0]}
+        return {"actions": actions}
 
     def close(self) -> None:
         """Forget the client."""
         self._stack.close()
         self._actor = self._run = None
 
-    def _begin(self, request: Request, rows: int) -> None:
+    def _begin(self, request: Request) -> None:
         self._stack.close()
         self._run = run = self._run or self._served.own_copy()
-        seeds = request.seeds
-        if seeds is None:
-            words = (self._served.seed, _SERVED, self._number, self._episodes)
-            seeds = [(*words, row) for row in range(rows)]
+        words = request.seed or (self._served.seed, _SERVED, self._number, self._episodes, 0)
         policy = self._stack.enter_context(run.acting(request.task))
-        draws = [generator(*words) for words in seeds]
-        actor = PolicyActor(policy, run.embed(request.task), run.device, run.eval.precision, draws)
-        actor.reset(rows)
-        self._actor, self._task, self._rows = actor, request.task, rows
+        actor = PolicyActor(
+            policy, run.embed(request.task), run.device, run.eval.precision, [generator(*words)]
+        )
+        actor.reset(1)
+        self._actor, self._task = actor, request.task
         self._episodes += 1
 
 
@@ -366,33 +268,27 @@ def _array(value: Any, key: str) -> np.ndarray:
         raise PolicyError(f"{key} is not an array ({error})") from None
 
 
-def _checked(message: Mapping[str, Any], name: str, shape: tuple[int, ...], rows: bool) -> np.ndarray:
-    """Return an array of a request with a leading axis, (B, *shape)."""
+def _checked(message: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return an array of a request with a leading axis, (1, *shape)."""
     key, image = PREFIX + name, len(shape) == 3
     if key not in message:
         names = shorten(", ".join(sorted(str(k) for k in message)) or "nothing", 500)
         raise PolicyError(f"the request lacks {key}; it has {names}")
     value = _array(message[key], key)
-    expected = f"({'B, ' if rows else ''}{', '.join(map(str, shape))})"
-    wanted = "u" if image else "fiu"
-    batch = value if rows else value[None]
-    if value.dtype.kind not in wanted or (image and value.dtype != np.uint8):
+    if value.dtype.kind not in ("u" if image else "fiu") or (image and value.dtype != np.uint8):
         raise PolicyError(f"{key} has dtype {value.dtype}; valid: {'uint8' if image else 'floats'}")
-    if batch.shape[1:] != shape or not 1 <= len(batch) <= MAX_ROWS:
-        raise PolicyError(f"{key} has shape {value.shape}; this policy's is {expected}")
-    if not image and not np.isfinite(batch).all():
+    if value.shape != shape:
+        raise PolicyError(f"{key} has shape {value.shape}; this policy's is {shape}")
+    if not image and not np.isfinite(value).all():
         raise PolicyError(f"{key} has values that are not finite")
-    return batch
+    return value[None]
 
 
-def _seeds(seeds: Any, count: int, rows: bool) -> list[tuple[int, ...]]:
-    """Return the words of each row's seed: a list of integers, or one such list for each row."""
-    words = _array(seeds if rows else [seeds], "seed")
-    if words.ndim != 2 or words.dtype.kind not in "iu" or len(words) != count or (words < 0).any():
-        raise PolicyError(
-            f"seed is {shown(seeds)}; valid: integers from 0, as a list, or a list for each of {count} rows"
-        )
-    return [tuple(map(int, row)) for row in words]
+def _seed(seed: Any) -> tuple[int, ...]:
+    words = _array(seed, "seed")
+    if words.ndim != 1 or words.dtype.kind not in "iu" or not len(words) or (words < 0).any():
+        raise PolicyError(f"seed is {shown(seed)}; valid: a list of integers from 0")
+    return tuple(map(int, words))
 
 
 class PolicyServer:
@@ -429,9 +325,10 @@ class PolicyServer:
         Raises:
             ServerError: The address cannot be listened on.
         """
+        need("msgpack")  # before anything is listened to
         serve = need("websockets.asyncio.server").serve
-        row = sum(8 * math.prod(one["shape"]) for one in self._metadata["observation"].values())
-        most = (1 << 20) + MAX_ROWS * row  # of a request, [bytes]
+        sent = sum(8 * math.prod(one["shape"]) for one in self._metadata["observation"].values())
+        most = (1 << 20) + sent  # of a request, [bytes]
         options = {"compression": None, "max_size": most, "max_queue": 1}
         loop = asyncio.get_running_loop()
         loop.set_default_executor(ThreadPoolExecutor(1, thread_name_prefix="policy"))  # one request at a time

@@ -5,6 +5,7 @@ a folder they share, see `libero_eval.work.worker`; each may be killed, and the 
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -16,16 +17,18 @@ from typing import Any
 
 from libero_env.errors import LiberoError
 from libero_env.expert.expert import solved_from_events
+from libero_env.parallel import this_process
 from libero_env.perturbations import parse_perturbations
 from libero_env.perturbations.events import NEVER
 from libero_env.tasks import Task
 from libero_env.text import json_safe
-from libero_eval.evaluation_file import EvaluationResult, Stopped, TaskResult, world_of
+from libero_eval.evaluation_file import EvaluationResult, Stopped, TaskResult, known_by, world_of
+from libero_eval.protocols.naming import compared
 from libero_eval.protocols.protocol import EvalProtocol
-from libero_eval.work.claims import LEASE
+from libero_eval.stats.sequential import shuffled
 from libero_eval.work.progress import busy_seconds
 from libero_eval.work.stopping import StoppingRule
-from libero_eval.work.store import PLAN_FORMAT, Unit, UnitResult, WorkStore, describe, partition, this_process
+from libero_eval.work.store import PLAN_FORMAT, Unit, UnitResult, WorkStore, describe, partition
 from lifelong.errors import ConfigError, EvaluationIncompleteError
 from lifelong.evaluation.actors import Actor, WatchesWorld
 from lifelong.evaluation.environments import EnvPool, VectorEnv, common_environment, describe_environment
@@ -59,9 +62,9 @@ class Evaluation:
         probe: What the policy answers to a fixed observation, where that repeats; another answer is another policy.
         policy_threads: Number of threads of the policy on the CPU, on which its bits depend; None where the policy is
             not one of this package, or runs elsewhere. Whoever runs the evaluation sets it.
-        lease: Time after which a unit of a silent process is given to another, [s].
         until: When it may stop before all episodes are run.
         stopped: How the result was stopped that is run again; None where this is not one, or it was not.
+        shuffled: Whether units are of starts in the order in which `until` looks at them, see `shuffled`.
     """
 
     identity: Mapping[str, Any]
@@ -80,36 +83,38 @@ class Evaluation:
     versions: Mapping[str, str] = field(default_factory=installed_versions)
     probe: Sequence[float] | None = None
     policy_threads: int | None = None
-    lease: float = LEASE
     until: StoppingRule | None = None
     stopped: Stopped | None = None
+    shuffled: bool = False
 
     @cached_property
     def units(self) -> tuple[Unit, ...]:
         """Units in order."""
-        return partition(self.tasks, self.init_states, self.unit_starts)
+        return partition(self.tasks, self._starts, self.unit_starts)
 
     @cached_property
-    def _rounds(self) -> list[tuple[Unit, ...]]:
-        """Units with the same starts of all tasks."""
-        parts: dict[str, list[Unit]] = {}
-        for unit in self.units:
-            parts.setdefault(unit.task.id, []).append(unit)
-        return list(zip(*parts.values(), strict=True))
+    def _starts(self) -> tuple[int, ...]:
+        """Starts in the order in which they are run."""
+        return shuffled(self.init_states) if self.shuffled else self.init_states
+
+    def turn(self, unit: Unit) -> int:
+        """Return the round in which a unit is looked at first; 0 where the evaluation cannot be stopped."""
+        order = shuffled(self.init_states) if self.until else ()
+        return min((order.index(start) for start in unit.init_states), default=0) if order else 0
 
     @cached_property
     def store(self) -> WorkStore:
         """The folder of the results, which other processes may share."""
         plan = {
             "format": PLAN_FORMAT,
-            "evaluated": dict(self.identity),
-            "protocol": self._resolved_protocol,
+            "evaluated": known_by(self.identity),
+            "protocol": compared(self._resolved_protocol),
             "unit_starts": self.unit_starts,
             "errors_are_failures": self.errors_are_failures,
             "policy_threads": self.policy_threads,
             "simulation": {k: v for k, v in self.versions.items() if k in DECISIVE},
         }
-        return WorkStore(self.out, plan, self.probe, self.lease)
+        return WorkStore(self.out, plan, self.probe, shuffled=self.shuffled)
 
     @property
     def _resolved_protocol(self) -> dict[str, Any]:
@@ -129,17 +134,24 @@ class Evaluation:
         by_id = {task.id: task for task in self.tasks}
         return EnvPool(lambda key: self.env(by_id[key[0]], key[1]), capacity=1)
 
-    def evaluate(self, unit: Unit, pool: EnvPool, label: str = "") -> UnitResult:
+    def evaluate(
+        self,
+        unit: Unit,
+        pool: EnvPool,
+        label: str = "",
+        on_step: Callable[[int, int], None] = lambda steps, most: None,
+    ) -> UnitResult:
         """Run the episodes of a unit.
 
         Args:
             unit: Unit of this evaluation.
             pool: Open environments, see `pool`.
             label: Text before the progress bar.
+            on_step: See `run_episodes`.
         """
         started = time.time()
         env = pool.get((unit.task.id, len(unit.init_states)))
-        done = self._run(unit, env, label)
+        done = self._run(unit, env, label, on_step)
         self._save_videos(unit, done)
         return self._unit_result(unit, done, env, started)
 
@@ -197,14 +209,16 @@ class Evaluation:
     def starts_needed(self, done: Mapping[str, UnitResult]) -> tuple[int, ...] | None:
         """Return the starts that the result is of; None where more units have to be run.
 
-        The rule that may stop it sees the starts that all tasks have been run from, whatever else is done.
+        The rule that may stop it sees the starts that all tasks have been run from, in the order of `shuffled`,
+        whatever else is done.
         """
-        rounds = list(takewhile(lambda units: all(unit.name in done for unit in units), self._rounds))
-        known = tuple(start for units in rounds for start in units[0].init_states)
+        units = [unit for unit in self.units if unit.name in done]
+        ran = Counter(start for unit in units for start in unit.init_states)
+        known = tuple(takewhile(lambda start: ran[start] == len(self.tasks), shuffled(self.init_states)))
         if self.until is not None and known:
-            for unit in rounds[0]:
+            for unit in units:
                 self.until.check_world(world_of(done[unit.name].environment))
-            if count := self.until.starts_needed(_by_task(rounds, done), known):
+            if count := self.until.starts_needed(self._by_task(units, done), known):
                 return known[:count]
         return known if len(known) == len(self.init_states) else None
 
@@ -221,9 +235,9 @@ class Evaluation:
         starts = self.starts_needed(done)
         if starts is None:
             raise ConfigError(f"{len(done)} of {len(self.units)} units are done: there is no result yet")
-        rounds = [units for units in self._rounds if units[0].init_states[0] in starts]
-        units = {unit.name: done[unit.name] for part in rounds for unit in part}
-        tasks = [task.of_starts(starts) for task in _by_task(rounds, done)]
+        chosen = [unit for unit in self.units if {*unit.init_states} & {*starts}]
+        units = {unit.name: done[unit.name] for unit in chosen}
+        tasks = [task.of_starts(starts) for task in self._by_task(chosen, done)]
         if lost := next((task for task in tasks if not task.init_states), None):
             raise EvaluationIncompleteError(
                 f"simulation errors ended all episodes of {lost.task}, which has no success: "
@@ -236,7 +250,7 @@ class Evaluation:
         return EvaluationResult(
             evaluated=self.identity,
             protocol=self._resolved_protocol,
-            init_states=starts,
+            init_states=tuple(sorted(starts)),
             versions=common_environment([one.versions for one in units.values()]),
             environment=common_environment([one.environment for one in units.values()]),
             unit_starts=self.unit_starts,
@@ -245,8 +259,21 @@ class Evaluation:
             times=self._times(units),
         )
 
-    def _run(self, unit: Unit, env: VectorEnv, label: str = "") -> Rollouts:
-        filmed = [i for i, start in enumerate(unit.init_states) if start in self.init_states[: self.videos]]
+    def _by_task(self, units: Sequence[Unit], done: Mapping[str, UnitResult]) -> list[TaskResult]:
+        """Return the results of each task from those of units, in the order of the starts' numbers."""
+        parts: dict[str, list[TaskResult]] = {}
+        for unit in units:
+            parts.setdefault(unit.task.id, []).append(done[unit.name].result)
+        return [TaskResult.joined(part) for part in parts.values()]
+
+    def _run(
+        self,
+        unit: Unit,
+        env: VectorEnv,
+        label: str = "",
+        on_step: Callable[[int, int], None] = lambda steps, most: None,
+    ) -> Rollouts:
+        filmed = [i for i, start in enumerate(unit.init_states) if start in self._starts[: self.videos]]
         with self.actor(_acted_task(env, unit), unit.init_states) as actor:
             if isinstance(actor, WatchesWorld):
                 actor.watch(env)  # type: ignore[arg-type]  # of every environment of this package
@@ -261,6 +288,7 @@ class Evaluation:
                 recorded=filmed,
                 label=label or unit.task.id,
                 progress=self.progress,
+                on_step=on_step,
             )
         if not any(one.began for one in done.episodes):
             return done
@@ -309,23 +337,18 @@ class Evaluation:
 
     def is_filmed(self, unit: Unit) -> bool:
         """Return whether the episodes of a unit that are to be filmed have been."""
-        starts = {*unit.init_states} & {*self.init_states[: self.videos]}
+        starts = {*unit.init_states} & {*self._starts[: self.videos]}
         return all(any((self.out / "videos").glob(_video(unit, start, "*"))) for start in starts)
 
     def _save_videos(self, unit: Unit, done: Rollouts) -> None:
         seconds = self.record_every / self.protocol.world.control_freq
-        filmed = [e for e in done.episodes if e.init_state in self.init_states[: self.videos]]
+        filmed = [e for e in done.episodes if e.init_state in self._starts[: self.videos]]
         for frames, episode in zip(done.recordings, filmed, strict=False):
             if frames:
                 outcome = "success" if episode.success else "failure"
                 outcome = "simulation_error" if episode.simulation_error else outcome
                 name = _video(unit, episode.init_state, f"{outcome}.webp")
                 save_animation(frames, self.out / "videos" / name, seconds_per_frame=seconds)
-
-
-def _by_task(rounds: Sequence[Sequence[Unit]], done: Mapping[str, UnitResult]) -> list[TaskResult]:
-    of_tasks = zip(*rounds, strict=True)
-    return [TaskResult.joined([done[unit.name].result for unit in units]) for units in of_tasks]
 
 
 def _video(unit: Unit, start: int, ending: str) -> str:

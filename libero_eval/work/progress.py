@@ -5,9 +5,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from libero_env.tasks.published import parse_plus_id
+from libero_env.progress import estimated_total
+from libero_env.published import parse_plus_id
 from libero_env.text import duration, shorten
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
+from libero_eval.protocols.naming import protocol_label
 from libero_eval.work.store import UnitResult, WorkStore, read_plan, read_unit
 from lifelong.results.failures import causes_text, safety_text
 from lifelong.stats.intervals import Estimate
@@ -17,13 +19,40 @@ RECENT = 50  # units from which the speed is taken
 
 
 @dataclass(frozen=True)
+class Batch:
+    """How far the episodes of a unit are, which run together.
+
+    Attributes:
+        steps: Control steps of all episodes so far.
+        most: Largest number that they can become.
+        timed: Number of them that have been timed.
+        seconds: Time that these took.
+    """
+
+    unit: str
+    steps: int
+    most: int
+    timed: int
+    seconds: float
+
+    @property
+    def expected(self) -> float:
+        """Seconds that all steps take, within a factor of two; NaN where that is not known yet."""
+        known = self.timed and self.seconds >= 1.0
+        return estimated_total(self.steps, self.most) * self.seconds / self.timed if known else math.nan
+
+
+@dataclass(frozen=True)
 class Progress:
     """How far an evaluation is, all processes together.
 
     Attributes:
         running: Number of units that processes work on.
         failed: Number of units that are not done and ended with an error.
-        per_hour: Episodes per hour of the recent units, over the time in which any process ran one; NaN at first.
+        per_hour: Episodes per hour of the recent units, over the time in which any process ran one; at first what the
+            running batch lets expect, NaN before that.
+        steps: Control steps of the batch that this process runs.
+        ahead: Episodes that this batch and those of other processes have done by now, if they are as far.
     """
 
     units: int
@@ -33,15 +62,19 @@ class Progress:
     running: int
     failed: int
     per_hour: float
+    steps: int = 0
+    ahead: float = 0.0
 
     @property
     def seconds_left(self) -> float:
         """Time until the end at this speed, [s]; NaN if the speed is not known."""
-        return 3600 * (self.episodes - self.episodes_done) / self.per_hour if self.per_hour else math.nan
+        left = max(self.episodes - self.episodes_done - self.ahead, 0.0)
+        return 3600 * left / self.per_hour if self.per_hour else math.nan
 
     def __str__(self) -> str:
         """Return one line, such as `12 of 50 units, 120 of 500 episodes, 1,830 an hour, 12 min left, 3 running`."""
         parts = [f"{self.done} of {self.units} units", f"{self.episodes_done} of {self.episodes} episodes"]
+        parts += [f"{self.steps:,} control steps of the next"] if self.steps else []
         if math.isfinite(self.per_hour):
             parts += [f"{self.per_hour:,.0f} an hour"]
             parts += [f"{duration(self.seconds_left)} left"] if self.done < self.units else []
@@ -51,7 +84,11 @@ class Progress:
 
 
 def measure_progress(
-    units: Mapping[str, int], done: Mapping[str, UnitResult], running: int = 0, failed: int = 0
+    units: Mapping[str, int],
+    done: Mapping[str, UnitResult],
+    running: int = 0,
+    failed: int = 0,
+    batch: Batch | None = None,
 ) -> Progress:
     """Return the progress of an evaluation.
 
@@ -59,10 +96,19 @@ def measure_progress(
         units: Number of episodes of each unit, by its name.
         running: Number of units that processes work on.
         failed: Number of units with errors.
+        batch: The batch that this process runs, or ran last.
     """
     recent = sorted(done.values(), key=lambda unit: unit.finished)[-RECENT:]
     busy = busy_seconds((unit.started, unit.finished) for unit in recent)
     count = sum(len(unit.result.starts) for unit in recent)
+    per_hour = 3600 * count / busy if busy else math.nan
+    runs = batch is not None and batch.unit not in done
+    ahead = 0.0
+    if batch is not None and math.isfinite(seconds := batch.expected):
+        together = max(running, 1) * units[batch.unit]
+        if len(done) <= max(running, 1):  # the time of the first units has what was compiled in it
+            per_hour = 3600 * together / seconds
+        ahead = together * min(batch.steps / estimated_total(batch.steps, batch.most), 1.0) if runs else 0.0
     return Progress(
         units=len(units),
         done=sum(name in done for name in units),
@@ -70,7 +116,9 @@ def measure_progress(
         episodes_done=sum(count for name, count in units.items() if name in done),
         running=running,
         failed=failed,
-        per_hour=3600 * count / busy if busy else math.nan,
+        per_hour=per_hour,
+        steps=batch.steps if batch is not None and runs else 0,
+        ahead=ahead,
     )
 
 
@@ -103,8 +151,7 @@ def describe_status(path: Path) -> tuple[str, Progress]:
         f"policy    {', '.join(f'{k} {shorten(str(v))}' for k, v in plan['evaluated'].items())}",
         f"progress  {progress}",
     ]
-    for name, claim in sorted(held.items()):
-        lines.append(f"running   {name} by {claim.holder}, seen {max(0.0, claim.silent):.0f} s ago")
+    lines += [f"running   {name} by {holder}" for name, holder in sorted(held.items())]
     for name, error in errors.items():
         lines.append(f"error     {name}, {error.attempts} attempts: {error.last}; see {error.path}")
     if len(done) == len(units):
@@ -135,8 +182,10 @@ def total_rows(result: EvaluationResult) -> list[str]:
     for task in results:
         if task.suite.startswith(PLUS):
             kinds.setdefault(f"  {parse_plus_id(task.name).kind}", []).append(task)
-    suites = result.by_suite
+    suites, labels = result.by_suite, result.suite_labels
     rows = {**(suites if len(suites) > 1 else {}), **(kinds if len(kinds) > 1 else {})}
+    parts = [label for suite, label in labels.items() if label != suite and len(suites) == 1]
+    width = max(18, *(len(labels.get(name, name)) for name in rows), 0)
     lines = []
     for name, tasks in {**rows, "mean over tasks": results}.items():
         wins, episodes = sum(sum(r.successes) for r in tasks), sum(len(r.successes) for r in tasks)
@@ -144,12 +193,18 @@ def total_rows(result: EvaluationResult) -> list[str]:
         note = (
             f"  ({failed} of {episodes + failed} ended by a simulation error, not counted)" if failed else ""
         )
-        note += f"  ({result.stop_note})" if tasks is results and result.stopped else ""
-        lines.append(f"{name:<18} {f'{wins}/{episodes}':>9} {_percent(result.success_of(tasks))}{note}")
+        if tasks is results:
+            note += f"  {', '.join(parts)}" if parts else ""
+            note += f"  ({result.stop_note})" if result.stopped else ""
+        lines.append(
+            f"{labels.get(name, name):<{width}} {f'{wins}/{episodes}':>9} {_percent(result.success_of(tasks))}{note}"
+        )
+    label = protocol_label(result.protocol, suites)
+    lines += [f"{'protocol':<18} {label}"] if label != result.protocol.get("name") else []
     found = {"failed because": causes_text(results), "costs": safety_text(results)}
     return [*lines, *(f"{name:<18} {text}" for name, text in found.items() if text)]
 
 
 def _percent(e: Estimate) -> str:
-    interval = f"[{100 * e.low:.1f}, {100 * e.high:.1f}]"
+    interval = f"[{100 * e.low:.1f}, {100 * e.high:.1f}]" if math.isfinite(e.low) else "-"
     return f"{100 * e.value:6.1f} {interval:>13}"

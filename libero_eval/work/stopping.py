@@ -10,10 +10,11 @@ import numpy as np
 from libero_env.tasks import Task
 from libero_env.text import flatten, json_safe, shorten, shown
 from libero_eval.evaluation_file import EvaluationResult, TaskResult, by_start
+from libero_eval.protocols.naming import compared
 from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.stats.sequential import anytime_interval, log_evidence
 from lifelong.errors import ConfigError
-from lifelong.stats.intervals import ALPHA
-from lifelong.stats.sequential import anytime_interval, log_evidence
+from lifelong.stats.intervals import ALPHA, LEAST_EPISODES
 
 _EXPECTED = "expected width=0.05, against=RESULT, or against=RESULT,margin=0.05; numbers are between 0 and 1"
 
@@ -65,7 +66,9 @@ class StoppingRule:
             return cls(text, numbers["width"])
         result = EvaluationResult.read(Path(values["against"]))
         if result.protocol.get("digest") != protocol.digest:
-            here, there = flatten(json_safe(protocol.resolved())), flatten(dict(result.protocol))
+            here, there = (
+                flatten(compared(one)) for one in (json_safe(protocol.resolved()), result.protocol)
+            )
             differ = sorted(k for k in here.keys() | there.keys() if here.get(k) != there.get(k))
             raise ConfigError(f"--until {text}: the protocol there differs in {', '.join(differ)}")
         here = {task.id: (protocol.words(task), task.digest) for task in tasks}
@@ -107,6 +110,7 @@ class StoppingRule:
         else:
             ends = [anytime_interval(int(w), int(n)) for w, n in zip(won, episodes, strict=True)]
             known = np.array([end.high - end.low < self.width for end in ends])
+        known &= episodes >= LEAST_EPISODES
         return int(known.argmax()) + 1 if known.any() else None
 
     def verdict(self, tasks: Sequence[TaskResult], starts: Sequence[int]) -> str:

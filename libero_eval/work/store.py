@@ -14,7 +14,6 @@ import hashlib
 import json
 import os
 import shutil
-import socket
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -27,13 +26,14 @@ from pydantic import Field
 from typing_extensions import TypedDict
 
 from libero_env.errors import InvalidInputError
-from libero_env.storage import create_text, read_json, require_own_folders, write_json
+from libero_env.parallel import this_process
+from libero_env.storage import create_text, own_folder, read_json, write_json
 from libero_env.tasks import Task
 from libero_env.text import flatten, json_safe, shorten, to_json
 from libero_env.validation import validate
 from libero_eval.evaluation_file import FILE_NAME, TaskResult
 from libero_eval.policies import PROBE_TOLERANCE
-from libero_eval.work.claims import LEASE, Claim, Claims
+from libero_eval.work.claims import Claims
 from lifelong.errors import ConfigError, LifelongError, writing
 from lifelong.results.provenance import utc_now
 
@@ -62,9 +62,11 @@ class Unit:
 
     @property
     def name(self) -> str:
-        """Name of the unit's files, such as `libero_goal_03_starts_10_19`."""
-        first, last = self.init_states[0], self.init_states[-1]
-        return f"{self.task.suite}_{self.task.index:02d}_starts_{first:02d}_{last:02d}"
+        """Name of the unit's files, such as `libero_goal_03_starts_10_19`; of starts in another order with a digest."""
+        starts, digest = self.init_states, ""
+        if list(starts) != sorted(starts):
+            digest = f"_{hashlib.sha256(repr(starts).encode()).hexdigest()[:8]}"
+        return f"{self.task.suite}_{self.task.index:02d}_starts_{starts[0]:02d}_{starts[-1]:02d}{digest}"
 
 
 def partition(tasks: Iterable[Task], init_states: Sequence[int], size: int) -> tuple[Unit, ...]:
@@ -100,6 +102,7 @@ class Plan(TypedDict):
     tasks: tuple[str, ...]
     units: dict[str, Annotated[int, Field(ge=1)]]  # name -> number of episodes
     probe: tuple[float, ...] | None  # what the policy answers to a fixed observation, where that repeats
+    shuffled: bool  # whether it was begun with units of starts in the order in which `--until` looks at them
     started: str
 
 
@@ -145,22 +148,27 @@ class WorkStore:
     Args:
         plan: Plain data that define the evaluation: policy, protocol, size of units, simulation.
         probe: What the policy answers to a fixed observation, where that repeats.
-        lease: Time after which a unit whose holder is silent is given to another process, [s].
+        shuffled: Whether units are of starts in the order in which a rule looks at them that may stop the evaluation.
     """
 
     def __init__(
-        self, path: Path, plan: Mapping[str, Any], probe: Sequence[float] | None = None, lease: float = LEASE
+        self,
+        path: Path,
+        plan: Mapping[str, Any],
+        probe: Sequence[float] | None = None,
+        *,
+        shuffled: bool = False,
     ):
-        self.path, self._plan, self._probe = path, json_safe(plan), probe
-        self.claims = Claims(path / "claims", lease)
+        self.path, self._plan, self._probe, self._shuffled = path, json_safe(plan), probe, shuffled
+        self.claims = Claims(path / "claims")
         self._results: dict[str, UnitResult] = {}
 
     def join(self, units: Sequence[Unit]) -> None:
         """Start the evaluation, or join it; starts and tasks that are not in it yet are added.
 
         Raises:
-            ConfigError: The folder holds another evaluation (the message names every difference), or a folder that is a
-                link out of it.
+            ConfigError: The folder holds another evaluation (the message names every difference), or a folder
+                that is a link.
             LifelongError: The folder cannot be written, or holds a broken file.
         """
         growing = {
@@ -168,12 +176,13 @@ class WorkStore:
             "tasks": list(dict.fromkeys(unit.task.id for unit in units)),
             "units": {unit.name: len(unit.init_states) for unit in units},
         }
-        require_own_folders(self.path, *FOLDERS, error=ConfigError)
+        for name in FOLDERS:
+            own_folder(self.path, name, error=ConfigError)
         with writing(self.path, "the folder of the evaluation"):
             self.path.mkdir(parents=True, exist_ok=True)
             file = self.path / PLAN_NAME
             if not file.exists():
-                begun = {"probe": self._probe, "started": utc_now()}
+                begun = {"probe": self._probe, "shuffled": self._shuffled, "started": utc_now()}
                 create_text(file, to_json({**self._plan, **growing, **begun}))
             stored = read_plan(self.path)
             self._check_plan(stored, growing)
@@ -188,12 +197,13 @@ class WorkStore:
         """Remove the evaluation with its videos; files of others stay.
 
         Raises:
-            ConfigError: Another process works on it, or a folder in it is a link that leads out of it.
+            ConfigError: Another process works on it, or a folder in it is a link.
         """
-        require_own_folders(self.path, *FOLDERS, error=ConfigError)
-        for held in self.claims.held().values():
+        for name in FOLDERS:
+            own_folder(self.path, name, error=ConfigError)
+        for unit, holder in self.claims.held().items():
             raise ConfigError(
-                f"{self.path}: {held.holder} works on {held.unit}; end it before you repeat the evaluation"
+                f"{self.path}: {holder} works on {unit}; end it before you repeat the evaluation"
             )
         for name in PARTS:
             path = self.path / name
@@ -250,7 +260,7 @@ class WorkStore:
                 errors[name] = UnitErrors(len(entries), entries[-1].get("error", "unknown"), path)
         return errors
 
-    def take(self, units: Iterable[Unit]) -> tuple[Unit, Claim] | None:
+    def take(self, units: Iterable[Unit]) -> Unit | None:
         """Claim the first of the units that nobody works on; None if there is none.
 
         Raises:
@@ -258,11 +268,10 @@ class WorkStore:
         """
         with writing(self.path, "the claim of a unit"):
             for unit in units:
-                claim = self.claims.take(unit.name)
-                if claim and self._unit_path(unit).exists():  # it was finished a moment ago
-                    self.claims.release(claim)
-                elif claim:
-                    return unit, claim
+                if self.claims.take(unit.name):
+                    if not self._unit_path(unit).exists():
+                        return unit
+                    self.claims.release(unit.name)  # it was finished a moment ago
         return None
 
     @property
@@ -335,7 +344,7 @@ def read_plan(path: Path) -> Plan:
     """
     file = path / PLAN_NAME
     if not file.exists():
-        raise LifelongError(f"{path} holds no evaluation: {file.name} is missing")
+        raise LifelongError(f"{path} holds no evaluation: none was begun there")
     try:
         return validate(Plan, _of_format(file, PLAN_FORMAT))
     except InvalidInputError as error:
@@ -353,11 +362,6 @@ def _of_format(path: Path, wanted: str) -> dict[str, Any]:
     if stated != wanted:
         raise InvalidInputError(f"the format is {stated!r}, not {wanted!r}")
     return values
-
-
-def this_process() -> str:
-    """Return the machine and number of this process, such as `node3:4711`."""
-    return f"{socket.gethostname()}:{os.getpid()}"
 
 
 def describe(error: BaseException) -> str:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, RenderError
 from libero_env.parallel import (
     NO_PICTURE,
     NO_PICTURE_TEXT,
@@ -22,9 +22,8 @@ from libero_env.parallel import (
 )
 from libero_env.text import printable
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
-from libero_eval.work.claims import Claim
 from libero_eval.work.evaluation import Evaluation
-from libero_eval.work.progress import Progress, measure_progress
+from libero_eval.work.progress import Batch, Progress, measure_progress
 from libero_eval.work.store import Unit, UnitErrors, UnitResult, describe
 from lifelong.errors import ConnectionLost, EvaluationIncompleteError
 
@@ -63,6 +62,7 @@ class Worker:
         self._announced: set[str] = set()
         self._succeeded, self._in_a_row, self._said = False, 0, -math.inf
         self._task: str | None = None
+        self._batch: Batch | None = None  # that this process runs, or ran last
 
     def run(self, *, wait: bool = True) -> EvaluationResult | None:
         """Evaluate units; write `eval.json` and return its content if all are done.
@@ -84,8 +84,8 @@ class Worker:
                 self._on_wait(len(done))
                 errors, held = self._errors(), set(store.claims.held())
                 choice = self._order(done, errors, held)
-                if taken := store.take(choice):
-                    self._work(*taken)
+                if unit := store.take(choice):
+                    self._work(unit)
                 elif not wait:
                     return None
                 elif choice or held & self._names:
@@ -123,9 +123,13 @@ class Worker:
         def preference(unit: Unit) -> tuple:
             task = unit.task.id
             tried, others = self._tries(unit, errors) > 0, task in busy
-            # rounds over all tasks, to stop after one
-            turn = unit.init_states[0] if self._evaluation.until else 0
-            return tried, turn, task != self._task, others, -counts[task] if others else 0
+            return (
+                tried,
+                self._evaluation.turn(unit),
+                task != self._task,
+                others,
+                -counts[task] if others else 0,
+            )
 
         return sorted(left, key=preference)
 
@@ -133,23 +137,37 @@ class Worker:
         attempts = errors[unit.name].attempts if unit.name in errors else 0
         return max(0, attempts - self._attempts_before.get(unit.name, 0))
 
-    def _work(self, unit: Unit, claim: Claim) -> None:
-        self._task = unit.task.id
-        with self._store.claims.keeping(claim, on_beat=self._beat):
+    def _work(self, unit: Unit) -> None:
+        self._task, first = unit.task.id, None
+
+        def note(steps: int, most: int) -> None:
+            nonlocal first
+            now = time.monotonic()
+            first = first or (steps, now)  # what compiles before does not count
+            self._batch = Batch(unit.name, steps, most, steps - first[0], now - first[1])
+            if now - self._said > SAY_EVERY:
+                with suppress(LiberoError, OSError):  # the loop reports what is wrong
+                    self._say(self._store.done(self._evaluation.units))
+
+        try:
             done = self._store.done(self._evaluation.units)
             label = f"{self._progress(done)} | {unit.task.id}" if self._evaluation.progress else ""
             try:
-                result: UnitResult | None = self._evaluation.evaluate(unit, self._pool, label)
+                result: UnitResult | None = self._evaluation.evaluate(unit, self._pool, label, note)
             except Exception as error:  # noqa: BLE001 - policies raise errors of any type
                 self._pool.close()
                 result = self._after_error(unit, error)
             if result is not None:
                 self._store.publish(unit, result)
                 self._succeeded, self._in_a_row = True, 0
+        finally:
+            self._store.claims.release(unit.name)
         self._say(self._store.done(self._evaluation.units))
 
     def _after_error(self, unit: Unit, error: Exception) -> UnitResult | None:
         """Record an error; return a result if the protocol counts it; raise it if going on makes no sense."""
+        if isinstance(error, RenderError):  # of this machine
+            raise error
         if isinstance(error, OSError) and str(self._evaluation.out) in str(error.filename or ""):
             raise error
         errors = self._store.add_error(unit, error)
@@ -178,11 +196,6 @@ class Worker:
             "the same command tries these units again"
         )
 
-    def _beat(self) -> None:
-        if time.monotonic() - self._said > SAY_EVERY:
-            with suppress(LiberoError, OSError):  # the loop reports what is wrong
-                self._say(self._store.done(self._evaluation.units))
-
     def _say(self, done: Mapping[str, UnitResult]) -> None:
         """Report the progress, but not too often; always when everything is done."""
         now = time.monotonic()
@@ -193,7 +206,7 @@ class Worker:
     def _progress(self, done: Mapping[str, UnitResult]) -> Progress:
         running, failed = len(self._names & self._store.claims.held().keys()), len(self._errors())
         sizes = {unit.name: len(unit.init_states) for unit in self._evaluation.units}
-        return measure_progress(sizes, done, running, failed)
+        return measure_progress(sizes, done, running, failed, self._batch)
 
 
 class Workers:

@@ -17,27 +17,22 @@ from pathlib import Path
 from typing import Any
 
 from libero_env.demos.actions import KINDS, ActionConverter
+from libero_env.demos.agreement import noisy_labels, require_alike, require_default_control, stated_facts
 from libero_env.demos.contents import json_attribute, read_header
 from libero_env.demos.hdf5 import BrokenDemoError
-from libero_env.demos.observe import (
-    recorded_rendering,
-    recorded_robot,
-    recorded_task,
-    require_default_frequency,
-)
+from libero_env.demos.observe import recorded_rendering, recorded_robot, recorded_task
 from libero_env.demos.read import Episode, Labels, read_episodes
 from libero_env.demos.write import require_absent
 from libero_env.errors import DemoError, InvalidInputError, UnknownNameError, require_known
-from libero_env.parallel import progress_bar
+from libero_env.progress import progress_bar
 from libero_env.storage import atomic_folder
 from libero_env.tasks import Task
 from libero_env.timing import CONTROL_HZ
-from libero_integrations.exports.layouts import PUBLISHED, RECORDED, STATE, Layout
+from libero_integrations.exports.layouts import GRIPPER, ORIGIN, PUBLISHED, RECORDED, STATE, Layout
 from libero_integrations.exports.lerobot import EpisodeDatasetWriter, VideoDatasetWriter, write_json
 from libero_integrations.exports.regeneration import Regeneration, regenerate
 from libero_integrations.exports.rlds import RldsWriter
 
-ORIGIN = "meta/libero.json"  # how a data set was made
 Writer = VideoDatasetWriter | EpisodeDatasetWriter | RldsWriter
 
 
@@ -52,6 +47,7 @@ def export(
     assets: str | None,
     drawing: str | None,
     task: Task | None,
+    despite: Sequence[str] = (),
 ) -> list[str]:
     """Do what `libero demos export` is asked for; return lines about what was written.
 
@@ -65,12 +61,12 @@ def export(
         raise InvalidInputError(f"{', '.join(given)} cannot be used with --as {form}; only with {forms}")
     if form not in PUBLISHED:
         episodes, frames = export_demos(
-            files, root, form, labels=labels, actions=actions or "delta", task=task
+            files, root, form, labels=labels, actions=actions or "delta", task=task, despite=despite
         )
         return [f"{root}: {episodes} episodes, {frames} frames"]
     chosen: dict[str, Any] = {"settle_steps": settle, "assets": assets, "drawing": drawing}
     config = Regeneration(labels=labels, **{key: value for key, value in chosen.items() if value is not None})
-    episodes, frames, failed = export_published(files, root, form, config, task=task)
+    episodes, frames, failed = export_published(files, root, form, config, task=task, despite=despite)
     return [
         f"{root}: {episodes} episodes, {frames} frames, as {form}",
         f"models: {config.pack().name}, drawing: {config.drawing}",
@@ -87,6 +83,7 @@ def export_demos(
     actions: str = "delta",
     video_mb: float | None = None,
     task: Task | None = None,
+    despite: Sequence[str] = (),
     progress: bool | None = None,
 ) -> tuple[int, int]:
     """Write demonstration files, as they were recorded, as one data set.
@@ -99,6 +96,7 @@ def export_demos(
         actions: Kind of the actions, one of `libero_env.demos.actions.KINDS`.
         video_mb: Size from which a video of LeRobot's form is continued in another file, [MiB].
         task: Task that all files recorded; None for those that they state.
+        despite: In what the files may differ, of `libero_env.demos.agreement.FACTS`.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.
 
     Returns:
@@ -112,9 +110,9 @@ def export_demos(
     if form not in RECORDED:
         raise UnknownNameError("form of a data set", form, (*RECORDED, *PUBLISHED))
     layout = RECORDED[form].of_joints() if actions == "joint" else RECORDED[form]
+    facts = _checked_facts(files, labels, despite, f"the layout {form}")
     with _data_set(root, layout, video_mb) as (folder, dataset):
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
-            require_default_frequency(file, f"the layout {form}")
             language = recorded_language(file, task)
             with closing(ActionConverter(file, actions, task)) as converter:
                 for episode in read_episodes(file):
@@ -127,6 +125,7 @@ def export_demos(
             "drawing": [recorded_rendering(file).drawing or "not stated" for file in files],
             "perturb": [str(read_header(file).get("perturb", "none")) for file in files],
         }
+        stated |= _origins(facts)
         how |= {key: "; ".join(sorted(set(values))) for key, values in stated.items()}
         return _finish(folder, dataset, how)
 
@@ -138,6 +137,7 @@ def export_published(
     config: Regeneration | None = None,
     *,
     task: Task | None = None,
+    despite: Sequence[str] = (),
     progress: bool | None = None,
 ) -> tuple[int, int, list[str]]:
     """Run demonstrations again and write them as one data set in the form of a published one.
@@ -148,6 +148,7 @@ def export_published(
         name: Published set, one of `libero_integrations.exports.layouts.PUBLISHED`.
         config: How the demonstrations are run.
         task: Task that all files recorded; None for those that they state.
+        despite: In what the files may differ, of `libero_env.demos.agreement.FACTS`.
         progress: Whether to show a progress bar. None shows one if stderr is a terminal.
 
     Returns:
@@ -161,9 +162,10 @@ def export_published(
     """
     require_known("published data set", name, PUBLISHED)
     config, exported, failed = config or Regeneration(), 0, []
+    # models are drawn anew
+    facts = _checked_facts(files, config.labels, (*despite, "models"), f"the layout {name}")
     with _data_set(root, PUBLISHED[name]) as (folder, dataset):
         for file in progress_bar(files, desc="export", unit="file", progress=progress):
-            require_default_frequency(file, f"the layout {name}")
             if perturb := read_header(file).get("perturb"):
                 raise DemoError(
                     f"{file} was rendered under {perturb}, and the layout {name} has images that are drawn anew, "
@@ -180,7 +182,25 @@ def export_published(
         if failed and not exported:
             raise DemoError(f"{failed[0]}: neither this demonstration nor any other reaches its goal again")
         how = {"robot": _robots(files), "as": name, "left_out": len(failed)}
+        how |= {key: "; ".join(sorted(set(values))) for key, values in _origins(facts).items()}
         return *_finish(folder, dataset, config.record() | how), failed
+
+
+def _checked_facts(
+    files: Sequence[Path], labels: Labels, despite: Sequence[str], use: str
+) -> list[dict[str, str]]:
+    """Return what files state of themselves; raise a DemoError where that does not suit the use, or differs."""
+    for file in files:
+        require_default_control(file, use)
+        if labels == "expert" and (noisy := noisy_labels(file)):
+            raise DemoError(f"{file} {noisy}; --labels executed exports them as they are")
+    facts = {file: stated_facts(file, labels) for file in files}
+    require_alike(facts, despite, "--despite {0}")
+    return list(facts.values())
+
+
+def _origins(facts: Sequence[dict[str, str]]) -> dict[str, list[str]]:
+    return {"expert": [one["expert"] for one in facts], "actions_are": [one["labels"] for one in facts]}
 
 
 @contextmanager
@@ -209,7 +229,7 @@ def _finish(folder: Path, dataset: Writer, how: dict[str, Any]) -> tuple[int, in
     origin = {
         "generator": "libero-lifelong",
         "images": images,
-        "gripper": "1 opens, 0 closes" if layout.open_gripper else "-1 opens, +1 closes",
+        "gripper": GRIPPER[layout.open_gripper],
         "control_hz": CONTROL_HZ,
         "fps_is": "a label; time between frames is 1 / control_hz"
         if layout.fps != CONTROL_HZ

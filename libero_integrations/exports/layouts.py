@@ -17,12 +17,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from libero_env.demos.video import AV1, H264, PIXEL_FORMAT, Codec
+from libero_env.curating.video import AV1, H264, PIXEL_FORMAT, Codec
 from libero_env.storage import parse_yaml
 
 ROBOT_TYPE = "panda"
 STATE = ("ee_pos", "ee_ori", "gripper_states")  # observations that are the 8 numbers of state
 FILES_PER_CHUNK = 1000
+ORIGIN = "meta/libero.json"  # how a data set was made
+GRIPPER = {False: "-1 opens, +1 closes", True: "1 opens, 0 closes"}  # by `Layout.open_gripper`
 INDICES = ("frame_index", "episode_index", "index", "task_index")
 _AXES = ("height", "width", "channel")
 

@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from libero_env.curating.video import H264, Mp4Writer, encode_image, import_av
 from libero_env.demos.read import Episode
-from libero_env.demos.video import H264, Mp4Writer, encode_image, import_av
 from libero_env.errors import DemoError, need
 from libero_env.storage import atomic_write_text
 from libero_integrations.exports.layouts import FILES_PER_CHUNK, ROBOT_TYPE, STATE, Layout
@@ -21,8 +21,8 @@ from libero_integrations.exports.layouts import FILES_PER_CHUNK, ROBOT_TYPE, STA
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 _EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
-_V2_DATA_PATH = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
-_V2_VIDEO_PATH = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+V2_DATA_PATH = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+V2_VIDEO_PATH = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
 _V2_STATISTICS = ("max", "mean", "min", "std")
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 _QUANTILE_NAMES = tuple(f"q{round(100 * q):02d}" for q in QUANTILES)
@@ -113,7 +113,7 @@ class _LeRobotWriter(DatasetWriter):
 
     def __init__(self, root: Path, layout: Layout):
         super().__init__(root, layout)
-        self._pa, self._pq = need("pyarrow", "export"), need("pyarrow.parquet", "export")
+        self._pa, self._pq = need("pyarrow"), need("pyarrow.parquet")
         self._frames = 0
         self._tasks: dict[str, int] = {}
         self._episodes: list[dict[str, Any]] = []
@@ -225,13 +225,13 @@ class EpisodeDatasetWriter(_LeRobotWriter):
                 rows = [{"bytes": png, "path": f"frame_{t:06d}.png"} for t, png in enumerate(pictures)]
                 arrays[key] = pa.array(rows, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
             else:
-                path = self._folder(_V2_VIDEO_PATH.format(video_key=key, **place))
+                path = self._folder(V2_VIDEO_PATH.format(video_key=key, **place))
                 with Mp4Writer(path, self.layout.fps, self.layout.codec) as video:
                     video.add(frames)
         arrays |= _arrays(pa, columns)
         schema = {"info": {"features": self._hub_features(arrays)}}  # by which `datasets` decodes the images
         table = pa.table(arrays).replace_schema_metadata({"huggingface": json.dumps(schema)})
-        self._pq.write_table(table, self._folder(_V2_DATA_PATH.format(**place)))
+        self._pq.write_table(table, self._folder(V2_DATA_PATH.format(**place)))
         self._statistics.append({"episode_index": number, "stats": dict(stats)})
         return {}
 
@@ -267,8 +267,8 @@ class EpisodeDatasetWriter(_LeRobotWriter):
         info = self._info(
             total_videos=len(self._episodes) * len(self._shapes) * has_videos,
             total_chunks=-(-len(self._episodes) // FILES_PER_CHUNK),
-            data_path=_V2_DATA_PATH,
-            video_path=_V2_VIDEO_PATH,
+            data_path=V2_DATA_PATH,
+            video_path=V2_VIDEO_PATH,
         )
         write_json(meta / "info.json", info)
 
@@ -320,7 +320,8 @@ class VideoDatasetWriter(_LeRobotWriter):
         place = video.open()
         first = video.writer.frames
         video.writer.add(frames)
-        video.bytes = video.writer.path.stat().st_size
+        path = video.writer.path  # AV1's encoder may hold back the first frames, and the file with them
+        video.bytes = path.stat().st_size if path.exists() else 0
         times = {"from_timestamp": first / fps, "to_timestamp": video.writer.frames / fps}
         return {f"videos/{key}/{name}": value for name, value in {**place, **times}.items()}
 

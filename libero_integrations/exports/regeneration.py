@@ -26,6 +26,7 @@ from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import Episode, Labels, keeps_gripper
 from libero_env.demos.replay import EXTRA_STEPS
 from libero_env.envs.config import Assets, Drawing, Size
+from libero_env.images import flip_rows, rotate_180
 from libero_env.tasks import Task
 from libero_env.validation import checked
 from libero_integrations.exports.layouts import STATE
@@ -111,7 +112,7 @@ def _regenerate_episode(renderer: StateRenderer, episode: Episode, config: Regen
         if success and i >= len(recorded):
             break
         for key, rows in env.render_cameras().items():
-            stored[key].append(rows[0, :, ::-1].copy())  # here images are upright: mirrored is half a turn
+            stored[key].append(rotate_180(flip_rows(rows[0])).copy())
         obs = env.proprioception()
         for key in (*STATE, "joint_states"):
             stored[key].append(obs[key][0].copy())

@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.demos.agreement import recorded_frequency
 from libero_env.demos.config import MASK_NAMES, RenderConfig
 from libero_env.demos.contents import is_image, json_attribute, read_header
-from libero_env.demos.observe import StateRenderer, recorded_frequency
+from libero_env.demos.observe import StateRenderer
 from libero_env.demos.read import Episode
 from libero_env.errors import LiberoError, need
-from libero_env.parallel import progress_bar
+from libero_env.progress import progress_bar
 from libero_env.storage import atomic_path
 from libero_env.tasks import Task
 from libero_integrations.exports.demonstrations import recorded_language
@@ -47,7 +48,7 @@ def write_rerun(
         LiberoError: The file to write has another ending.
         MissingPackageError: Rerun is not installed.
     """
-    rerun = need("rerun", "rerun")
+    rerun = need("rerun")
     if target.suffix != ".rrd":
         raise LiberoError(f"{target}: Rerun opens files that end with .rrd")
     hz = recorded_frequency(file)

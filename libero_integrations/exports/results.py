@@ -9,18 +9,27 @@ from typing import Any
 import numpy as np
 import yaml
 
-from libero_env.storage import atomic_write_text, write_json
-from libero_eval.evaluation_file import EvaluationResult, TaskResult
-from libero_eval.judging.evaluation_page import facts
+from libero_env.storage import atomic_write_text, own_folder, write_json
+from libero_env.text import counted
+from libero_eval.evaluation_file import EvaluationResult, TaskResult, suite_label
+from libero_eval.judging.comparability import facts
+from libero_eval.protocols.naming import protocol_label, section_of
+from libero_eval.work.progress import PLUS
 from lifelong.errors import ConfigError, writing
 
 
 def export(
-    result: EvaluationResult, folder: Path, form: str, dataset: str = "", source: str = ""
+    result: EvaluationResult,
+    folder: Path,
+    form: str,
+    dataset: str = "",
+    source: str = "",
+    *,
+    partial: bool = False,
 ) -> list[Path]:
     """Write a result in one of the forms `vla-eval`, `lerobot` and `eval-results`; return the files."""
     if form == "eval-results":
-        return export_eval_results(result, folder, dataset, source)
+        return export_eval_results(result, folder, dataset, source, partial=partial)
     return (export_vla_eval if form == "vla-eval" else export_lerobot)(result, folder)
 
 
@@ -34,7 +43,7 @@ def export_vla_eval(result: EvaluationResult, folder: Path) -> list[Path]:
         ResultsError: A file cannot be written.
     """
     return [
-        _write(folder / f"{suite}_aggregate.json", _aggregate(result, suite, tasks))
+        _write(folder / _named(suite, "_aggregate.json"), _aggregate(result, suite, tasks))
         for suite, tasks in result.by_suite.items()
     ]
 
@@ -57,14 +66,11 @@ def export_lerobot(result: EvaluationResult, folder: Path) -> list[Path]:
             number = task.task.rpartition("/")[2]  # of the task in its suite; its place where the id has none
             rewards = [float(won) for won in task.successes]
             metrics = {"sum_rewards": rewards, "max_rewards": rewards, "successes": list(task.successes)}
-            per_task.append(
-                {
-                    "task_group": suite,
-                    "task_id": int(number) if number.isdigit() else place,
-                    "metrics": metrics | {"video_paths": []},
-                }
-            )
+            task_id = int(number) if number.isdigit() else place
+            metrics |= {"video_paths": []}
+            per_task.append({"task_group": suite, "task_id": task_id, "metrics": metrics})
     info = {
+        "protocol": protocol_label(result.protocol, result.suites),
         "per_task": per_task,
         "per_group": {suite: _lerobot_rates(tasks) for suite, tasks in suites.items()},
         "overall": {**overall, "eval_s": seconds, "eval_ep_s": seconds / overall["n_episodes"]},
@@ -72,7 +78,9 @@ def export_lerobot(result: EvaluationResult, folder: Path) -> list[Path]:
     return [_write(folder / "eval_info.json", info)]
 
 
-def export_eval_results(result: EvaluationResult, folder: Path, dataset: str, source: str = "") -> list[Path]:
+def export_eval_results(
+    result: EvaluationResult, folder: Path, dataset: str, source: str = "", *, partial: bool = False
+) -> list[Path]:
     """Write `.eval_results/SUITE.yaml` for each suite, which the Hugging Face Hub reads in the repository of a model.
 
     Args:
@@ -80,21 +88,29 @@ def export_eval_results(result: EvaluationResult, folder: Path, dataset: str, so
         folder: Folder of the repository.
         dataset: Id on the Hub of the benchmark's data set, whose `eval.yaml` names the suites as its tasks.
         source: Address of where this is from, such as a repository with `eval.json`.
+        partial: Whether fewer tasks than the suite has, or fewer episodes than the protocol counts, may stand for it.
 
     Raises:
-        ConfigError: An id or an address is not one.
+        ConfigError: An id or an address is not one, or the result is of a part of a suite.
         ResultsError: A file cannot be written.
     """
     if not re.fullmatch(r"[\w.-]+/[\w.-]+", dataset):
         raise ConfigError(f"the data set of the benchmark is {dataset!r}; expected ORG/NAME, as on the Hub")
     if not re.fullmatch(r"(https?://\S+)?", source):
         raise ConfigError(f"the source is {source!r}; expected an address that begins with https://")
-    paths, names = [], ("protocol", "models", "robot", "perturbed by", "clock")
+    lacks = {suite: _lacks(replace(result, tasks=tuple(tasks))) for suite, tasks in result.by_suite.items()}
+    if not partial and (part := next((text for text in lacks.values() if text), None)):
+        raise ConfigError(f"this is not the whole of the suite: {part}; with --partial its notes say so")
+    names = ("protocol", "digest", "models", "initial states", "robot", "perturbed by", "horizon", "clock")
+    paths = []
     for suite, tasks in result.by_suite.items():
-        success, described = replace(result, tasks=tuple(tasks)).success, dict(facts(result))
+        one = replace(result, tasks=tuple(tasks))
+        success, described = one.success, dict(facts(one))
+        count = sum(len(task.successes) for task in tasks)
         about = [
-            f"success in percent over {sum(len(task.successes) for task in tasks)} episodes of {len(tasks)} tasks",
-            f"95 % interval {100 * success.low:.1f} to {100 * success.high:.1f}",
+            *([f"PARTIAL: {lacks[suite]}"] if lacks[suite] else []),
+            f"success in percent over {counted(count, 'episode')} of {counted(len(tasks), 'task')}",
+            *[f"95 % interval {100 * success.low:.1f} to {100 * success.high:.1f}"] * (success.low >= 0),
             *(f"{name} {described[name]}" for name in names if name in described),
             *([result.stop_note] if result.stopped else []),
         ]
@@ -106,11 +122,20 @@ def export_eval_results(result: EvaluationResult, folder: Path, dataset: str, so
             "evaluation_framework": "libero-lifelong",
             "notes": ", ".join(about),
         }
-        path = folder / ".eval_results" / f"{suite}.yaml"
+        path = own_folder(folder, ".eval_results", error=ConfigError) / _named(suite, ".yaml")
         with writing(path, "the result"):
             atomic_write_text(path, yaml.safe_dump([entry], sort_keys=False, allow_unicode=True, width=1000))
         paths.append(path)
     return paths
+
+
+def _lacks(result: EvaluationResult) -> str:
+    """Return what of a suite, and of its protocol's episodes, a result lacks, as text; empty for a whole one."""
+    ((suite, label),) = result.suite_labels.items()
+    least = min(len(task.starts) for task in result.tasks)
+    trials = 1 if suite.startswith(PLUS) else section_of(result.protocol, "counting").get("trials")
+    known = isinstance(trials, int) and least < trials
+    return ", ".join([label] * (label != suite) + [f"{least} of {trials} episodes of a task"] * known)
 
 
 def _aggregate(result: EvaluationResult, suite: str, tasks: Sequence[TaskResult]) -> dict[str, Any]:
@@ -128,7 +153,11 @@ def _aggregate(result: EvaluationResult, suite: str, tasks: Sequence[TaskResult]
         "tasks": rows,
         "config": {
             "benchmark": "libero-lifelong",
-            "params": {"suite": suite, "seed": result.evaluated.get("seed")},
+            "params": {
+                "suite": suite_label(suite, [task.task for task in tasks]),
+                "protocol": protocol_label(result.protocol, [suite]),
+                "seed": result.evaluated.get("seed"),
+            },
             "evaluated": result.evaluated,
             "protocol": result.protocol,
             "environment": result.environment,
@@ -167,6 +196,15 @@ def _lerobot_rates(tasks: Sequence[TaskResult]) -> dict[str, Any]:
     rate = float(np.mean(wins))
     means = {"avg_sum_reward": rate, "avg_max_reward": rate, "pc_success": 100 * rate}
     return {**means, "n_episodes": len(wins), "video_paths": []}
+
+
+def _named(suite: str, ending: str) -> str:
+    """Return the name of a suite's file; results may be somebody else's, and so is the suite."""
+    if not re.fullmatch(r"[\w.-]+", suite):
+        raise ConfigError(
+            f"the suite {suite!r} does not make the name of a file; expected letters, digits, _ . -"
+        )
+    return f"{suite}{ending}"
 
 
 def _write(path: Path, values: Mapping[str, Any]) -> Path:

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.compilation import compiled
+from libero_env.curating.video import encode_image
 from libero_env.demos.hdf5 import BrokenDemoError
 from libero_env.demos.read import Episode
-from libero_env.demos.video import encode_image
 from libero_env.errors import DemoError, InvalidInputError
-from libero_env.parallel import compiled
 from libero_integrations.exports.layouts import STATE, Layout
 from libero_integrations.exports.lerobot import DatasetWriter, write_json
 
@@ -99,7 +99,7 @@ class RldsWriter(DatasetWriter):
             self._lengths.append(0)
         length = len(record).to_bytes(8, "little")
         with self._shard(len(self._lengths) - 1).open("ab") as file:
-            file.write(length + _checksum(length) + record + _checksum(record))
+            file.write(length + checksum(length) + record + checksum(record))
         self._lengths[-1] += 1
         self._bytes += len(record)
 
@@ -190,7 +190,8 @@ def _message(number: int, content: bytes) -> bytes:
     return bytes(length) + content
 
 
-def _checksum(content: bytes) -> bytes:
+def checksum(content: bytes | memoryview) -> bytes:
+    """Return the masked CRC-32C of some bytes, 4 bytes."""
     crc = int(_crc32c(np.frombuffer(content, np.uint8)))
     return (((crc >> 15 | crc << 17) + 0xA282EAD8) % 2**32).to_bytes(4, "little")
 

@@ -17,17 +17,8 @@ from typing_extensions import TypedDict
 from libero_env.text import shorten, shown
 from libero_env.validation import validate
 from libero_eval.protocols.adapter import PolicyInput
-from libero_eval.servers.transport import (
-    API_KEY,
-    MAX_MESSAGE_BYTES,
-    Codec,
-    EpisodeStart,
-    Limits,
-    PolicyClient,
-    ending,
-    need,
-    refuse,
-)
+from libero_eval.servers.codec import Codec, ending, refuse
+from libero_eval.servers.transport import API_KEY, MAX_MESSAGE_BYTES, EpisodeStart, Limits, PolicyClient, need
 from lifelong.errors import CodecError, ServerError
 
 VIDEO = {"image": "agentview", "wrist_image": "robot0_eye_in_hand"}  # key -> camera
@@ -182,11 +173,9 @@ class GrootClient(PolicyClient):
     def _actions(self, answer: Any, count: int) -> np.ndarray:
         """Return the actions (B, H, 7) of an answer, which is a list of actions by key and of further data."""
         actions = answer[0] if isinstance(answer, list | tuple) and answer else None
-        lacking = [k for k in ACTION if not isinstance(actions, Mapping) or f"action.{k}" not in actions]
-        if not isinstance(actions, Mapping) or lacking:
-            came = type(answer).__name__
-            if isinstance(actions, Mapping):
-                came = shorten(str(sorted(map(str, actions))))
+        actions = actions if isinstance(actions, Mapping) else {}
+        if lacking := [key for key in ACTION if f"action.{key}" not in actions]:
+            came = shorten(str(sorted(map(str, actions)))) if actions else type(answer).__name__
             raise ServerError(
                 f"{self.address} answered {came} without {', '.join(f'action.{k}' for k in lacking)}; start it with "
                 "--use-sim-policy-wrapper"

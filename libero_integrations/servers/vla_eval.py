@@ -16,15 +16,8 @@ from typing_extensions import TypedDict
 from libero_env.text import plain, shown
 from libero_env.validation import validate
 from libero_eval.protocols.adapter import PolicyInput
-from libero_eval.servers.transport import (
-    Codec,
-    Connection,
-    EpisodeStart,
-    WebSocketClient,
-    array_of,
-    ending,
-    refuse,
-)
+from libero_eval.servers.codec import Codec, array_of, ending, refuse
+from libero_eval.servers.transport import Connection, EpisodeStart, WebSocketClient
 from lifelong.errors import ProtocolMismatchError, ServerError
 
 VERSION = "0.8.0"  # of the harness whose messages these are

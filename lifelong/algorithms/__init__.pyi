@@ -1,26 +1,26 @@
 from .agem import AGEM
-from .averaging import Averaging
 from .base import Algorithm, Phase
-from .clare import CLARE
 from .compressed_er import CompressedER
+from .contrib.averaging import Averaging
+from .contrib.clare import CLARE
+from .contrib.dmpel import DMPEL
+from .contrib.m2distill import M2Distill
+from .contrib.mlr import MLR
+from .contrib.omla import OMLA
+from .contrib.slca import SLCA
 from .derpp import DERpp
-from .dmpel import DMPEL
 from .er import ER
 from .ewc import EWC
 from .iscil import IsCiL
 from .lora import LoRA
 from .lwf import LwF
-from .m2distill import M2Distill
 from .mas import MAS
 from .mir import MIR
-from .mlr import MLR
 from .multitask import Multitask
-from .omla import OMLA
 from .packnet import PackNet
 from .sequential import Sequential
 from .si import SI
 from .single_task import SingleTask
-from .slca import SLCA
 
 __all__ = [
     "AGEM",

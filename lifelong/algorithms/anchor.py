@@ -13,6 +13,23 @@ from lifelong.errors import CheckpointError
 from lifelong.policies.base import Policy
 
 
+class WeightedDistance(torch.autograd.Function):
+    """`sum_i Omega_i (theta_i - anchor_i)^2` over all tensors at once, with its gradient `2 Omega (theta - anchor)`."""
+
+    @staticmethod
+    def forward(ctx: Any, anchors: list[Tensor], importance: list[Tensor], *weights: Tensor) -> Tensor:
+        """Return the sum, a scalar."""
+        moved = torch._foreach_sub(weights, anchors)
+        ctx.pulls = torch._foreach_mul(moved, importance)
+        torch._foreach_mul_(moved, ctx.pulls)
+        return torch.stack([part.sum() for part in moved]).sum()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        """Return the gradients by weights, times that of what follows."""
+        return None, None, *torch._foreach_mul(ctx.pulls, 2 * grads[0])
+
+
 class Anchored(Algorithm):
     """Surrogate `strength * sum_i Omega_i (theta_i - anchor_i)^2` of the loss on earlier tasks when weights move.
 
@@ -35,12 +52,9 @@ class Anchored(Algorithm):
         """Return `strength * sum Omega (theta - anchor)^2`, a scalar; None before the first task ends."""
         if not self.anchor:
             return None
-        terms = [
-            (self.importance[name] * (p - self.anchor[name]).square()).sum()
-            for name, p in policy.named_parameters()
-            if name in self.anchor
-        ]
-        return self.strength * torch.stack(terms).sum()
+        weights = {name: p for name, p in policy.named_parameters() if name in self.anchor}
+        anchors, importance = ([of[name] for name in weights] for of in (self.anchor, self.importance))
+        return self.strength * WeightedDistance.apply(anchors, importance, *weights.values())
 
     @torch.no_grad()
     def move_anchor(self, policy: Policy, added: Mapping[str, Tensor], decay: float = 1.0) -> None:

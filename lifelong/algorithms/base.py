@@ -37,7 +37,7 @@ from torch import Tensor, nn
 from lifelong import checkpoints
 from lifelong.data.windows import TaskWindows
 from lifelong.errors import CheckpointError, DataError
-from lifelong.policies.base import Policy
+from lifelong.policies.base import Policy, has_hooks
 from lifelong.types import Batch
 
 Augmentation = Callable[[Batch, torch.Generator], Batch]
@@ -61,34 +61,7 @@ class Phase:
 class Algorithm:
     """Sequential fine-tuning, and the base of all algorithms, which override the hooks they need.
 
-    The hooks and the order of their calls are listed at the top of this module. An algorithm that keeps the weights
-    of the last task close:
-
-    >>> import torch
-    >>> class L2(Algorithm):
-    ...     def __init__(self, *, strength: float):
-    ...         self.strength, self.anchor = strength, {}
-    ...
-    ...     def penalty(self, policy):
-    ...         terms = [
-    ...             (p - self.anchor[n]).square().sum() for n, p in policy.named_parameters() if n in self.anchor
-    ...         ]
-    ...         return self.strength * sum(terms) if terms else None
-    ...
-    ...     def end_task(self, task_index, dataset, policy, generator):
-    ...         self.anchor = {n: p.detach().clone() for n, p in policy.named_parameters()}
-    ...
-    ...     def state_dict(self):
-    ...         return {"anchor": self.anchor}
-    ...
-    ...     def load_state_dict(self, state, datasets):
-    ...         self.anchor = dict(state["anchor"])
-    >>> algorithm, policy = L2(strength=10.0), torch.nn.Linear(2, 2)
-    >>> algorithm.penalty(policy) is None  # nothing is learned yet
-    True
-    >>> algorithm.end_task(0, None, policy, torch.Generator())
-    >>> algorithm.penalty(policy).item()
-    0.0
+    The hooks and the order of their calls are listed at the top of this module.
 
     Attributes:
         augment: Augmentation of training batches, for algorithms that also apply it elsewhere; None for no
@@ -104,6 +77,35 @@ class Algorithm:
             `libero tune` then learns it once for all such algorithms.
         draws_after_backward: Whether `after_backward` draws at random, by dropout for instance: the gradients of the
             first rank are then those of all.
+
+    Examples:
+        An algorithm that keeps the weights of the last task close:
+
+        >>> import torch
+        >>> class L2(Algorithm):
+        ...     def __init__(self, *, strength: float):
+        ...         self.strength, self.anchor = strength, {}
+        ...
+        ...     def penalty(self, policy):
+        ...         terms = [
+        ...             (p - self.anchor[n]).square().sum() for n, p in policy.named_parameters() if n in self.anchor
+        ...         ]
+        ...         return self.strength * sum(terms) if terms else None
+        ...
+        ...     def end_task(self, task_index, dataset, policy, generator):
+        ...         self.anchor = {n: p.detach().clone() for n, p in policy.named_parameters()}
+        ...
+        ...     def state_dict(self):
+        ...         return {"anchor": self.anchor}
+        ...
+        ...     def load_state_dict(self, state, datasets):
+        ...         self.anchor = dict(state["anchor"])
+        >>> algorithm, policy = L2(strength=10.0), torch.nn.Linear(2, 2)
+        >>> algorithm.penalty(policy) is None  # nothing is learned yet
+        True
+        >>> algorithm.end_task(0, None, policy, torch.Generator())
+        >>> algorithm.penalty(policy).item()
+        0.0
     """
 
     augment: Augmentation | None = None
@@ -128,6 +130,8 @@ class Algorithm:
         """Prepare for a task, before the first step on it.
 
         Args:
+            task_index: Position of the task in the task sequence.
+            dataset: Windows of its demonstrations.
             policy: Policy with the weights that the last task ended with.
         """
 
@@ -193,13 +197,15 @@ class Algorithm:
         """Finish a task, after its last phase.
 
         Args:
+            task_index: Position of the task in the task sequence.
+            dataset: Windows of its demonstrations.
             policy: Policy with the task's final weights.
             generator: CPU generator of the task's end.
         """
 
     @contextmanager
     def policy_for(self, task_index: int, policy: Policy) -> Iterator[Policy]:
-        """Yield the policy that acts on a task; after the context the policy is as before."""
+        """Yield the policy that acts on the task at `task_index`; after the context the policy is as before."""
         yield policy
 
     def acting_state(self, task_index: int, policy: Policy) -> Any:
@@ -210,13 +216,13 @@ class Algorithm:
         here and no layer has hooks; otherwise everything in `state_dict`, which is always right.
 
         Args:
+            task_index: Position of the task in the task sequence.
             policy: Policy that `policy_for` yields for the task.
 
         Returns:
             Nested dictionaries of tensors, numbers and strings.
         """
-        hooked = any(module._forward_hooks or module._forward_pre_hooks for module in policy.modules())
-        plain = type(self).policy_for is Algorithm.policy_for and not hooked
+        plain = type(self).policy_for is Algorithm.policy_for and not has_hooks(policy)
         owner = next(one for one in type(self).__mro__ if "policy_for" in vars(one))
         by_weights = self.acts_by_weights and "acts_by_weights" in vars(owner)
         return {} if plain or by_weights else self.state_dict()

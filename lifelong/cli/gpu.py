@@ -6,7 +6,7 @@ from functools import partial
 
 import torch
 
-from libero_env.cli.doctor import COMPILE_SECONDS, Finding, run_probe
+from libero_env.health import COMPILE_SECONDS, Finding, run_probe
 from lifelong.algorithms import Sequential
 from lifelong.cli.runs import check_torch
 from lifelong.data.dataset import SequenceVLDataset
@@ -34,7 +34,7 @@ def check(name: str, device: str) -> Finding:
     """Run one of the probes on a device."""
     done, text = run_probe(["-m", "lifelong.cli.gpu", name, device], COMPILE_SECONDS)
     _, remedy, essential = PROBES[name]
-    return Finding(name, text, done, remedy, essential)
+    return Finding(name, text, bool(done), remedy, essential)
 
 
 def multiply_in_bf16(device: str) -> str:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from libero_env.cli.options import Answer, Field, FilePath, Positional
 from libero_env.storage import read_json
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, require_run
 
 if TYPE_CHECKING:
-    from libero_env.cli.doctor import Finding
+    from libero_env.health import Finding
     from lifelong.data.settings import DataSettings
 
 _TRAIN_HELP = """\
@@ -90,6 +90,8 @@ def report(
         margin: Difference in success from which on two methods are not equivalent.
         other_worlds: Compare runs in other models or with another MuJoCo, too.
     """
+    for run in run_dirs:
+        require_run(run)
     from lifelong.report.comparison import Plan
     from lifelong.report.page import comparison_text, shift_text, write_report
 
@@ -111,7 +113,7 @@ def report(
 
 def examine() -> "list[Finding]":
     """Return findings about PyTorch, its device and threads, and the packages that training needs."""
-    from libero_env.cli.doctor import check_package
+    from libero_env.health import check_package
 
     extras = [check_package("hydra-core"), check_package("safetensors")]
     purpose = "only for instructions whose embeddings are not shipped"
@@ -126,7 +128,7 @@ def examine() -> "list[Finding]":
 
 def check_torch() -> "Finding":
     """Return a finding about the device that training would use."""
-    from libero_env.cli.doctor import Finding, gpu_name
+    from libero_env.health import Finding, gpu_name
 
     if importlib.util.find_spec("torch") is None:
         return Finding("torch", "not installed", False, "make setup")

@@ -10,29 +10,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from libero_env.cli.options import MAX_SEED, Field, FilePath, Positional, Probability
+from libero_env.cli.options import MAX_SEED, Field, FilePath, Positional
 from libero_env.errors import InvalidInputError
 from lifelong.errors import ConfigError
 
 if TYPE_CHECKING:
     from libero_env.tasks import Task
     from lifelong.settings import Configuration
-    from lifelong.tuning.proxy import Candidate
-
-MEASUREMENT = (
-    "for each value, the geometric mean over the streams of the factor on the error that fine-tuning leaves on a task "
-    "it has just learned"
-)
+    from lifelong.tuning.trials import Candidate
 
 
 @dataclass(frozen=True, kw_only=True)
 class TuneRequest:
-    """Choose a setting without rollouts.
+    """Choose a setting by success on short streams of tasks.
 
-    Short streams of tasks outside of the evaluated suites are learned with each value, and errors on held-out
-    demonstrations take the place of success. Prints the frontier of retention and plasticity, keeps a picture and a
-    JSON file, and names the value with the least error on all tasks at the end. A sweep that was stopped goes on with
-    the same command. Examples:
+    Tasks outside of the evaluated suites are learned one after the other with each value, and rolled out at the end.
+    Prints the frontier of retention and plasticity with the seconds that it took, keeps a picture and a JSON file, and
+    names the value with the largest success over all tasks. A sweep that was stopped goes on with the same command.
+    Examples:
 
     libero tune algo=ewc: the values that the algorithm suggests
 
@@ -52,7 +47,7 @@ class TuneRequest:
             (default: five of libero_90, in one scene).
         seeds: Seeds with which each stream is learned, such as 1,2.
         steps: Optimiser steps a task.
-        held_out: Share of the demonstrations that is measured on.
+        starts: Initial states, the first ones, from which each task is rolled out at the end.
         beside: Algorithms to compare with.
         out: Folder of numbers, picture and measurements.
         config_dir: A folder of configuration files to be added.
@@ -64,9 +59,9 @@ class TuneRequest:
     suite: str = "libero_90"
     stream: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     seeds: str = "1"
-    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 160
-    held_out: Probability = 0.25
-    beside: tuple[str, ...] = ("er",)
+    steps: Annotated[int, Field(ge=1, le=1_000_000)] = 600
+    starts: Annotated[int, Field(ge=1, le=50)] = 10
+    beside: tuple[str, ...] = ("sequential", "er")
     out: FilePath = Path("runs/tuning")
     config_dir: FilePath | None = None
     write: FilePath | None = None
@@ -88,12 +83,7 @@ class TuneRequest:
 
 def tune(request: TuneRequest) -> None:
     """Measure all values and write table, picture, JSON file and the chosen value."""
-    import torch
-
     from lifelong.composition import compose_run, config_folder, config_folders, swept
-    from lifelong.settings import Configuration, plain_data
-    from lifelong.tuning.frontier import draw_frontier, render, write_frontier, write_tuned
-    from lifelong.tuning.proxy import ProxySettings, check_obeyed, measure_frontier
 
     lists = swept(request.overrides, config_folders(request.config_dir))
     if empty := [key for key, found in lists.items() if not found]:
@@ -101,11 +91,21 @@ def tune(request: TuneRequest) -> None:
     words = [word for word in request.overrides if word.partition("=")[0] not in lists]
     for key in (word.lstrip("+~").partition("=")[0] for word in words):
         # a preset may set them for the runs
-        if key.partition(".")[0] in ("seed", "benchmark", "eval") or key == "train.steps_per_epoch":
+        if (
+            key.partition(".")[0] in ("seed", "benchmark", "eval", "learner")
+            or key == "train.steps_per_epoch"
+        ):
             raise ConfigError(
                 f"{key} has no effect in libero tune; leave it out: see --seeds, --suite, --stream and --steps"
             )
+    words.append(f"benchmark={request.suite}")  # whose horizon presets take
     config, choices = compose_run(words, request.config_dir)
+    import torch
+
+    from lifelong.settings import Configuration, plain_data
+    from lifelong.tuning.frontier import draw_frontier, render, write_frontier, write_tuned
+    from lifelong.tuning.trials import TrialSettings, check_obeyed, measure_frontier
+
     plain = plain_data(config)
     check_obeyed(plain, lists)
     checked = Configuration(plain)
@@ -133,20 +133,28 @@ def tune(request: TuneRequest) -> None:
     if threads := checked.settings().threads:
         torch.set_num_threads(threads)
     beside = [other(algo) for algo in request.beside if algo != choices["algo"]]
-    proxy = ProxySettings(_streams(request), request.seed_numbers, request.steps, request.held_out)
-    frontier = measure_frontier(candidates, beside, other("sequential"), proxy, request.out)
+    trials = TrialSettings(_streams(request), request.seed_numbers, request.steps, request.starts)
+    frontier = measure_frontier(candidates, beside, trials, request.out)
 
     algo, head = choices["algo"], choices.get("policy/head", choices["policy"])
     keys = ", ".join(candidates[0].settings)
     default = _label(str(_value_at(plain, key)) for key in lists)
-    print(f"\n{keys} of {algo}: {MEASUREMENT}\n\n{render(frontier, default)}\n")
+    print(
+        f"\n{keys} of {algo}: for each value, success at the end, from {request.starts} starts of each task, "
+        f"and what a stream took\n\n{render(frontier, default)}\n"
+    )
     best = frontier.chosen
     print("chosen: " + " ".join(f"{key}={value}" for key, value in best.settings.items()))
-    if len(values) > 1 and all(one.trials == best.trials for one in frontier.outcomes):
-        print(f"all values have the same errors: {keys} has no effect on what is measured", file=sys.stderr)
+    weights = {tuple(trial.weights for trial in one.trials) for one in frontier.outcomes}
+    if len(values) > 1 == len(weights):
+        print(f"all values leave the same weights: {keys} has no effect on what is measured", file=sys.stderr)
+    elif len(equal := frontier.equals()) > 1:
+        named, rate = ", ".join(one.label for one in equal), best.score.value
+        more = "--starts or --seeds" if rate else f"--steps than {request.steps} a task"
+        print(f"{named} succeed equally ({rate:.0%}): give more {more}", file=sys.stderr)
     elif frontier.at_edge():
         print("the chosen value is the first or the last one: try values beyond it", file=sys.stderr)
-    about = _about(request, proxy.streams, choices, plain)
+    about = _about(request, trials.streams, choices, plain)
     names = "-".join(key.rpartition(".")[2].replace("/", "-") for key in best.settings)
     stem = request.out / f"{algo}-{head}-{names}"
     write_frontier(frontier, stem.with_suffix(".json"), about)
@@ -178,7 +186,7 @@ def _candidate(
 ) -> "Candidate":
     from lifelong.composition import compose_run
     from lifelong.settings import Configuration, plain_data
-    from lifelong.tuning.proxy import Candidate
+    from lifelong.tuning.trials import Candidate
 
     config = plain_data(compose_run(words, config_dir)[0])
     for group in ("algo", "data", "train", "stream", "pretrain"):  # before anything is recorded or learned
@@ -215,7 +223,7 @@ def _streams(request: TuneRequest) -> "tuple[tuple[Task, ...], ...]":
     """
     from libero_env.tasks import get_suite
     from lifelong.settings import BenchmarkSettings
-    from lifelong.tuning.proxy import STREAMS
+    from lifelong.tuning.trials import STREAMS
 
     get_suite(request.suite)  # not `own`, whose files no option names
     chosen = [text.split(",") for text in request.stream] if request.stream else STREAMS
@@ -244,7 +252,7 @@ def _about(
         "seeds": list(request.seed_numbers),
         "steps": request.steps,
         "batch_size": plain["train"].get("batch_size"),
-        "held_out": request.held_out,
+        "starts": request.starts,
         "versions": {
             "libero-lifelong": importlib.metadata.version("libero-lifelong"),
             "torch": torch.__version__,
@@ -256,7 +264,7 @@ def _about(
 def _options(request: TuneRequest) -> list[str]:
     """Return the options that results depend on and that are not the default ones."""
     defaults = TuneRequest(overrides=("algo=er",))
-    names = ("suite", "seeds", "steps", "held_out")
+    names = ("suite", "seeds", "steps", "starts")
     differing = [name for name in names if getattr(request, name) != getattr(defaults, name)]
     chosen = [(f"--{name.replace('_', '-')}", f"{getattr(request, name)}") for name in differing]
     chosen += [("--stream", tasks) for tasks in request.stream]
@@ -268,6 +276,6 @@ def _comment(about: dict[str, Any], score: float) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     return (
         f"Chosen by: {about['command']}\nWith preset {about['preset']}, {about['steps']} steps of "
-        f"{about['batch_size']} windows a task; {versions}\nError on all tasks at the end {score:.2f} times that of "
-        "tasks just learned by fine-tuning"
+        f"{about['batch_size']} windows a task; {versions}\nSuccess on all tasks at the end {score:.0%}, from "
+        f"{about['starts']} starts of each"
     )

@@ -1,24 +1,37 @@
 """Demonstrations of a run's tasks: recorded if there are none, read when they are needed."""
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from weakref import WeakValueDictionary
 
 import torch
 
 from libero_env.assets.pack import BUILTIN, select_pack
-from libero_env.demos.config import DemoConfig, RenderConfig
-from libero_env.demos.contents import demo_names, json_attribute, read_header
+from libero_env.curating.rendering import RenderJob, ensure_rendered
+from libero_env.demos.agreement import (
+    UNSTATED,
+    models_here,
+    noisy_labels,
+    other_control,
+    recorded_frequency,
+    require_alike,
+    stated_facts,
+)
+from libero_env.demos.config import GENERATOR, DemoConfig, RenderConfig
+from libero_env.demos.contents import LOW_DIM_KEYS, demo_names, json_attribute, read_header
 from libero_env.demos.generate import demo_path, ensure_demos
 from libero_env.demos.hdf5 import open_demo_file
-from libero_env.demos.observe import recorded_frequency, recorded_robot, recorded_task
+from libero_env.demos.observe import recorded_robot, recorded_task
 from libero_env.demos.read import demo_lengths
-from libero_env.demos.rendering import RenderJob, ensure_rendered
+from libero_env.doors import doors, enter
 from libero_env.errors import DemoError
+from libero_env.paths import demos_dir
 from libero_env.perturbations import Perturbation, replace_perturbations
-from libero_env.sim.scene import FAST
+from libero_env.sim.scene_spec import FAST
+from libero_env.storage import files_below
 from libero_env.tasks import Task
 from libero_env.tasks.problem import same_meaning
 from libero_env.text import closest
@@ -29,6 +42,8 @@ from lifelong.data.windows import StageWindows, TaskWindows
 from lifelong.errors import DataError
 from lifelong.types import PolicySpec
 
+_MOST_PATHS = 100_000  # below a folder of demonstrations
+
 
 def find_demos(
     tasks: Sequence[Task],
@@ -36,11 +51,14 @@ def find_demos(
     data: DataSettings,
     progress: bool | None,
     others: Sequence[Task] = (),
+    learned: Sequence[int] | None = None,
+    own: bool = False,
+    record: Callable[..., list[Path]] | None = None,
 ) -> list[Path]:
     """Return the demonstration file of each task; missing demonstrations are recorded.
 
     Files of `data.files` are those of the tasks that they state. Of `data.folder`, a file `<suite>/<task>_demo.hdf5`,
-    the layout of the original's data sets, is used, or else the one file of the folder that states the task and fits.
+    the layout of the original's data sets, is used; the other tasks are recorded into it.
 
     Args:
         tasks: Tasks in learning order.
@@ -48,6 +66,10 @@ def find_demos(
         data: Image size, robot, and the files or their folder.
         progress: Whether to show a progress bar; None shows one in a terminal, and lines otherwise.
         others: Further tasks of which `data.files` may have files, such as those of a pretraining.
+        learned: Numbers of demonstrations that a saved run states, which may be somebody else's. They must be there:
+            only what is required beyond them is recorded, and nothing into a folder that the run names.
+        own: Whether `data.folder` is not the run's word, but the user's.
+        record: Function that records missing ones, by default `ensure_demos`.
 
     Raises:
         DataError: A named file or folder does not exist, or demonstrations that are there cannot be used.
@@ -59,7 +81,8 @@ def find_demos(
     by_id = {task.id: task for task in tasks}
     files = _named_files(tasks, required, data, others)
     if folder is not None:
-        files = _files_in(folder, [t for t in by_id.values() if t.id not in files], required, data) | files
+        left = [t for t in by_id.values() if t.id not in files]
+        files = _files_in(folder, left, required, data) | files
     headers = {file: read_header(file) for file in files.values()}
     recorded = others or by_id.keys() - files.keys()
     if data.seed is not None and not recorded and not any("seed" in header for header in headers.values()):
@@ -73,11 +96,14 @@ def find_demos(
             "original's demonstrations set LIBERO_ASSETS=original",
             file=sys.stderr,
         )
+    if learned is not None:
+        _require_recorded([t for t in tasks if t.id not in files], tasks, learned, data, own)
+    _require_alike(files.values(), len(files) < len(by_id), data)
     for count in sorted(set(counts), reverse=True):
         missing = [t for t in by_id.values() if required[t.id] == count and t.id not in files]
         if not missing:
             continue
-        paths = ensure_demos(
+        paths = (record or ensure_demos)(
             missing,
             count,
             camera_size=(data.image_size, data.image_size),
@@ -91,6 +117,15 @@ def find_demos(
     return [files[task.id] for task in tasks]
 
 
+def _require_alike(files: Iterable[Path], recording: bool, data: DataSettings) -> None:
+    """Check that files agree, also with what will be recorded; a DemoError names differences and `data.despite`."""
+    facts = {file: stated_facts(file, data.labels) for file in files}
+    if recording:
+        labels = "intended" if data.labels == "expert" else "executed"
+        facts[Path("what is recorded")] = {"models": models_here(), "expert": GENERATOR, "labels": labels}
+    require_alike(facts, data.despite or (), "data.despite=[{1}]")
+
+
 def _named_files(
     tasks: Sequence[Task], required: Mapping[str, int], data: DataSettings, others: Sequence[Task]
 ) -> dict[str, Path]:
@@ -100,7 +135,7 @@ def _named_files(
         DataError: One is not of a task of the run or does not fit, or two are of the same task.
     """
     files: dict[str, Path] = {}
-    for path in map(Path, data.files):
+    for name, path in _each_file(tasks, required, data, others):
         stated = recorded_task(path)
         task = next((one for one in tasks if same_meaning(one.problem, stated.problem)), None)
         if task is None and any(same_meaning(one.problem, stated.problem) for one in others):
@@ -111,18 +146,40 @@ def _named_files(
         if task.id in files:
             raise DataError(f"data.files: {files[task.id]} and {path} are of the same task, {task.name!r}")
         if reason := _misfit(path, required[task.id], data):
-            raise DataError(f"data.files: {path} {reason}")
+            raise DataError(f"data.files: {name} {reason}")
         files[task.id] = path
     return files
+
+
+def _each_file(
+    tasks: Sequence[Task], required: Mapping[str, int], data: DataSettings, others: Sequence[Task]
+) -> Iterator[tuple[str, Path]]:
+    """Yield name and path of each of `data.files`; those of a data set `FORMAT:FOLDER` are made when they are there.
+
+    Raises:
+        DataError: A data set does not fit, which its first episodes show.
+    """
+    for name in data.files:
+        form, _, folder = name.partition(":")
+        if form not in doors("sets"):
+            yield name, Path(name)
+            continue
+        read = enter("sets", form)
+        for counts in (dict.fromkeys(required, 1), required):
+            files = read(Path(folder).expanduser(), [*tasks, *others], counts, data.labels)
+            for path in files if counts is not required else ():
+                if reason := _misfit(path, 1, data):
+                    raise DataError(f"data.files: {name} {reason}")
+        yield from ((f"{name}, {path.stem},", path) for path in files)
 
 
 def _files_in(
     folder: Path, tasks: Sequence[Task], required: Mapping[str, int], data: DataSettings
 ) -> dict[str, Path]:
-    """Return the files of a folder that are used as they are, by the id of their task; say which are not, and why.
+    """Return the files of a folder that lie in the original's layout, by the id of their task.
 
     Raises:
-        DataError: Demonstrations that the expert did not record do not fit, or several files do.
+        DataError: One does not fit, or the folder has files of other names, while demonstrations of a task are missing.
     """
     files: dict[str, Path] = {}
     for task in tasks:
@@ -131,66 +188,40 @@ def _files_in(
             if reason := _other_task(file, task) or _misfit(file, required[task.id], data):
                 raise DataError(f"data.folder: {file} {reason}")
             files[task.id] = file
-    if not (left := [task for task in tasks if task.id not in files]):
-        return files
-    stated = _stated_tasks(folder, list(files.values()))
-    for task in left:
-        size = (data.image_size, data.image_size)
-        own = demo_path(
-            folder, DemoConfig(task, size, data.seed or 0, drawing=data.drawing, robot=data.robot)
-        )
-        paths = [path for path, other in stated if same_meaning(task.problem, other.problem)]
-        if own in paths:
-            paths.remove(own)
-            if all(_recorded_by_expert(path) for path in paths):  # the recording completes its own
-                continue
-        reasons = {path: _misfit(path, required[task.id], data) for path in paths}
-        fitting = [path for path, reason in reasons.items() if not reason]
-        if len(fitting) > 1:
-            several = ", ".join(map(str, fitting))
+    if len(files) < len(tasks):  # the others are recorded
+        found = islice(files_below(folder, "*"), _MOST_PATHS)
+        odd = (path for path in found if path.suffix == ".hdf5" and path.parent.suffix != ".parts")
+        if own := next((path for path in odd if not path.stem.endswith("_demo")), None):
             raise DataError(
-                f"data.folder has several files of {task.name!r}: {several}; name one in data.files"
+                f"data.folder: {own} is not used, as it is not named SUITE/TASK_demo.hdf5: name it in data.files, "
+                "which takes files by the task that they state, or have demonstrations recorded into another folder"
             )
-        if fitting:
-            files[task.id] = fitting[0]
-            continue
-        for path, reason in reasons.items():
-            if not _recorded_by_expert(path):
-                raise DataError(f"data.folder: {path} {reason}")
-            print(f"not used: {path} {reason}; others are recorded", file=sys.stderr)
-    if stated and not files and not any(same_meaning(t.problem, o.problem) for t in left for _, o in stated):
-        names = ", ".join(sorted({task.name for _, task in stated})[:3])
-        print(f"data.folder has demonstrations of other tasks only, such as {names}", file=sys.stderr)
     return files
 
 
-def _stated_tasks(folder: Path, used: Sequence[Path]) -> list[tuple[Path, Task]]:
-    """Return the files in a folder, each with the task that it states; say which state none or are behind a link.
+def _recorded_path(folder: Path, task: Task, data: DataSettings) -> Path:
+    """Return where the expert's demonstrations of a task are in a folder."""
+    size = (data.image_size, data.image_size)
+    config = DemoConfig(task, size, data.seed or 0, drawing=data.drawing, robot=data.robot)
+    return demo_path(folder, config)
 
-    Args:
-        used: Files in it that are used already.
+
+def _require_recorded(
+    missing: Sequence[Task], tasks: Sequence[Task], learned: Sequence[int], data: DataSettings, own: bool
+) -> None:
+    """Check that what a saved run learned from is in a folder of the user's, so that only more of it is recorded.
+
+    Raises:
+        DataError: It is not, or the run names another folder, into which nothing is recorded; see `find_demos`.
     """
-    stated, links = [], []
-    for path in sorted(folder.rglob("*")):
-        if path.parent.suffix == ".parts" or not (path.suffix == ".hdf5" or path.is_dir()):
-            continue
-        if path.is_symlink():
-            links += [] if any(path in (file, *file.parents) for file in used) else [str(path)]
-        if path.is_symlink() or path.is_dir():
-            continue
-        try:
-            stated.append((path, recorded_task(path)))
-        except DemoError as error:
-            print(f"not used: {error}", file=sys.stderr)
-    if links:
-        print(f"not used: links, which are not followed: {', '.join(links)}; see data.files", file=sys.stderr)
-    return stated
-
-
-def _recorded_by_expert(file: Path) -> bool:
-    """Return whether a file is the expert's, all of it."""
-    header = read_header(file)
-    return str(header.get("generator", "")).startswith("scripted-expert") and "filter" not in header
+    for task in missing:
+        if data.folder is not None and not own:
+            raise DataError(f"data.folder: {data.folder} has no demonstrations of {task.name!r}")
+        path = _recorded_path(Path(data.folder or demos_dir()), task, data)
+        needed = max(n for t, n in zip(tasks, learned, strict=True) if t.id == task.id)
+        there = len(demo_lengths(path, needed)) if path.is_file() else 0
+        if there < needed:
+            raise DataError(f"{path} has {there} of the {needed} demonstrations that the run learned from")
 
 
 def _other_task(file: Path, task: Task) -> str:
@@ -213,11 +244,16 @@ def _misfit(file: Path, required: int, data: DataSettings) -> str:
         return f"has the robot {recorded_robot(file)}; data.robot is {data.robot}"
     if (hz := recorded_frequency(file)) != CONTROL_HZ:
         return f"was recorded at {hz} Hz; runs act at {CONTROL_HZ} Hz"
+    if other := other_control(file):
+        return f"states {other}: runs learn relative actions of OSC_POSE"
+    if data.labels == "expert" and (noisy := noisy_labels(file)):
+        return f"{noisy}; data.labels=executed learns them as they are"
     if data.seed is not None and header.get("seed", data.seed) != data.seed:
         return f"was recorded with seed {header['seed']}; data.seed is {data.seed}"
-    models, used = json_attribute(header, "models", file).get("pack"), select_pack().name
-    if models not in (None, used):
-        return f"shows the models {models}; those of this run are {used}, see LIBERO_ASSETS"
+    models, used = stated_facts(file, data.labels)["models"], models_here()
+    if "models" not in (data.despite or ()) and models not in (UNSTATED, used):
+        more = "see LIBERO_ASSETS, or use them all the same by data.despite=[models]"
+        return f"shows the models {models}; those of this run are {used}: {more}"
     if json_attribute(header, "variation", file).get("reserved"):
         return "starts from the stored initial states, from which policies are evaluated"
     if data.drawing and "generator" in header and header.get("drawing", FAST) != data.drawing:
@@ -228,6 +264,9 @@ def _misfit(file: Path, required: int, data: DataSettings) -> str:
     with open_demo_file(file) as handle:
         obs = handle["data"][demo_names(handle, file)[0]].get("obs", {})
         shapes = {view: tuple(obs[view].shape[1:3]) for view in data.views if view in obs}
+        readings = [name for name in LOW_DIM_KEYS if name in obs]
+    if lacking := [name for name in data.proprio if name not in readings]:
+        return f"has no {lacking[0]}, which data.proprio has; use of {', '.join(readings)}"
     for view in data.views:
         if view not in shapes:
             return f"has no {view}, which data.views has; `libero demos rerender` draws it"
@@ -285,6 +324,7 @@ def perturb_demos(
     perturb: Sequence[Sequence[Perturbation]],
     data: DataSettings,
     progress: bool | None,
+    own: Sequence[Path] | None = None,
 ) -> list[Path]:
     """Return the files of demonstrations as they look under perturbations; what is missing is rendered beside them.
 
@@ -295,15 +335,24 @@ def perturb_demos(
         perturb: Perturbations of each task.
         data: Image size and drawing.
         progress: As for `find_demos`.
+        own: Folders in which files may be written; None for any.
 
     Raises:
         DemoError: A file is broken, or cannot be written.
+        DataError: One is missing beside a file that is not in these folders.
     """
     size = (data.image_size, data.image_size)
     jobs = [
         RenderJob(path, task, n, RenderConfig(size=size, drawing=data.drawing, perturb=tuple(of_task)))
         for path, task, n, of_task in zip(paths, tasks, counts, perturb, strict=True)
     ]
+    places = None if own is None else [folder.resolve() for folder in own]
+    for job in jobs if places is not None else ():
+        is_own = any(job.path.resolve().is_relative_to(place) for place in places or ())
+        if job.config.perturb and not is_own and not job.is_complete(job.n):
+            raise DataError(
+                f"{job.path}, {job.file} under perturbations, is missing or has too few demonstrations"
+            )
     return ensure_rendered(jobs, progress=progress)
 
 
@@ -314,6 +363,7 @@ def demo_copies(
     perturb: Sequence[Sequence[Perturbation]],
     data: DataSettings,
     progress: bool | None,
+    own: Sequence[Path] | None = None,
 ) -> list[tuple[Path, ...]]:
     """Return the files of further copies of each task's demonstrations, each copy under draws of its own.
 
@@ -324,6 +374,7 @@ def demo_copies(
         perturb: Perturbations of each task; those of `data` replace those of the same kind.
         data: Perturbations and number of the copies.
         progress: As for `find_demos`.
+        own: As for `perturb_demos`, with its errors.
 
     Raises:
         DemoError: A file is broken, or cannot be written.
@@ -332,7 +383,7 @@ def demo_copies(
     for number in range(data.copies):
         draws = [replace(one, seed=one.seed + number) for one in data.perturbations()]
         of_copy = [replace_perturbations(own, draws) for own in perturb]
-        of_each.append(perturb_demos(paths, tasks, counts, of_copy, data, progress))
+        of_each.append(perturb_demos(paths, tasks, counts, of_copy, data, progress, own))
     return list(zip(*of_each, strict=True)) or [()] * len(paths)
 
 
@@ -347,6 +398,7 @@ class DemoDatasets(Mapping[int, TaskWindows]):
         languages: Embeddings of the instructions, (K, L) for K tasks.
         data: How the files are read, and where frames are held.
         copies: Files of copies of each task's demonstrations, from which its windows are, too; () for none.
+        wait: Function that waits until a file is there.
     """
 
     paths: Sequence[Path]
@@ -356,11 +408,13 @@ class DemoDatasets(Mapping[int, TaskWindows]):
     data: DataSettings
     device: torch.device
     copies: Sequence[Sequence[Path]] = ()
+    wait: Callable[[Path], object] = lambda path: None
     _held: WeakValueDictionary[int, TaskWindows] = field(default_factory=WeakValueDictionary)
 
     def __getitem__(self, task: int) -> TaskWindows:
         dataset = self._held.get(task)
         if dataset is None:
+            self.wait(self.paths[task])
             copies = self.copies[task] if self.copies else ()
             parts = [self._windows(path, task) for path in (self.paths[task], *copies)]
             dataset = self._held[task] = StageWindows(parts, task) if copies else parts[0]

@@ -20,10 +20,9 @@ from libero_env.storage import read_npz
 from libero_env.text import show_bytes
 from lifelong.data.dataset import SequenceVLDataset
 from lifelong.data.frame_cache import FrameFile, ensure_frames
+from lifelong.data.settings import MEMORY
 from lifelong.data.source import DemoSource, check_language
 from lifelong.errors import DataError
-
-MEMORY = ("auto", "host", "pinned", "device", "disk")
 
 _GPU_RESERVE = 0.4  # [share of GPU memory] kept free for training
 _HOST_RESERVE = 0.25  # [share of host memory] kept free for everything else
@@ -69,9 +68,10 @@ def open_windows(
 
 
 def _open_on_disk(source: DemoSource, language: Tensor, task_id: int) -> SequenceVLDataset:
-    language, (folder, shape) = check_language(language, source.spec), ensure_frames(source)
+    language, folder = check_language(language, source.spec), ensure_frames(source)
     arrays = {name: torch.from_numpy(array) for name, array in read_npz(folder / "arrays.npz").items()}
     proprio = {name: arrays[f"proprio/{name}"] for name in source.spec.proprio}
+    shape = (len(arrays["last"]), len(source.spec.views), *source.spec.image_size, 3)
     frames = FrameFile(folder / "images.u8", shape)
     return SequenceVLDataset(
         frames, proprio, arrays["actions"], arrays["last"], language, task_id, source.spec.seq_len

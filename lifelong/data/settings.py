@@ -7,15 +7,16 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from libero_env.assets.robot import DEFAULT_ROBOT, ROBOTS
-from libero_env.demos.config import rendered_perturbations
+from libero_env.demos.agreement import FACTS
 from libero_env.demos.contents import LOW_DIM_KEYS
 from libero_env.errors import LiberoError
 from libero_env.perturbations import Perturbation, parse_perturbations
+from libero_env.perturbations.episodes import rendered_perturbations
 from libero_env.validation import OneOf, checked
-from lifelong.data.loading import MEMORY
 from lifelong.errors import ConfigError
 from lifelong.types import Natural, PathText, PolicySpec, Width
 
+MEMORY = ("auto", "host", "pinned", "device", "disk")  # see `lifelong.data.loading`
 # view -> camera in the model
 CAMERAS = {"agentview_rgb": "agentview", "eye_in_hand_rgb": "robot0_eye_in_hand"}
 # A text such as `light=1,camera=0.3`, or kinds with severities: on a command line `stream.perturb={light:1}` needs no
@@ -37,8 +38,8 @@ class DataSettings:
         pairing: `aligned` pairs each action with the observation before it; `stored` reads files as they are.
         labels: `expert` learns the actions that the expert chose, `executed` those with noise that were executed.
         robot: Model of the arm in demonstrations and evaluation, see `libero_env.assets.robot`.
-        files: Demonstration files of tasks of the run, which are the tasks that they state; other tasks have theirs in
-            `folder`.
+        files: Demonstration files of tasks of the run, which are the tasks that they state, and data sets of other
+            tools, `lerobot:FOLDER` and `rlds:FOLDER`; other tasks have theirs in `folder`.
         folder: Folder of the demonstrations; None for `libero_env.paths.demos_dir()`.
         memory: Where frames are held, see `lifelong.data.loading`; batches do not depend on it.
         drawing: How images are drawn, in the demonstrations and in evaluations of the policy: `fast`, `faithful`, or
@@ -49,6 +50,8 @@ class DataSettings:
         perturb_seed: Seed of the first copy's draws; those of the others follow.
         seed: Seed of the expert's demonstrations: of their starts, motions and noise. None: 0 for those that are
             recorded, and any for those of `files` and `folder`.
+        despite: In what demonstrations may differ from each other, `expert` (what recorded them) and `labels`, and from
+            what the policy is evaluated on, `models`; None: in nothing.
         statistics: What policies normalise readings by (those of LeRobot actions, too): `constants`; or statistics of
             the frames of the `first` task (of what was learned before the stream, if anything was), of the `latest`, of
             all `seen` so far, or of the whole `stream`, later tasks included, which no learner can know. None: the
@@ -68,10 +71,11 @@ class DataSettings:
     memory: Annotated[str, OneOf(MEMORY)] = "auto"
     drawing: Literal["fast", "faithful"] | None = None
     perturb: PerturbSetting | None = None
-    perturb_copies: Annotated[int, Field(ge=0, le=1000)] = 1
+    perturb_copies: Annotated[int, Field(ge=1, le=1000)] = 1
     perturb_seed: Natural = 0
     seed: Natural | None = None
     statistics: Statistics | None = None
+    despite: Sequence[Annotated[str, OneOf(FACTS)]] | None = None
 
     def __post_init__(self) -> None:
         require_switched_on(self, "data", perturb=("perturb_copies", "perturb_seed"))
@@ -136,7 +140,7 @@ def require_switched_on(settings: Any, group: str, **parts: Sequence[str]) -> No
 def read_perturbations(
     value: PerturbSetting | None, key: str, *, seed: int = 0, rendered: bool = False
 ) -> tuple[Perturbation, ...]:
-    """Return the perturbations of a setting, in the order in which they are applied, without those of severity 0.
+    """Return the perturbations of a setting, in the order in which they are applied.
 
     Args:
         value: The setting; None for no perturbations.
@@ -145,11 +149,15 @@ def read_perturbations(
         rendered: Whether recorded demonstrations are to be rendered under them.
 
     Raises:
-        ConfigError: A kind does not exist, a severity is out of range, or a kind cannot be rendered.
+        ConfigError: A kind does not exist, a severity is out of range or 0, or a kind cannot be rendered.
     """
-    text = value if isinstance(value, str) else ",".join(f"{k}={v}" for k, v in (value or {}).items())
+    if value is None:
+        return ()
+    text = value if isinstance(value, str) else ",".join(f"{k}={v}" for k, v in value.items())
     try:
-        perturbations = tuple(one for one in parse_perturbations(text, seed) if one.severity)
+        perturbations = parse_perturbations(text, seed)
+        if not all(one.severity for one in perturbations) or not perturbations:
+            raise ConfigError("expected severities above 0; null is for no perturbations")
         return rendered_perturbations(perturbations) if rendered else perturbations
     except LiberoError as error:
         raise ConfigError(f"{key} is {text!r}: {error}") from error

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import dataclass, replace
-from functools import reduce
 from itertools import zip_longest
 from typing import Protocol, TypeVar
 
@@ -80,9 +79,8 @@ class JoinedWindows:
 
     def batch(self, indices: Tensor) -> Batch:
         """Return the windows of the given indices ((B,) int64), those of one dataset after those of another."""
-        return reduce(
-            Batch.join, [dataset.batch(chosen) for dataset, chosen in divided(self.datasets, indices)]
-        )
+        first, *rest = [dataset.batch(chosen) for dataset, chosen in divided(self.datasets, indices)]
+        return first.join(*rest) if rest else first
 
     def expect(self, indices: Tensor) -> None:
         """Read the windows of the given indices, (B,) int64, ahead where datasets can."""

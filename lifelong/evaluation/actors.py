@@ -1,21 +1,23 @@
 """Actors of rollouts: what answers observations with actions, such as a policy of this package."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from libero_env.tasks import Task
-from lifelong.evaluation.environments import Obs
-from lifelong.policies.base import Policy
-from lifelong.training.precision import autocast, float32_products
-from lifelong.types import Observation, PolicySpec, Unfinished
+if TYPE_CHECKING:  # judging needs no PyTorch
+    import torch
+    from torch import Tensor
 
-if TYPE_CHECKING:
     from libero_env.envs.batch import BatchEnv
+    from libero_env.tasks import Task
+    from lifelong.policies.base import Policy
+    from lifelong.types import Observation, PolicySpec
+
+Obs = Mapping[str, np.ndarray]  # name -> (B, ...)
 
 
 class Actor(Protocol):
@@ -48,7 +50,7 @@ class TakesNote(Protocol):
 class WatchesWorld(Protocol):
     """An actor that sees the whole state, as no policy does; it is given the simulations before the episodes."""
 
-    def watch(self, env: "BatchEnv") -> None:
+    def watch(self, env: BatchEnv) -> None:
         """Receive the simulations of the next episodes."""
 
 
@@ -99,7 +101,7 @@ class PolicyActor:
         assert self.embed is not None, "evaluations with events give it"
         rows = self.language.expand(len(self.draws), -1).clone()
         rows[i] = self.embed(task)
-        if not torch.equal(rows, self.language.expand_as(rows)):
+        if not rows.equal(self.language.expand_as(rows)):
             self.language = rows
 
     @property
@@ -121,6 +123,10 @@ class PolicyActor:
             before: What of the last chunk is left, and how many of these actions are probably executed until the next
                 one is there, by simulation, for a policy that inpaints.
         """
+        import torch
+
+        from lifelong.types import Unfinished
+
         unfinished: dict[int, Unfinished] | None = None
         if before is not None:
             unfinished = {i: Unfinished(torch.from_numpy(left), delay) for i, (left, delay) in before.items()}
@@ -128,6 +134,8 @@ class PolicyActor:
 
     def _compute(self, obs: Obs, answer: Callable[[Observation], Tensor]) -> np.ndarray:
         """Return what the policy answers to an observation, float64, in its precision."""
+        from lifelong.training.precision import autocast, float32_products
+
         seen = observe(obs, self.policy.spec, self.language, self.device)
         with autocast(self.device, self.precision), float32_products(self.precision):
             return answer(seen).cpu().numpy().astype(np.float64)
@@ -141,6 +149,10 @@ def observe(obs: Obs, spec: PolicySpec, language: Tensor, device: torch.device) 
         spec: Inputs of the policy.
         language: (L,) embedding of the instruction, or (B, L).
     """
+    import torch
+
+    from lifelong.types import Observation
+
     images = np.stack([obs[view] for view in spec.views], axis=1)[:, None]  # (B, 1, V, H, W, C)
     proprio = {name: torch.from_numpy(np.asarray(obs[name], np.float32))[:, None] for name in spec.proprio}
     languages = language.expand(len(images), -1)

@@ -1,13 +1,14 @@
 """Environments of an evaluation: the interface that rollouts use, a pool, held-out shifts, what numbers depend on."""
 
+from __future__ import annotations
+
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from libero_env.envs.batch import BatchEnv
 from libero_env.errors import RenderError
@@ -23,10 +24,12 @@ from libero_env.sim.scene import build_scene
 from libero_env.tasks import Task
 from lifelong.data.settings import CAMERAS, DataSettings
 from lifelong.errors import ConfigError
+from lifelong.evaluation.actors import Obs
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.types import PolicySpec
 
-Obs = Mapping[str, np.ndarray]  # name -> (B, ...)
+if TYPE_CHECKING:  # judging needs no PyTorch
+    from torch import Tensor
 
 
 class VectorEnv(Protocol):
@@ -67,12 +70,16 @@ class EnvPool:
         self._open.move_to_end(key)
         return self._open[key]
 
+    def empty(self) -> EnvPool:
+        """Return another pool that builds as this one does."""
+        return EnvPool(self._make, self._capacity)
+
     def close(self) -> None:
         """Close all environments."""
         while self._open:
             self._open.popitem()[1].close()
 
-    def __enter__(self) -> "EnvPool":
+    def __enter__(self) -> EnvPool:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -155,7 +162,7 @@ def held_out_shift(
     if words == said:
         return HeldOutShift(format_perturbations(shift), perturb, languages)
     again, found = embed([*said, *words]).split(len(said))
-    if not torch.equal(again, languages):  # the same texts, at other positions
+    if not again.equal(languages):  # the same texts, at other positions
         raise ConfigError(
             f"eval.shift={format_perturbations(shift)} changes instructions, and this language encoder knows tasks by "
             "their position; choose another, such as language=minilm"
@@ -190,6 +197,10 @@ def describe_environment(env: VectorEnv) -> dict[str, Any]:
     if (config := getattr(env, "config", None)) is not None and config.cameras and not config.backend.is_warp:
         backend, renderer = renderer_name()
         found |= {"gl": backend, "renderer": renderer}
+    if find_spec("torch") is None:
+        return found
+    import torch
+
     return found | {
         "instruction_set": torch.backends.cpu.get_cpu_capability(),
         "policy_threads": torch.get_num_threads(),

@@ -2,8 +2,9 @@
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from inspect import isclass
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,12 @@ from lifelong import checkpoints
 from lifelong.algorithms.base import Algorithm, load_algorithm
 from lifelong.data.settings import DataSettings
 from lifelong.data.windows import TaskWindows
-from lifelong.errors import CheckpointError, LifelongError
+from lifelong.errors import CheckpointError, ConfigError, LifelongError, require_run
 from lifelong.evaluation.environments import run_environment
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.policies.base import Policy
 from lifelong.results.run_directory import RunDirectory, read_saved_config
-from lifelong.settings import Configuration
+from lifelong.settings import Configuration, find_target
 from lifelong.streams import Stages, learning_stages, plan_tasks
 from lifelong.training.distributed import Ranks
 from lifelong.training.memory import check_memory, policy_bytes
@@ -150,6 +151,7 @@ def restore(
     path, checkpoint = _find(source, after)
     config = read_config(path / "config.yaml", allow)
     where = Ranks().device(device)
+    config = _from_own_files(config, path)
     plan, language = plan_tasks(config), config.build("language")
     data: DataSettings = config.build("data")
     tasks, instructions = plan.tasks, plan.instructions
@@ -183,6 +185,16 @@ def restore(
     )
 
 
+def _from_own_files(config: Configuration, run: Path) -> Configuration:
+    """Return the configuration of a run with a policy that is built from what the run has saved, nothing elsewhere."""
+    node: Any = config.values.get("policy")
+    with suppress(ConfigError, KeyError, TypeError):  # which building it says
+        kind = find_target(node["_target_"], config.allowed)
+        if isclass(kind) and issubclass(kind, Policy):
+            return replace(config, values={**config.values, "policy": kind.saved_arguments(node, run)})
+    return config
+
+
 def _find(source: Path, after: int | None) -> tuple[Path, Path]:
     """Return the directory of the run, and the checkpoint."""
     if source.is_file():
@@ -191,12 +203,7 @@ def _find(source: Path, after: int | None) -> tuple[Path, Path]:
                 f"{source} is one checkpoint, and after={after} names another; give one of them"
             )
         return source.parent.parent, source
-    if not source.exists():
-        raise LifelongError(
-            f"{source} does not exist; give the directory of a run, such as runs/libero_object/er/NAME, or one of its "
-            "checkpoints"
-        )
-    folder = RunDirectory(source).checkpoints
+    folder = RunDirectory(require_run(source)).checkpoints
     there = folder.tasks()
     if not (source / "config.yaml").is_file() or not there:
         raise LifelongError(

@@ -1,20 +1,20 @@
 """The evaluation loop. The package has no other."""
 
+from __future__ import annotations
+
 import hashlib
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from PIL import Image
-from torch import Tensor
-from tqdm import tqdm
 
 from libero_env.errors import SimulationError
+from libero_env.progress import progress_bar
 from libero_env.sim.causes import Failure
 from libero_env.sim.costs import Costs
 from libero_env.sim.watch import EpisodeWatch
@@ -22,8 +22,13 @@ from libero_env.storage import atomic_path
 from lifelong.errors import ConfigError
 from lifelong.evaluation.actors import Actor, Hears, PolicyActor, TakesNote
 from lifelong.evaluation.environments import Obs, VectorEnv
-from lifelong.policies.base import Policy, in_mode
 from lifelong.seeding import generator
+
+if TYPE_CHECKING:  # judging needs no PyTorch
+    import torch
+    from torch import Tensor
+
+    from lifelong.policies.base import Policy
 
 
 @dataclass(frozen=True)
@@ -147,7 +152,7 @@ def rollout(
     precision: str = "auto",
     record_every: int = 0,
     label: str = "",
-    progress: bool = False,
+    progress: bool | None = False,
 ) -> Rollouts:
     """Run episodes of a policy from the given initial states, all at once; see `run_episodes`.
 
@@ -159,14 +164,19 @@ def rollout(
         horizon: Maximum number of control steps of the policy per episode.
         settle_steps: Number of steps before the policy acts.
         seed: Integers from which stochastic policies get a generator per episode.
+        device: Device on which the policy acts.
         precision: Precision of the policy, see `lifelong.training.settings.FitSettings`.
         record_every: Number of control steps between two recorded frames of the first simulation; 0 records none.
         label: Text before the progress bar.
-        progress: Whether to show a progress bar.
+        progress: As for `libero_env.progress.progress_bar`.
 
     Raises:
         ConfigError: The numbers of simulations and of initial states differ.
     """
+    import torch
+
+    from lifelong.policies.base import in_mode
+
     draws = [generator(*seed, state) for state in init_states]
     before = _states(draws)
     with in_mode(policy, training=False):
@@ -180,7 +190,7 @@ def rollout(
             label=label,
             progress=progress,
         )
-    return replace(done, random=not torch.equal(before, _states(draws)))
+    return replace(done, random=not before.equal(_states(draws)))
 
 
 def run_episodes(
@@ -189,12 +199,14 @@ def run_episodes(
     init_states: Sequence[int],
     *,
     horizon: int,
+    seeds: Sequence[int] | None = None,
     settle_steps: int = 5,
     settle_action: Sequence[float] | None = None,
     record_every: int = 0,
     recorded: Sequence[int] = (0,),
     label: str = "",
-    progress: bool = False,
+    progress: bool | None = False,
+    on_step: Callable[[int, int], None] = lambda steps, most: None,
 ) -> Rollouts:
     """Run episodes of an actor from the given initial states, all at once.
 
@@ -208,11 +220,14 @@ def run_episodes(
         env: Environment with one simulation for each initial state.
         init_states: Indices of stored initial states, one per simulation.
         horizon: Maximum number of control steps of the actor per episode.
+        seeds: Seeds by which initial states are sampled in place of the stored ones, which then are numbers only.
         settle_steps: Number of steps before the actor acts, so that objects come to rest (LIBERO: 5).
         settle_action: Action of these steps; zeros by default.
         record_every: Number of control steps between two recorded frames; 0 records none.
         label: Text before the progress bar.
-        progress: Whether to show a progress bar.
+        progress: As for `libero_env.progress.progress_bar`.
+        on_step: Function called after each step with the number of control steps of all episodes, and with the largest
+            number that it can become.
 
     Raises:
         ConfigError: The numbers of simulations and of initial states differ.
@@ -224,7 +239,8 @@ def run_episodes(
     started, limits = time.perf_counter(), _limits_reached(env)
     actor.reset(env.num_envs)
     _draw(env, not settle_steps)
-    obs, info = env.reset(options={"init_state": np.asarray(init_states)})
+    stored = {"init_state": np.asarray(init_states)} if seeds is None else {}
+    obs, info = env.reset(seed=seeds, options=stored)
     tracker = EpisodeTracker(env, info)
     settling = np.zeros(actor.action_dim) if settle_action is None else np.asarray(settle_action, float)
     for left in reversed(range(settle_steps)):
@@ -234,8 +250,8 @@ def run_episodes(
     lengths = np.zeros(env.num_envs, int)
     digests = [hashlib.sha256() for _ in init_states]
     recordings: list[list[np.ndarray]] = [[] for _ in (recorded if record_every else ())]
-    bar = tqdm(range(horizon), desc=label, disable=not progress, unit="step", leave=False)
-    for step in bar:
+    bar = progress_bar(total=env.num_envs * horizon, desc=label, unit="step", leave=False, progress=progress)
+    for step in range(horizon):
         for frames, i in zip(recordings, recorded, strict=False):
             if step % record_every == 0 and not tracker.over[i]:
                 frames.append(_frame(obs, actor.views, i))
@@ -249,7 +265,11 @@ def run_episodes(
         filmed = bool(recordings) and (step + 1) % record_every == 0
         _draw(env, filmed or getattr(actor, "sees_next", True))
         obs = tracker.step(actions)
-        bar.set_postfix(done=int(tracker.over.sum()), refresh=False)
+        steps, running = int(lengths.sum()), int((~tracker.over).sum())
+        bar.least_total, bar.total = steps, steps + running * (horizon - step - 1)
+        bar.set_postfix(ended=env.num_envs - running, refresh=False)
+        bar.update(steps - bar.n)
+        on_step(steps, bar.total)
     bar.close()
     _draw(env, True)
     _tell(actor, tracker, env)
@@ -390,6 +410,8 @@ def _tell(actor: Actor, tracker: EpisodeTracker, env: VectorEnv) -> None:
 
 def _states(draws: Sequence[torch.Generator]) -> Tensor:
     """Return the states of generators and of the global one, (n, bytes) uint8."""
+    import torch
+
     return torch.stack([*(draw.get_state() for draw in draws), torch.get_rng_state()])
 
 

@@ -6,13 +6,14 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from libero_env.errors import LiberoError
-from libero_env.init_states.store import NUM_INIT_STATES
 from libero_env.perturbations import Perturbation
 from libero_env.sim.backend import MUJOCO, Backend
+from libero_env.tasks.task import NUM_INIT_STATES
 from libero_env.validation import checked
 from lifelong.data.settings import PerturbSetting, read_perturbations
 from lifelong.errors import ConfigError
-from lifelong.results.records import MatrixCells, Phase, measured_tasks
+from lifelong.results.cells import MatrixCells, measured_tasks
+from lifelong.results.records import Phase
 from lifelong.stats.metrics import Transfer
 from lifelong.types import Count, Natural
 
@@ -34,6 +35,8 @@ class EvalSettings:
             `sampled` adds a random share of the others to both, from which NBT and AUC are estimated without bias, see
             `lifelong.stats.metrics.estimate_cells`.
         cells_share: Share of the earlier tasks that `sampled` measures after each task.
+        cells_seed: Seed by which these are drawn. A run whose configuration has none draws by its own seed, so that the
+            error of the sample differs between seeds, and is in their intervals.
         unseen: Whether tasks are evaluated before they are learned: the `next` after each task, or `all` that are to
             come; and all before the first task. Zero-shot success and forward transfer in GEM's sense follow.
         reuse: Whether rollouts that would repeat earlier ones to the bit are copied instead of run: same weights and
@@ -53,6 +56,8 @@ class EvalSettings:
         record_every: Number of control steps between two frames of the recorded rollouts; 0 records none.
         open_environments: Number of environments kept open, of different tasks.
         sim_threads: Number of threads that step simulations; 0 uses all cores.
+        beside: Whether the success matrix is measured, and demonstrations of later tasks are recorded, in processes of
+            their own while a task is learned, to the same bits; on a CPU with several cores only.
         backend: Back end of the rollouts, `mujoco` or `warp` with its settings, such as `warp,device=cuda:1`.
         shift: Perturbations under which each task just learned, and all tasks at the end, are evaluated besides, from
             the same starts; as for `stream.perturb`, of any kinds. It may be chosen when a run is resumed or finished.
@@ -65,6 +70,7 @@ class EvalSettings:
     curve: Literal["all", "trained", "none"] = "all"
     cells: MatrixCells = "all"
     cells_share: Annotated[float, Field(gt=0, le=1)] = 0.1
+    cells_seed: Natural | None = None
     unseen: Literal["none", "next", "all"] = "none"
     reuse: bool = True
     horizon: Count = 600
@@ -76,6 +82,7 @@ class EvalSettings:
     record_every: Natural = 4
     open_environments: Count = 4
     sim_threads: Natural = 0
+    beside: bool = False
     backend: str = MUJOCO
     shift: PerturbSetting | None = None
 
@@ -84,15 +91,17 @@ class EvalSettings:
             self.back_end.require_installed()
         except LiberoError as error:
             raise ConfigError(f"eval.backend: {error}") from error
-        if self.cells != "sampled" and self.cells_share != type(self).cells_share:
-            raise ConfigError(
-                "eval.cells_share has no effect without eval.cells=sampled; leave it out, or set both"
-            )
+        for name in ("cells_share", "cells_seed"):
+            if self.cells != "sampled" and getattr(self, name) != getattr(type(self), name):
+                raise ConfigError(
+                    f"eval.{name} has no effect without eval.cells=sampled; leave it out, or set both"
+                )
         self.shift_perturbations()
-        needed = self.episodes + (self.curve_episodes if self.selection == "apart" else 0)
-        if max(needed, self.curve_episodes) > NUM_INIT_STATES:
+        points = 0 if self.curve == "none" else self.curve_episodes
+        needed = self.episodes + (points if self.selection == "apart" else 0)
+        if max(needed, points) > NUM_INIT_STATES:
             raise ConfigError(
-                f"eval.episodes={self.episodes} and eval.curve_episodes={self.curve_episodes} need {needed} "
+                f"eval.episodes={self.episodes} and eval.curve_episodes={points} need {needed} "
                 f"initial states, a task has {NUM_INIT_STATES}: lower one of them, or set "
                 "eval.selection=reporting"
             )
@@ -122,7 +131,7 @@ class EvalSettings:
         return read_perturbations(self.shift, "eval.shift")
 
     def init_states(self, phase: Phase) -> range:
-        """Return the indices of the initial states of a learning curve, or of the success matrix and under a shift."""
+        """Return the indices of a phase's initial states: `curve`, or of the success matrix and under a shift."""
         if phase != "curve":
             return range(self.episodes)
         if self.selection == "reporting":
@@ -138,10 +147,10 @@ class EvalSettings:
 
     def row(self, stage: Sequence[int], tasks: int) -> Sequence[int]:
         """Return the tasks that are measured after a stage of a run of so many tasks."""
-        return measured_tasks(self.cells, stage, tasks, self.cells_share)
+        return measured_tasks(self.cells, stage, tasks, self.cells_share, self.cells_seed)
 
     def unseen_tasks(self, later: Sequence[Sequence[int]]) -> list[int]:
-        """Return the tasks that are evaluated although they are not learned, of the stages that are to come."""
+        """Return the tasks that are evaluated although they are not learned, of the later stages."""
         counted = {"none": later[:0], "next": later[:1], "all": later}[self.unseen]
         return [task for stage in counted for task in stage]
 

@@ -1,5 +1,6 @@
 from .augmentation import Augmentation, ColorJitter, Compose, RandomShift
 from .flow import FlowHead
+from .frozen import FrozenEncoder
 from .heads import ActionHead, DeterministicHead, GMMHead
 from .tokens import LanguageToken, ProprioScaling, ProprioTokens
 from .transformer import SpatialTransformer, TemporalLSTM, TemporalTransformer
@@ -13,6 +14,7 @@ __all__ = [
     "DeterministicHead",
     "FiLM",
     "FlowHead",
+    "FrozenEncoder",
     "GMMHead",
     "LanguageToken",
     "PatchEncoder",

@@ -150,7 +150,7 @@ class TemporalTransformer(nn.Module):
     def forward(self, tokens: Tensor) -> Tensor:
         """Map tokens (B, T, M, E) to the same shape; those of a time step carry that step's position code."""
         b, t, m, e = tokens.shape
-        mask = block_causal_mask(t, m, tokens.device)
+        mask = block_causal_mask(t, m, tokens.device) if t > 1 else None
         x = (tokens + self.positions[:t, None]).reshape(b, t * m, e)
         for layer in self.layers:
             x = layer(x, mask)

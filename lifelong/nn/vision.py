@@ -99,7 +99,7 @@ class FiLM(nn.Module):
         frames = n // language.shape[0]
         windows = h.view(-1, frames, c, height, width)
         scale, shift = (1 + gamma)[:, None, :, None, None], beta[:, None, :, None, None]
-        return torch.addcmul(shift, windows, scale).view(n, c, height, width)
+        return (windows * scale + shift).view(n, c, height, width)
 
 
 class BasicBlock(nn.Module):

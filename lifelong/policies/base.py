@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -22,32 +23,7 @@ class Policy(nn.Module, ABC):
 
     A subclass implements `window_losses`, `reset` and `_act`, and `predict` for algorithms that distil. What it
     computes on a window in training and what it computes when the same frames come one by one must be the same. It
-    never changes a batch. A policy that sees the joints only:
-
-    >>> import torch
-    >>> from lifelong.data.fake import fake_batch, fake_observation
-    >>> class JointPolicy(Policy):
-    ...     def __init__(self, *, spec: PolicySpec):
-    ...         super().__init__(spec)
-    ...         self.linear = torch.nn.Linear(spec.proprio["joint_states"], spec.action_dim)
-    ...
-    ...     def predict(self, batch):
-    ...         return self.linear(batch.observation.proprio["joint_states"]).tanh()
-    ...
-    ...     def window_losses(self, batch):
-    ...         return (self.predict(batch) - batch.actions).square().mean((1, 2))
-    ...
-    ...     def reset(self, num_envs): ...
-    ...
-    ...     def _act(self, observation, generators):
-    ...         return self.linear(observation.proprio["joint_states"][:, 0]).tanh()
-    >>> spec, draws = PolicySpec(image_size=(32, 32)), torch.Generator().manual_seed(0)
-    >>> policy = JointPolicy(spec=spec)
-    >>> policy.window_losses(fake_batch(spec, 4, draws)).shape
-    torch.Size([4])
-    >>> policy.eval().reset(num_envs=2)
-    >>> policy.act(fake_observation(spec, 2, draws, steps=1)).shape
-    torch.Size([2, 7])
+    never changes a batch.
 
     Args:
         spec: What the policy observes and does.
@@ -59,6 +35,34 @@ class Policy(nn.Module, ABC):
         execute: Number of these that are executed before it predicts again.
         inpaints: Whether a chunk can continue what is being executed, see `plan`.
         statistics: What it normalises by where `data.statistics` does not say.
+
+    Examples:
+        A policy that sees the joints only:
+
+        >>> import torch
+        >>> from lifelong.data.fake import fake_batch, fake_observation
+        >>> class JointPolicy(Policy):
+        ...     def __init__(self, *, spec: PolicySpec):
+        ...         super().__init__(spec)
+        ...         self.linear = torch.nn.Linear(spec.proprio["joint_states"], spec.action_dim)
+        ...
+        ...     def predict(self, batch):
+        ...         return self.linear(batch.observation.proprio["joint_states"]).tanh()
+        ...
+        ...     def window_losses(self, batch):
+        ...         return (self.predict(batch) - batch.actions).square().mean((1, 2))
+        ...
+        ...     def reset(self, num_envs): ...
+        ...
+        ...     def _act(self, observation, generators):
+        ...         return self.linear(observation.proprio["joint_states"][:, 0]).tanh()
+        >>> spec, draws = PolicySpec(image_size=(32, 32)), torch.Generator().manual_seed(0)
+        >>> policy = JointPolicy(spec=spec)
+        >>> policy.window_losses(fake_batch(spec, 4, draws)).shape
+        torch.Size([4])
+        >>> policy.eval().reset(num_envs=2)
+        >>> policy.act(fake_observation(spec, 2, draws, steps=1)).shape
+        torch.Size([2, 7])
     """
 
     by_window = True
@@ -104,7 +108,7 @@ class Policy(nn.Module, ABC):
 
         Args:
             batch: Windows.
-            teacher: The teacher's `answers` on them.
+            teacher: The teacher's answers on them, as of `answers`.
         """
         return (self.predict(batch) - teacher["mean"]).square().sum(-1)
 
@@ -141,6 +145,11 @@ class Policy(nn.Module, ABC):
 
     def save_beside(self, folder: Path) -> None:
         """Write the policy in the format of another package into a folder, where it has one. By default nothing."""
+
+    @classmethod
+    def saved_arguments(cls, values: Mapping[str, Any], folder: Path) -> Mapping[str, Any]:
+        """Return the values of the arguments that build the policy of a run from its folder, not from elsewhere."""
+        return values
 
     @abstractmethod
     def reset(self, num_envs: int) -> None:
@@ -215,6 +224,11 @@ class Policy(nn.Module, ABC):
         missing = [name for name in self.spec.proprio if name not in observation.proprio]
         if missing:
             raise PolicyError(f"the observation lacks {missing}; it has {sorted(observation.proprio)}")
+
+
+def has_hooks(policy: nn.Module) -> bool:
+    """Return whether functions are attached to layers, which neither weights nor another process have."""
+    return any(module._forward_hooks or module._forward_pre_hooks for module in policy.modules())
 
 
 def device_of(policy: nn.Module) -> torch.device:

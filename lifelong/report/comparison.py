@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from lifelong.errors import ComparisonError
-from lifelong.report.runs import Group, Run, algorithm_of, check_same_world, settings_of, stage_of, unlike
+from lifelong.report.runs import Group, Run, algorithm_of, settings_of, stage_of
+from lifelong.report.unlike import check_same_world, unlike
 from lifelong.results.provenance import few_of
 from lifelong.results.shifts import shift_scores
 from lifelong.stats.intervals import mean_and_half_width
@@ -54,7 +55,7 @@ def compare(groups: Sequence[Group], plan: Plan = Plan()) -> dict[str, Any]:  # 
         `after_base_stage`: `metrics` by label and `differences` over the later tasks alone, as if the sequence began
         with them, of the methods whose runs all learned a task after a base stage; None if there are none. `backend`:
         what simulated all rollouts. `conditions`: sentences about all else in which runs differ, see
-        `lifelong.report.runs.unlike`.
+        `lifelong.report.unlike.unlike`.
 
     Raises:
         ComparisonError: The runs are of different back ends or worlds, or a reference is not a method.
@@ -289,7 +290,7 @@ def _shifts(own: _Shifted, references: Mapping[str, _Shifted]) -> dict[str, dict
 
 
 def costs_of(runs: Sequence[Run]) -> dict[str, float]:
-    """Return the costs of a method: storage at the end, the largest peaks, and means over tasks of everything else.
+    """Return the costs of a method: what is kept at the end, the largest peaks, and means over tasks of all else.
 
     Costs that no run recorded are omitted.
     """
@@ -297,18 +298,25 @@ def costs_of(runs: Sequence[Run]) -> dict[str, float]:
     by_task, last = [row for rows in tables for row in rows], [row for rows in tables for row in rows[-1:]]
     found = {}
     for name in dict.fromkeys(name for row in by_task for name in row):
-        values = [row[name] for row in (last if name == "stored_bytes" else by_task) if name in row]
+        values = [
+            row[name] for row in (last if name in ("stored_bytes", "kept_share") else by_task) if name in row
+        ]
         reduce = np.max if name.startswith("peak_") else np.mean
         found[name] = float(reduce(values)) if values else float("nan")
     return found
 
 
 def _costs_by_task(run: Run) -> list[dict[str, float]]:
-    """Return the costs of every task; tasks that are learned together have equal parts of their times."""
+    """Return the costs of every task; tasks that are learned together have equal parts of times, updates, windows."""
     rows = []
     for task, costs in run.results.costs_by_task().items():
         count = len(stage_of(run, task))
-        rows += [{k: v / count if k.endswith("_seconds") else v for k, v in costs.items()}] * count
+        rows += [
+            {
+                k: v / count if k.endswith("_seconds") or k in ("updates", "windows") else v
+                for k, v in costs.items()
+            }
+        ] * count
     return rows
 
 

@@ -2,16 +2,20 @@
 
 import math
 import re
+import sys
 from collections.abc import Mapping, Sequence
 from glob import glob
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from libero_env.storage import atomic_path
-from libero_env.text import flatten
+from libero_env.errors import need
+from libero_env.storage import atomic_path, files_below
+from libero_env.text import Table, counted, flatten
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import compare, costs_of
 from lifelong.report.runs import Group, Run, group_runs, load_run
+from lifelong.results.provenance import few_of
 from lifelong.results.summary import summarize
 from lifelong.stats.metrics import METRIC_NAMES
 
@@ -34,15 +38,19 @@ def load_runs(*patterns: str | Path) -> "pd.DataFrame":
         patterns: Run directories, folders that hold some at any depth, or patterns such as `runs/*/er/*`.
 
     Raises:
+        MissingPackageError: pandas is not installed.
         LifelongError: A pattern holds no run, or a run cannot be read.
     """
-    import pandas as pd
+    return need("pandas").DataFrame(_rows(patterns))
 
+
+def _rows(patterns: Sequence[str | Path]) -> list[dict[str, object]]:
+    """Return what `load_runs` has of each run."""
     runs = find_runs(patterns)
     groups = {
         run.path: group for group in group_runs(runs) for run in (*group.runs, *group.repeats, *group.behind)
     }
-    return pd.DataFrame([_row(run, groups[run.path]) for run in runs])
+    return [_row(run, groups[run.path]) for run in runs]
 
 
 def find_runs(patterns: Sequence[str | Path]) -> list[Run]:
@@ -53,7 +61,7 @@ def find_runs(patterns: Sequence[str | Path]) -> list[Run]:
     found: dict[Path, None] = {}
     for pattern in map(str, patterns):
         folders = [Path(name) for name in sorted(glob(pattern))] or [Path(pattern)]
-        logs = [log for folder in folders for log in sorted(folder.rglob("results.jsonl"))]
+        logs = [log for folder in folders for log in sorted(files_below(folder, "results.jsonl"))]
         inside = [
             run
             for log in logs
@@ -74,21 +82,27 @@ def export_runs(
     The LaTeX table is of the package booktabs: the mean over seeds and its 95 % interval, in percent.
 
     Raises:
+        MissingPackageError: pandas or pyarrow, which write `parquet`, is not installed.
         LifelongError: The runs cannot be read or compared, or the file cannot be written.
     """
-    content = _latex(find_runs(patterns)) if form == "latex" else load_runs(*patterns)
+    content = _latex(find_runs(patterns)) if form == "latex" else _csv(patterns) if form == "csv" else ""
+    table = load_runs(*patterns) if form == "parquet" and need("pyarrow") else None
     try:
         with atomic_path(target) as part:
-            if isinstance(content, str):
-                part.write_text(content, encoding="utf-8")
-            elif form == "csv":
-                content.to_csv(part, index=False)
+            if table is None:
+                part.write_bytes(content.encode())
             else:
-                content.to_parquet(part, index=False)
-    except (OSError, ImportError) as error:
-        reason = "pip install 'libero-lifelong[export]'" if isinstance(error, ImportError) else str(error)
-        raise LifelongError(f"{target}: the table cannot be written: {reason}") from error
+                table.to_parquet(part, index=False)
+    except OSError as error:
+        raise LifelongError(f"{target}: the table cannot be written: {error}") from error
     return target
+
+
+def _csv(patterns: Sequence[str | Path]) -> str:
+    rows = _rows(patterns)
+    keys = list(dict.fromkeys(chain(*rows)))
+    cells = [[row.get(key, "") for key in keys] for row in rows]
+    return Table(keys, [["" if value != value else value for value in row] for row in cells]).csv()
 
 
 def _row(run: Run, group: Group) -> dict[str, object]:
@@ -117,8 +131,19 @@ def _row(run: Run, group: Group) -> dict[str, object]:
 
 
 def _latex(runs: Sequence[Run]) -> str:
-    found = compare(group_runs(runs))
-    lines = [f"% {' '.join(text.split())}" for text in found["conditions"]]
+    """Return the table of the runs that are finished: the fewer tasks are learned, the better they look."""
+    behind = [
+        f"{run.path}: {run.learned} of {counted(len(run.record.tasks), 'task')} learned"
+        for run in runs
+        if not run.results.finished
+    ]
+    if len(behind) == len(runs):
+        raise LifelongError(f"no run is finished, and a paper's table is of finished runs: {few_of(behind)}")
+    for text in behind:
+        print(f"note: left out, as it is not finished: {text}", file=sys.stderr)
+    found = compare(group_runs([run for run in runs if run.results.finished]))
+    lines = [f"% left out, not finished: {' '.join(text.split())}" for text in behind]
+    lines += [f"% {' '.join(text.split())}" for text in found["conditions"]]
     lines += [rf"\begin{{tabular}}{{l{'r' * (1 + len(METRIC_NAMES))}}}", r"\toprule"]
     lines.append(
         " & ".join(["method", "runs", *(_TITLES.get(name, name.upper()) for name in METRIC_NAMES)]) + r" \\"

@@ -1,18 +1,17 @@
 """A self-contained report page about one run, or a comparison of several."""
 
-import base64
 import json
 import os
-from collections.abc import Mapping, Sequence
+import shlex
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from libero_env.errors import InvalidInputError
-from libero_env.storage import atomic_write_text, read_bounded, require_own_folders, write_json
-from libero_env.text import duration
+from libero_env.storage import atomic_write_text, write_json
+from libero_env.text import Table, duration
 from lifelong.errors import LifelongError
 from lifelong.report.comparison import MUJOCO, Plan, compare, findings, published_metrics
 from lifelong.report.figures import (
@@ -25,24 +24,30 @@ from lifelong.report.figures import (
     save,
     storage_figure,
 )
+from lifelong.report.media import media
 from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
 from lifelong.report.tables import (
-    atom_rows,
+    COST_COLUMNS,
+    atom_table,
     cost_table,
-    failure_table,
+    interference_table,
     mean_heatmap,
+    method_table,
     most_forgotten,
     page_template,
     percent,
     run_heatmap,
     shift_table,
-    tally_table,
+    shift_tables,
+    subgoal_table,
+    tally_tables,
     task_costs,
     triangle,
+    with_contents,
 )
 from lifelong.results.failures import failure_score, safety_score
 from lifelong.results.records import RunRecord
-from lifelong.results.relearning import by_measure, read_relearning, savings_heads, savings_rows
+from lifelong.results.relearning import by_measure, read_relearning, savings_table
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_scores
 from lifelong.results.summary import write_episodes
@@ -62,14 +67,6 @@ TRANSFER_TEXTS: dict[str, str] = {
     "cross_fitted": "FWT holds the best epoch, chosen without the start that measures it.",
     "published": "FWT holds the best epoch as measured.",
 }
-MEDIA_TYPES = {
-    ".gif": "image/gif",
-    ".webp": "image/webp",
-    ".png": "image/png",
-    ".mp4": "video/mp4",
-    ".webm": "video/webm",
-}
-MEDIA_LIMIT = 48 * 2**20  # [bytes] of rollout recordings in one page
 
 
 def write_report(
@@ -100,8 +97,7 @@ def write_report(
             out = out / "report.html"
         out.parent.mkdir(parents=True, exist_ok=True)
         context = _single_run(runs[0], out.parent) if len(runs) == 1 else _comparison(runs, out.parent, plan)
-        page = page_template("page.html").render(context)
-        atomic_write_text(out, page)
+        atomic_write_text(out, with_contents(page_template("page.html").render(context)))
     except OSError as error:
         raise LifelongError(f"{out or Path.cwd()}: the report cannot be written ({error})") from error
     return out
@@ -149,6 +145,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
     return {
         "title": f"{record.algo} on {record.benchmark}",
         "facts": _facts(run),
+        "command": shlex.join(["python", "train.py", *record.overrides]) if record.overrides else "",
         "notes": run.notes,
         "metrics": run.metrics,
         "metric_texts": _metric_texts([run]),
@@ -164,14 +161,13 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "times": [(name, duration(s), 100 * s / sum(times.values())) for name, s in times.items()],
         "total_time": duration(sum(times.values())),
         "episodes": run.results.episodes(),
-        "relearning": [
-            (savings_heads(part), savings_rows(part)) for part in by_measure(read_relearning(run.path))
-        ],
-        "shifts": [shift_table(score, labels) for score in shift_scores(run.results)],
-        "safety": tally_table(safety_score(run.results), labels),
-        "failures": failure_table(failure_score(run.results), labels),
-        "subgoals": run.results.subgoals().predicates,
-        "atoms": atom_rows(run.results.subgoals(), labels),
+        "relearning": [savings_table(part) for part in by_measure(read_relearning(run.path))],
+        "shifts": [(score.shift, shift_table(score, labels)) for score in shift_scores(run.results)],
+        "safety": tally_tables(safety_score(run.results), labels),
+        "failures": tally_tables(failure_score(run.results), labels),
+        "interference": interference_table(failure_score(run.results), labels),
+        "subgoals": subgoal_table(run.results.subgoals()),
+        "atoms": atom_table(run.results.subgoals(), labels),
         "most_forgotten": most_forgotten(run.results.subgoals().atoms),
         "costs": task_costs(run, labels),
         "media": media(run.path / "videos"),
@@ -223,12 +219,15 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
         "metrics": {label: group["metrics"] for label, group in found["groups"].items()},
         "later": later,
         "metric_texts": _metric_texts(counted),
-        "other_conventions": _forgotten(found, "other_conventions"),
-        "spreads": [
-            (label, group["spreads"])
-            for label, group in found["groups"].items()
-            if any(np.isfinite(group["spreads"][factor]["auc"]) for factor in ("order", "demonstrations"))
-        ],
+        "other_conventions": method_table(found, "other_conventions", 1),
+        "spreads": Table(
+            ("method", "order of tasks", "demonstrations", "seed"),
+            [
+                [label, *(percent(factor["auc"]) for factor in group["spreads"].values())]
+                for label, group in found["groups"].items()
+                if any(np.isfinite(group["spreads"][factor]["auc"]) for factor in ("order", "demonstrations"))
+            ],
+        ),
         "differences": found["differences"],
         "findings": _findings(found),
         "margin": plan.margin,
@@ -237,33 +236,28 @@ def _comparison(runs: Sequence[Run], folder: Path, plan: Plan) -> dict[str, Any]
             (label, group["published"])
             for label, group in found["groups"].items()
             if np.isfinite(group["published"]["fwt"])
+            and any(
+                percent(v) != percent(group["metrics"][name]["mean"])
+                for name, v in group["published"].items()
+            )
         ],
         "transfer": " ".join(dict.fromkeys(TRANSFER_TEXTS[_compared_transfer(r, counted)] for r in counted)),
-        "forgotten_tasks": _forgotten(found, "forgetting_by_task", texts),
-        "forgotten_subgoals": _forgotten(found, "subgoals"),
-        "shifted": _shifted(found, plan.references),
-        "costs": cost_table([(label, group["costs"]) for label, group in found["groups"].items()]),
+        "forgotten_tasks": method_table(found, "forgetting_by_task", 0, texts),
+        "forgotten_subgoals": method_table(found, "subgoals", 0),
+        "shifted": shift_tables(found, plan.references),
+        "costs": cost_table("method", [(label, group["costs"]) for label, group in found["groups"].items()]),
+        "cost_columns": COST_COLUMNS,
+        "spent": [
+            name
+            for name in ("kept_share", "updates")
+            if any(name in group["costs"] for group in found["groups"].values())
+        ],
         "heatmaps": heatmaps,
         "forgetting": as_svg(forgetting_figure(lines)),
         "storage": as_svg(storage_figure(stored)) if stored else None,
         "triangles": {name: rows for name in METRIC_TEXTS if (rows := triangle(found, name))},
         "runs": [_run_row(run, group.label, folder) for group in groups for run in group.runs],
     }
-
-
-def _shifted(found: Mapping[str, Any], references: Sequence[str]) -> dict[str, tuple[list[str], list[Any]]]:
-    """Return by held-out shift the references, and a row for each method, that were evaluated under it."""
-    groups: Mapping[str, Any] = found["groups"]
-    tables: dict[str, tuple[list[str], list[Any]]] = {}
-    for shift in dict.fromkeys(shift for group in groups.values() for shift in group["shifts"]):
-        own = {label: group["shifts"][shift] for label, group in groups.items() if shift in group["shifts"]}
-        names = [name for name in references if name in own]
-        rows = [
-            {"label": label, **values, "lost": [values["lost"], *map(values["lost_less"].get, names)]}
-            for label, values in own.items()
-        ]
-        tables[shift] = names, rows
-    return tables
 
 
 def _comparable(groups: Sequence[Group]) -> list[Group]:
@@ -357,7 +351,8 @@ def _published(run: Run) -> dict[str, float] | None:
     if run.metrics is None or run.results.transfer == "published":
         return None
     values = published_metrics([run])
-    return values if np.isfinite(values["fwt"]) else None
+    same = all(percent(values[name]) == percent(getattr(run.metrics, name).value) for name in values)
+    return values if np.isfinite(values["fwt"]) and not same else None
 
 
 def _stored(found: dict[str, Any]) -> dict[str, tuple[float, Estimate]]:
@@ -368,24 +363,6 @@ def _stored(found: dict[str, Any]) -> dict[str, tuple[float, Estimate]]:
         if np.isfinite([size, auc["mean"]]).all():
             points[label] = size, Estimate(auc["mean"], auc["low"], auc["high"])
     return points if len(points) > 1 else {}
-
-
-def _forgotten(
-    found: dict[str, Any], key: str, texts: Mapping[str, str] | None = None
-) -> list[dict[str, Any]]:
-    """Return a row for each task or predicate, with its forgetting in each group, and with a text in place of its name.
-
-    Args:
-        key: What a group has the forgetting under.
-        texts: The names in the order of the rows, each with its text; by default the names in the groups.
-    """
-    tables = [group[key] for group in found["groups"].values()]
-    rows = texts or {name: name for table in tables for name in table}
-    return [
-        {"label": text, "cells": [table.get(name) for table in tables]}
-        for name, text in rows.items()
-        if any(name in table for table in tables)
-    ]
 
 
 def _run_row(run: Run, label: str, folder: Path) -> dict[str, Any]:
@@ -420,32 +397,3 @@ def _task_rows(run: Run, rates: np.ndarray) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def media(folder: Path, pattern: str = "*") -> dict[str, Any]:
-    """Return the images and videos of a folder as data URLs, with captions from text files of the same stem."""
-    items: list[dict[str, Any]] = []
-    left_out: list[str] = []
-    used = 0
-    try:
-        require_own_folders(folder.parent, folder.name)
-    except InvalidInputError as error:
-        return {"items": items, "left_out": [str(error)]}
-    for path in sorted(folder.glob(pattern)) if folder.is_dir() else []:
-        kind = MEDIA_TYPES.get(path.suffix.lower())
-        if kind is None:
-            continue
-        note, caption = path.with_suffix(".txt"), path.stem.replace("_", " ")
-        try:  # a run may be somebody else's, and its page is passed on
-            content = read_bounded(path, MEDIA_LIMIT - used, within=folder.parent)
-            if os.path.lexists(note):
-                caption = read_bounded(note, 1 << 20, within=folder.parent).decode(errors="replace").strip()
-        except OSError as error:
-            left_out.append(f"{path.name} ({error})")
-            continue
-        used += len(content)
-        data = base64.b64encode(content).decode()
-        items.append(
-            {"url": f"data:{kind};base64,{data}", "video": kind.startswith("video"), "caption": caption}
-        )
-    return {"items": items, "left_out": left_out}

@@ -3,14 +3,15 @@
 import math
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from libero_env.demos.agreement import UNSTATED, differing
 from libero_env.errors import InvalidInputError
 from libero_env.storage import MAX_YAML_BYTES, parse_yaml_text, read_bounded
-from lifelong.errors import ComparisonError, LifelongError, ResultsError
+from lifelong.errors import LifelongError, ResultsError
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import few_of, result_relevant, resume_notes
 from lifelong.results.records import RunRecord, TaskEndRecord
@@ -18,13 +19,14 @@ from lifelong.results.results import Results
 from lifelong.stats.metrics import Metrics, lifelong_metrics
 
 _TOLD = ("packnet", "lora", "omla", "singletask")
-_BASICS = ("algo", "benchmark", "policy", "preset")
+BASICS = ("algo", "benchmark", "policy", "preset")
 # of keys that change no result by themselves, besides those of `lifelong.results.provenance.VOLATILE`
 _IGNORED = (
     "benchmark.order",
     "benchmark.order_seed",
     "benchmark.horizon",
     "data.seed",
+    "eval.cells_seed",
     "eval.record_every",
     "eval.reuse",
     "eval.transfer",
@@ -119,7 +121,14 @@ def load_run(path: Path) -> Run:
     if not results.finished:
         so_far = f"{learned} of {len(record.tasks)} tasks are learned"
         notes.insert(0, f"This run is not finished: {so_far}, and the metrics are over these.")
-    remarks = (*notes, *_untrained(results), *resume_notes(results), *results.error_notes, *results.problems)
+    remarks = (
+        *notes,
+        *_untrained(results),
+        *_unlike_origins(results),
+        *resume_notes(results),
+        *results.error_notes,
+        *results.problems,
+    )
     return Run(path, results, record, config, text, remarks, learned, metrics)
 
 
@@ -134,6 +143,24 @@ def _untrained(results: Results) -> list[str]:
         "Next to no weight was free, so nothing was trained on, or hardly anything:": full,
     }
     return [f"{text} {few_of(list(dict.fromkeys(tasks)))}." for text, tasks in told.items() if tasks]
+
+
+def _unlike_origins(results: Results) -> list[str]:
+    """Return sentences about demonstrations that differ from each other, or from what the run was evaluated with."""
+    if (found := results.demonstrations) is None:
+        return []
+    columns = {"models": found.models, "expert": found.generators, "labels": found.labels}
+    facts = {
+        task: {name: values[i] or UNSTATED for name, values in columns.items() if values}
+        for i, task in enumerate(results.run.tasks)
+    }
+    versions = results.run.versions
+    here = f"{versions.get('models')} {versions.get('models_digest')}"
+    others = [models for models in dict.fromkeys(found.models) if models not in (UNSTATED, here)]
+    return [
+        *(f"Its demonstrations differ in {line}." for line in differing(facts)),
+        *(f"Demonstrations show the models {models}; it was evaluated on {here}." for models in others),
+    ]
 
 
 def short_labels(instructions: Sequence[str]) -> list[str]:
@@ -196,149 +223,14 @@ def _label(identity: dict[str, Any], others: Sequence[dict[str, Any]], *, whole:
     differs = {
         k: v
         for k, v in identity.items()
-        if k != "algo" and any(o.get(k) != v for o in (others if k in _BASICS else rivals))
+        if k != "algo" and any(o.get(k) != v for o in (others if k in BASICS else rivals))
     }
-    words = [str(v) if k in _BASICS else f"{k.rpartition('.')[2]} {v}" for k, v in differs.items()]
+    words = [str(v) if k in BASICS else f"{k.rpartition('.')[2]} {v}" for k, v in differs.items()]
     if whole:
         words = [f"{key} {value!r}" for key, value in differs.items()]
     elif len(words) > 3:
         words = [*words[:3], "…"]
     return f"{identity['algo']} ({', '.join(words)})" if words else str(identity["algo"])
-
-
-def unlike(groups: Sequence[Group]) -> list[str]:
-    """Return a sentence for all in which runs differ besides their methods' names, or that a record does not tell."""
-    return [
-        *(
-            f"Runs differ in {text}."
-            for text in _unlike_facts(groups, (*_WORLD, "source", "estimate of FWT", "tasks learned"))
-        ),
-        *(
-            f"{group.label} seed {run.record.seed} has learned {_progress(run)} tasks; it is not counted."
-            for group in groups
-            for run in group.behind
-        ),
-        *_unlike_draws(groups),
-        *_unlike_demonstrations(groups),
-        *_unlike_settings(groups),
-    ]
-
-
-def check_same_world(groups: Sequence[Group]) -> None:
-    """Check that runs are of one world: of the same models, simulated by the same MuJoCo.
-
-    Raises:
-        ComparisonError: They are not; the message names runs of each. What no record tells is not refused.
-    """
-    if found := _unlike_facts(groups, _WORLD, unknown=False):
-        raise ComparisonError(
-            f"runs of different worlds are only compared with --other-worlds: they differ in {'; in '.join(found)}"
-        )
-
-
-_WORLD = ("models digest", "mujoco")
-
-
-def _unlike_facts(groups: Sequence[Group], names: Sequence[str], *, unknown: bool = True) -> list[str]:
-    """Return the facts of the records in which runs differ, each with its values and the runs of each value."""
-    lines = []
-    for name in names:
-        found: dict[str, list[str]] = {}
-        for label, run in ((group.label, run) for group in groups for run in group.runs):
-            facts = {
-                **run.record.versions,
-                **run.record.conditions,
-                "estimate of FWT": run.results.transfer,
-                "tasks learned": _progress(run),
-            }
-            value = facts.get(name.replace(" ", "_"), facts.get(name))
-            if value is not None or unknown:
-                found.setdefault(value or "unknown", []).append(f"{label} seed {run.record.seed}")
-        if len(found) > 1:
-            lines.append(f"{name} ({'; '.join(f'{value}: {few_of(runs)}' for value, runs in found.items())})")
-    return lines
-
-
-def _progress(run: Run) -> str:
-    return f"{run.learned} of {len(run.record.tasks)}"
-
-
-def _unlike_draws(groups: Sequence[Group]) -> list[str]:
-    """Return a sentence where methods were run with other seeds, orders of tasks, or seeds of demonstrations."""
-    draws: dict[str, Callable[[RunRecord], Any]] = {
-        "seeds": lambda record: record.seed,
-        "tasks or their orders": lambda record: record.tasks,
-        "seeds of the demonstrations (data.seed)": lambda record: record.demonstrations_seed,
-    }
-    lines = []
-    for name, drawn in draws.items():
-        sets: dict[Any, dict[Any, list[str]]] = {}
-        for group in groups:
-            first = group.runs[0].record  # other benchmarks and lengths are told elsewhere
-            alike = sets.setdefault((first.benchmark, len(first.tasks)), {})
-            alike.setdefault(frozenset(drawn(r.record) for r in group.runs), []).append(group.label)
-        lines += [
-            f"The {name} differ between methods: {' against '.join(map(few_of, alike.values()))}."
-            for alike in sets.values()
-            if len(alike) > 1
-        ]
-    subsets = {group.label: len({frozenset(r.record.tasks) for r in group.runs}) for group in groups}
-    return lines + [
-        f"The runs of {name} learn {n} different sets of tasks." for name, n in subsets.items() if n > 1
-    ]
-
-
-def _unlike_demonstrations(groups: Sequence[Group]) -> list[str]:
-    """Return a sentence for each set of runs whose demonstrations differ although settings and `data.seed` are equal.
-
-    That happens when the expert was improved, or files of `data.folder` were replaced, between two runs.
-    """
-    sets: dict[Any, dict[tuple[tuple[str, str], ...], list[str]]] = {}
-    unknown = []
-    for group in groups:
-        for run in group.runs:
-            name = f"{group.label} seed {run.record.seed}"
-            if (found := run.results.demonstrations) is None:
-                unknown.append(name)
-                continue
-            counts = tuple(sorted(zip(run.record.tasks, found.counts, strict=True)))
-            digests = tuple(sorted(zip(run.record.tasks, found.digests, strict=True)))
-            data = tuple(item for item in settings_of(run).items() if item[0].startswith("data."))
-            alike = sets.setdefault((run.record.benchmark, run.record.demonstrations_seed, counts, data), {})
-            alike.setdefault(digests, []).append(name)
-    lines = (
-        [f"No record tells which demonstrations these learned from: {few_of(unknown)}."] if unknown else []
-    )
-    for (first, names), *others in (list(alike.items()) for alike in sets.values()):
-        for digests, others_names in others:
-            differ = [task for (task, was), (_, now) in zip(first, digests, strict=True) if was != now]
-            lines.append(
-                f"{few_of(others_names)} learned from other demonstrations of {few_of(differ)} than {few_of(names)}: "
-                "a difference between them may be due to that."
-            )
-    return lines
-
-
-def _unlike_settings(groups: Sequence[Group]) -> list[str]:
-    """Return a sentence with the settings that differ between methods, and that their names do not tell."""
-    known = [(group.label, settings_of(group.runs[0])) for group in groups if group.runs[0].config]
-    one_policy = len({settings["policy"] for _, settings in known}) == 1
-    named = ("algo.",) if one_policy else ("algo.", "policy.")  # keys of another policy mean something else
-    keys = {key for _, settings in known for key in settings if not key.startswith(named)}
-    untold = []
-    for key in sorted(keys - set(_BASICS)):
-        found: dict[Any, list[str]] = {}
-        for label, settings in known:
-            found.setdefault(settings.get(key), []).append(label)
-        told = all(
-            f"{key.rpartition('.')[2]} {settings[key]}" in label
-            for label, settings in known
-            if key in settings
-        )
-        if len(found) > 1 and not told:
-            values = ", ".join(f"{value} of {few_of(labels)}" for value, labels in found.items())
-            untold.append(f"{key.rstrip('.')} ({values})")
-    return [f"Settings differ that no method's name tells: {few_of(untold, 6)}."] if untold else []
 
 
 def algorithm_of(run: Run) -> str:
@@ -369,7 +261,7 @@ def settings_of(run: Run) -> dict[str, Any]:
         settings["tasks"] = len(record.tasks)
     if init_from := run.config.get("init_from"):  # each seed may start from a run of the same seed
         settings["init_from"] = re.sub(r"seed\d+", "seed", str(init_from))
-    return {n: getattr(record, n) for n in _BASICS} | dict(sorted(settings.items()))
+    return {n: getattr(record, n) for n in BASICS} | dict(sorted(settings.items()))
 
 
 def _load_config(path: Path) -> tuple[dict[str, Any], str, list[str]]:

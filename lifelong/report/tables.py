@@ -1,5 +1,6 @@
 """Tables of pages, and the templates that show them: self-contained HTML in one style."""
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -9,7 +10,7 @@ import jinja2
 import numpy as np
 
 from libero_env.storage import atomic_write_text
-from libero_env.text import duration, quantity
+from libero_env.text import Cell, Table, counted, duration, quantity
 from lifelong.errors import writing
 from lifelong.report.comparison import costs_of
 from lifelong.report.figures import cell_colours
@@ -18,19 +19,27 @@ from lifelong.results.failures import FailureScore, Tally
 from lifelong.results.results import Results
 from lifelong.results.shifts import ShiftScore
 from lifelong.results.subgoals import AtomRates, Subgoals
-from lifelong.stats.intervals import mean_and_half_width, wilson_interval
+from lifelong.stats.intervals import Estimate, mean_and_half_width, wilson_interval
 
 # costs by their names in `lifelong.training.costs`: head of the column, its tooltip, and how a value is shown
 _bytes, _flop = (partial(quantity, unit=unit) for unit in ("B", "FLOP"))
+_percent, _count = "{:.3g} %".format, "{:.0f}".format
 COST_COLUMNS: dict[str, tuple[str, str, Callable[[float], str]]] = {
     "training_seconds": ("Training", "wall time of training on a task", duration),
     "evaluation_seconds": ("Evaluation", "wall time of rollouts while and after learning a task", duration),
     "end_task_seconds": ("Between tasks", "wall time of what the algorithm does after a task", duration),
-    "flops_per_step": ("A step", "operations of a training step, replay and penalties included", _flop),
-    "flops_per_action": ("An action", "operations of one action with a full history", _flop),
+    "flops_per_step": (
+        "FLOPs a step",
+        "matrix products and convolutions of a training step with replay, and a penalty's element-wise operations; "
+        "not those of layers and optimiser",
+        _flop,
+    ),
+    "flops_per_action": ("FLOPs an action", "operations of one action with a full history", _flop),
     "parameters": ("Parameters", "of the policy and of what the algorithm trains beside it", quantity),
     "parameters_trained": ("Trained", "parameters that training may change", quantity),
     "stored_bytes": ("Stored", "kept from task to task: state, and frames to replay", _bytes),
+    "kept_share": ("Kept", "share of the windows of all tasks so far that is kept to replay", _percent),
+    "updates": ("Updates", "of the weights while learning a task", _count),
     "peak_gpu_bytes": ("GPU memory", "largest while learning a task", _bytes),
     "peak_memory_bytes": ("Memory", "largest of the process so far", _bytes),
 }
@@ -38,7 +47,7 @@ COST_COLUMNS: dict[str, tuple[str, str, Callable[[float], str]]] = {
 
 @cache
 def page_template(name: str, package: str = "lifelong.report") -> jinja2.Template:
-    """Return a template of a package, with the filters `percent` and `quantity`; an undefined name is an error.
+    """Return a template of a package, with filters `percent`, `quantity` and `counted`; an undefined name is an error.
 
     Args:
         name: File of the template, which extends `base.html` of `lifelong.report`.
@@ -51,7 +60,7 @@ def page_template(name: str, package: str = "lifelong.report") -> jinja2.Templat
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(percent=percent, quantity=quantity)
+    environment.filters.update(percent=percent, quantity=quantity, counted=counted)
     return environment.get_template(name)
 
 
@@ -89,40 +98,62 @@ def triangle(found: Mapping[str, Any], metric: str) -> list[dict[str, Any]]:
     return [{"label": row, "cells": [of.get((row, column)) for column in labels[1:]]} for row in labels[:-1]]
 
 
-def cost_table(rows: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, Any] | None:
-    """Return labelled rows of costs, with the columns that any row has; None if there are none."""
+def with_contents(page: str) -> str:
+    """Return a page with a list of its sections under its head."""
+    titles = re.findall("<h2>(.*?)</h2>", page)
+    for number, title in enumerate(titles):
+        page = page.replace(f"<h2>{title}</h2>", f'<h2 id="s{number}">{title}</h2>', 1)
+    links = "".join(f'<a href="#s{number}">{title}</a>' for number, title in enumerate(titles))
+    return page.replace("</header>", f'<nav class="contents">{links}</nav></header>', 1)
+
+
+def cost_table(name: str, rows: Sequence[tuple[str, Mapping[str, float]]]) -> Table:
+    """Return labelled rows of costs, with the columns that any row has; without rows if there are none.
+
+    Args:
+        name: Head of the labels.
+    """
     columns = {
         name: column for name, column in COST_COLUMNS.items() if any(name in costs for _, costs in rows)
     }
-    if not columns:
-        return None
 
     def text(costs: Mapping[str, float], name: str) -> str:
         return columns[name][2](costs[name]) if np.isfinite(costs.get(name, np.nan)) else "–"
 
-    texts = [(label, [text(costs, name) for name in columns]) for label, costs in rows if costs]
-    return {"columns": [(head, title) for head, title, _ in columns.values()], "rows": texts}
+    heads = [Cell(head, title=title) for head, title, _ in columns.values()]
+    return Table(
+        [name, *heads], [[label, *(text(costs, one) for one in columns)] for label, costs in rows if costs]
+    )
 
 
-def task_costs(run: Run, labels: Sequence[str]) -> dict[str, Any] | None:
+def task_costs(run: Run, labels: Sequence[str]) -> Table:
     """Return the costs of every task of a run, of tasks that are learned together in one row, and their average."""
     rows = []
     for last, costs in run.results.costs_by_task().items():
         first = stage_of(run, last)[0]
         name = f"{last + 1}  {labels[last]}" if first == last else f"{first + 1} to {last + 1}, together"
         rows.append((name, costs))
-    return cost_table([*rows, ("average of a task; largest memory", costs_of([run]))]) if rows else None
+    return cost_table("task", [*rows, ("average of a task; largest memory", costs_of([run]))] if rows else [])
 
 
-def atom_rows(found: Subgoals, labels: Sequence[str]) -> list[dict[str, Any]]:
-    """Return a row for each atom of each task; the first of a task has the task's label."""
-    rows: list[dict[str, Any]] = []
-    for atom in found.atoms:
-        first = not rows or rows[-1]["atom"].task != atom.task
-        rows.append(
-            {"atom": atom, "text": atom.atom.strip("()"), "label": labels[atom.task] if first else ""}
+def atom_table(found: Subgoals, labels: Sequence[str]) -> Table:
+    """Return how often each atom of each task was reached; the first of a task has the task's label."""
+    rows, task = list[list[object]](), -1
+    for a in found.atoms:
+        held = (
+            "held from the start" if a.at_start == 1 else f"held from the start in {percent(a.at_start, 0)} %"
         )
-    return rows
+        names = (a.task + 1, labels[a.task]) if a.task != task else ("", "")
+        rates = (a.learned_ever, a.learned_end, a.final_ever, a.final_end, a.forgotten)
+        note = held if a.at_start > 0 else ""
+        rows.append([*names, Cell(a.atom.strip("()"), note), *(percent(rate, 0) for rate in rates)])
+        task = a.task
+    ever = [
+        f"reached at any time, {when}" for when in ("right after learning the task", "after the last task")
+    ]
+    end = Cell("Held", title="held when the episode ended")
+    heads = (Cell("Just learned", title=ever[0]), end, Cell("At the end", title=ever[1]), end, "forgotten")
+    return Table(("#", "task", "atom", *heads), rows, left=3)
 
 
 def most_forgotten(atoms: Iterable[AtomRates], threshold: float = 0.005) -> list[AtomRates]:
@@ -131,68 +162,72 @@ def most_forgotten(atoms: Iterable[AtomRates], threshold: float = 0.005) -> list
     return sorted(lost, key=lambda a: -a.forgotten)[:3]
 
 
-def shift_table(score: ShiftScore, labels: Sequence[str]) -> dict[str, Any]:
-    """Return the template's table of success and forgetting under a held-out shift.
+def shift_table(score: ShiftScore, labels: Sequence[str]) -> Table:
+    """Return the table of success and forgetting under a held-out shift.
 
     Args:
         score: Success under the shift.
         labels: Short names of the run's tasks.
     """
     names, ways = ("learned", "learned_shifted", "final", "final_shifted"), (False, True)
-    rows = [
-        {
-            "number": task.task + 1,
-            "label": labels[task.task],
-            "cells": [*map(task.rate, names), *(task.forgotten(shifted=way) for way in ways)],
-        }
-        for task in score.tasks
-    ]
+    rows: list[list[object]] = []
+    for task in score.tasks:
+        rates = [*map(task.rate, names), *(task.forgotten(shifted=way) for way in ways)]
+        rows.append([task.task + 1, labels[task.task], *(percent(rate, 0) for rate in rates)])
     means = [*map(score.success, names), *(score.forgetting(shifted=way) for way in ways)]
-    return {"name": score.shift, "rows": rows, "means": means}
+    rows.append(["", Cell("mean", strong=True), *(estimate_cell(e, strong=True) for e in means)])
+    heads = [part for name in ("just learned", "at the end", "forgotten") for part in (name, "under shift")]
+    return Table(("#", "task", *heads), rows, left=2)
 
 
-def failure_table(score: FailureScore | None, labels: Sequence[str]) -> dict[str, Any] | None:
-    """Return the template's tables of causes and of interference; None without a score.
+def estimate_cell(e: Estimate | None, digits: int = 0, *, strong: bool = False) -> Cell:
+    """Return an estimate in percent with its interval behind it; a dash for none."""
+    if e is None:
+        return Cell("–")
+    known = not np.isnan(e.low)
+    note = f"[{percent(e.low, digits)}, {percent(e.high, digits)}]" if known else ""
+    return Cell(percent(e.value), note, strong)
 
-    Args:
-        score: Why the rollouts of a run failed.
-        labels: Short names of the run's tasks.
-    """
-    if score is None:
+
+def interference_table(score: FailureScore | None, labels: Sequence[str]) -> Table | None:
+    """Return how many rollouts of each task served another one; None where none did."""
+    if score is None or not score.interference:
         return None
     tasks = sorted({task for pair in score.interference for task in pair})
-    served = [(task, labels[task], [score.interference.get((task, k), 0) for k in tasks]) for task in tasks]
-    return {**(tally_table(score, labels) or {}), "tasks": tasks, "served": served}
+    rows = [[t + 1, labels[t], *(score.interference.get((t, k), "") for k in tasks)] for t in tasks]
+    return Table(("#", "task", *(task + 1 for task in tasks)), rows, left=2)
 
 
-def tally_table(score: Tally | None, labels: Sequence[str]) -> dict[str, Any] | None:
-    """Return the template's tables of rollouts by outcome; None without a score.
+def tally_tables(score: Tally | None, labels: Sequence[str]) -> list[Table]:
+    """Return tables of rollouts by outcome: of each task at the end, and of all after learning each.
 
     Args:
         score: Numbers of rollouts.
         labels: Short names of the run's tasks.
     """
     if score is None:
-        return None
-    tables = [
-        (head, [(k, labels[k], [found.get(one, 0) for one in score.outcomes]) for k, found in rows.items()])
-        for head, rows in (("Task, at the end", score.by_task), ("All tasks, after learning", score.after))
+        return []
+    return [
+        Table(
+            ("#", head, *score.outcomes),
+            [[k + 1, labels[k], *(found.get(one, 0) for one in score.outcomes)] for k, found in rows.items()],
+            left=2,
+        )
+        for head, rows in (("task, at the end", score.by_task), ("all tasks, after learning", score.after))
     ]
-    return {"outcomes": score.outcomes, "tables": tables}
 
 
 def run_heatmap(results: Results, labels: Sequence[str]) -> dict[str, Any]:
     """Return the cells of one run's matrix: percent, colours, and Wilson's interval as the tooltip."""
     rates, episodes = results.success_matrix()
     low, high = wilson_interval(np.nan_to_num(rates) * episodes, episodes)
-    spread = "{} of {} episodes; 95 % interval {} to {} %"
 
     def hint(i: int, j: int) -> str:
-        ends = (f"{100 * end[i, j]:.0f}" for end in (low, high))
-        return spread.format(round(rates[i, j] * episodes[i, j]), episodes[i, j], *ends)
+        found = f"{round(rates[i, j] * episodes[i, j])} of {episodes[i, j]} episodes"
+        return found + (f"; 95 % interval {text.replace('–', ' to ')} %" if (text := detail(i, j)) else "")
 
     def detail(i: int, j: int) -> str:
-        return f"{100 * low[i, j]:.0f}–{100 * high[i, j]:.0f}"
+        return "" if np.isnan(low[i, j]) else f"{100 * low[i, j]:.0f}–{100 * high[i, j]:.0f}"
 
     return _grid(rates, labels, hint, detail)
 
@@ -231,3 +266,64 @@ def _grid(
         average = f"{100 * known.mean():.0f}" if not np.isnan(known).any() else ""
         rows.append({"label": labels[i], "cells": [cell(i, j) for j in range(size)], "average": average})
     return {"rows": rows, "size": size, "title": ""}
+
+
+def shift_tables(found: Mapping[str, Any], references: Sequence[str]) -> dict[str, Table]:
+    """Return by held-out shift a row for each method that was evaluated under it, beside the references."""
+    groups: Mapping[str, Any] = found["groups"]
+    tables = {}
+    for shift in dict.fromkeys(shift for group in groups.values() for shift in group["shifts"]):
+        own = {label: group["shifts"][shift] for label, group in groups.items() if shift in group["shifts"]}
+        names = [name for name in references if name in own]
+        rows: list[list[object]] = []
+        for label, values in own.items():
+            lost = [values["lost"], *map(values["lost_less"].get, names)]
+            cells = [estimate_cell(one and Estimate(**one), 1) for one in lost]
+            rows.append(
+                [label, values["runs"], *map(percent, (values["final"], values["final_shifted"])), *cells]
+            )
+        heads = ("method", "runs", "at the end", "under shift", "lost", *(f"less {name}'s" for name in names))
+        tables[shift] = Table(heads, rows)
+    return tables
+
+
+def method_table(
+    found: dict[str, Any], key: str, digits: int, texts: Mapping[str, str] | None = None
+) -> Table:
+    """Return a row for each task or predicate, with its value in each method, ± half of Student's interval.
+
+    Args:
+        key: What a group has the values under.
+        digits: Digits of percents.
+        texts: The names in the order of the rows, each with its text; by default the names in the groups.
+    """
+
+    def cell(value: Mapping[str, Any] | None) -> Cell:
+        if value is None:
+            return Cell("–")
+        shown, of = value.get("forgotten", value), value.get("learned")
+        half = "" if np.isnan(shown["half_width"]) else f"± {percent(shown['half_width'], digits)}"
+        note = f"{half} of {percent(of['mean'], 0)}".strip() if of else half
+        return Cell(percent(shown["mean"], digits), note)
+
+    tables = [group[key] for group in found["groups"].values()]
+    rows = texts or {name: name.replace("_", " ") for table in tables for name in table}
+    return Table(
+        ("", *map(Cell, found["groups"])),
+        [
+            [text, *(cell(table.get(name)) for table in tables)]
+            for name, text in rows.items()
+            if any(name in table for table in tables)
+        ],
+    )
+
+
+def subgoal_table(found: Subgoals) -> Table:
+    """Return how often each predicate was reached."""
+    rows = []
+    for p in found.predicates:
+        low, high = percent(p.forgotten.low, 0), percent(p.forgotten.high, 0)
+        forgotten = Cell(percent(p.forgotten.value, 0), strong=True)
+        rates = [percent(e.value, 0) for e in (p.learned, p.final)]
+        rows.append([p.predicate, len(p.tasks), *rates, forgotten, "–" if low == "–" else f"{low} to {high}"])
+    return Table(("predicate", "tasks", "just learned", "at the end", "forgotten", "95 % interval"), rows)

@@ -38,6 +38,7 @@ VOLATILE = (
     "tracker",
     "data.folder",  # what was learned from is recorded by digest
     "data.memory",
+    "eval.beside",
     "eval.open_environments",
     "eval.sim_threads",
     "language.cache_dir",
@@ -56,9 +57,15 @@ _ROOT = Path(__file__).parents[2]
 
 
 def result_relevant(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the entries of a configuration that affect results, by dotted key."""
-    volatile = tuple(f"{key}." for key in VOLATILE)
-    return {k: v for k, v in flatten(config).items() if not f"{k}.".startswith(volatile)}
+    """Return the entries of a configuration that affect results, by dotted key; not on which shelf an algorithm is."""
+    found = {k: v for k, v in flatten(config).items() if not _is_volatile(k)}
+    if isinstance(target := found.get("algo._target_"), str):
+        found["algo._target_"] = target.replace("lifelong.algorithms.contrib.", "lifelong.algorithms.")
+    return found
+
+
+def _is_volatile(key: str) -> bool:
+    return f"{key}.".startswith(tuple(f"{volatile}." for volatile in VOLATILE))
 
 
 def config_digest(config: Mapping[str, Any]) -> str:
@@ -67,11 +74,12 @@ def config_digest(config: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def start_record(*, config: Mapping[str, Any], **facts: Any) -> RunRecord:
+def start_record(*, config: Mapping[str, Any], overrides: Sequence[str] = (), **facts: Any) -> RunRecord:
     """Return the record of a run that starts now, on this machine.
 
     Args:
         config: Resolved configuration as plain data, whose digest is recorded.
+        overrides: Those of the command, of which those that change no result are left out.
         facts: Other fields of `RunRecord`; those that are tuples may be any sequence.
     """
     columns = ("tasks", "instructions", "perturbed", "group_sizes")
@@ -82,6 +90,7 @@ def start_record(*, config: Mapping[str, Any], **facts: Any) -> RunRecord:
         commit=source_commit(),
         cpu_count=os.cpu_count() or 1,
         started=utc_now(),
+        overrides=tuple(word for word in overrides if not _is_volatile(word.lstrip("+").partition("=")[0])),
         **fields,
     )
 

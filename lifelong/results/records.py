@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, field
 from itertools import accumulate
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
-import numpy as np
 from pydantic import Field, WrapValidator
 
 from libero_env.errors import InvalidInputError
@@ -16,36 +15,14 @@ from libero_env.sim.causes import Failure
 from libero_env.sim.costs import Costs
 from libero_env.text import json_safe
 from libero_env.validation import validate
+from lifelong.results.cells import MatrixCells, measured_tasks
 from lifelong.stats.metrics import Transfer
 
 _CHECKSUM = "crc32"
 
 Count = Annotated[int, Field(ge=0, le=10**9)]
-MatrixCells = Literal["all", "diagonal", "last_row", "diagonal_and_last_row", "sampled"]
 Phase = Literal["curve", "matrix", "unseen", "initial", "shift"]
 Number = Annotated[float, WrapValidator(lambda value, parse: math.nan if value is None else parse(value))]
-
-
-def measured_tasks(cells: MatrixCells, stage: Sequence[int], tasks: int, share: float = 1.0) -> Sequence[int]:
-    """Return the tasks that are measured after a stage, ascending: its row of the success matrix.
-
-    Args:
-        stage: Positions of the tasks that were learned together last, ascending and without gaps.
-        share: Share of the earlier tasks that `sampled` measures in each row but the last: the same ones in all runs.
-    """
-    final = stage[-1] == tasks - 1
-    if cells == "all" or (final and cells != "diagonal"):
-        return range(stage[-1] + 1)
-    if cells == "last_row":
-        return range(0)
-    earlier = sampled_tasks(stage[0], share) if cells == "sampled" else []
-    return [*earlier, *range(stage[0], stage[-1] + 1)]
-
-
-def sampled_tasks(earlier: int, share: float) -> list[int]:
-    """Return a share, rounded up, of the tasks before position `earlier`, drawn uniformly without replacement."""
-    chosen = np.random.default_rng(earlier).choice(earlier, math.ceil(share * earlier), replace=False)
-    return sorted(chosen.tolist())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +45,7 @@ class RunRecord:
     conditions: Mapping[str, str] = field(default_factory=dict)  # see `lifelong.results.provenance`
     cells: MatrixCells = "all"  # of the success matrix, which are measured
     cells_share: Annotated[float, Field(gt=0, le=1)] = 1.0  # of each row, where they are sampled
+    cells_seed: Count | None = None  # by which they are drawn; None: one drawing for all runs, as of old
     # number of tasks in each group that is one step of the sequence; () for one task at a time
     group_sizes: tuple[Annotated[int, Field(ge=1)], ...] = ()
     transfer: Transfer = "cross_fitted"  # estimate of forward transfer, see `lifelong.stats.metrics`
@@ -75,6 +53,7 @@ class RunRecord:
     perturbed: tuple[str, ...] = ()
     backend: str = "mujoco"  # of the rollouts: mujoco or warp
     data_seed: Count | None = None  # of the demonstrations, where the configuration names one
+    overrides: tuple[str, ...] = ()  # of the command, but for what changes no result
 
     def __post_init__(self) -> None:
         if not len(self.tasks) == len(self.instructions) > 0:
@@ -102,6 +81,10 @@ class RunRecord:
         """Whether more tasks were learned together first than in any later group."""
         return len(self.groups) > 1 and len(self.groups[0]) > max(map(len, self.groups[1:]))
 
+    def row(self, stage: Sequence[int]) -> Sequence[int]:
+        """Return the tasks that are measured after a stage, see `measured_tasks`."""
+        return measured_tasks(self.cells, stage, len(self.tasks), self.cells_share, self.cells_seed)
+
     def group(self, task: int) -> range:
         """Return the positions of the tasks in a task's group."""
         return next(group for group in self.groups if task in group)
@@ -115,6 +98,31 @@ class LossRecord:
     task: Count
     epoch: Count
     loss: Number
+    seconds: Number
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectionRecord:
+    """Episodes of the policy itself, with drawn actions, that it learned from in one epoch.
+
+    Attributes:
+        epoch: The epoch, from 1.
+        episodes: Number of episodes.
+        successes: How many of them succeeded.
+        steps: Number of their control steps.
+        groups: Number of initial states from which some succeeded and some did not.
+        entropy: Mean of the negative log-probability of the actions, [nat].
+        seconds: Wall time.
+    """
+
+    kind: Literal["collection"] = "collection"
+    task: Count
+    epoch: Count
+    episodes: Count
+    successes: Count
+    steps: Count
+    groups: Count
+    entropy: Number
     seconds: Number
 
 
@@ -249,12 +257,16 @@ class DemonstrationsRecord:
         counts: Number of demonstrations.
         generators: What recorded them, such as `scripted-expert-1`; "" where their file does not say.
         digests: Digest of their states and actions, see `libero_env.demos.DemoOrigin`.
+        models: Models that their images show; none in records of before they were noted.
+        labels: Whether the actions that are learned are `intended` or `executed`; none in such records.
     """
 
     kind: Literal["demonstrations"] = "demonstrations"
     counts: tuple[Count, ...]
     generators: tuple[str, ...]
     digests: tuple[str, ...]
+    models: tuple[str, ...] = ()
+    labels: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not len(self.counts) == len(self.generators) == len(self.digests) > 0:
@@ -355,6 +367,7 @@ class RunEndRecord:
 Record = (
     RunRecord
     | LossRecord
+    | CollectionRecord
     | EvalRecord
     | PhaseRecord
     | DemonstrationsRecord

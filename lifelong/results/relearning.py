@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from libero_env.text import text_table
+from libero_env.text import Table
 from lifelong.results.log import ResultLog
 from lifelong.results.records import RelearnRecord
 
@@ -96,37 +96,27 @@ def savings(records: Sequence[RelearnRecord]) -> list[Savings]:
     return found
 
 
-def savings_heads(records: Sequence[RelearnRecord]) -> tuple[str, ...]:
-    """Return the heads of the columns of `savings_rows`, for one part of `by_measure`."""
+def savings_table(records: Sequence[RelearnRecord]) -> Table:
+    """Return the savings of one part of `by_measure`, a row for each task, counted from 1."""
     one = records[0]
     what, on = (
         ("success", f"{one.episodes} rollouts") if one.episodes else ("error", f"{one.held_out} held out")
     )
-    again = f"steps again (tolerance {one.tolerance:g}, {on})"
+    shown = _percent if one.episodes else "{:.3f}".format
     weights = next((f" (weights {r.weights[:8]})" for r in records if r.weights), "")
-    learned = f"{what} just learned", f"{what} at the end"
-    return "task", *learned, again, f"steps at first{weights}", "savings", "measured every"
-
-
-def savings_rows(records: Sequence[RelearnRecord]) -> list[tuple[str, ...]]:
-    """Return the savings of one part of `by_measure` as text, a row for each task, counted from 1."""
-    shown = _percent if records[0].episodes else "{:.3f}".format
-    rows: list[tuple[str, ...]] = []
-    for row in savings(records):
-        first = "–" if row.first_tried is None else _steps(row.first, row.first_tried)
-        again = _steps(row.again, row.again_tried)
-        share = "–" if row.share is None else f"{100 * row.share:.0f} %".replace("-", "−")
-        measured = shown(row.learned_error), shown(row.final_error)
-        every = f"{row.every} steps" if row.every else "–"
-        rows.append((str(row.task + 1), *measured, again, first, share, every))
-    return rows
-
-
-def savings_tables(records: Sequence[RelearnRecord]) -> str:
-    """Return what was measured as tables in plain text, one for each part of `by_measure`."""
-    return "\n\n".join(
-        text_table([savings_heads(part), *savings_rows(part)], left=0) for part in by_measure(records)
-    )
+    again, first = f"steps again (tolerance {one.tolerance:g}, {on})", f"steps at first{weights}"
+    heads = ("task", f"{what} just learned", f"{what} at the end", again, first, "savings", "measured every")
+    rows = [
+        (
+            *(row.task + 1, shown(row.learned_error), shown(row.final_error)),
+            _steps(row.again, row.again_tried),
+            "–" if row.first_tried is None else _steps(row.first, row.first_tried),
+            "–" if row.share is None else f"{100 * row.share:.0f} %".replace("-", "−"),
+            f"{row.every} steps" if row.every else "–",
+        )
+        for row in savings(records)
+    ]
+    return Table(heads, rows, left=0)
 
 
 def _percent(failed: float) -> str:

@@ -22,7 +22,6 @@ from lifelong.results.records import (
     RunEndRecord,
     RunRecord,
     TaskEndRecord,
-    measured_tasks,
 )
 from lifelong.results.subgoals import Subgoals, subgoals
 from lifelong.stats.metrics import (
@@ -135,7 +134,7 @@ class Results:
         rates, _ = self.success_matrix()
 
         def is_complete(group: range) -> bool:  # without cells to be measured: whether it has ended
-            columns = measured_tasks(self.run.cells, group, len(rates), self.run.cells_share)
+            columns = self.run.row(group)
             row = rates[group[-1], columns]
             return bool(np.isfinite(row).all()) if columns else self.task_end(group[-1]) is not None
 

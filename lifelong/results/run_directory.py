@@ -21,7 +21,7 @@ from filelock import FileLock, Timeout
 from torch import Tensor
 
 from libero_env.errors import InvalidInputError
-from libero_env.storage import PART_SUFFIX, atomic_write_text, read_yaml_file, require_own_folders
+from libero_env.storage import PART_SUFFIX, atomic_write_text, leads_out, own_folder, read_yaml_file
 from lifelong import checkpoints
 from lifelong.errors import CheckpointError, ConfigError, RunLockedError
 from lifelong.results.log import ResultLog
@@ -32,7 +32,7 @@ BROKEN_SUFFIX = ".broken"
 _RUN = (None, str)
 _TASK = {"run": _RUN, "task": int, "policy": dict, "algorithm": dict}
 _FIT = {"epoch": int, "loss": float, "penalty": float, "policy": dict, "optimizer": dict}
-_PROGRESS = {**_TASK, "policy": (None, dict), "phase": int, "fit": (None, _FIT)}
+_PROGRESS = {**_TASK, "policy": (None, dict), "phase": int, "fit": (None, {**_FIT, "reference": dict}, _FIT)}
 _BEST = {"run": _RUN, "task": int, "epoch": int, "policy": dict, "own": [Tensor]}
 
 
@@ -105,6 +105,13 @@ class CheckpointFolder:
         """Return the state in `best_path`; errors are those of `load_task`."""
         return self._load(self.best_path, _BEST, device)
 
+    def require_own(self, path: Path) -> None:
+        """Raise a CheckpointError where a checkpoint is a link that leads out of the run."""
+        if leads_out(path, self.path.parent):
+            raise CheckpointError(
+                f"{path} is a link that leads out of {self.path.parent}; put the file itself there"
+            )
+
     def set_aside(self, path: Path) -> Path:
         """Give a damaged checkpoint a name under which nothing reads it, and return that."""
         target = path.with_name(path.name + BROKEN_SUFFIX)
@@ -112,6 +119,7 @@ class CheckpointFolder:
         return target
 
     def _load(self, path: Path, form: Any, device: torch.device | str) -> dict[str, Any]:
+        self.require_own(path)
         state = checkpoints.load(path, device)
         checkpoints.check(state, form, path)
         known = self._run()
@@ -142,7 +150,7 @@ class RunDirectory:
             resume: Whether to resume an existing run; otherwise it is moved aside.
 
         Raises:
-            ConfigError: The existing run has another configuration, or a folder in it is a link that leads out of it.
+            ConfigError: The existing run has another configuration, or a folder in it is a link.
             RunLockedError: Another process is writing there.
         """
         self.path.parent.mkdir(parents=True, exist_ok=True)
@@ -150,7 +158,8 @@ class RunDirectory:
             if not resume and self.path.exists():
                 os.rename(self.path, _free_name(self.path))
             self.path.mkdir(exist_ok=True)
-            require_own_folders(self.path, self.videos.name, self.checkpoints.path.name, error=ConfigError)
+            for folder in (self.videos, self.checkpoints.path):
+                own_folder(self.path, folder.name, error=ConfigError)
             self._digest = None
             for part in self.path.rglob(f".*{PART_SUFFIX}"):  # left by a process that was killed
                 part.unlink(missing_ok=True)
@@ -230,3 +239,16 @@ def _free_name(path: Path) -> Path:
     while (candidate := path.with_name(f"{path.name}.old{number}")).exists():
         number += 1
     return candidate
+
+
+def check_writable(directory: Path) -> None:
+    """Check that a directory exists or can be made, and files in it.
+
+    Raises:
+        ConfigError: They cannot.
+    """
+    nearest = next(folder for folder in (directory, *directory.parents) if os.path.lexists(folder))
+    if not nearest.is_dir():
+        raise ConfigError(f"runs_dir: {nearest} is a file; expected a folder, in which {directory} is made")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise ConfigError(f"runs_dir: nothing can be written into {nearest}, in which {directory} is made")

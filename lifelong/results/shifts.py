@@ -6,11 +6,9 @@ Rollouts under a shift begin in the starts of the success matrix. They are no pa
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-
 from lifelong.results.records import EvalRecord
 from lifelong.results.results import Results
-from lifelong.stats.intervals import UNKNOWN, Estimate, combine_intervals, wilson_interval
+from lifelong.stats.intervals import UNKNOWN, Estimate, difference_of, mean_success
 
 Cell = EvalRecord | None
 
@@ -49,8 +47,8 @@ class ShiftedTask:
 class ShiftScore:
     """Success and forgetting under one shift, with the same without it.
 
-    The intervals are of starts, at 95 %: those of the cells' rates (Wilson), combined (MOVER). Cells are taken to be
-    independent, so that those of differences are rather too wide, as cells share their starts.
+    The intervals are of starts, at 95 %: see `mean_success`, and `difference_of` for the difference of two means, which
+    share their starts: its interval is rather too wide.
 
     Attributes:
         shift: The perturbations, as text.
@@ -62,17 +60,14 @@ class ShiftScore:
 
     def success(self, name: str) -> Estimate:
         """Return the mean over the tasks of one of the four evaluations; unknown unless all are there."""
-        return _mean((1.0, getattr(task, name)) for task in self.tasks)
+        return _mean(getattr(task, name) for task in self.tasks)
 
     def forgetting(self, *, shifted: bool) -> Estimate:
         """Return the mean forgetting over the tasks after which others were learned; see `ShiftedTask.forgotten`."""
         names = ("learned_shifted", "final_shifted") if shifted else ("learned", "final")
         earlier = [task for task in self.tasks if not task.is_last]
-        return _mean(
-            (sign, getattr(task, name))
-            for task in earlier
-            for sign, name in zip((1.0, -1.0), names, strict=True)
-        )
+        first, last = (_mean(getattr(task, name) for task in earlier) for name in names)
+        return difference_of(first, last)
 
 
 def shift_scores(results: Results) -> list[ShiftScore]:
@@ -118,15 +113,7 @@ def shift_summary(results: Results) -> list[dict[str, object]]:
     ]
 
 
-def _mean(cells: Iterable[tuple[float, Cell]]) -> Estimate:
-    """Return the sum of signed rates over the number of positive ones, with its interval."""
-    signed = list(cells)
-    count = sum(sign > 0 for sign, _ in signed)
-    records = [cell for _, cell in signed if cell is not None]
-    if not signed or len(records) < len(signed):
-        return UNKNOWN
-    wins, episodes = (
-        np.array(x) for x in zip(*((sum(r.successes), len(r.successes)) for r in records), strict=True)
-    )
-    low, high = wilson_interval(wins, episodes)
-    return combine_intervals([sign / count for sign, _ in signed], wins / episodes, low, high)
+def _mean(cells: Iterable[Cell]) -> Estimate:
+    """Return the mean success of cells; unknown unless all are there."""
+    counts = [cell and (sum(cell.successes), len(cell.successes)) for cell in cells]
+    return mean_success(*zip(*counts, strict=True)) if counts and all(counts) else UNKNOWN

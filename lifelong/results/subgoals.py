@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lifelong.results.records import EvalRecord
-from lifelong.stats.intervals import UNKNOWN, Estimate, combine_intervals, wilson_interval
+from lifelong.stats.intervals import UNKNOWN, Estimate, difference_of, mean_success
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,8 @@ def _predicates(pairs: Sequence[tuple[EvalRecord, EvalRecord]], ends: Sequence[i
         first, last = ([shares[i] for *_, shares in counted] for i in (0, 1))
         # A task that is not followed by another has one evaluation only, so no difference.
         drops = [s for learned, final, s in counted if learned.learned != final.learned]
-        forgotten = _mean([s[0] for s in drops], [s[1] for s in drops], over=len(counted))
+        before, after = (_mean([s[i] for s in drops]) for i in (0, 1))
+        forgotten = difference_of(before, after, len(drops) / len(counted))
         just, end = map(all, zip(*(_measured(a, b, ends) for a, b, _ in counted), strict=True))
         found.append(
             PredicateRates(
@@ -151,16 +152,10 @@ def _shares(record: EvalRecord, predicate: str) -> NDArray[np.float64]:
     return reached.sum(1)[count > 0] / count[count > 0]
 
 
-def _mean(
-    plus: Sequence[NDArray[np.float64]], minus: Sequence[NDArray[np.float64]] = (), over: int | None = None
-) -> Estimate:
-    """Return the mean over tasks, or the mean difference, with the interval of `combine_intervals`.
+def _mean(shares: Sequence[NDArray[np.float64]]) -> Estimate:
+    """Return the mean over tasks, with the interval of `mean_success`.
 
     Atoms of one episode are not independent, so an episode counts once, with the share that it reached;
     Wilson's interval is wide enough for that, as no share in [0, 1] varies more than a success rate of its mean.
     """
-    cells, count = [*plus, *minus], over or len(plus)
-    rates, episodes = np.array([c.mean() for c in cells]), np.array([len(c) for c in cells])
-    weights = np.array([1.0] * len(plus) + [-1.0] * len(minus)) / count
-    low, high = wilson_interval(rates * episodes, episodes)
-    return combine_intervals(weights, rates, low, high)
+    return mean_success([each.sum() for each in shares], [len(each) for each in shares])

@@ -1,13 +1,14 @@
-"""What a run leaves for others: `results.json`, and every episode of one or several runs as a table, and back.
+"""What a run leaves for others: `results.json`, and every episode of one or several runs as a table.
 
 results.json     the success matrix, learning curves, metrics and times of a run
 episodes.csv.gz  one row an episode: the method's label, the run's number among those of its method, seeds of the run
                  and its demonstrations, its order, `transfer` (how its forward transfer is estimated), `together`
-                 (numbers of tasks learned together), which `cells` of the matrix were measured and their share, the
-                 evaluation (`phase` curve or matrix, `row`: position of the task learned last, `epoch` trained on it),
-                 the task (`position` in the sequence, and its name), `start` (initial state), `success` (0 or 1),
-                 `length` [control steps]; the last two are empty where a simulation error ended the episode. Of a run
-                 that is not finished, the episodes of the tasks that it has learned
+                 (numbers of tasks learned together), which `cells` of the matrix were measured, their share, the seed
+                 by which they were drawn (empty: one drawing for all runs), the evaluation (`phase` curve or matrix,
+                 `row`: position of the task learned last, `epoch` trained on it), the task (`position` in the sequence,
+                 and its name), `start` (initial state), `success` (0 or 1), `length` [control steps]; the last two are
+                 empty where a simulation error ended the episode. Of a run that is not finished, the episodes of the
+                 tasks that it has learned
 """
 
 import csv
@@ -24,18 +25,18 @@ import numpy as np
 
 from libero_env.storage import atomic_path, atomic_write_text
 from libero_env.text import json_safe, to_json
-from libero_env.validation import validate
 from lifelong.errors import ResultsError, writing
 from lifelong.results.failures import rollout_summary
 from lifelong.results.provenance import resume_notes
-from lifelong.results.records import DemonstrationsRecord, EvalRecord, Record, RunRecord, TaskEndRecord
+from lifelong.results.records import DemonstrationsRecord, RunRecord, TaskEndRecord
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_summary
 from lifelong.stats.intervals import wilson_interval
 from lifelong.stats.metrics import METRIC_NAMES, Metrics, lifelong_metrics
 
 COLUMNS = (
-    *("method", "run", "seed", "data_seed", "order", "transfer", "together", "cells", "cells_share"),
+    *("method", "run", "seed", "data_seed", "order", "transfer", "together"),
+    *("cells", "cells_share", "cells_seed"),
     *("phase", "row", "epoch", "position", "task", "start", "success", "length"),
 )
 _OF_EPISODES = (
@@ -163,7 +164,8 @@ def write_episodes(path: Path, runs: Iterable[tuple[str, Results]]) -> Path:
 def _rows(method: str, number: int, order: int, results: Results) -> Iterator[tuple[Any, ...]]:
     run = results.run
     together = " ".join(str(len(group)) for group in run.groups)
-    seeds, kind = (run.seed, run.data_seed), (results.transfer, together, run.cells, run.cells_share)
+    cells = (run.cells, run.cells_share, run.cells_seed)
+    seeds, kind = (run.seed, run.data_seed), (results.transfer, together, *cells)
     learned = results.learned_tasks()
     for record in (r for r in results.evaluations() if r.learned < learned):
         place = (record.learned, record.epoch, record.task, run.tasks[record.task])
@@ -171,79 +173,3 @@ def _rows(method: str, number: int, order: int, results: Results) -> Iterator[tu
         for start, won, length in zip(record.init_states, record.successes, record.lengths, strict=True):
             yield (*key, start, int(won), length)
         yield from ((*key, start, "", "") for start, _ in record.simulation_errors)
-
-
-def read_episodes(path: Path) -> list[tuple[str, Results]]:
-    """Return the runs of a table as (label, results), enough for all metrics, intervals and tests.
-
-    Raises:
-        ResultsError: The file is missing or is no such table.
-    """
-    try:
-        content = path.read_bytes()
-        text = (gzip.decompress(content) if path.suffix == ".gz" else content).decode()
-        reader = csv.DictReader(io.StringIO(text))
-        if tuple(reader.fieldnames or ()) != COLUMNS:
-            raise ResultsError(f"{path} is no table of episodes; expected the columns {', '.join(COLUMNS)}")
-        runs: dict[tuple[str, ...], list[dict[str, str]]] = {}
-        orders: dict[str, dict[int, str]] = {}
-        for row in reader:
-            runs.setdefault((row["method"], row["run"]), []).append(row)
-            orders.setdefault(row["order"], {})[int(row["position"])] = row["task"]
-        return [(key[0], _results(rows, orders[rows[0]["order"]])) for key, rows in runs.items()]
-    except (OSError, ValueError, KeyError, TypeError, EOFError) as error:
-        raise ResultsError(f"{path}: the episodes cannot be read ({error})") from error
-
-
-def _results(rows: list[dict[str, str]], names: Mapping[int, str]) -> Results:
-    first = rows[0]
-    count = sum(map(int, first["together"].split()))
-    tasks = [names.get(place, f"not learned by any run of order {first['order']}") for place in range(count)]
-    records: list[Record] = [_run(first, tasks)]
-    cells: dict[tuple[str, ...], list[dict[str, str]]] = {}
-    for row in rows:
-        cells.setdefault(tuple(row[c] for c in ("phase", "row", "epoch", "position")), []).append(row)
-    kept: dict[int, int] = {}
-    for episodes in cells.values():
-        record = _evaluation(episodes)
-        records.append(record)
-        if record.phase == "matrix" or record.learned not in kept:
-            kept[record.learned] = record.epoch
-    records += [TaskEndRecord(task=task, best_epoch=epoch, seconds=0.0) for task, epoch in kept.items()]
-    return Results(tuple(records))
-
-
-def _run(row: Mapping[str, str], tasks: list[str]) -> RunRecord:
-    values: dict[str, Any] = {
-        **dict.fromkeys(("benchmark", "policy", "preset", "config_digest", "started"), ""),
-        "algo": row["method"],
-        "seed": int(row["seed"]),
-        "data_seed": int(row["data_seed"]) if row["data_seed"] else None,
-        "tasks": tasks,
-        "instructions": [name.replace("_", " ") for name in tasks],
-        "versions": {},
-        "commit": None,
-        "cpu_count": 0,
-        "group_sizes": [int(size) for size in row["together"].split()],
-        "transfer": row["transfer"],
-        "cells": row["cells"],
-        "cells_share": float(row["cells_share"]),
-    }
-    return validate(RunRecord, values)
-
-
-def _evaluation(rows: list[dict[str, str]]) -> EvalRecord:
-    lost = [(int(row["start"]), "") for row in rows if not row["success"]]
-    rows = [row for row in rows if row["success"]]
-    values: dict[str, Any] = {
-        "phase": rows[0]["phase"],
-        "learned": int(rows[0]["row"]),
-        "epoch": int(rows[0]["epoch"]),
-        "task": int(rows[0]["position"]),
-        "successes": [bool(int(row["success"])) for row in rows],
-        "lengths": [int(row["length"]) for row in rows],
-        "init_states": [int(row["start"]) for row in rows],
-        "simulation_errors": lost,
-        "seconds": 0.0,
-    }
-    return validate(EvalRecord, values)

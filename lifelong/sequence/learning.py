@@ -10,6 +10,7 @@ each other wherever one reads what another has written, or is about to overwrite
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -19,8 +20,9 @@ from libero_env.errors import is_quiet
 from lifelong.context import RunContext
 from lifelong.data.settings import Statistics
 from lifelong.data.windows import TaskWindows, frame_moments, frames_of
+from lifelong.evaluation.beside import RolloutProcess
 from lifelong.policies.base import Policy
-from lifelong.results.records import CostRecord, EvalRecord, LossRecord, TaskEndRecord
+from lifelong.results.records import CostRecord, EvalRecord, LossRecord, Phase, TaskEndRecord
 from lifelong.seeding import BEGIN_TASK, END_TASK, FIT, generator, seeded
 from lifelong.sequence.measuring import Evaluator
 from lifelong.sequence.recovery import Recovery, say
@@ -53,6 +55,7 @@ class TaskSequence:
         self.data = StageData(datasets, self.stages, context.stream, context.seed)
         self.evaluator = Evaluator(context, self.stages)
         self._frames: dict[int, tuple[Tensor, Tensor]] = {}  # readings and actions of stages
+        self._row: Callable[[], None] | None = None  # records a row that is being measured beside training
         self._reached = -1  # number of the stage after which the policy is; -1: before the first
         self.recovery = Recovery(context, self.data)
         context.algorithm.set_augmentation(context.augment)
@@ -65,13 +68,16 @@ class TaskSequence:
         Args:
             evaluate: Whether to fill the success matrix.
         """
-        ranks = self.context.ranks
-        for number, stage in enumerate(self.stages):
-            if ranks.broadcast(self._to_learn, number):
-                self._learn_stage(number)
-            if evaluate and ranks.broadcast(self._to_evaluate, stage):
-                self._bring_to(number)
-                ranks.broadcast(self._evaluate_seen_tasks, stage)
+        ranks, context = self.context.ranks, self.context
+        with RolloutProcess(context.envs) as process:
+            beside = process if context.works_beside else None
+            for number, stage in enumerate(self.stages):
+                if ranks.broadcast(self._to_learn, number):
+                    self._learn_stage(number)
+                if evaluate and ranks.broadcast(self._to_evaluate, stage):
+                    self._bring_to(number)
+                    ranks.broadcast(self._evaluate_seen_tasks, stage, beside)
+            self._end_row()
         self._bring_to(len(self.stages) - 1)
 
     def _to_learn(self, number: int) -> bool:
@@ -141,23 +147,26 @@ class TaskSequence:
         context = self.context
         if resume is None:
             context.algorithm.begin_phase(phase.kind, context.policy)
-        fit(
-            context.policy,
-            dataset,
-            context.algorithm,
-            settings=replace(
-                context.fit,
-                epochs=phase.epochs,
-                steps_per_epoch=phase.steps_per_epoch,
-                statistics_first=context.fit.statistics_first and not phase.number,
-            ),
-            seed=(context.seed, FIT, phase.task, phase.number),
-            augment=context.augment,
-            on_epoch=lambda end: context.ranks.broadcast(self._after_epoch, phase, end),
-            resume=resume,
-            progress=f"task {phase.task + 1} {phase.kind.name}" if context.progress else None,
-            ranks=context.ranks,
-        )
+        seed, learner = (context.seed, FIT, phase.task, phase.number), context.learner
+        cloning = nullcontext({"augment": context.augment})
+        with learner.training(context, phase.stage, seed, resume) if learner else cloning as options:
+            fit(
+                context.policy,
+                dataset,
+                context.algorithm,
+                settings=replace(
+                    context.fit,
+                    epochs=phase.epochs,
+                    steps_per_epoch=phase.steps_per_epoch,
+                    statistics_first=context.fit.statistics_first and not phase.number,
+                ),
+                seed=seed,
+                on_epoch=lambda end: context.ranks.broadcast(self._after_epoch, phase, end),
+                resume=resume,
+                progress=f"task {phase.task + 1} {phase.kind.name}" if context.progress else None,
+                ranks=context.ranks,
+                **options,
+            )
         if phase.selects_best:
             self.recovery.load_best(phase)
             if context.ranks.first and not any((rates := phase.points(self.log.read())).values()):
@@ -203,27 +212,67 @@ class TaskSequence:
         spent = {
             "end_task_seconds": time.perf_counter() - began,
             "stored_bytes": costs.stored_bytes(algorithm),
+            **self._effort(task, len(dataset)),
         }
         with algorithm.policy_for(task, policy) as acting:
-            spent |= costs.action_costs(acting) | costs.peak_costs(self.context.device)
+            spent |= costs.action_costs(acting, self.context.languages[task])
+            spent |= costs.peak_costs(self.context.device)
         self.log.append(CostRecord(task=task, costs=spent))
         self.checkpoints.save_task(task, policy.state_dict(), self.recovery.algorithm_state())
         policy.save_beside(self.context.directory.path)
 
-    def _evaluate_seen_tasks(self, stage: Sequence[int]) -> None:
-        """Fill the stage's row of the success matrix, as far as it is to be measured and not recorded yet."""
+    def _effort(self, task: int, windows: int) -> dict[str, float]:
+        """Return the number of updates on a stage, of its windows, and the share [%] kept of all windows so far."""
+        phases = training_phases(self.context, next(stage for stage in self.stages if stage[-1] == task))
+        fit, results = self.context.fit, self.log.read()
+        seen = windows + sum(
+            results.costs(stage[-1]).get("windows", 0.0) for stage in self.stages if stage[-1] < task
+        )
+        return {
+            "updates": sum(
+                p.epochs * (p.steps_per_epoch or math.ceil(windows / fit.batch_size)) for p in phases
+            ),
+            "windows": windows,
+            "kept_share": 100 * costs.windows_kept(self.context.algorithm) / seen,
+        }
+
+    def _evaluate_seen_tasks(self, stage: Sequence[int], beside: RolloutProcess | None = None) -> None:
+        """Fill the stage's row of the success matrix, as far as it is to be measured and not recorded yet.
+
+        Beside training the row is begun only, and ended before the next one begins. After the last stage nothing is
+        left to learn, and both processes take their share.
+        """
+        self._end_row()
         task, results = stage[-1], self.log.read()
         first = training_phases(self.context, stage)[0]
         best = first.best_epoch(results, first.epochs)
         columns = self.context.eval.row(stage, len(self.context.tasks))
         # there and back, so that a row begins with the environments that the one before ended with
         turn = 1 if self.stages.index(stage) % 2 else -1
-        row = [self.evaluator.evaluate("matrix", task, seen, best) for seen in columns[::turn]]
+        cells: list[tuple[Phase, int]] = [("matrix", seen) for seen in columns[::turn]]
         later = self.stages[self.stages.index(stage) + 1 :]
-        for unseen in self.context.eval.unseen_tasks(later):
-            self.evaluator.evaluate("unseen", task, unseen, best)
+        cells += [("unseen", unseen) for unseen in self.context.eval.unseen_tasks(later)]
         shifted = self.context.eval.shifted_row(stage, len(self.context.tasks)) if self.context.shift else ()
-        under = [self.evaluator.evaluate("shift", task, seen, best) for seen in shifted]
+        cells += [("shift", seen) for seen in shifted]
+        sent = cells if later else cells[::2]
+        begun = [self.evaluator.begin(phase, task, seen, best, beside) for phase, seen in sent if beside]
+        own = [cell for cell in cells if not (beside and cell in sent)]
+        records = [self.evaluator.evaluate(phase, task, seen, best) for phase, seen in own]
+        self._row = lambda: self._record_row(stage, best, [*(finish() for finish in begun), *records])
+        if not (beside and later):
+            self._end_row()
+
+    def _end_row(self) -> None:
+        """Wait for the row that is measured beside training, if there is one, and record it."""
+        if self._row is not None:
+            end, self._row = self._row, None
+            end()
+
+    def _record_row(self, stage: Sequence[int], best: int, records: Sequence[EvalRecord]) -> None:
+        """Record the end of a stage, all of whose evaluations are recorded, and tell what it came to."""
+        task, results = stage[-1], self.log.read()
+        row = [record for record in records if record.phase == "matrix"]
+        under = [record for record in records if record.phase == "shift"]
         if results.task_end(task) is None:
             spent = sum(r.seconds for r in results.of(LossRecord) if r.task == task)
             spent += sum(r.seconds for r in self.log.read().of(EvalRecord) if r.learned == task)
@@ -236,7 +285,7 @@ class TaskSequence:
         told = f"success {new:.0%} on it, {mean:.0%} over {len(row)} so far" if row else "not measured"
         if under and self.context.shift:
             told += f", {mean_rate(under):.0%} over {len(under)} under {self.context.shift.text}"
-        self._tell(f"  learned: {told}{self._eta(task)}")
+        self._tell(f"  task {task + 1} learned: {told}{self._eta(task)}")
 
     def _tell(self, progress: str) -> None:
         if not is_quiet():
@@ -259,7 +308,8 @@ class TaskSequence:
         training = sum(r.seconds for r in results.of(LossRecord))
         training += sum(r.seconds for r in evals if r.phase == "curve")
         rows = [self.context.eval.row(stage, count) for stage in self.stages if stage[-1] > task]
-        seconds = remaining * training / learned + sum(map(len, rows)) * sum(cells) / max(1, len(cells))
+        train, measure = remaining * training / learned, sum(map(len, rows)) * sum(cells) / max(1, len(cells))
+        seconds = max(train, measure) if self.context.eval.beside else train + measure
         return f"; about {max(1, round(seconds / 60))} min left"
 
 

@@ -6,8 +6,9 @@ first row that has it are those of all others.
 
 import hashlib
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,9 @@ from libero_env.perturbations import format_perturbations
 from libero_env.storage import atomic_path, atomic_write_text
 from libero_env.timing import CONTROL_PERIOD
 from lifelong.context import RunContext
-from lifelong.evaluation.rollout import rollout, save_animation
-from lifelong.policies.base import Policy
+from lifelong.evaluation.beside import RolloutProcess
+from lifelong.evaluation.rollout import Rollouts, rollout, save_animation
+from lifelong.policies.base import Policy, has_hooks
 from lifelong.results.provenance import all_conditions
 from lifelong.results.records import EvalRecord, Phase, RunRecord
 from lifelong.results.results import Results
@@ -49,11 +51,21 @@ class Evaluator:
             task: Position of the task to act on.
             epoch: Number of epochs trained on the task that was learned last.
         """
+        return self.begin(phase, learned, task, epoch)()
+
+    def begin(
+        self, phase: Phase, learned: int, task: int, epoch: int, beside: RolloutProcess | None = None
+    ) -> Callable[[], EvalRecord]:
+        """Begin to evaluate a task; return a function that waits for the rollouts, and records them.
+
+        Args:
+            beside: Process in which the rollouts run; by default they run in this one, at once.
+        """
         context, (shift, languages) = self._context, self._told(phase)
         known = epoch if phase == "curve" else None
         found = self._log.read().evaluation(phase, learned, task, known, shift=shift)
         if found is not None:
-            return found
+            return lambda: found
         key: dict[str, Any] = {
             "phase": phase,
             "learned": learned,
@@ -67,10 +79,15 @@ class Evaluator:
             if context.eval.reuse:
                 more = context.algorithm.acting_state(stage[-1], acting)
                 decided_by = digest({**self._circumstances(phase, task), "more": more}, acting)
-            record = self._copied(decided_by, key) or self._measured(acting, decided_by, key, languages[task])
+            if (copied := self._copied(decided_by, key)) is not None:
+                return partial(self._recorded, copied)
+            done = self._rollouts(acting, key, languages[task], beside)
+        return lambda: self._recorded(self._measured(done(), decided_by, key))
+
+    def _recorded(self, record: EvalRecord) -> EvalRecord:
         self._log.append(record)
         for note in Results((record,)).error_notes:
-            say(context, note)
+            say(self._context, note)
         return record
 
     def _told(self, phase: Phase) -> tuple[str, Tensor]:
@@ -107,26 +124,31 @@ class Evaluator:
             return None
         return replace(found, seconds=0.0, same_as=(found.phase, found.learned, found.epoch), **key)
 
-    def _measured(
-        self, acting: Policy, decided_by: str, key: Mapping[str, Any], language: Tensor
-    ) -> EvalRecord:
-        """Run the rollouts and return their record."""
+    def _rollouts(
+        self, acting: Policy, key: Mapping[str, Any], language: Tensor, beside: RolloutProcess | None
+    ) -> Callable[[], Rollouts]:
+        """Run the rollouts, or send them; return a function that returns them."""
         context, settings, task, shift = self._context, self._context.eval, key["task"], key["shift"]
         states = settings.init_states(key["phase"])
-        done = rollout(
-            acting,
-            context.envs.get((task, len(states), shift) if shift else (task, len(states))),
-            states,
-            language=language,
-            horizon=settings.horizon,
-            settle_steps=settings.settle_steps,
-            seed=(context.seed, ROLLOUT, key["learned"], key["epoch"], task),
-            device=context.device,
-            precision=settings.precision,
-            record_every=settings.record_every if self._is_filmed(key) else 0,
-            label=f"rollouts on task {task + 1}",
-            progress=bool(context.progress),
-        )
+        env = (task, len(states), shift) if shift else (task, len(states))
+        options: dict[str, Any] = {
+            "language": language,
+            "horizon": settings.horizon,
+            "settle_steps": settings.settle_steps,
+            "seed": (context.seed, ROLLOUT, key["learned"], key["epoch"], task),
+            "device": context.device,
+            "precision": settings.precision,
+            "record_every": settings.record_every if self._is_filmed(key) else 0,
+        }
+        if beside is not None and not has_hooks(acting):
+            return beside.submit(rollout, acting, env, states, **options)
+        shown: dict[str, Any] = {"label": f"rollouts on task {task + 1}", "progress": context.progress}
+        done = rollout(acting, context.envs.get(env), states, **options, **shown)
+        return lambda: done
+
+    def _measured(self, done: Rollouts, decided_by: str, key: Mapping[str, Any]) -> EvalRecord:
+        """Return the record of rollouts, and save what is filmed."""
+        settings, task = self._context.eval, key["task"]
         if not done.counted:
             raise SimulationError(done.failed)
         record = EvalRecord(

@@ -1,18 +1,5 @@
 """Settings of a run, and what is built from its configuration."""
 
-from lifelong.data.settings import CAMERAS, DataSettings
-from lifelong.settings.configuration import GROUPS, Configuration, build, find_target, plain_data
-from lifelong.settings.run import BenchmarkSettings, PretrainSettings, RunSettings
+import lazy_loader
 
-__all__ = [
-    "CAMERAS",
-    "GROUPS",
-    "BenchmarkSettings",
-    "Configuration",
-    "DataSettings",
-    "PretrainSettings",
-    "RunSettings",
-    "build",
-    "find_target",
-    "plain_data",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -16,7 +16,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import import_module
-from importlib.machinery import PathFinder
 from importlib.util import find_spec
 from inspect import isclass
 from types import NoneType, UnionType
@@ -27,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from libero_env.text import shown, suggest
 from libero_env.validation import is_plain, parameters_of, validate, validate_arguments
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, require_same_module
 from lifelong.settings.run import RunSettings
 from lifelong.types import CompletedWith
 
@@ -47,7 +46,9 @@ GROUPS = {
     "eval": "lifelong.evaluation.settings.EvalSettings",
     "language": "lifelong.language.encoder.LanguageEncoder",
     "tracker": "lifelong.tracking.Tracker",
+    "learner": "lifelong.context.Learner",
 }
+_OPTIONAL = ("learner",)  # groups that a configuration may lack
 # Components of algorithms and policies.
 _COMPONENTS = (
     "lifelong.data.memory.ReplayMemory",
@@ -86,7 +87,8 @@ class Configuration:
             if key not in valid:
                 raise ConfigError(f"{key} is an unknown key.{suggest(key, valid)} Valid: {', '.join(valid)}")
         for group in GROUPS:
-            self._node(group)
+            if group in self.values or group not in _OPTIONAL:
+                self._node(group)
         top = {key: value for key, value in self.values.items() if key not in GROUPS}
         return validate(RunSettings, top, error=ConfigError)
 
@@ -173,6 +175,13 @@ def _build(
     except ConfigError as error:
         raise ConfigError(f"{name}._target_ {error}") from None
     values = {str(key): value for key, value in node.items() if key not in _SPECIAL}
+    if allowed is not None and (loads := getattr(target, "loads_from_elsewhere", None)):
+        package, what = loads(values)
+        if what and package not in allowed:
+            raise ConfigError(
+                f"{name}.{what} has {package} load what it names, on this machine or from a network; if you know and "
+                f"trust it, allow it with --allow {package}"
+            )
     is_partial = node.get("_partial_", False)
     if is_partial not in (True, False) or (completed and _is_own(target) and not is_partial):
         raise ConfigError(
@@ -318,28 +327,6 @@ def _resolve(name: str) -> Target:
     return target
 
 
-def require_same_module(package: str, folders: Sequence[str], text: str) -> None:
-    """Check that a module that has been imported is the one that an import from some folders would find.
-
-    Args:
-        package: Name of the module, without points.
-        folders: Folders in the order in which they are searched.
-        text: What names the module, with which the message begins.
-
-    Raises:
-        ConfigError: It is another file.
-    """
-    loaded = getattr(sys.modules.get(package), "__file__", None)
-    if not loaded or package == "__main__":  # which is run, not found
-        return
-    found = PathFinder.find_spec(package, folders)
-    if found and found.origin and os.path.realpath(loaded) != os.path.realpath(found.origin):
-        raise ConfigError(
-            f"{text}: this process has already imported {package} from {loaded}, which is not {found.origin}; "
-            "use the other in a process of its own"
-        )
-
-
 def _own_class(parts: Sequence[str]) -> Target | None:
     """Return one of the classes of this package that are made to be built; None for any other name."""
     *module, attribute = parts
@@ -348,6 +335,8 @@ def _own_class(parts: Sequence[str]) -> Target | None:
     try:
         target = getattr(import_module(".".join(module)), attribute, None)
     except ImportError:
+        if module[1:2] == ["algorithms"] and len(module) == 3:  # as runs of before name those that have moved
+            return _own_class([*module[:2], "contrib", module[2], attribute])
         return None
     return target if isclass(target) and _is_own(target) and issubclass(target, _buildable()) else None
 

@@ -11,7 +11,7 @@ from libero_env.errors import UnknownNameError
 from libero_env.tasks import Suite, Task, get_suite, suite_names
 from libero_env.tasks.suites import OWN, read_suite
 from libero_env.validation import checked
-from lifelong.data.settings import require_switched_on
+from lifelong.data.settings import CAMERAS, DataSettings, require_switched_on  # noqa: F401 - offered by the package
 from lifelong.errors import ConfigError
 from lifelong.types import Count, Natural, PathText
 

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
+import scipy  # its parts are imported when they are first used
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 
 Floats = NDArray[np.float64]
 ALPHA = 0.05  # of tests
 CONFIDENCE = 0.95
+LEAST_EPISODES = 5  # that an interval is given of
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,11 @@ def wilson_interval(
 
     Args:
         successes: Number of successes s, any shape.
-        episodes: Number of episodes n, same shape; where it is 0 the interval is [0, 1].
+        episodes: Number of episodes n, same shape.
         confidence: Two-sided confidence level.
 
     Returns:
-        Lower and upper ends in [0, 1], of the broadcast shape.
+        Lower and upper ends in [0, 1], of the broadcast shape; NaN of fewer than five episodes.
     """
     s, n = np.broadcast_arrays(np.asarray(successes, dtype=float), np.asarray(episodes, dtype=float))
     z = NormalDist().inv_cdf(0.5 + confidence / 2)
@@ -48,27 +49,40 @@ def wilson_interval(
     centre = (p + z**2 / (2 * safe)) / (1 + z**2 / safe)
     half = z * np.sqrt(np.maximum(p * (1 - p), 0) / safe + z**2 / (4 * safe**2)) / (1 + z**2 / safe)
     # At the ends the bound is exactly 0 or 1; rounding must not put it on the wrong side of p.
-    low, high = np.clip(centre - half, 0, p), np.clip(centre + half, p, 1)
-    return np.where(n > 0, low, 0.0), np.where(n > 0, high, 1.0)
+    low, high, enough = np.clip(centre - half, 0, p), np.clip(centre + half, p, 1), n >= LEAST_EPISODES
+    return np.where(enough, low, np.nan), np.where(enough, high, np.nan)
 
 
-def combine_intervals(weights: ArrayLike, rates: ArrayLike, low: ArrayLike, high: ArrayLike) -> Estimate:
-    """Return a weighted sum of independent rates, with the interval implied by theirs.
+def mean_success(successes: ArrayLike, episodes: ArrayLike) -> Estimate:
+    """Return the mean of success rates over tasks, with Wilson's interval at this mean over all their episodes.
 
-    MOVER (Zou & Donner, Statistics in Medicine 2008): for θ = Σ w·p,
-    θ_low = θ - sqrt(Σ (w·(p - end))²) with the cell's end that lowers w·p, and likewise θ_high.
+    Tasks count alike, so T tasks with n_k episodes are worth n = T² / Σ(1/n_k) episodes: their sum where all have the
+    same number. Where tasks differ in difficulty the interval is rather too wide, as independent trials whose chances
+    differ vary less than as many with the mean chance (Hoeffding, Annals of Mathematical Statistics 27, 1956).
 
     Args:
-        weights: (C,) weights w.
-        rates: (C,) rates p.
-        low: (C,) lower ends of their intervals.
-        high: (C,) upper ends of their intervals.
+        successes: (T,) number of successes of each task.
+        episodes: (T,) number of episodes of each task.
     """
-    w, p, lo, hi = (np.asarray(x, dtype=float) for x in (weights, rates, low, high))
-    value = float(np.sum(w * p))
-    down = np.where(w > 0, w * (p - lo), w * (p - hi))
-    up = np.where(w > 0, w * (hi - p), w * (lo - p))
-    return Estimate(value, value - float(np.hypot.reduce(down)), value + float(np.hypot.reduce(up)))
+    s, n = np.broadcast_arrays(np.asarray(successes, dtype=float), np.asarray(episodes, dtype=float))
+    if not s.size or n.min() <= 0:
+        return UNKNOWN
+    count = n.sum() if np.ptp(n) == 0 else n.size**2 / (1 / n).sum()
+    value = s.sum() / count if np.ptp(n) == 0 else (s / n).mean()
+    low, high = wilson_interval(value * count, count)
+    return Estimate(float(value), float(low), float(high))
+
+
+def difference_of(first: Estimate, second: Estimate, share: float = 1.0) -> Estimate:
+    """Return a share of the difference of two independent success rates, with Newcombe's interval.
+
+    It is method 10 of Newcombe (Statistics in Medicine 17, 1998): with p and q in [p_low, p_high] and [q_low, q_high],
+    p - q - sqrt((p - p_low)² + (q_high - q)²), and likewise above.
+    """
+    value = first.value - second.value
+    down = np.hypot(first.value - first.low, second.high - second.value)
+    up = np.hypot(first.high - first.value, second.value - second.low)
+    return Estimate(*(float(share * end) for end in (value, value - down, value + up)))
 
 
 def mean_and_standard_error(values: ArrayLike) -> tuple[float, float]:
@@ -82,7 +96,7 @@ def mean_and_half_width(values: ArrayLike) -> tuple[float, float]:
     """Return the mean over seeds and half of Student's t interval; NaN for the interval of one seed."""
     mean, error = mean_and_standard_error(values)
     df = np.size(values) - 1
-    return mean, float(special.stdtrit(df, 0.5 + CONFIDENCE / 2)) * error if df > 0 else float("nan")
+    return mean, float(scipy.special.stdtrit(df, 0.5 + CONFIDENCE / 2)) * error if df > 0 else float("nan")
 
 
 def holm(p_values: Sequence[float]) -> list[float]:

@@ -60,7 +60,7 @@ class MethodRun:
 
 
 @dataclass(frozen=True)
-class Difference:
+class SeedDifference:
     """The difference of a metric between two methods, first minus second.
 
     Attributes:
@@ -94,11 +94,11 @@ def mean_over_seeds(values: Floats, episodes: int, possible: tuple[float, float]
         return Estimate(mean, low, high) if half > 1e-9 or mean == 0 else replace(UNKNOWN, value=mean)
     if len(values) > 1:
         ends = wilson_interval(mean * episodes, episodes)
-        low, high = min(low, float(ends[0])), max(high, float(ends[1]))
+        low, high = np.fmin(low, float(ends[0])), np.fmax(high, float(ends[1]))
     return Estimate(mean, low, high)
 
 
-def paired_difference(differences: Floats, margin: float = MARGIN) -> Difference:
+def paired_difference(differences: Floats, margin: float = MARGIN) -> SeedDifference:
     """Test the differences of each seed by Student's paired t.
 
     Args:
@@ -112,7 +112,7 @@ def paired_difference(differences: Floats, margin: float = MARGIN) -> Difference
     return _tested(mean, error, len(differences) - 1, margin, error * np.sqrt(len(differences)))
 
 
-def welch_difference(first: Floats, second: Floats, margin: float = MARGIN) -> Difference:
+def welch_difference(first: Floats, second: Floats, margin: float = MARGIN) -> SeedDifference:
     """Test two methods that share too few seeds by Welch's t (Biometrika 1947), with Satterthwaite's degrees.
 
     Args:
@@ -125,21 +125,21 @@ def welch_difference(first: Floats, second: Floats, margin: float = MARGIN) -> D
     """
     value = float(first.mean() - second.mean())
     if min(len(first), len(second)) < LEAST_SEEDS:
-        return Difference(replace(UNKNOWN, value=value))
+        return SeedDifference(replace(UNKNOWN, value=value))
     a, b = (v.var(ddof=1) / len(v) for v in (first, second))
     df = (a + b) ** 2 / (a**2 / (len(first) - 1) + b**2 / (len(second) - 1)) if a + b > 0 else 0.0
     return _tested(value, np.sqrt(a + b), df, margin, np.sqrt(first.var(ddof=1) + second.var(ddof=1)))
 
 
-def _tested(value: float, error: float, df: float, margin: float, spread: float) -> Difference:
+def _tested(value: float, error: float, df: float, margin: float, spread: float) -> SeedDifference:
     """Return a difference with its t interval, test, and two one-sided tests (Schuirmann, J. Pharmacokinet. 1987)."""
     if df < 1 or not error > 1e-12:
-        return Difference(replace(UNKNOWN, value=value))
+        return SeedDifference(replace(UNKNOWN, value=value))
     half = float(special.stdtrit(df, 0.5 + CONFIDENCE / 2)) * error
     estimate = Estimate(value, value - half, value + half)
     if df < LEAST_SEEDS - 1:
-        return Difference(estimate)
-    return Difference(
+        return SeedDifference(estimate)
+    return SeedDifference(
         estimate,
         p_value=float(2 * special.stdtr(df, -abs(value) / error)),
         equivalence=float(special.stdtr(df, (abs(value) - margin) / error)),

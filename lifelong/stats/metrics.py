@@ -143,6 +143,18 @@ def lifelong_metrics(scores: Scores) -> Metrics:
 
     Success rates have Wilson's interval over their episodes, which says what other episodes of these weights would
     change. FWT, NBT and AUC have none (NaN): how far they vary, several seeds say (`lifelong.stats.methods`).
+
+    Args:
+        scores: Learning curves, and the success matrix: row the task learned last, column the task evaluated.
+
+    Examples:
+        >>> epochs, counts = np.array([0, 5, 10]), np.full(3, 20)
+        >>> rates = (np.array([0.0, 0.5, 0.8]), np.array([0.1, 0.6, 0.6]))
+        >>> matrix = np.array([[0.8, np.nan], [0.3, 0.6]])
+        >>> curves = tuple(Curve(epochs, rate, counts) for rate in rates)
+        >>> found = lifelong_metrics(Scores(curves, matrix, np.array([[20, 0], [20, 20]])))
+        >>> round(found.fwt.value, 4), round(found.nbt.value, 4)
+        (0.4333, 0.25)
     """
     fwt = forward_transfer(scores.curves, scores.transfer)
     nbt, auc = negative_backward_transfer(scores.matrix), area_under_curve(fwt, scores.matrix)

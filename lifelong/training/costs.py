@@ -8,6 +8,7 @@ import copy
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any
 
@@ -15,11 +16,12 @@ import psutil
 import torch
 from torch import Tensor
 from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from lifelong.algorithms.base import Algorithm
 from lifelong.data.fake import fake_batch
-from lifelong.data.memory import ReplayMemory
+from lifelong.data.memory import ReplayMemory, TaskMemory
 from lifelong.data.windows import WindowDataset
 from lifelong.policies.base import Policy, device_of, in_mode
 from lifelong.seeding import generator, seeded
@@ -32,9 +34,11 @@ def step_costs(
 ) -> dict[str, float]:
     """Count the parameters, and the floating-point operations of one training step.
 
-    Real steps are made, on copies and in float32, with replay and penalties; clipping, the optimiser and what follows
-    it do not count. Policy and algorithm are unchanged afterwards. The number of operations is linear in the batch
-    size, so two small batches determine that of any; they are such that replay has its exact share of both.
+    Real steps are made, on copies and in float32, with replay and penalties: matrix products and convolutions count,
+    and element-wise operations of a penalty that has none of these, such as that of EWC. Those of layers, clipping, the
+    optimiser and what follows it do not. Policy and algorithm are unchanged afterwards. The number of operations is
+    linear in the batch size, so two small batches determine that of any; they are such that replay has its exact share
+    of both.
 
     Args:
         policy: Policy in the middle of training.
@@ -58,25 +62,55 @@ def _step_flops(policy: Policy, algorithm: Algorithm, windows: WindowDataset, si
     batch = windows.batch(torch.arange(size) % len(windows))
     trained = algorithm.trained(policy)
     algorithm.mode_train(policy)
-    with count_flops() as counter, seeded(0, device=device):
-        mixed = algorithm.mix(batch, generator(0)).to(device)
-        loss, penalty = policy.loss(mixed), algorithm.penalty(policy)
-        (loss if penalty is None else loss + penalty).backward()
-        algorithm.after_backward(policy)
+    elementwise = _Elementwise()
+    with seeded(0, device=device):
+        with count_flops() as counter:
+            mixed = algorithm.mix(batch, generator(0)).to(device)
+            loss, before = policy.loss(mixed), counter.get_total_flops()
+            with elementwise:
+                penalty = algorithm.penalty(policy)
+            of_weights = counter.get_total_flops() == before
+        if penalty is not None and of_weights and penalty.requires_grad:
+            with elementwise:
+                torch.autograd.grad(penalty, trained, retain_graph=True, allow_unused=True)
+        with count_flops() as after:
+            (loss if penalty is None else loss + penalty).backward()
+            algorithm.after_backward(policy)
     for parameter in trained:  # the algorithm's own parameters are not copied
         parameter.grad = None
-    return float(counter.get_total_flops())
+    products = counter.get_total_flops() + after.get_total_flops()
+    return float(products + (elementwise.count if of_weights else 0))
 
 
-def action_costs(policy: Policy) -> dict[str, float]:
+class _Elementwise(TorchDispatchMode):
+    """Counts an operation for each number that an element-wise function gives or a sum takes, two for a product's."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        found = func(*args, **(kwargs or {}))
+        if func.overloadpacket in (torch.ops.aten.sum, torch.ops.aten.dot):
+            self.count += args[0].numel() * (1 + (func.overloadpacket is torch.ops.aten.dot))
+        elif func.overloadpacket.__name__.startswith("_foreach_"):
+            self.count += sum(tensor.numel() for tensor in args[0])
+        elif torch.Tag.pointwise in func.tags and isinstance(found, Tensor):
+            self.count += found.numel()
+        return found
+
+
+def action_costs(policy: Policy, language: Tensor) -> dict[str, float]:
     """Count the operations of one action in one simulation with a full history: the mean over those of one plan.
 
     Args:
         policy: Policy to measure. Its history is reset; its mode and weights stay.
+        language: Embedding of an instruction that it has learned, (L,).
     """
     draws = generator(0)
     policy.reset(1)
     observation = fake_batch(policy.spec, 1, draws, steps=1).to(device_of(policy)).observation
+    observation = replace(observation, language=language[None].to(observation.language))
     with in_mode(policy, training=False):
         for _ in range(policy.spec.seq_len):
             policy.act(observation, [draws])
@@ -123,6 +157,11 @@ def stored_bytes(algorithm: Algorithm) -> int:
             read = [windows.observation.images, *windows.observation.proprio.values(), windows.actions]
             total += memory.count_frames() * _count_bytes(read) // windows.actions[..., 0].numel()
     return total
+
+
+def windows_kept(algorithm: Algorithm) -> int:
+    """Count the windows of earlier tasks that an algorithm replays, as they are or compressed or as latents."""
+    return sum(len(memory) for memory in vars(algorithm).values() if isinstance(memory, TaskMemory))
 
 
 def reset_peak(device: torch.device) -> None:

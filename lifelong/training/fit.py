@@ -15,13 +15,13 @@ from tqdm import tqdm
 from lifelong.algorithms.base import Algorithm
 from lifelong.checkpoints import check, load_weights
 from lifelong.data.windows import WindowDataset, batches_in_order
-from lifelong.errors import CheckpointError, TrainingError
+from lifelong.errors import CheckpointError, ConfigError, TrainingError
 from lifelong.policies.base import Policy, device_of
 from lifelong.seeding import generator, seeded
 from lifelong.training.distributed import Ranks
 from lifelong.training.precision import float32_products
 from lifelong.training.settings import FitSettings
-from lifelong.training.step import BatchAugmentation, Step
+from lifelong.training.step import BatchAugmentation, Step, like
 from lifelong.types import Batch
 
 TrainStep = Callable[[Batch, torch.Generator, float], tuple[Tensor, Tensor]]
@@ -38,6 +38,7 @@ class EpochEnd:
         seconds: Wall-clock time of the epoch, [s].
         policy: Policy with the weights of this moment.
         optimizer: Optimiser of these weights.
+        more: Further entries of the state.
     """
 
     epoch: int
@@ -46,6 +47,7 @@ class EpochEnd:
     seconds: float
     policy: Policy = field(repr=False)
     optimizer: torch.optim.Optimizer = field(repr=False)
+    more: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     def state(self) -> dict[str, Any]:
         """Return what `fit(resume=...)` needs to continue from here."""
@@ -55,6 +57,7 @@ class EpochEnd:
             "penalty": self.penalty,
             "policy": self.policy.state_dict(),
             "optimizer": self.optimizer.state_dict(),
+            **self.more,
         }
 
 
@@ -72,6 +75,8 @@ def fit(
     ranks: Ranks = Ranks(),  # noqa: B008 - frozen
     step: TrainStep | None = None,
     load: Callable[[Sequence[Tensor]], Iterable[Batch]] | None = None,
+    objective: Callable[[Batch], Tensor] | None = None,
+    more: Mapping[str, Any] | None = None,
 ) -> None:
     """Train a policy on one task's windows, with the replay and the penalties of an algorithm.
 
@@ -95,6 +100,8 @@ def fit(
             returns the loss and the penalty. Default: `Step` with AdamW.
         load: Function that returns the batches of an epoch, given the indices of each; it may read ahead. Default:
             those of `dataset.batch`, with the next one read ahead where frames are on disk.
+        objective: Function from a batch to what `Step` minimises. Default: `policy.loss`.
+        more: Further entries of `EpochEnd.state`.
 
     Raises:
         TrainingError: The dataset is empty, or the loss is not finite.
@@ -105,7 +112,7 @@ def fit(
     device, size = device_of(policy), settings.batch_size
     trained, factors = algorithm.trained(policy), algorithm.rate_factors(policy)
     optimizer = _make_optimizer(trained, settings, algorithm.named_parameters(policy), factors)
-    default_step = Step(policy, algorithm, optimizer, settings, augment, ranks)
+    default_step = Step(policy, algorithm, optimizer, settings, augment, ranks, objective=objective)
     step, load = step or default_step, load or partial(batches_in_order, dataset)
     steps, windows = _epoch_size(len(dataset), settings)
     first, loss, penalty = 0, math.nan, 0.0
@@ -117,7 +124,7 @@ def fit(
         with seeded(*seed, 0, 2, device=device), float32_products(settings.precision):
             _adapt_statistics(policy, dataset, algorithm, size, augment, generator(*seed, 0, 3))
     own_draws = () if ranks.first else (ranks.rank,)  # dropout differs between ranks
-    on_epoch(EpochEnd(first, loss, penalty, 0.0, policy, optimizer))
+    on_epoch(EpochEnd(first, loss, penalty, 0.0, policy, optimizer, more or {}))
     make_bar = partial(tqdm, desc=progress, disable=progress is None, unit="step", leave=False)
     total = settings.epochs * steps
     with make_bar(total=total, initial=first * steps) as bar:
@@ -135,7 +142,8 @@ def fit(
                     f"the loss is {loss}: lower train.lr or algo.strength, or set train.precision=fp32"
                 )
             bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
-            on_epoch(EpochEnd(epoch + 1, loss, penalty, time.perf_counter() - began, policy, optimizer))
+            seconds = time.perf_counter() - began
+            on_epoch(EpochEnd(epoch + 1, loss, penalty, seconds, policy, optimizer, more or {}))
 
 
 def _take_steps(
@@ -146,7 +154,7 @@ def _take_steps(
     for batch in batches:
         losses.append(torch.stack(step(batch, draws, next(rates))))
         bar.update()
-    return torch.stack(losses)
+    return torch.stack(losses) if losses else torch.zeros(1, 2)
 
 
 def _epoch_size(windows: int, settings: FitSettings) -> tuple[int, int]:
@@ -154,6 +162,24 @@ def _epoch_size(windows: int, settings: FitSettings) -> tuple[int, int]:
     steps = settings.steps_per_epoch or math.ceil(windows / settings.batch_size)
     short = settings.last_batch == "short" and not settings.steps_per_epoch
     return steps, windows if short else steps * settings.batch_size
+
+
+def check_warmup(settings: FitSettings, algorithm: Algorithm, windows: int) -> None:
+    """Check that the warm-up ends before training does.
+
+    Args:
+        windows: Number of windows of the smallest stage, which counts where an epoch is a pass over them.
+
+    Raises:
+        ConfigError: The learning rate would never be `train.lr`.
+    """
+    for phase in algorithm.phases() if settings.warmup_steps else ():
+        steps = max(1, round(settings.epochs * phase.share)) * _epoch_size(windows, settings)[0]
+        if settings.warmup_steps > steps:
+            raise ConfigError(
+                f"train.warmup_steps is {settings.warmup_steps}, and a task has {steps} steps: the learning rate would "
+                "never be train.lr; lower it, or raise train.epochs"
+            )
 
 
 def learning_rate(step: int, total: int, settings: FitSettings, epoch_start: int = 0) -> float:
@@ -204,7 +230,11 @@ def _make_optimizer(
     named: Iterable[tuple[str, nn.Parameter]],
     factors: Mapping[str, float],
 ) -> torch.optim.AdamW:
-    """Return the optimiser; parameters with the same factor of the learning rate are a group."""
+    """Return the optimiser; parameters with the same factor of the learning rate are a group.
+
+    On a CPU all parameters move in one fused loop, which takes weights, gradients and moments to lie alike in memory:
+    see `Step` and `_load_optimizer`.
+    """
     of_parameter = {
         id(parameter): factor
         for name, parameter in named
@@ -219,6 +249,7 @@ def _make_optimizer(
         lr=settings.lr,
         betas=tuple(settings.betas),
         weight_decay=settings.weight_decay,
+        fused=all(p.device.type == "cpu" and p.stride() == torch.empty_like(p).stride() for p in trained),
     )
 
 
@@ -236,5 +267,7 @@ def _load_optimizer(optimizer: torch.optim.AdamW, state: dict[str, Any]) -> None
     if not fits:
         raise CheckpointError("the state of the optimiser belongs to other parameters than those of this run")
     optimizer.load_state_dict(state)
-    for entry in optimizer.state.values():  # as in an uninterrupted run: AdamW reads the counter on the host
+    for parameter, entry in optimizer.state.items():  # as in an uninterrupted run
         entry["step"] = entry["step"].cpu()
+        for name in ("exp_avg", "exp_avg_sq"):
+            entry[name] = like(parameter, entry[name])

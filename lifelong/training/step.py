@@ -35,6 +35,7 @@ class Step:
         augment: Augmentation of the mixed batch.
         ranks: Rank of this process among those that train together.
         loss_scale: Factor of the gradients before they are clipped.
+        objective: Function from a batch to a scalar that is minimised in place of the policy's loss.
 
     Raises:
         ConfigError: The batch is divided, and the policy normalises over the batch.
@@ -47,6 +48,7 @@ class Step:
     augment: BatchAugmentation | None = None
     ranks: Ranks = Ranks()
     loss_scale: float = 1.0
+    objective: Callable[[Batch], Tensor] | None = None
 
     def __post_init__(self) -> None:
         if self.settings.accumulate * self.ranks.size > 1:
@@ -89,6 +91,9 @@ class Step:
         if self.settings.grad_clip:
             nn.utils.clip_grad_norm_(self._optimized, self.settings.grad_clip)
         self.algorithm.after_clipping(self.policy)
+        for p in self._optimized:
+            if p.grad is not None:
+                p.grad = like(p, p.grad)
         for group in self.optimizer.param_groups if lr is not None else ():
             group["lr"] = lr * group.get("factor", 1.0)
         self.optimizer.step()
@@ -143,14 +148,19 @@ class Step:
 
     @cached_property
     def _loss(self) -> Callable[[Batch], Tensor]:
-        mode = self.settings.compile
+        mode, loss = self.settings.compile, self.objective or self.policy.loss
         if mode == "off":
-            return self.policy.loss
-        return torch.compile(self.policy.loss, mode=None if mode == "default" else mode)
+            return loss
+        return torch.compile(loss, mode=None if mode == "default" else mode)
 
     @property
     def _uses_cuda_graphs(self) -> bool:
         return self.settings.compile == "reduce-overhead" and self.device.type == "cuda"
+
+
+def like(parameter: Tensor, value: Tensor) -> Tensor:
+    """Return a tensor of a parameter's shape in its memory format, which a fused optimiser takes for granted."""
+    return value if value.stride() == parameter.stride() else torch.empty_like(parameter).copy_(value)
 
 
 def refuse_batch_norm(policy: nn.Module) -> None:

@@ -1,8 +1,7 @@
 """What values of a setting keep and let learn, and which of them is best: as a table, a picture and files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import cached_property
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,83 +10,78 @@ import numpy as np
 import yaml
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
-from numpy.typing import NDArray
+from matplotlib.ticker import PercentFormatter
 
 from libero_env.storage import atomic_write_text, write_json
-from lifelong.report.figures import INK, LINE_COLOURS, STYLE, save
-
-Errors = list[list[float]]  # of one trial: after each stage, the error on each task so far
-_TICKS = (1.0, 1.05, 1.1, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 8.0, 9.0)  # of factors
-_FEW_TICKS = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)  # where an axis is longer than a factor of two
+from lifelong.report.figures import LINE_COLOURS, STYLE, save
 
 
 @dataclass(frozen=True)
-class Ratio:
-    """A factor on errors over several trials: their geometric mean, the least and the largest."""
+class Measured:
+    """What one trial came to.
+
+    Attributes:
+        success: Share of successful rollouts on each task at the end, (K,).
+        weights: Digest of the policy at the end.
+        seconds: Wall time of learning and of the rollouts, [s].
+    """
+
+    success: list[float]
+    weights: str = ""
+    seconds: list[float] = field(default_factory=lambda: [0.0, 0.0])
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A success rate over several trials: their mean, the least and the largest."""
 
     value: float
     low: float
     high: float
 
     def __str__(self) -> str:
-        if f"{self.low:.2f}" == f"{self.high:.2f}":
-            return f"{self.value:.2f}"
-        return f"{self.value:.2f} [{self.low:.2f}, {self.high:.2f}]"
+        shown = f"{self.value:.0%}"
+        return shown if self.low == self.high else f"{shown} [{self.low:.0%}, {self.high:.0%}]"
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What one value of the settings came to.
 
-    All are factors on the errors that fine-tuning leaves on a task that it has just learned: 1 is as good as that, 2
-    has twice the error.
-
     Attributes:
         label: The value, as the tables name it.
         settings: Values of the settings by dotted key; none of an algorithm that is shown to compare with.
-        trials: Errors of each trial, one for each stream and seed.
-        fine_tuning: Errors of fine-tuning in the same trials.
+        trials: What each trial came to, one for each stream and seed.
     """
 
     label: str
     settings: dict[str, Any]
-    trials: tuple[Errors, ...]
-    fine_tuning: tuple[Errors, ...]
-
-    @cached_property
-    def _logs(self) -> list[NDArray[np.float64]]:
-        """Logarithms of the factors at the end, of each trial, (K,)."""
-        return [
-            np.log([error / base[task][task] for task, error in enumerate(errors[-1])])
-            for errors, base in zip(self.trials, self.fine_tuning, strict=True)
-        ]
+    trials: tuple[Measured, ...]
 
     @property
-    def kept(self) -> Ratio:
-        """Error on the earlier tasks at the end."""
-        return _ratio([logs[:-1].mean() for logs in self._logs])
+    def kept(self) -> Rate:
+        """Success on the earlier tasks at the end."""
+        return _rate([np.mean(one.success[:-1]) for one in self.trials])
 
     @property
-    def learned(self) -> Ratio:
-        """Error on the newest task at the end."""
-        return _ratio([logs[-1] for logs in self._logs])
+    def learned(self) -> Rate:
+        """Success on the newest task at the end."""
+        return _rate([one.success[-1] for one in self.trials])
 
     @property
-    def score(self) -> Ratio:
-        """Error on all tasks at the end, which the choice makes least."""
-        return _ratio([logs.mean() for logs in self._logs])
+    def score(self) -> Rate:
+        """Success on all tasks at the end, which the choice makes largest."""
+        return _rate([np.mean(one.success) for one in self.trials])
 
     @property
-    def errors(self) -> tuple[float, float]:
-        """Mean error on the earlier tasks and on the newest one at the end, in units of the actions."""
-        last = [errors[-1] for errors in self.trials]
-        return float(np.mean([np.mean(e[:-1]) for e in last])), float(np.mean([e[-1] for e in last]))
+    def seconds(self) -> tuple[float, float]:
+        """Mean wall time of a trial's learning and of its rollouts, [s]."""
+        learning, rollouts = np.mean([one.seconds for one in self.trials], axis=0)
+        return float(learning), float(rollouts)
 
 
-def _ratio(logs: Sequence[float]) -> Ratio:
-    value, low, high = np.exp([np.mean(logs), np.min(logs), np.max(logs)])
-    return Ratio(float(value), float(low), float(high))
+def _rate(values: Sequence[Any]) -> Rate:
+    return Rate(float(np.mean(values)), float(np.min(values)), float(np.max(values)))
 
 
 @dataclass(frozen=True)
@@ -104,15 +98,19 @@ class Frontier:
 
     @property
     def chosen(self) -> Outcome:
-        """The value with the least error on all tasks at the end; of equal ones the first."""
-        return min(self.outcomes, key=lambda outcome: outcome.score.value)
+        """The value with the largest success on all tasks at the end; of equal ones the first."""
+        return max(self.outcomes, key=lambda outcome: outcome.score.value)
+
+    def equals(self) -> tuple[Outcome, ...]:
+        """Return the values whose success on all tasks is that of the chosen one, which is among them."""
+        return tuple(one for one in self.outcomes if one.score.value == self.chosen.score.value)
 
     def is_efficient(self, outcome: Outcome) -> bool:
         """Return whether no other value keeps and lets learn at least as well, and one of both better."""
         mine = outcome.kept.value, outcome.learned.value
         return not any(
-            (kept := other.kept.value) <= mine[0]
-            and (learned := other.learned.value) <= mine[1]
+            (kept := other.kept.value) >= mine[0]
+            and (learned := other.learned.value) >= mine[1]
             and (kept, learned) != mine
             for other in self.outcomes
         )
@@ -129,7 +127,7 @@ def render(frontier: Frontier, default: str | None) -> str:
         frontier: What was measured.
         default: Label of the value that is used without tuning; None where it is not among them.
     """
-    rows = [("value", "kept", "learned", "all", "error kept", "error learned", "")]
+    rows: list[tuple[str, ...]] = [("value", "kept", "learned", "all", "s: learning", "rollouts", "")]
     for outcome in (*frontier.outcomes, *frontier.others):
         marks = []
         if outcome in frontier.outcomes and frontier.is_efficient(outcome):
@@ -138,9 +136,8 @@ def render(frontier: Frontier, default: str | None) -> str:
             marks.append("**chosen**")
         if outcome in frontier.outcomes and outcome.label == default:
             marks.append("default")
-        kept, learned = (f"{error:.3f}" for error in outcome.errors)
-        factors = (str(outcome.kept), str(outcome.learned), str(outcome.score))
-        rows.append((outcome.label, *factors, kept, learned, ", ".join(marks)))
+        rates = (str(outcome.kept), str(outcome.learned), str(outcome.score))
+        rows.append((outcome.label, *rates, *(f"{s:.0f}" for s in outcome.seconds), ", ".join(marks)))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["| " + " | ".join(map(str.ljust, row, widths)) + " |" for row in rows]
     lines.insert(1, "|" + "|".join("-" * (width + 2) for width in widths) + "|")
@@ -149,10 +146,9 @@ def render(frontier: Frontier, default: str | None) -> str:
 
 @matplotlib.rc_context(STYLE)
 def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
-    """Draw what is kept against what is learned and write `stem`.png and `stem`.pdf; below and left is better.
+    """Draw what is kept against what is learned and write `stem`.png and `stem`.pdf; above and right is better.
 
-    Values are joined in their order, with bars from the least to the largest trial. On the dashed line, all tasks
-    together have the error of the chosen value.
+    Values are joined in their order, with bars from the least to the largest trial.
 
     Args:
         frontier: What was measured.
@@ -161,7 +157,7 @@ def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
     """
     figure = Figure(figsize=(4.6, 3.6), layout="constrained")
     axes = figure.subplots()
-    axes.set(xscale="log", yscale="log")
+    axes.set(xlim=(-0.05, 1.05), ylim=(-0.05, 1.05))
     learned = [o.learned.value for o in frontier.outcomes]
     axes.plot(learned, [o.kept.value for o in frontier.outcomes], color=LINE_COLOURS[0], lw=0.8, alpha=0.6)
     for outcome in frontier.outcomes:
@@ -169,17 +165,10 @@ def draw_frontier(frontier: Frontier, title: str, stem: Path) -> None:
         _point(axes, outcome, "o", LINE_COLOURS[0], filled=frontier.is_efficient(outcome), large=chosen)
     for outcome in frontier.others:
         _point(axes, outcome, "s", LINE_COLOURS[-1], filled=True, large=False)
-    _equal_scores(axes, frontier.chosen)
     _name_points(axes, frontier)
     for axis in (axes.xaxis, axes.yaxis):
-        low, high = axis.get_view_interval()
-        axis.set_major_locator(LogLocator(base=10, subs=_FEW_TICKS if high > 2 * low else _TICKS))
-        axis.set_minor_locator(NullLocator())
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}"))
-        axis.set_minor_formatter(NullFormatter())
-    axes.set(
-        xlabel="error on the newest task\n(1: just learned by fine-tuning)", ylabel="error on earlier tasks"
-    )
+        axis.set_major_formatter(PercentFormatter(1, 0))
+    axes.set(xlabel="success on the newest task", ylabel="success on earlier tasks")
     axes.set_title(title, loc="left")
     save(figure, stem)
 
@@ -219,19 +208,8 @@ def _name_points(axes: Axes, frontier: Frontier) -> None:
         )
 
 
-def _equal_scores(axes: Axes, chosen: Outcome) -> None:
-    """Draw where kept^(K-1) learned is that of the chosen value."""
-    earlier = len(chosen.trials[0][-1]) - 1
-    limits = axes.get_xlim(), axes.get_ylim()
-    x = np.geomspace(*limits[0], 50)
-    y = chosen.kept.value * (chosen.learned.value / x) ** (1 / earlier)
-    axes.plot(x, y, color=INK, lw=0.7, ls="--", alpha=0.6, scalex=False, scaley=False)
-    axes.set_xlim(limits[0])
-    axes.set_ylim(limits[1])
-
-
 def write_frontier(frontier: Frontier, path: Path, about: Mapping[str, Any]) -> None:
-    """Write a frontier with all errors to a JSON file.
+    """Write a frontier with what all trials came to to a JSON file.
 
     Args:
         frontier: What was measured.
@@ -251,7 +229,7 @@ def _row(outcome: Outcome) -> dict[str, Any]:
         "label": outcome.label,
         "settings": outcome.settings,
         **{name: asdict(getattr(outcome, name)) for name in ("kept", "learned", "score")},
-        "errors": outcome.trials,
+        "trials": [asdict(one) for one in outcome.trials],
     }
 
 

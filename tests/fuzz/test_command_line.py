@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from libero_env.cli.main import ALL, load, main
+from libero_cli.main import ALL, load, main
 from libero_env.cli.options import options_of
 from lifelong.errors import ConfigError
 from lifelong.report.figures import Line, Panel, as_svg, forgetting_figure, heatmap_figure

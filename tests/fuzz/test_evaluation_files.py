@@ -15,9 +15,9 @@ from libero_eval.cli.compare import _single_groups
 from libero_eval.evaluation_file import FILE_NAME, EvaluationResult, TaskResult
 from libero_eval.judging.comparison import compare_groups, write_comparison
 from libero_eval.judging.page import render
-from libero_eval.plan import repeated
 from libero_eval.protocols.files import load_protocol
 from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.repeating import repeated
 from libero_eval.requests import EvalRequest
 from libero_integrations.exports.results import export_lerobot, export_vla_eval
 from tests.harness.fuzz import examples, survive

@@ -9,8 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from libero_env.curating.curate import describe, examine
 from libero_env.demos.contents import read_header
-from libero_env.demos.curate import describe, examine
 from libero_env.demos.observe import recorded_robot
 from libero_env.demos.read import demo_lengths, read_demos, read_episodes
 from lifelong.data import DemoSource, SequenceVLDataset

@@ -47,34 +47,19 @@ def pickled(protocol: int) -> bytes:
     return pickle.dumps(ROWS, protocol)
 
 
-def tensor(offset: int = 1, shape=(3, 2), strides=(6, 2)) -> bytes:
-    """Return the pickle that torch writes for a tensor of the storage `0`."""
-    number = lambda value: pickle.dumps(value, 2)[2:-1]  # noqa: E731
-    text = lambda value: b"X" + struct.pack("<I", len(value)) + value  # noqa: E731
-    key = b"(%sctorch\nDoubleStorage\n%s%sK\x18tQ" % (text(b"storage"), text(b"0"), text(b"cpu"))
-    pairs = b"".join(number(value) for value in (offset, shape, strides))
-    return b"\x80\x02ctorch._utils\n_rebuild_tensor_v2\n(%s%s\x89ccollections\nOrderedDict\n)RtR." % (
-        key,
-        pairs,
-    )
-
-
 def zipped(content: bytes, compression: int = zipfile.ZIP_STORED, root: str = "archive") -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", compression) as archive:
         archive.writestr(f"{root}/data.pkl", content)
-        archive.writestr(f"{root}/data/0", ROWS.tobytes())
-        archive.writestr(f"{root}/byteorder", b"little")
     return stream.getvalue()
 
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory):
-    """Return a file of each kind with the rows that it has."""
+    """Return a file with the rows that it has."""
     folder = tmp_path_factory.mktemp("states")
     write_states(folder / "array", ROWS)
-    (folder / "tensor").write_bytes(zipped(tensor()))
-    return {folder / "array": ROWS, folder / "tensor": ROWS.ravel()[1 + 6 * np.arange(3)[:, None] + [0, 2]]}
+    return {folder / "array": ROWS}
 
 
 def check(good, folder, content: bytes) -> None:
@@ -100,7 +85,7 @@ def test_arrays_of_every_protocol_are_read(tmp_path, protocol):
 @st.composite
 def changed_pickles(draw):
     """Return a valid pickle with operations that are changed, dropped, doubled, swapped or put in between."""
-    content = draw(st.sampled_from([tensor(), *(pickled(protocol) for protocol in range(6))]))
+    content = draw(st.sampled_from([pickled(protocol) for protocol in range(6)]))
     starts = [at for _, _, at in pickletools.genops(content)]
     parts = [content[a:b] for a, b in zip(starts, [*starts[1:], len(content)], strict=True)]
     for _ in range(draw(st.integers(1, 4))):
@@ -131,18 +116,12 @@ def test_changed_pickles_are_read_or_refused(good, tmp_path_factory, content, wr
     check(good, tmp_path_factory.getbasetemp(), zipped(content) if wrapped else content)
 
 
-@given(st.tuples(NUMBERS, NUMBERS), st.tuples(NUMBERS, NUMBERS), NUMBERS)
-@examples(short=40, long=500)
-def test_tensors_of_any_shape_are_read_or_refused(good, tmp_path_factory, shape, strides, offset):
-    check(good, tmp_path_factory.getbasetemp(), zipped(tensor(offset, shape, strides)))
-
-
 @given(
     data=st.data(), compression=st.sampled_from((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA))
 )
 @examples(short=100, long=2000)
 def test_changed_zips_are_read_or_refused(good, tmp_path_factory, data, compression):
-    content = bytearray(zipped(data.draw(st.sampled_from([pickled(2), tensor()])), compression))
+    content = bytearray(zipped(pickled(2), compression))
     directory = content.find(b"PK\x01\x02")
     for _ in range(data.draw(st.integers(1, 4))):
         first = data.draw(st.sampled_from((0, directory, len(content) - 22)))

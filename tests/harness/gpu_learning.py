@@ -31,8 +31,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook, register_op
 from lifelong.algorithms import Sequential
 from lifelong.data import SequenceVLDataset, fake_batch
 from lifelong.data.compressed import compress
-from lifelong.evaluation.actors import PolicyActor
-from lifelong.evaluation.environments import Obs
+from lifelong.evaluation.actors import Obs, PolicyActor
 from lifelong.policies import Policy
 from lifelong.results.records import LossRecord
 from lifelong.seeding import generator, seeded

@@ -17,14 +17,15 @@ START_UP = 0.2  # share of the kills that come before the process has written an
 HALF_WRITTEN = 0.3  # share of the others that come while a file is being written
 DEADLINE = 1800.0  # s; of a machine that has other things to do
 TINY = (
-    "preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "threads=1", "data.demos=2", "train.epochs=2",
+    "preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "threads=1", "data.demos=2",
+    "data.seq_len=2", "train.epochs=2",
     "train.steps_per_epoch=2", "train.batch_size=4", "eval.every=1", "eval.horizon=3", "eval.episodes=1",
-    "eval.curve_episodes=1", "eval.record_every=0", "progress=false"
+    "train.warmup_steps=0", "eval.curve_episodes=1", "eval.record_every=0", "progress=false"
 )  # fmt: skip
 
 
-def start(algo: str, runs: Path, demos: Path) -> subprocess.Popen:
-    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"algo={algo}", f"runs_dir={runs}"]
+def start(algo: str, runs: Path, demos: Path, *more: str) -> subprocess.Popen:
+    command = [sys.executable, str(ROOT / "train.py"), *TINY, f"algo={algo}", f"runs_dir={runs}", *more]
     env = os.environ | {"LIBERO_DEMOS": str(demos)}
     runs.mkdir(exist_ok=True)
     log = open(runs / "output.txt", "a")  # noqa: SIM115 - the process keeps it

@@ -1,4 +1,4 @@
-"""vla-eval, Inspect Robots and LeRobot in environments of their own, from which this checkout can be imported too."""
+"""vla-eval, Rerun and LeRobot in environments of their own, from which this checkout can be imported too."""
 
 import json
 import os
@@ -65,15 +65,13 @@ def vla_eval() -> Peer:
     """Return vla-eval's environment; what this package needs comes from the environment of the tests."""
     same = [f"{name}=={version(name)}" for name in ("numpy", "pillow", "omegaconf")]
     python = counterpart("vla-eval==0.8.0", *same)
-    ours = str(INTEGRATIONS / "vla_eval_libero_lifelong")
-    return Peer(python, (str(ROOT), ours, sysconfig.get_path("purelib")))
+    return Peer(python, (str(ROOT), sysconfig.get_path("purelib")))
 
 
-def inspect_robots() -> Peer:
-    """Return the environment of Inspect Robots with our distribution, and Rerun, 530 MB, beside that of the tests."""
-    python = counterpart("hatchling", no_deps=("inspect-robots==0.60.0", "rerun-sdk==0.41.0"))
-    installed = _installed(python, "inspect_robots_libero_lifelong")
-    return Peer(python, (str(ROOT), installed, sysconfig.get_path("purelib")))
+def rerun() -> Peer:
+    """Return the environment of Rerun, 530 MB, beside that of the tests."""
+    python = counterpart(no_deps=("rerun-sdk==0.41.0",))
+    return Peer(python, (str(ROOT), sysconfig.get_path("purelib")))
 
 
 def lerobot() -> Peer:

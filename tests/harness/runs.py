@@ -18,7 +18,7 @@ from tests.harness.configs import CONFIGS
 
 TINY = (
     *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "device=cpu", "data.image_size=32"),
-    *("policy.encoder.width=8", "policy.head.hidden=16"),
+    *("data.seq_len=2", "policy.encoder.width=8", "policy.head.hidden=16"),
 )
 
 

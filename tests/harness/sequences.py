@@ -48,6 +48,7 @@ EVERY = ALGORITHMS | {
     "dmpel": lambda: algos.DMPEL(rank=2, alpha=4.0, pool=2, recall_steps=20),
     "iscil": lambda: algos.IsCiL(rank=2, alpha=4.0, bases=3, states=10),
     "lora": lambda: algos.LoRA(rank=2, alpha=4.0),
+    "lora_one": lambda: algos.LoRA(rank=2, alpha=4.0, adapters="shared"),
     "lwf": algos.LwF,
     "m2distill": lambda: algos.M2Distill(budget=12),
     "mas": algos.MAS,

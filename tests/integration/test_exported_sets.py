@@ -15,16 +15,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from libero_env.demos.read import read_episodes
+from libero_env.demos.read import read_demos, read_episodes
+from libero_env.tasks import get_suite
 from libero_integrations.exports.demonstrations import export_demos, export_published
 from libero_integrations.exports.regeneration import Regeneration
-from tests.harness.demos import generate
+from libero_integrations.imports.demonstrations import rlds_files
+from tests.harness.demos import episode, generate
 from tests.harness.peers import ROOT, lerobot
 
 pytest.importorskip("av")
 parquet = pytest.importorskip("pyarrow.parquet")
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 READ_RLDS = ROOT / "tests/harness/peer_scripts/read_rlds.py"
+WRITE_RLDS = READ_RLDS.with_name("write_rlds.py")
 DRIVER = Path(__file__).with_name("lerobot_driver.py")
 HOW = Regeneration(settle_steps=0, assets="builtin", drawing="fast")
 LANGUAGE = "pick up the milk and place it in the basket"
@@ -118,3 +121,28 @@ def test_tensorflow_datasets_reads_ours(file, tmp_path):
     assert images.shape == drawn.shape and abs(images - drawn).mean() < 5.0  # JPEG
     last = [False] * (len(recorded) - 1) + [True]
     assert one["ends"] == last and one["rewards"] == [float(end) for end in last]
+
+
+def test_what_tensorflow_datasets_writes_is_read(tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
+    tasks, episodes = get_suite("libero_object").tasks[:2], [episode(k, 9, 32) for k in range(3)]
+    arrays: dict = {"count": len(episodes)}
+    for k, one in enumerate(episodes):
+        state = np.concatenate([one.obs[key] for key in ("ee_pos", "ee_ori", "gripper_states")], axis=1)
+        smooth = (np.linspace(0, 180, 32)[None, :, None] + np.zeros((9, 32, 32, 3)) + 10 * k).astype(np.uint8)
+        numbers = {"state": state, "joint_state": one.obs["joint_states"], "action": one.actions}
+        columns = {key: values.astype(np.float32) for key, values in numbers.items()}
+        columns |= {"image": smooth, "wrist_image": smooth, "language": np.array(tasks[k % 2].language)}
+        arrays |= {f"{k}/{key}": values for key, values in columns.items()}
+    np.savez(tmp_path / "episodes.npz", **arrays)
+    _run(_named("LIBERO_TFDS"), tmp_path, tmp_path / "episodes.npz", tmp_path / "sets", script=WRITE_RLDS)
+    counts = {tasks[0].id: 2, tasks[1].id: 1}
+    paths = rlds_files(tmp_path / "sets/mine", tasks, counts, "executed")
+    read = [demo for path in paths for demo in read_demos(path)]
+    order = [k for k, _ in sorted(enumerate(read), key=lambda one: one[1].actions.tobytes())]
+    written = sorted(range(3), key=lambda k: episodes[k].actions.astype(np.float32).astype(float).tobytes())
+    for k, number in zip(order, written, strict=True):  # TensorFlow Datasets shuffles them
+        np.testing.assert_array_equal(read[k].actions, arrays[f"{number}/action"])
+        np.testing.assert_array_equal(read[k].obs["joint_states"], arrays[f"{number}/joint_state"])
+        apart = read[k].obs["agentview_rgb"].astype(int) - arrays[f"{number}/image"][:, :, ::-1]
+        assert np.abs(apart).max() <= 6 and read[k].success

@@ -17,7 +17,8 @@ def test_killed_twice_a_run_ends_in_the_same_bits(demos, tmp_path):
     )
     whole = finish(start(algo, tmp_path / "whole", demos), tmp_path / "whole")
     draws, killed = random.Random(f"kills of {algo}"), tmp_path / "killed"
+    own = killed, tmp_path / "demos", "eval.beside=true"  # it records demonstrations meanwhile, too
     for _ in range(KILLS):
-        assert kill_somewhere(start(algo, killed, demos), killed, draws), "it ended before it could be killed"
-    again = finish(start(algo, killed, demos), killed)
+        assert kill_somewhere(start(algo, *own), killed, draws), "it ended before it could be killed"
+    again = finish(start(algo, *own), killed)
     assert_same_runs(again, whole)

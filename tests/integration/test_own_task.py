@@ -11,16 +11,17 @@ import trimesh
 import yaml
 from PIL import Image
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from libero_env.envs.env import LiberoEnv
 from libero_env.tasks import read_task, write_task
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 TINY = (
-    "preset=smoke", "algo=er", "threads=1", "data.demos=2", "data.image_size=32", "train.epochs=1",
+    "preset=smoke", "algo=er", "threads=1", "data.demos=2",
+    "data.seq_len=2", "data.image_size=32", "train.epochs=1",
     "train.steps_per_epoch=3", "train.batch_size=4", "eval.every=1", "eval.horizon=8", "eval.episodes=1",
-    "eval.curve_episodes=1"
+    "eval.curve_episodes=1", "train.warmup_steps=0"
 )  # fmt: skip
 SCENE = {
     "fixtures": {"kitchen_table": "kitchen_table"},

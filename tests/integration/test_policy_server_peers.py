@@ -138,7 +138,7 @@ def test_openpi_client_and_libero_serve(python, run, tmp_path):
         actor = PolicyActor(policy, restored.embed(task), restored.device, "fp32", [generator(0)])
         actor.reset(1)
         wanted = [actor.act({k: v[i : i + 1] for k, v in frames.items()}) for i in range(5)]
-    command = [sys.executable, "-m", "libero_env.cli", "serve", str(run), "--port", "0", "--device", "cpu"]
+    command = [sys.executable, "-m", "libero_cli", "serve", str(run), "--port", "0", "--device", "cpu"]
     with process(*command) as server:
         line = server.stdout.readline()
         assert "serving" in line and "after task 1 at ws://127.0.0.1:" in line

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from libero_env.tasks import get_suite
 from lifelong import checkpoints
 from lifelong.algorithms import PackNet

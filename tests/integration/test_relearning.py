@@ -4,15 +4,16 @@ import sys
 
 import pytest
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from lifelong.results.relearning import read_relearning
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 TINY = (
     *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "threads=1", "data.demos=2"),
+    "data.seq_len=2",
     *("train.epochs=1", "train.steps_per_epoch=4", "train.batch_size=4", "eval.horizon=6", "eval.episodes=1"),
-    *("eval.curve_episodes=1", "policy.encoder.width=4", "algo=lora"),
+    *("eval.curve_episodes=1", "train.warmup_steps=0", "policy.encoder.width=4", "algo=lora"),
 )
 
 

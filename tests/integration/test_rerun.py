@@ -5,14 +5,14 @@ import sys
 import numpy as np
 import pytest
 
-from libero_env.cli.main import main
+from libero_cli.main import main
+from libero_env.curating.rendering import rerender
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.read import read_episodes
-from libero_env.demos.rendering import rerender
 from libero_env.tasks import get_task
 from libero_integrations.exports.demonstrations import recorded_language
 from tests.harness.demos import STEPS, record_wander
-from tests.harness.peers import inspect_robots
+from tests.harness.peers import rerun
 
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
@@ -29,7 +29,7 @@ def file(tmp_path_factory):
 
 
 def test_rerun_reads_cameras_states_actions_and_predicates(file, tmp_path):
-    found = inspect_robots().run("show_demos.py", file, tmp_path / "out.rrd", cwd=tmp_path)
+    found = rerun().run("show_demos.py", file, tmp_path / "out.rrd", cwd=tmp_path)
     episodes = {one.name: one for one in read_episodes(file)}
     assert set(episodes) == {"demo_0", "demo_1"}
     for name, one in episodes.items():

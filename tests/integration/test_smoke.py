@@ -18,8 +18,9 @@ ROOT = Path(__file__).parents[2]
 ALGORITHMS = ("er", "packnet", "dmpel", "single_task", "multitask")
 TINY = (
     "preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "algo=packnet", "threads=1", "data.demos=2",
+    "data.seq_len=2",
     "train.epochs=2", "train.steps_per_epoch=2", "train.batch_size=4", "eval.every=1", "eval.horizon=12",
-    "eval.episodes=2", "eval.curve_episodes=1"
+    "eval.episodes=2", "eval.curve_episodes=1", "train.warmup_steps=0"
 )  # fmt: skip
 
 
@@ -66,7 +67,7 @@ def records(path: Path) -> list[dict]:
 def test_smoke_from_the_command_line_to_a_report(home, here, tmp_path, capsys):
     command = (
         *("preset=smoke", "algo=er", "data.demos=3", "train.epochs=2", "eval.curve=none", "eval.select=last"),
-        "eval.horizon=90",
+        *("eval.horizon=90", "eval.episodes=3"),
     )
     output = finish(start(home, tmp_path, *command))
     path = run_dir(tmp_path)
@@ -89,12 +90,25 @@ def test_smoke_from_the_command_line_to_a_report(home, here, tmp_path, capsys):
     assert main([*command]) == 0 and "is finished" in capsys.readouterr().out
     assert main([*command, "train.lr=0.5"]) == 2
     told = capsys.readouterr().err
-    assert "train.lr 0.003 -> 0.5" in told and "run_id=" in told and "Traceback" not in told
+    assert "train.lr 0.002 -> 0.5" in told and "run_id=" in told and "Traceback" not in told
+
+
+@pytest.mark.parametrize("seed", [2, 3])  # the first: test_docs, by the command of README.md
+def test_the_smallest_preset_learns_both_tasks(seed, home, tmp_path):
+    finish(start(home, tmp_path, "preset=smoke", f"seed={seed}", "eval.cells=diagonal"))
+    summary = json.loads((run_dir(tmp_path) / "results.json").read_text())
+    (first, _), (_, second) = summary["success_matrix"]["rates"]
+    assert first >= 0.6 and second >= 0.3
+
+
+def without_curve(words):
+    """Return the words of a command that says nothing of a learning curve."""
+    return [word for word in words if not word.startswith(("eval.curve_episodes", "eval.every"))]
 
 
 def test_a_sweep_of_algorithms_ends_with_a_comparison_report(home, tmp_path):
     few = ("train.epochs=1", "eval.horizon=4", "eval.episodes=1", "eval.curve=none", "eval.select=last")
-    tiny = (*(t for t in TINY if not t.startswith("algo")), *few, "benchmark.tasks=1")
+    tiny = (*(t for t in without_curve(TINY) if not t.startswith("algo")), *few, "benchmark.tasks=1")
     output = finish(start(home, tmp_path, "-m", f"algo={','.join(ALGORITHMS)}", *tiny))
     assert f"{len(ALGORITHMS)} runs compared" in output
     assert len(list(tmp_path.glob("sweep/algo-*/report.html"))) == 1
@@ -117,8 +131,8 @@ def test_rollouts_of_another_back_end_are_named(here, tmp_path, capsys):
     pytest.importorskip("mujoco_warp")
     short = ("benchmark.tasks=1", "algo=sequential", "eval.curve=none", "eval.select=last", "eval.horizon=4")
     other = ('eval.backend="warp,device=cpu"', f"runs_dir={tmp_path}")
-    assert main([*TINY, *short, "train.epochs=1", *other]) == 0
+    assert main([*without_curve(TINY), *short, "train.epochs=1", *other]) == 0
     path = run_dir(tmp_path)
-    assert "1 tasks learned" in capsys.readouterr().out
+    assert "1 task learned" in capsys.readouterr().out
     assert records(path)[0]["backend"] == "warp"
     assert "simulated by" in (path / "report.html").read_text()

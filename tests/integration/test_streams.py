@@ -12,9 +12,10 @@ from lifelong.launch import main
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 TINY = (
-    "preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "threads=1", "data.demos=2", "train.epochs=1",
+    "preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "threads=1", "data.demos=2",
+    "data.seq_len=2", "train.epochs=1",
     "train.steps_per_epoch=2", "train.batch_size=4", "eval.horizon=6", "eval.episodes=1", "eval.curve_episodes=1",
-    "policy.encoder.width=4"
+    "policy.encoder.width=4", "train.warmup_steps=0"
 )  # fmt: skip
 
 
@@ -28,13 +29,13 @@ def test_streams_from_the_command_line(tmp_path, demos, monkeypatch, capsys):
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("LIBERO_DEMOS", str(demos))
     stream = (
-        "algo=er", "benchmark.tasks=2", "benchmark.group_size=2", "pretrain.suite=libero_object",
-        "pretrain.tasks=[1]"
+        "algo=er", "benchmark.tasks=3", "stream.base_tasks=2", "pretrain.suite=libero_object",
+        "pretrain.tasks=[5]"
     )  # fmt: skip
     assert train(tmp_path, *stream, "data.memory=disk") == 0
     output = capsys.readouterr().out
-    assert "1 tasks of libero_object" in output and "Tasks 1-2/2: together" in output
-    assert "2 tasks learned" in output
+    assert "1 task of libero_object" in output and "Tasks 1-2/3: together" in output
+    assert "3 tasks learned" in output
     assert list((tmp_path / "cache" / "frames").glob("*/images.u8"))
     (before,) = (tmp_path / "runs" / "pretrain" / "libero_object").glob("*/checkpoints/task_0.safetensors")
     assert train(tmp_path, *stream, "data.memory=host") == 0

@@ -8,6 +8,7 @@ def no_configuration(tmp_path_factory, monkeypatch):
     monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path_factory.getbasetemp() / "no-config"))
     # The facade would use the original's models where they are installed.
     monkeypatch.setenv("LIBERO_ASSETS", "builtin")
+    monkeypatch.delenv("LIBERO_DRAWING", raising=False)
 
 
 @pytest.fixture(scope="session")

@@ -42,9 +42,6 @@ CONTROLLERS = [
      [0.101252, -0.088099, 0.060957, -2.328058, 0.063836, 2.264075, 0.849023]),
     ({"type": "JOINT_VELOCITY", "kp": [10.0, 20, 30, 40, 5, 6, 7]}, {},
      [0.017369, -0.14285, -0.012691, -2.367325, 0.008638, 2.212301, 0.816814]),
-    ({"type": "JOINT_TORQUE"}, {}, [1e-06, -0.161038, -1e-06, -2.444587, -1e-06, 2.226747, 0.785402]),
-    ({"type": "JOINT_TORQUE", "output_max": 5, "output_min": -5, "torque_limits": [-3, 4]}, {},
-     [0.0197, -0.130653, 0.002595, -2.382417, 0.01841, 2.240615, 0.863012]),
     ({"type": "OSC_POSE"}, {"control_freq": 10},
      [0.061666, -0.240983, 0.138981, -2.332332, 0.252187, 2.280223, 0.694333]),
     ({"type": "OSC_POSE"}, {"control_freq": 40},
@@ -196,10 +193,7 @@ def test_torques_are_clipped_at_the_limits_of_the_model(make_env, name):
         assert env.robots[0].controller.actuator_max[0] == 80.0
         env.step([1.0] * env.env.action_dim)
         force = env.sim.data.actuator_force[0]
-        if limit > 80.0 and name == "JOINT_TORQUE":
-            assert 80.0 < force < 100.0  # its goal is clipped at that of the last reset, and gravity balanced
-        else:
-            assert force == (min(limit, 80.0) if name == "JOINT_VELOCITY" else limit)
+        assert force == (min(limit, 80.0) if name == "JOINT_VELOCITY" else limit)
     env.reset()
     assert env.robots[0].controller.actuator_max[0] == 400.0
 
@@ -293,7 +287,6 @@ def test_rooms_of_the_arguments(make_env):
         ({"controller": {"type": "OSC_POSE", "orientation_limits": [[0] * 3] * 2}}, "orientation_limits"),
         ({"controller": {"type": "OSC_POSE", "interpolation": "linear"}}, "interpolation='linear': not supported"),
         ({"controller": {"type": "OSC_POSE", "kd": 3}}, "unknown key of the controller OSC_POSE 'kd'"),
-        ({"controller": {"type": "JOINT_TORQUE", "kp": 3}}, "unknown key of the controller JOINT_TORQUE 'kp'"),
         ({"controller": {"type": "JOINT_POSITION", "output_max": [0.1] * 6}}, "output_max=.*; expected .* 7 numbers"),
         ({"controller": {"type": "OSC_POSE", "kp": "high"}}, "kp='high'; expected a number, or 6 numbers"),
         ({"controller": {"type": "OSC_POSE", "position_limits": 1.0}}, "position_limits=1.0; expected two rows of 3"),

@@ -16,7 +16,8 @@ from libero.libero.utils.task_generation_utils import (
 )
 from libero_env.errors import BDDLError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl, get_suite
-from libero_env.tasks.problem import And, Atom, Or, differences
+from libero_env.tasks.expression import And, Atom, Or
+from libero_env.tasks.problem import differences
 
 
 @pytest.fixture
@@ -178,7 +179,7 @@ def test_failures_keep_their_cause(tmp_path):
     assert paths == []
     assert isinstance(failures[0].cause, BDDLError)
     assert "mug_1 is not declared" in str(failures[0].cause)
-    assert "unknown predicate 'Juggle'" in str(failures[1].cause)
+    assert "Juggle is not a predicate" in str(failures[1].cause)
     assert "On takes 2 names" in str(failures[2].cause)
     assert "kitchen_scene77" in str(failures[3].cause)
     with pytest.raises(LiberoError, match="mug_1 is not declared"):
@@ -231,35 +232,31 @@ def test_functions_of_bddl_generation_utils(tmp_path, capsys):
     assert [pieces.object_naming_mapping(*one) for one in given] == ["main_table", "plate_2", "floor"]
     with pytest.raises(LiberoError, match="floor: 2 of them; a scene has one workspace"):
         pieces.object_naming_mapping("floor", 2)
-    assert pieces.get_objects_of_interest(["a", "b", "a"]) == ("a", "b")
     zones = pieces.get_xy_region("zone", "main_table", [[0.0, 0.1], [0.2, 0.3]], (0.01, 0.02))
     assert np.allclose(zones.ranges, [(-0.01, 0.08, 0.01, 0.12), (0.19, 0.28, 0.21, 0.32)])
     cook = pieces.get_object_affordance_region("cook_region", "flat_stove_1")
     assert (cook.address, cook.ranges) == ("flat_stove_1_cook_region", ())
     assert isinstance(cook, pieces.Region)
-    assert list(pieces.RegionWrapper([zones, cook, cook]).regions) == ["main_table_zone", cook.address]
     places = pieces.get_affordance_region_kwargs_list_from_fixture_info({"main_table": 1, "flat_stove": 1})
     assert places == [{"region_name": "cook_region", "target_name": "flat_stove_1"}]
     rectangles = [{"region_name": "zone", "target_name": "main_table", "region_centroid_xy": (0.0, 0.0)}]
     assert [r.name for r in pieces.region_module(rectangles, places)] == ["zone", "cook_region"]
     assert pieces.get_init_state([("TurnOn", "flat_stove_1")]) == (Atom("Turnon", ("flat_stove_1",)),)
-    on = pieces.LogicalState("On", "plate_1", cook.address)
-    assert pieces.get_goal_state(("On", "plate_1", cook.address)) == And((on,))
+    assert pieces.get_goal_state(("On", "plate_1", cook.address)) == And(
+        (Atom("On", ("plate_1", cook.address)),)
+    )
     either = pieces.get_goal_state([("Or", ("Up", "plate_1"), ("Up", "plate_2"))])
     assert either == Or((Atom("Up", ("plate_1",)), Atom("Up", ("plate_2",))))
-    assert pieces.Language(" put\n it  away ") == "put it away"
-
-    @pieces.PDDLDefinition("LIBERO_Tabletop_Manipulation")
-    def lift(name):
-        return {
-            "language": "lift it",
-            "fixtures": {"main_table": "table"},
-            "objects": {name: "plate"},
-            "goal": pieces.LogicalState("Up", name),
-        }
-
-    text = lift("plate_1")
-    assert bddl.parse(text).goal == Atom("Up", ("plate_1",))
+    text = pieces.floor_task_suites_generator(
+        " lift\n it ",
+        fixture_object_dict={"floor": ["floor"]},
+        movable_object_dict={"plate": ["plate_1"]},
+        objects_of_interest=["plate_1", "plate_1"],
+        goal_states=("Up", "plate_1"),
+    )
+    problem = bddl.parse(text)
+    assert (problem.language, problem.obj_of_interest) == ("lift it", ("plate_1",))
+    assert problem.goal == And((Atom("Up", ("plate_1",)),))
     pieces.print_result(text)
     assert capsys.readouterr().out.strip() == pieces.get_result(text.splitlines()).strip()
     path = pieces.save_to_file(text, "my_scene", "Lift it!", tmp_path / "new")

@@ -141,7 +141,6 @@ def test_configured_variants(file):
         "bc_transformer_policy",
         file,
         "policy.extra_num_layers=2",
-        "policy/language_encoder=rnn_encoder",
         "policy/policy_head=deterministic_head",
         "policy.policy_head.network_kwargs.hidden_size=8",
         "+policy.policy_head.network_kwargs.action_squash=false",
@@ -200,25 +199,6 @@ def test_extra_modalities():
         bc_transformer_policy.ExtraModalityTokens()
 
 
-class OnePatch(nn.Module):
-    """Acts on the brightness of one patch of one camera."""
-
-    def forward(self, data):
-        value = data["obs"]["agentview_rgb"][..., 8:16, 0:8].mean((-1, -2, -3))
-        return value[..., None].expand(*value.shape, 7)
-
-
-def test_perturbation_attention_finds_the_patch_that_matters():
-    obs = {"agentview_rgb": torch.rand(2, 3, 32, 32), "eye_in_hand_rgb": torch.rand(2, 3, 32, 32)}
-    obs["agentview_rgb"][..., 8:16, 0:8] = 1.0
-    found = bc_transformer_policy.PerturbationAttention(OnePatch(), (32, 32), (4, 4))({"obs": obs})
-    heat = found["agentview_rgb"]
-    assert heat.shape == (2, 32, 32) and not found["eye_in_hand_rgb"].any()
-    places = [np.unravel_index(one.argmax(), one.shape) for one in heat]
-    assert all(4 <= y < 20 and x < 12 for y, x in places), "rows count from the bottom"
-    assert heat[:, 8:16, :8].min() > 0 and not heat[:, 26:].any() and not heat[:, :, 20:].any()
-
-
 def test_image_modules():
     x = torch.rand(6, 3, 64, 64)
     encoder = rgb_modules.ResnetEncoder((3, 64, 64), 16, remove_layer_num=4, language_dim=5)
@@ -229,11 +209,6 @@ def test_image_modules():
     deaf = rgb_modules.ResnetEncoder((3, 64, 64), remove_layer_num=5, language_dim=5, language_fusion="none")
     assert torch.equal(deaf(x, torch.randn(6, 5)), deaf(x))
     assert rgb_modules.PatchEncoder((3, 64, 32), (8, 8), embed_size=4)(x[..., :32]).shape == (6, 4, 4, 2)
-    heat = torch.full((1, 2, 5, 5), -50.0)
-    heat[0, 0, 0, 4], heat[0, 1, 4, 2] = 50, 50
-    assert torch.allclose(rgb_modules.SpatialSoftmax(2, 5, 5)(heat), torch.tensor([[1.0, -1, 0, 1]]))
-    projection = rgb_modules.SpatialProjection((3, 8, 8), 6)
-    assert projection(torch.rand(2, 3, 8, 8)).shape == projection.output_shape((2, 3, 8, 8)) == (2, 6)
     with pytest.raises(LiberoError, match="remove_layer_num"):
         rgb_modules.ResnetEncoder((3, 64, 64), remove_layer_num=7)
 
@@ -244,8 +219,6 @@ def test_language_modules():
     encoder = language_modules.MLPEncoder(5, 8, 4, 2)  # as in the original: input, hidden, output, layers
     assert torch.equal(encoder({"task_emb": emb}), encoder(emb)) and encoder(emb).shape == (3, 4)
     assert len(language_modules.MLPEncoder(5, 8, 4, 1).projection) == 1
-    assert language_modules.RNNEncoder(5, 8, 4, 1)(emb).shape == (3, 4)
-    assert language_modules.CLIPEncoder(output_size=4)(torch.randn(3, 512)).shape == (3, 4)
 
 
 def test_transformer_modules():
@@ -265,24 +238,11 @@ def test_transformer_modules():
     assert torch.allclose(out[:, :2], changed[:, :2], atol=1e-6) and not torch.allclose(
         out[:, 2], changed[:, 2]
     )
-    attention = transformer_modules.Attention(8, num_heads=2, head_output_size=4).eval()
     tokens = x.flatten(1, 2)
-    alone = attention(tokens, torch.eye(12)[None])
-    values = tokens @ attention.qkv.weight[16:].T
-    assert torch.allclose(alone, attention.output_layer(values), atol=1e-5), "a token that sees only itself"
     seen = torch.ones(2, 12)
     seen[1, 5:] = 0  # of the second sequence; a mask of tokens is (B, N), as in the original
-    assert torch.allclose(attention(tokens, seen)[0], attention(tokens)[0], atol=1e-6)
-    assert torch.allclose(attention(tokens, seen)[1, :5], attention(tokens[1:, :5])[0], atol=1e-6)
     pairs = seen[:, None].expand(-1, 12, -1)  # (B, N, N)
-    assert torch.allclose(attention(tokens, pairs), attention(tokens, seen), atol=1e-6)
     assert torch.allclose(decoder(tokens, pairs), decoder(tokens, seen), atol=1e-6)
-    assert transformer_modules.TransformerFeedForwardNN(8, 16)(tokens).shape == tokens.shape
-    assert torch.allclose(transformer_modules.Norm(8)(x).mean(-1), torch.zeros(2, 3, 4), atol=1e-5)
-    drop, ones = transformer_modules.DropPath(0.5), torch.ones(64, 3)
-    torch.manual_seed(0)
-    assert set(drop(ones).unique().tolist()) == {0.0, 2.0}
-    assert torch.equal(drop.eval()(ones), ones)
 
 
 def test_heads():

@@ -14,8 +14,8 @@ from libero._adapters import files
 from libero.libero import benchmark, get_default_path_dict, get_libero_path, set_libero_default_path
 from libero.libero.benchmark.libero_suite_task_map import libero_task_map
 from libero_env.assets.pack import chosen_assets, pack_of
+from libero_env.curating.curate import find_demo_files
 from libero_env.demos.config import DemoConfig, Variation
-from libero_env.demos.curate import find_demo_files
 from libero_env.demos.generate import demo_path
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.init_states.pickles import read_states, write_states

@@ -136,11 +136,32 @@ def test_no_sites_are_drawn_where_observations_have_segmentations(make_env, kind
     assert (SITE in seen[..., 0]) == (kind is None)
 
 
-def test_the_drawing_can_be_asked_for(make_env):
-    faithful, fast = make_env(), make_env(drawing="fast")
-    state = faithful.reset() and faithful.get_sim_state()
-    pictures = [env.set_init_state(state)["agentview_image"].astype(int) for env in (faithful, fast)]
-    assert 0 < np.abs(pictures[0] - pictures[1]).mean() < 10
-    assert np.array_equal(faithful.get_sim_state(), fast.get_sim_state())
-    with pytest.raises(UnknownNameError, match="drawing"):
-        make_env(drawing="quick")
+def test_builtin_models_are_drawn_as_natively(make_env, suite):
+    env, native = make_env(), LiberoEnv("libero_object/0")
+    drawn = env.set_init_state(suite.get_task_init_states(0)[0])
+    observed = native.set_state(env.get_sim_state())
+    native.close()
+    for camera in CAMERAS:
+        image = observed[f"{camera.removeprefix('robot0_')}_rgb"]
+        assert np.array_equal(drawn[f"{camera}_image"][::-1], image) and image.std() > 10
+
+
+def test_the_drawing_can_be_asked_for(make_env, monkeypatch):
+    envs = [make_env(), make_env(drawing="faithful")]
+    monkeypatch.setenv("LIBERO_DRAWING", "faithful")
+    envs += [make_env(), make_env(drawing="fast")]
+    assert [env.env.drawing for env in envs] == ["fast", "faithful", "faithful", "fast"]
+    state = envs[0].reset() and envs[0].get_sim_state()
+    plain, asked, chosen, overridden = (
+        env.set_init_state(state)["agentview_image"].astype(int) for env in envs
+    )
+    assert np.array_equal(plain, overridden) and np.array_equal(asked, chosen)
+    assert 0 < np.abs(plain - asked).mean() < 10
+    for env in envs:
+        env.step(np.full(7, 0.3))
+        assert np.array_equal(env.get_sim_state(), envs[0].get_sim_state())
+    monkeypatch.setenv("LIBERO_DRAWING", "quick")
+    with pytest.raises(UnknownNameError, match="LIBERO_DRAWING 'quick'"):
+        make_env()
+    with pytest.raises(UnknownNameError, match="drawing 'best'"):
+        make_env(drawing="best")

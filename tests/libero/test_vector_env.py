@@ -12,7 +12,7 @@ import pytest
 
 from libero._adapters.workers import WorkerError
 from libero.libero.envs import ControlEnv, DummyVectorEnv, SubprocVectorEnv
-from libero.libero.envs.venv import BaseVectorEnv, CloudpickleWrapper, EnvWorker, ShArray
+from libero.libero.envs.venv import CloudpickleWrapper
 from libero_env.errors import LiberoError
 
 pytestmark = pytest.mark.sim
@@ -48,8 +48,8 @@ def test_subprocesses_give_the_results_of_one_process(suite):
     args = {"bddl_file_name": suite.get_task_bddl_file_path(0), "use_camera_obs": False}
     rows = suite.get_task_init_states(0)[:2]
     results = []
-    for make, options in ((DummyVectorEnv, {}), (SubprocVectorEnv, {"share_memory": True})):
-        env = make([lambda: ControlEnv(**args) for _ in range(2)], **options)
+    for make in (DummyVectorEnv, SubprocVectorEnv):
+        env = make([lambda: ControlEnv(**args) for _ in range(2)])
         assert len(env) == 2
         env.seed(5)
         env.reset()
@@ -98,11 +98,9 @@ class Stacked(gymnasium.Wrapper):
         return self.env.set_init_state(state)
 
 
-@pytest.mark.parametrize(
-    ("make", "options"), [(DummyVectorEnv, {}), (SubprocVectorEnv, {"share_memory": True})]
-)
-def test_environments_of_gymnasiums_interface_are_carried(make, options):
-    env = make([lambda: Stacked(Wrapped())] * 2, **options)
+@pytest.mark.parametrize("make", [DummyVectorEnv, SubprocVectorEnv])
+def test_environments_of_gymnasiums_interface_are_carried(make):
+    env = make([lambda: Stacked(Wrapped())] * 2)
     space = gymnasium.vector.utils.batch_space(env.action_space[0], 2)
     assert env.observation_space[1] == Wrapped.observation_space
     obs, info = env.reset()
@@ -124,37 +122,6 @@ def test_environments_of_gymnasiums_interface_are_carried(make, options):
     env.close()
 
 
-def test_workers_of_a_clients_own_have_the_original_methods():
-    class Own(EnvWorker):
-        def __init__(self, env_fn):
-            super().__init__(env_fn)
-            self.env = env_fn()
-
-        def send(self, action, **kwargs):
-            self.result = self.env.reset(**kwargs) if action is None else self.env.step(action)
-
-        def recv(self):
-            return self.result
-
-        def get_env_attr(self, key):
-            return getattr(self.env, key)
-
-        def set_env_attr(self, key, value):
-            setattr(self.env, key, value)
-
-        def close_env(self):
-            self.env.close()
-
-    env = BaseVectorEnv([Slow, Slow], Own)
-    assert env.reset()[0]["count"].tolist() == [0.0, 0.0]
-    assert env.step([1, 2])[0][1]["count"].tolist() == [2.0, 2.0]
-    assert env.workers[0].step(1)[0]["count"].tolist() == [2.0, 2.0]
-    assert env.get_env_attr("count") == [2, 2]
-    with pytest.raises(LiberoError, match="Own does not define seed"):
-        env.seed(0)
-    env.close()
-
-
 def test_failures_are_reported_and_other_workers_continue():
     env = SubprocVectorEnv([Slow, Slow], call_timeout=30.0)
     env.reset()
@@ -167,26 +134,9 @@ def test_failures_are_reported_and_other_workers_continue():
     env.close()
 
 
-def test_step_returns_the_environments_that_are_ready():
-    env = SubprocVectorEnv([lambda: Slow(0.0), lambda: Slow(2.0)], wait_num=1)
-    env.reset()
-    obs, _, _, info = env.step([1, 1])
-    assert [i["env_id"] for i in info] == [0]
-    with pytest.raises(LiberoError, match="last step"):
-        env.reset(id=1)
-    assert env.step([1], id=0)[3][0]["env_id"] in (0, 1)
-    env.close()
-
-
-def test_shared_arrays_and_factories_can_be_pickled():
+def test_factories_can_be_sent():
     import pickle
 
-    array = ShArray(np.float32, (2, 3))
-    array.save(np.ones((2, 3)))
-    other = pickle.loads(pickle.dumps(array))  # noqa: S301 - our own
-    assert (other.get() == 1).all()
-    other.close()
-    array.close()
     assert pickle.loads(pickle.dumps(CloudpickleWrapper(lambda: 3))).data() == 3  # noqa: S301 - our own
 
 
@@ -200,7 +150,6 @@ from libero.libero.envs import DummyVectorEnv, OffScreenRenderEnv, SubprocVector
 from libero.libero.envs.base_object import OBJECTS_DICT, MujocoXMLObject
 from libero.libero.envs.predicates import VALIDATE_PREDICATE_FN_DICT, UnaryAtomic, update_predicate_fn_dict
 from libero_env import LiberoEnv, register_predicate
-from libero_env.envs.subproc import SubprocEnv
 from libero_env.parallel import run_each
 from libero_env.tasks import get_task
 
@@ -251,10 +200,10 @@ if __name__ == "__main__":
         print(*envs.step(np.zeros((1, 7)))[1:3], envs.check_success())
         envs.close()
     task = write("always.bddl", "(Not (Always milk_1))")
-    envs = SubprocEnv([lambda: LiberoEnv(Path(task), cameras=())])
-    envs.reset(seed=0), envs.step(np.zeros((1, 7)))
-    print(envs.call("task")[0].name, dict(run_each(category, [("red_can",), ("milk",)], 2)))
-    envs.close()
+    env = LiberoEnv(Path(task), cameras=())
+    env.reset(seed=0), env.step(np.zeros(7))
+    print(env.task.name, dict(run_each(category, [("red_can",), ("milk",)], 2)))
+    env.close()
     VALIDATE_PREDICATE_FN_DICT["broken"] = lambda state, lock=__import__("threading").Lock(): True
     SubprocVectorEnv([make])
 """

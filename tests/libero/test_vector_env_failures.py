@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from libero._adapters import workers
+from libero._adapters.worker import Worker
 from libero._adapters.workers import CALL_TIMEOUT, WorkerError
 from libero.libero.envs import DummyVectorEnv, SubprocVectorEnv
 from libero_env.errors import ClosedEnvironmentError, InvalidInputError
@@ -74,15 +74,12 @@ def call(env, method, ids, value):
     return {i: str(answer) for i, answer in answers.items()}, error
 
 
-@pytest.mark.parametrize(
-    ("methods", "share_memory"),
-    [(("seed", "step", "reset"), False), (("render", "get_env_attr", "step"), True)],
-)
-def test_survivors_of_kills_answer_as_in_a_vector_without_kills(methods, share_memory):
+@pytest.mark.parametrize("methods", [("seed", "step", "reset"), ("render", "get_env_attr", "step")])
+def test_survivors_of_kills_answer_as_in_a_vector_without_kills(methods):
     """Workers are killed one after the other at random moments; a twin in this process makes the calls of the rest."""
     rng, count = random.Random(SEED), len(methods) + 1
     factories = [echo(i) for i in range(count)]
-    env = SubprocVectorEnv(factories, share_memory=share_memory, call_timeout=60)
+    env = SubprocVectorEnv(factories, call_timeout=60)
     twin, alive, value = DummyVectorEnv(factories), list(range(count)), 0.0
     env.reset(), twin.reset()
     for method, victim in zip(methods, rng.sample(alive, len(methods)), strict=True):
@@ -108,42 +105,16 @@ def test_survivors_of_kills_answer_as_in_a_vector_without_kills(methods, share_m
     env.close()
 
 
-@pytest.mark.parametrize("wait_num", [1, 2])
-def test_kills_among_workers_that_are_not_waited_for(wait_num):
-    env = SubprocVectorEnv([echo(i, 0.004 * i) for i in range(3)], wait_num=wait_num, call_timeout=60)
-    env.reset()
-    failed, value, given = {}, 0.0, {i: [] for i in range(3)}
-    while min(map(len, given.values())) < 4:
-        value += 1.0
-        ready = [i for i in env.ready_id if i not in failed]
-        try:
-            observations = env.step([value] * len(ready), id=ready)[0]
-        except WorkerError as error:
-            failed |= error.failed
-            observations = [answer[0] for answer in error.results.values()]
-        for number, steps, action in (one["all"] for one in observations):
-            given[number].append((steps, action))
-        if value == 3.0:
-            env.workers[2].process.kill()
-        if failed:
-            given.pop(2, None)
-    assert list(failed) == [2]
-    for answers in given.values():  # none twice, none left out
-        assert [steps for steps, _ in answers] == list(range(1, len(answers) + 1))
-        assert sorted({action for _, action in answers}) == [action for _, action in answers]
-    env.close()
-
-
 def interrupt_answer(monkeypatch, number: int) -> None:
     """Press Ctrl-C while an answer is waited for: the first one for 0."""
-    wait_for, count = workers.wait_for, itertools.count()
+    answer, count = Worker.answer, itertools.count()
 
     def interrupted(*args):
         if next(count) == number:
             raise KeyboardInterrupt
-        return wait_for(*args)
+        return answer(*args)
 
-    monkeypatch.setattr(workers, "wait_for", interrupted)
+    monkeypatch.setattr(Worker, "answer", interrupted)
 
 
 def test_a_call_that_is_given_up_has_no_answer_later(monkeypatch):
@@ -164,8 +135,8 @@ def test_a_call_that_is_given_up_has_no_answer_later(monkeypatch):
 
 def test_a_worker_that_stops_within_an_answer_is_ended(monkeypatch):
     """Its answer has begun, so that a plain read would wait for the rest without limit."""
-    monkeypatch.setattr("libero_env.envs.worker._PIPE_TIMEOUT", 1.0)
-    monkeypatch.setattr("libero_env.envs.worker._JOIN_TIMEOUT", 0.2)
+    monkeypatch.setattr("libero._adapters.worker._PIPE_TIMEOUT", 1.0)
+    monkeypatch.setattr("libero._adapters.worker._JOIN_TIMEOUT", 0.2)
     env = SubprocVectorEnv([echo(0, size=1_000_000), echo(1)], call_timeout=30)
     env.reset()
     stopped = env.workers[0]
@@ -175,15 +146,14 @@ def test_a_worker_that_stops_within_an_answer_is_ended(monkeypatch):
     time.sleep(0.1)
     os.kill(stopped.process.pid, signal.SIGSTOP)
     with pytest.raises(WorkerError, match="in step: it stopped within an answer"):
-        stopped.finish("step")
+        stopped.recv()
     assert env.step([3.0], id=1)[0][0]["all"].tolist() == [1.0, 1.0, 3.0]
     env.close()
     assert not stopped.process.is_alive()
 
 
-@pytest.mark.parametrize("options", [{}, {"wait_num": 2}])
-def test_waits_have_a_limit_by_default_and_hung_workers_are_named_together(options):
-    env = SubprocVectorEnv([echo(i) for i in range(3)], **options)
+def test_waits_have_a_limit_by_default_and_hung_workers_are_named_together():
+    env = SubprocVectorEnv([echo(i) for i in range(3)])
     assert [worker._timeout for worker in env.workers] == [CALL_TIMEOUT] * 3
     env.reset()
     for worker in env.workers[:2]:
@@ -210,10 +180,6 @@ def test_after_close_every_call_says_so(make):
 
 
 def test_arguments_are_checked_before_a_process_starts():
-    bad = [{"wait_num": 3}, {"wait_num": 1.5}, {"wait_num": -1}, {"timeout": -1.0}, {"timeout": "x"}]
-    for options in [*bad, {"timeout": float("nan")}, {"timeout": float("inf")}]:
-        with pytest.raises(InvalidInputError, match=next(iter(options))):
-            DummyVectorEnv([echo(0)] * 2, **options)
     for limit in (0, -1, "x", float("nan"), True):
         with pytest.raises(InvalidInputError, match="call_timeout"):
             SubprocVectorEnv([echo(0)], call_timeout=limit)
@@ -225,9 +191,7 @@ def test_arguments_are_checked_before_a_process_starts():
     for chosen in (2, -3, [0, 0], 0.5, "a", [[0]], [True]):
         with pytest.raises(InvalidInputError, match="id="):
             env.reset(id=chosen)
-    for actions in ([1.0], 3, [1.0] * 3):
+    for actions in ([1.0], 3, [1.0] * 3, None):
         with pytest.raises(InvalidInputError, match="for 2 environments"):
             env.step(actions)
-    with pytest.raises(InvalidInputError, match="wait_num"):
-        env.step(None)
     env.close()

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from libero_env.design.preview import contact_sheet
 from libero_env.design.template import task_template
 from libero_env.envs.env import LiberoEnv
@@ -28,8 +28,9 @@ from libero_env.tasks import (
     suite_names,
     write_task,
 )
-from libero_env.tasks.builder import EMPTY, model_regions
-from libero_env.tasks.problem import Atom, Not, Or, differences
+from libero_env.tasks.expression import Atom, Not, Or
+from libero_env.tasks.merging import EMPTY, model_regions
+from libero_env.tasks.problem import differences
 from libero_env.workspaces import WORKSPACES
 from lifelong.errors import ConfigError
 from lifelong.settings import BenchmarkSettings
@@ -192,19 +193,6 @@ def test_errors_state_what_is_valid(changes, message):
         make_task(**said(**changes))
 
 
-def test_errors_name_the_file(tmp_path):
-    for text, message in (
-        ("a: [", "not valid YAML"),
-        ("- a", "expected keys"),
-        ("tasks: []\n", "contains 0 tasks"),
-    ):
-        (tmp_path / "bad.yaml").write_text(text)
-        with pytest.raises(LiberoError, match=f"bad.yaml.*{message}"):
-            read_task(tmp_path / "bad.yaml")
-    with pytest.raises(LiberoError, match="absent.yaml"):
-        read_task(tmp_path / "absent.yaml")
-
-
 def test_places_are_the_sites_that_goals_can_name():
     assert model_regions("basket") == ("contain_region",)
     assert {"top_region", "middle_region", "bottom_region", "top_side"} <= set(
@@ -249,7 +237,7 @@ def test_the_settings_of_a_run_take_files(tmp_path):
     with pytest.raises(ConfigError, match="give a list of task files"):
         BenchmarkSettings("own").sequence()
     for bad in ([], files[0]):
-        with pytest.raises(LiberoError, match=r"files is .* expected .*(list|tuple|entry)"):
+        with pytest.raises(LiberoError, match=r"files is .*(Sequence value|at least 1 item)"):
             BenchmarkSettings("own", files=bad)
     with pytest.raises(ConfigError, match="use benchmark=own"):
         BenchmarkSettings("libero_goal", files=files).sequence()
@@ -274,13 +262,6 @@ def test_templates_are_tasks_with_space_between_objects(options):
     middles = [(x0 + x1, y0 + y1) for r in task.problem.regions for x0, y0, x1, y1 in r.ranges]
     assert len(middles) == len(task.problem.objects) + len(task.problem.fixtures) - 1
     assert min(hypot(a[0] - b[0], a[1] - b[1]) / 2 for a, b in combinations(middles, 2)) >= 0.13
-
-
-def test_templates_that_cannot_be_are_refused():
-    with pytest.raises(LiberoError, match="a goal is required"):
-        task_template("kitchen_scene1", ["butter"])
-    with pytest.raises(LiberoError, match="not enough places for the objects"):
-        task_template("kitchen", ["butter"] * 9)
 
 
 @pytest.mark.sim
@@ -363,3 +344,6 @@ def test_a_task_runs_by_the_name_of_its_file_and_is_rendered(tmp_path, capsys):
     with Image.open(sheet) as opened:
         picture = np.asarray(opened)
     assert picture.shape == (64, 64, 3) and (picture[:32] != picture[32:]).any()
+    path.write_text(path.read_text() + "cameras: {top: {pos: [0, 0, 2], lookat: [0.1, 0, 0]}}\n")
+    with Image.open(contact_sheet(read_task(path), tmp_path / "own.png", starts=1, size=32)) as opened:
+        assert opened.size == (4 * 32, 32)  # three cameras, and the task's own

@@ -9,12 +9,12 @@ from libero_env.assets.pack import select_pack
 from libero_env.init_states.pickles import read_states
 from libero_env.init_states.placement import start_errors
 from libero_env.init_states.store import load_init_states
+from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import build_scene
-from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task, get_suite, get_task, read_task, suite_names
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 pytestmark = pytest.mark.sim
 

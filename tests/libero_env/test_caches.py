@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from libero_env import parallel
+from libero_env import compilation
 from libero_env.assets import published, simplify
 from libero_env.errors import BrokenFileError, LiberoError
 from libero_env.init_states import store
@@ -260,7 +260,7 @@ def test_paths_of_the_cache(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [("assets: 5", r"config.yaml:1: assets is 5; expected a text"), ("- a", "expected keys with values")]
+    [("assets: 5", r"config.yaml:1: assets is 5; expected a valid string"), ("- a", "expected an object")]
     + [
         ("assets: /x\nassets: /y", "config.yaml:2"),
         ("assets: [1", "not valid YAML"),
@@ -343,7 +343,10 @@ def test_broken_initial_states_are_generated_again(tmp_path, monkeypatch, lines,
 @pytest.fixture
 def function(tmp_path, monkeypatch):
     """Return a function of a module of its own, whose machine code is cached in this test's folder."""
-    monkeypatch.setattr(parallel, "_warn_uncached", lru_cache(parallel._warn_uncached.__wrapped__))
+    for name in ("_warn_uncached", "_tell", "_lock"):
+        monkeypatch.setattr(compilation, name, lru_cache(getattr(compilation, name).__wrapped__))
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     (tmp_path / "module.py").write_text("def twice(x):\n    return 2 * x\n")
     spec = importlib.util.spec_from_file_location("module", tmp_path / "module.py")
     module = importlib.util.module_from_spec(spec)
@@ -354,27 +357,25 @@ def function(tmp_path, monkeypatch):
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 @pytest.mark.parametrize("size", [0, 10])
 def test_compiled_functions_that_are_damaged_are_compiled_again(tmp_path, function, lines, kind, size):
-    assert parallel.compiled(function)(2) == 4
-    (file,) = tmp_path.glob(f"__pycache__/*.{kind}")
+    assert compilation.compiled(function)(2) == 4
+    (file,) = tmp_path.glob(f"compiled/*/*.{kind}")
     file.write_bytes(file.read_bytes()[:size])
-    assert parallel.compiled(function)(3) == 6
+    assert compilation.compiled(function)(3) == 6
     (line,) = lines()
     assert "twice" in line and line.endswith("compiled again")
-    again = parallel.compiled(function)
-    assert again(4) == 8 and sum(again.stats.cache_hits.values()) == 1
+    again = compilation.compiled(function)
+    assert again(4) == 8 and sum(again.dispatcher.stats.cache_hits.values()) == 1
 
 
 def test_functions_are_compiled_where_nothing_can_be_cached(tmp_path, function, lines, monkeypatch):
-    shutil.rmtree(tmp_path / "__pycache__", ignore_errors=True)  # of the module's byte code
-    (tmp_path / "__pycache__").write_text("no folder")
-    monkeypatch.setenv("XDG_CACHE_HOME", "/proc/1")
-    assert [parallel.compiled(function)(x) for x in (1, 2)] == [2, 4]
+    (tmp_path / "compiled").write_text("no folder")
+    assert [compilation.compiled(function)(x) for x in (1, 2)] == [2, 4]
     (line,) = lines()
     assert "Set NUMBA_CACHE_DIR" in line
 
 
 def test_functions_are_compiled_where_the_disk_is_full(function, lines, monkeypatch):
-    made = parallel.compiled(function)
+    made = compilation.compiled(function)
 
     def full(*_):
         raise OSError(28, "No space left on device")
@@ -382,6 +383,31 @@ def test_functions_are_compiled_where_the_disk_is_full(function, lines, monkeypa
     monkeypatch.setattr(os, "replace", full)
     assert made(1) == 2
     assert "No space left on device" in lines()[0]
+
+
+COMPILING = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import module
+from libero_env.compilation import compiled
+sys.stdin.readline()
+twice = compiled(module.twice)
+print(twice(2), sum(twice.dispatcher.stats.cache_hits.values()))
+"""
+
+
+def test_several_environments_compile_once_for_a_user_and_say_so_once(tmp_path, function):
+    """Each process imports a copy of its own, as those of several environments do; one compiles, the others wait."""
+    homes = [tmp_path / str(k) for k in range(3)]
+    for home in homes:
+        home.mkdir()
+        shutil.copy(tmp_path / "module.py", home)
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    processes = [subprocess.Popen([sys.executable, "-c", COMPILING, str(home)], **pipes) for home in homes]
+    answers = [process.communicate("go\n", timeout=300) for process in processes]
+    assert sorted(out for out, _ in answers) == ["4 0\n", "4 1\n", "4 1\n"]
+    assert "".join(err for _, err in answers).count("compiling, once for this user") == 1
+    assert len(list(tmp_path.glob("compiled/module-*"))) == 1
 
 
 PROGRAM = """

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import yaml
 
+from libero_cli.main import main
 from libero_env import BatchEnv, Camera, LiberoEnv, make_task, read_task
-from libero_env.cli.main import main
+from libero_env.curating.rendering import rerender
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import read_header
 from libero_env.demos.observe import recorded_rendering
 from libero_env.demos.read import read_demos
-from libero_env.demos.rendering import rerender
 from libero_env.errors import InvalidInputError, LiberoError, RenderError, UnknownNameError
 from libero_env.sim.render import largest_image
 from libero_env.tasks import bddl
@@ -140,10 +140,7 @@ def test_a_task_file_has_cameras(tmp_path, closing, capsys):
     [
         ("{pos: [0, 0, 1]}", "camera top: give one of quat and lookat"),
         ("{pos: [0, 0, 1], lookat: [0, 0, 1]}", "camera top looks at the point where it is"),
-        (
-            "{pos: [0, 0], lookat: [0, 0, 1]}",
-            "cameras.top.pos is [0, 0]; expected at least 3 entries",
-        ),
+        ("{pos: [0, 0], lookat: [0, 0, 1]}", "cameras.top.pos is [0, 0]; list should have at least 3 items"),
         ("{pos: [0, 0, 1], quat: [0, 0, 0, 0]}", "camera top: its quat is zero"),
         ("{pos: [0, 0, 1], lookat: [0, 0, 0], fovy: 0}", "Camera: fovy is 0"),
         ("{pos: [0, 0, 1], lookat: [0, 0, 0], foo: 0}", "cameras.top.foo is an unknown key"),

@@ -7,13 +7,14 @@ from libero_env.envs.batch import BatchEnv
 from libero_env.expert import Expert
 from libero_env.sim.causes import CAUSES, Failure, Missing, Trace, explain
 from libero_env.sim.watch import LIFTED, EpisodeWatch, over
+from libero_env.tasks.expression import Atom
 
 OWN = ["milk"]
 
 
 @pytest.mark.parametrize(
-    ("trace", "missing", "cause", "what"),
-    [
+    ("trace", "missing", "cause", "what", "astray"),
+    [(*row, *[()] * (5 - len(row))) for row in [
         (Trace(), Missing("milk"), "never reached", ""),
         (Trace(lifted={"soup": None}), Missing("milk"), "wrong object", "soup"),
         (Trace(touched={"milk"}), Missing("milk"), "missed grasp", ""),
@@ -30,10 +31,16 @@ OWN = ["milk"]
         (Trace(in_hand="milk"), Missing("milk"), "out of time", ""),
         (Trace(in_hand="milk"), Missing("milk", is_over=True), "not released", ""),
         (Trace(slipped={"milk": False}), Missing("milk", has_held=True, place="table"), "undone", "table"),
-    ],
+        (Trace(shut_at={"milk": None}), Missing("milk"), "missed grasp", ""),
+        (Trace(), Missing("milk"), "wrong object", "soup", ["shelf", "soup"]),
+        (Trace(shut_at={"milk": None}), Missing("milk"), "missed grasp", "", ["soup"]),
+        (Trace(touched={"milk"}), Missing("milk"), "missed grasp", "", ["soup"]),
+        (Trace(lifted={"soup": None}), Missing("milk"), "wrong object", "soup", ["shelf"]),
+        (Trace(impacts=[(3, "table", 150.0)]), Missing("milk"), "collided", "table", ["soup"]),
+    ]],
 )  # fmt: skip
-def test_each_branch_of_the_decision_tree(trace, missing, cause, what):
-    found = explain(trace, [missing], OWN)
+def test_each_branch_of_the_decision_tree(trace, missing, cause, what, astray):
+    found = explain(trace, [missing], OWN, astray)
     assert (found.cause, found.of, found.what) == (cause, "milk", what)
     assert found.newtons == (150.0 if cause == "collided" else 0.0)
 
@@ -120,3 +127,77 @@ def test_a_hard_press_on_the_table_is_a_collision_and_watching_moves_no_bit(lift
     np.testing.assert_array_equal(*ends)
     found = watch.failure(0, [False], env.missing(0))
     assert found.cause == "collided" and found.newtons > 100, found
+
+
+@pytest.fixture(scope="module")
+def butter():
+    """An environment whose goal is about the butter, with the pudding, much alike, beside it."""
+    with BatchEnv("libero_object/6", 1, cameras=(), horizon=200) as env:
+        env.reset(options={"init_state": [0]})
+        yield env, env.get_state(0), EpisodeWatch(env.views, env.goals.atoms)
+
+
+def put(env, state, name, place):
+    """Put an object of a state there, and what was there to where it was."""
+    here = slice(a := 1 + env.scene.pose_address(name), a + 3)
+    for other in env.scene.objects:
+        there = slice(b := 1 + env.scene.pose_address(other), b + 3)
+        if other != name and np.linalg.norm(state[there] - place) < 0.03:
+            state[there] = state[here]
+    state[here] = place
+
+
+@pytest.mark.parametrize(("below", "cause", "what"), [
+    ("butter_1", "missed grasp", ""),
+    ("chocolate_pudding_1", "wrong object", "chocolate_pudding_1"),
+    (None, "never reached", ""),
+])  # fmt: skip
+def test_fingers_that_shut_beside_an_object_have_missed_it_or_gone_for_the_wrong_one(
+    butter, below, cause, what
+):
+    env, before, watch = butter
+    env.set_state(0, before)
+    expert, view = Expert(env.task, np.random.default_rng(0)), env.views[0]
+    while below and np.linalg.norm(view.eef_pos - view.body_pos("butter_1")) > 0.055:
+        env.step(expert.act(view)[None])
+    if below:
+        state = env.get_state(0)
+        put(env, state, below, view.body_pos("butter_1"))
+        env.set_state(0, state)
+    watch.begin(0)
+    for _ in range(10):
+        env.step(np.array([HOLD], float))
+        watch.look(0)
+    assert not watch.traces[0].touched and [*watch.traces[0].shut_at] == [below] * bool(below)
+    found = watch.failure(0, [False], env.missing(0))
+    assert (found.cause, found.of, found.what) == (cause, "butter_1", what)
+
+
+@pytest.mark.parametrize("pushed", [False, True])
+def test_what_was_held_or_pushed_without_the_goals_object_is_the_wrong_one(butter, pushed):
+    env, before, _ = butter
+    env.set_state(0, before)
+    expert, view = Expert(env.task, np.random.default_rng(0)), env.views[0]
+    goal = Atom(
+        "In", ("chocolate_pudding_1", "basket_1_contain_region")
+    )  # while the expert is after the butter
+    watch = EpisodeWatch(env.views, [goal])
+    side = view.eef_mat[:, 0]  # on which a finger is
+
+    def is_there():
+        return pushed and np.linalg.norm(view.eef_pos - view.body_pos("butter_1")) < 0.055
+
+    while not is_there() and "butter_1" not in watch.traces[0].held:
+        env.step(expert.act(view)[None])
+        watch.look(0)
+    if pushed:
+        state = env.get_state(0)
+        put(env, state, "butter_1", view.body_pos("butter_1") + 0.08 * side)
+        env.set_state(0, state)
+        for move in [np.array([0, 0, -0.5])] * 5 + [side] * 12:
+            env.step(np.array([[*move, *OPEN[3:]]]))
+            watch.look(0)
+        assert "butter_1" in watch.costs[0].moved
+    assert ("butter_1" in watch.traces[0].held) is not pushed and not watch.traces[0].lifted
+    found = watch.failure(0, [False], [goal])
+    assert (found.cause, found.of, found.what) == ("wrong object", "chocolate_pudding_1", "butter_1")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from libero_cli.main import main
 from libero_env import LiberoEnv
-from libero_env.cli.main import main
 from libero_env.design import certify_perturbed
 from libero_env.design.certify_perturbed import REDRAWS, attempt_perturbed, shares_table
 from libero_env.errors import LiberoError
@@ -112,14 +112,6 @@ def test_results_of_other_models_are_not_taken(monkeypatch):
 def test_results_of_tasks_of_files_are_kept_apart(tmp_path):
     tasks = [replace(task, suite="file", index=0) for task in get_suite("libero_goal").tasks[:2]]
     assert len({certify_perturbed._path(tmp_path, task, ROBOT) for task in tasks}) == 2
-
-
-def test_samples_of_task_files_are_not_kept_for_all_files(expert, tmp_path, capsys):
-    file = tmp_path / "mine.bddl"
-    file.write_text(TASK.bddl_text)
-    words = ["perturb", "certify", str(file), "--kinds", "gain", "--starts", "1", "--jobs", "1", "--keep"]
-    assert main([*words, "--out", str(tmp_path)]) == 2
-    assert "--keep cannot be used with task files, such as that of mine" in capsys.readouterr().err
 
 
 def test_a_severity_counts_once_and_is_above_0(expert, tmp_path, capsys):

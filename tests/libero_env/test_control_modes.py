@@ -8,7 +8,7 @@ import pytest
 from libero_env.envs.batch import BatchEnv
 from libero_env.envs.config import EnvConfig
 from libero_env.envs.env import LiberoEnv
-from libero_env.errors import ActionError, InvalidInputError, LiberoError, UnknownNameError
+from libero_env.errors import ActionError, InvalidInputError
 from libero_env.expert import Expert
 from libero_env.sim.controller import (
     CONTROLLERS,
@@ -189,10 +189,3 @@ def test_the_expert_acts_at_one_frequency(closing):
     env.reset(options={"init_state": 0})
     with pytest.raises(InvalidInputError, match="the expert acts at 20 Hz; .* 50 physics steps per action"):
         Expert(env.task, np.random.default_rng(0)).act(env.view)
-
-
-def test_unknown_controllers_are_errors():
-    with pytest.raises(UnknownNameError, match="osc_pose"):
-        get_controller("osc_pos")
-    with pytest.raises(LiberoError, match="no absolute mode"):
-        get_controller("joint_velocity", control_delta=False)

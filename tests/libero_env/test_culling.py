@@ -8,7 +8,8 @@ import pytest
 
 from libero_env.sim.culling import Culling
 from libero_env.sim.render import Renderer, RenderTarget
-from libero_env.sim.scene import FAITHFUL, FAST, build_scene
+from libero_env.sim.scene import build_scene
+from libero_env.sim.scene_spec import FAITHFUL, FAST
 from libero_env.tasks import get_task
 
 pytestmark = pytest.mark.sim

@@ -3,6 +3,9 @@
 import json
 import os
 import shutil
+import subprocess
+import sys
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -12,7 +15,7 @@ from libero_env.demos.generate import _recording_lock
 from libero_env.demos.read import demo_origin, read_demos
 from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
-from tests.harness.demos import episode, header
+from tests.harness.demos import episode, header, write
 
 
 @pytest.fixture
@@ -156,9 +159,7 @@ def test_a_recording_follows_no_link_out_of_its_folder(tmp_path):
     writer = DemoWriter(path, {})
     writer.parts.symlink_to(tmp_path)
     for use in (writer.recorded, writer.finish, writer.discard_parts, lambda: writer.write(0, episode(0))):
-        with pytest.raises(
-            DemoError, match=r"x\.hdf5\.parts is not a folder, or is a link that leads out of"
-        ):
+        with pytest.raises(DemoError, match=r"x\.hdf5\.parts is a link, or is not a folder"):
             use()
     (path.parent / ".recording.lock").symlink_to(victim)
     with (
@@ -167,3 +168,31 @@ def test_a_recording_follows_no_link_out_of_its_folder(tmp_path):
     ):
         pass
     assert victim.read_text() == "precious, and no demonstration"
+
+
+FULL_DISK = """
+import resource, sys
+from pathlib import Path
+from tests.harness.demos import episode, write
+
+path, limit = Path(sys.argv[1]), int(sys.argv[2])
+resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+try:
+    write(path, [episode(k, size=64) for k in range(3)])
+except Exception as error:
+    print(f"{type(error).__name__}: {error}")
+"""
+
+
+@pytest.mark.parametrize("limit", [0, 1, 3_000, 40_000, 262_144, 300_000])
+def test_a_disk_that_is_full_ends_in_one_line_and_loses_nothing(tmp_path, limit):
+    path = tmp_path / "x.hdf5"
+    command = [sys.executable, "-c", FULL_DISK, str(path), str(limit)]
+    done = subprocess.run(command, cwd=Path(__file__).parents[2], capture_output=True, text=True)
+    assert done.returncode == 0 and not done.stderr
+    assert done.stdout.startswith(f"DemoError: {path}") and done.stdout.count("\n") == 1
+    assert str(path.parent / "x.hdf5.parts") in done.stdout
+    assert not list(tmp_path.rglob("*.part")) and not path.exists()
+    assert len(list(tmp_path.rglob("demo_*.hdf5"))) == (3 if limit == 300_000 else 0)
+    write(path, [episode(k, size=64) for k in range(3)])
+    assert len(read_demos(path)) == 3

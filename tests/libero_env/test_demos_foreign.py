@@ -8,19 +8,18 @@ import numpy as np
 import pytest
 
 from libero_env import memory
+from libero_env.curating.curate import describe, examine, filter_demos
+from libero_env.curating.video import check_video_path, write_video
 from libero_env.demos import hdf5
 from libero_env.demos.contents import read_header
-from libero_env.demos.curate import describe, examine, filter_demos
-from libero_env.demos.generate import make_demos
 from libero_env.demos.observe import recorded_robot, recorded_task
 from libero_env.demos.read import demo_lengths, iter_demos, read_demos, read_episodes
 from libero_env.demos.replay import rerun_actions
 from libero_env.demos.stored_model import read_fixture_poses
-from libero_env.demos.video import check_video_path, write_video
 from libero_env.demos.write import DemoWriter
-from libero_env.errors import DemoError, InvalidInputError, LiberoError
+from libero_env.errors import DemoError, LiberoError
 from libero_integrations.exports.demonstrations import export_demos
-from tests.harness.demos import episode, generate, header, write
+from tests.harness.demos import episode, header, write
 
 
 @pytest.fixture(scope="module")
@@ -380,22 +379,6 @@ def test_a_file_that_is_joined_again_keeps_its_permissions(path):
     writer = DemoWriter(path, header())
     writer.write(2, episode(2, steps=4, size=8))
     assert len(read_demos(writer.finish())) == 3 and path.stat().st_mode & 0o777 == 0o640
-
-
-def test_folders_that_cannot_be_written_are_one_line(tmp_path):
-    (tmp_path / "file").touch()
-    (tmp_path / "link").symlink_to(tmp_path / "nowhere" / "deeper")
-    for folder in ("file", "file/x", "link"):
-        with pytest.raises(DemoError, match="cannot be recorded there"):
-            generate("libero_object/0", 1, path=tmp_path / folder / "x.hdf5", workers=1, progress=False)
-
-
-@pytest.mark.parametrize("settings", [{"seed": -1}, {"pairing": "bogus"}, {"seed": True}])
-def test_settings_of_a_recording_are_checked(tmp_path, settings):
-    with pytest.raises(InvalidInputError, match=f"{next(iter(settings))} is"):
-        generate("libero_object/0", 1, path=tmp_path / "x.hdf5", **settings)
-    with pytest.raises(InvalidInputError, match="workers is -1"):
-        make_demos([], 1, workers=-1)
 
 
 def test_the_task_of_a_stranger_may_be_named_anything(path):

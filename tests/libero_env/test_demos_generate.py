@@ -12,14 +12,16 @@ import mujoco
 import numpy as np
 import pytest
 
+from libero_env.assets.robot import DEFAULT_ROBOT
 from libero_env.demos.config import GENERATOR, DemoConfig, Variation, model_digest
 from libero_env.demos.contents import demo_number, read_header
-from libero_env.demos.generate import RecordingJob, demo_path, ensure_demos
+from libero_env.demos.generate import LaterDemos, RecordingJob, demo_path, ensure_demos
 from libero_env.demos.read import read_demos, read_episodes
 from libero_env.demos.record import DemoRecorder
 from libero_env.demos.write import DemoWriter
 from libero_env.envs.env import LiberoEnv
 from libero_env.expert.expert import run_experts
+from libero_env.progress import ProgressBar
 from libero_env.tasks import get_task
 from tests.harness.demos import generate, wander
 
@@ -196,9 +198,27 @@ def test_a_file_of_an_older_scene_is_recorded_again(whole, tmp_path, capsys):
     assert "was recorded with other models: recording again" in capsys.readouterr().err
 
 
-def test_the_number_of_processes_does_not_matter(whole, tmp_path, monkeypatch):
+def test_the_number_of_processes_does_not_matter_and_each_demonstration_is_told(whole, tmp_path, monkeypatch):
     monkeypatch.setattr(DemoConfig, "batch", 2)  # of each process
+    told = []
+    monkeypatch.setattr(ProgressBar, "update", lambda bar, n: told.append(n))
     check_same(generate(TASK, 3, path=tmp_path / "two.hdf5", workers=2, **KINDS), whole)
+    assert [n for n in told if n] == [1, 1, 1]
+
+
+def test_those_of_later_tasks_are_recorded_meanwhile_and_are_the_same(whole, tmp_path):
+    tasks = [get_task("libero_object/8"), get_task(TASK)]
+    options = {"root": tmp_path, "seed": 0, "drawing": None, "robot": DEFAULT_ROBOT, **KINDS}
+    with LaterDemos(tasks[:1]) as later:
+        first, second = later.ensure(tasks, 3, **options)
+        assert len(read_demos(first)) == 3
+        assert not later.done
+        later.wait(second)
+        assert later.done
+    check_same(second, whole)
+    with LaterDemos(tasks[:1]) as later:
+        assert later.ensure(tasks, 3, **options) == [first, second]
+        assert later.done
 
 
 def test_a_script_without_a_main_guard_is_told_so_and_does_not_wait_for_itself(tmp_path):

@@ -220,9 +220,14 @@ def test_robots_drawings_and_perturbations_are_stated(files, tmp_path):
     other = write(
         tmp_path / "b.hdf5", [smooth(2, 5)], generator="x", robot="robosuite-1.4.1", perturb="light=0.5"
     )
-    export_demos([files[0], other], tmp_path / "set", progress=False)
+    with pytest.raises(
+        DemoError, match=r"differ in expert: not stated of .*, x of .*b.hdf5.*--despite expert"
+    ):
+        export_demos([files[0], other], tmp_path / "set", progress=False)
+    export_demos([files[0], other], tmp_path / "set", progress=False, despite=["expert"])
     origin = json.loads((tmp_path / "set" / ORIGIN).read_text())
     assert origin["robot"] == "libero, robosuite-1.4.1" and origin["perturb"] == "light=0.5; none"
     assert origin["drawing"] == "fast; not stated"
+    assert origin["expert"] == "not stated; x" and origin["actions_are"] == "intended"
     with pytest.raises(DemoError, match=r"b.hdf5 was rendered under light=0.5"):
         export_published([other], tmp_path / "none", "lerobot/libero", progress=False)

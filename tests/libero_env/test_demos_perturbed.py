@@ -7,17 +7,18 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_cli.main import main
 from libero_env.assets.pack import BuiltinPack
-from libero_env.cli.main import main
-from libero_env.demos.config import RenderConfig, rendered_perturbations
+from libero_env.curating.curate import describe, examine
+from libero_env.curating.rendering import rerender
+from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import read_header
-from libero_env.demos.curate import describe, examine
 from libero_env.demos.observe import recorded_rendering
 from libero_env.demos.read import read_demos, read_episodes
-from libero_env.demos.rendering import rerender
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError, InvalidInputError
 from libero_env.perturbations import parse_perturbations
+from libero_env.perturbations.episodes import rendered_perturbations
 from libero_env.tasks import get_task
 from libero_integrations.exports.demonstrations import recorded_language
 from tests.harness.demos import STEPS, record_wander

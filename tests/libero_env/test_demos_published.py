@@ -15,12 +15,13 @@ from PIL import Image
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.contents import read_header
 from libero_env.demos.observe import StateRenderer, recorded_task
-from libero_env.demos.read import read_episodes
+from libero_env.demos.read import read_demos, read_episodes
 from libero_env.demos.write import DemoWriter
-from libero_env.errors import DemoError, UnknownNameError
+from libero_env.errors import DemoError
 from libero_env.tasks import get_task
 from libero_integrations.exports.demonstrations import ORIGIN, export_demos, export_published
 from libero_integrations.exports.regeneration import Regeneration, published_noop_steps, regenerate
+from libero_integrations.imports.demonstrations import lerobot_files
 from tests.harness.demos import generate
 
 av = pytest.importorskip("av")
@@ -103,6 +104,16 @@ def test_features_are_the_published_ones(exported, name):
     assert info["features"] == FEATURES[name] and list(info["features"]) == list(FEATURES[name])
     assert (info["robot_type"], info["fps"], info["chunks_size"]) == ("panda", 10, 1000)
     assert info["splits"] == {"train": "0:1"} and info["total_tasks"] == 1
+
+
+def test_read_back_images_are_as_the_camera_sees_the_scene(exported, expected, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
+    task = get_task("libero_object/7")
+    (path,) = lerobot_files(exported["physical-intelligence/libero"], [task], {task.id: 1}, "executed")
+    (read,) = read_demos(path)
+    for key, images in expected.items():
+        if key.endswith("_rgb"):
+            np.testing.assert_array_equal(read.obs[key][0], images[0])
 
 
 def test_paths_are_those_of_the_two_versions(exported, episode):
@@ -250,8 +261,3 @@ def test_a_recording_that_ends_too_early_is_continued(file, episode, tmp_path):
 def test_a_task_that_the_states_do_not_fit_is_refused(file, tmp_path):
     with pytest.raises(DemoError, match=r"demo_0/states is .*expected \(T, \d+\) for"):
         export_demos([file], tmp_path / "set", task=get_task("libero_goal/3"), progress=False)
-
-
-def test_an_unknown_set_is_named(file, tmp_path):
-    with pytest.raises(UnknownNameError, match="Did you mean 'lerobot/libero'"):
-        export_published([file], tmp_path / "set", "lerobot/libro")

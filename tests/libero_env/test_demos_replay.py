@@ -8,21 +8,22 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env.curating.curate import examine
+from libero_env.curating.rendering import rerender
 from libero_env.demos.config import DemoConfig, RenderConfig, Variation
 from libero_env.demos.contents import read_header
-from libero_env.demos.curate import examine
 from libero_env.demos.generate import RecordingJob, ensure_demos, make_demos
 from libero_env.demos.observe import StateRenderer, fixture_poses, recorded_task
 from libero_env.demos.read import Episode, read_demos, read_episodes
-from libero_env.demos.rendering import rerender
-from libero_env.demos.replay import replay
+from libero_env.demos.replay import replay, rerun_actions
 from libero_env.demos.write import DemoWriter
 from libero_env.envs import EnvConfig
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import DemoError
 from libero_env.expert.expert import Attempt, run_experts
+from libero_env.storage import read_yaml
 from libero_env.tasks import get_task, make_task
-from libero_integrations.exports.demonstrations import export_demos
+from libero_integrations.exports.demonstrations import export_demos, export_published
 from lifelong.data import demonstrations
 from tests.harness.demos import STEPS, generate, record_wander, wander
 
@@ -71,6 +72,40 @@ def test_a_recording_longer_than_an_episode_is_replayed_to_its_end(path, tmp_pat
     )
     (result,) = replay(writer.finish())
     assert result.steps == len(steps) and not result.success
+
+
+STANDARD = read_yaml("demos/original_env.yaml")["controller_configs"]
+
+
+@pytest.mark.parametrize("key", [*STANDARD, "position_limits", "orientation_limits", "robots", "unheard_of"])
+def test_actions_of_another_controller_are_neither_run_nor_exported(path, tmp_path, key):
+    """Whatever a file states otherwise is named by each that would run its actions as relative ones of OSC_POSE."""
+    other = tmp_path / "other.hdf5"
+    other.write_bytes(path.read_bytes())
+    with h5py.File(other, "a") as file:
+        made = json.loads(file["data"].attrs["env_args"])
+        stated = made["env_kwargs"] if key == "robots" else made["env_kwargs"]["controller_configs"]
+        was = STANDARD.get(key)
+        stated[key] = (
+            not was if isinstance(was, bool) else [2.0] * 6 if isinstance(was, list | int) else ["x"]
+        )
+        file["data"].attrs["env_args"] = json.dumps(made)
+    uses = {
+        "replay": lambda: next(replay(other)),
+        "replay by state": lambda: next(replay(other, by="state")),
+        "run again": lambda: rerun_actions(other, tmp_path / "new.hdf5"),
+        "export": lambda: export_demos([other], tmp_path / "set"),
+        "convert": lambda: export_demos([other], tmp_path / "set", actions="absolute"),
+        "publish": lambda: export_published([other], tmp_path / "set", "lerobot/libero"),
+    }
+    for use, call in uses.items():
+        with pytest.raises(
+            DemoError, match=rf"other.hdf5 states .*{key} .*expected .*relative actions of OSC_POSE"
+        ):
+            call()
+        assert not (tmp_path / "set").exists(), use
+    (note,) = [note for note in examine(other).notes if "neither learned from" in note]
+    assert key in note
 
 
 def test_a_recording_of_another_frequency_is_replayed_at_it_and_not_exported(path, tmp_path):

@@ -6,9 +6,9 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.cli.main import main
+from libero_cli.main import main
+from libero_env.curating.curate import examine, filter_demos
 from libero_env.demos.contents import read_header
-from libero_env.demos.curate import examine, filter_demos
 from libero_env.demos.observe import recorded_task
 from libero_env.demos.read import noop_steps, read_demos, read_episodes
 from libero_env.errors import DemoError

@@ -5,14 +5,14 @@ import inspect
 
 import pytest
 
-from libero_env.envs import BatchEnv, EnvConfig, LiberoEnv, SubprocEnv
-from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
+from libero_env.envs import BatchEnv, EnvConfig, LiberoEnv
+from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.perturbations.corruptions import Corruption
 from libero_env.perturbations.filters import ActionDelay, ActionGain, StateBias
 
 TASK = "libero_object/0"
 FIELDS = [field.name for field in dataclasses.fields(EnvConfig)]
-ENVIRONMENTS = [LiberoEnv, BatchEnv, SubprocEnv]
+ENVIRONMENTS = [LiberoEnv, BatchEnv]
 
 
 def test_every_field_is_documented():
@@ -26,17 +26,6 @@ def test_the_signature_shows_the_options_with_their_default_values(environment):
     for field in dataclasses.fields(EnvConfig):
         assert parameters[field.name].default == field.default
         assert parameters[field.name].kind is inspect.Parameter.KEYWORD_ONLY
-
-
-@pytest.mark.parametrize("make", [
-    lambda **options: LiberoEnv(TASK, **options),
-    lambda **options: BatchEnv(TASK, 2, **options),
-    lambda **options: SubprocEnv([{"task": TASK}], **options),
-    lambda **options: SubprocEnv([{"task": TASK, **options}]),
-], ids=["LiberoEnv", "BatchEnv", "SubprocEnv", "specs of SubprocEnv"])  # fmt: skip
-def test_an_unknown_option_is_an_error_that_names_the_nearest(make):
-    with pytest.raises(UnknownNameError, match="camera_siz'.*'camera_size'.*control_delta"):
-        make(camera_siz=(64, 64))
 
 
 @pytest.mark.parametrize(
@@ -89,12 +78,6 @@ def test_an_event_at_a_step_that_no_episode_has_is_refused(closing):
     closing(LiberoEnv(TASK, cameras=(), horizon=6, perturb="noise=1@step5"))
 
 
-@pytest.mark.parametrize("specs", [[dict], [{"task": TASK, "config": EnvConfig(horizon=3)}]], ids=str)
-def test_options_that_no_environment_would_have_are_refused(specs):
-    with pytest.raises(InvalidInputError, match="cameras: "):
-        SubprocEnv(specs, cameras=())
-
-
 @pytest.mark.sim
 def test_options_replace_fields_of_the_configuration(closing):
     config = EnvConfig(cameras=("agentview",), camera_size=(16, 16), horizon=3, reward="staged")
@@ -106,12 +89,3 @@ def test_options_replace_fields_of_the_configuration(closing):
     with pytest.raises(LiberoError, match="reset"):
         env.step([0.0] * 7)
     assert LiberoEnv(TASK, camera_size=16, cameras=("agentview",)).config.camera_size == (16, 16)
-    envs = closing(
-        SubprocEnv(
-            [{"task": TASK}, {"task": TASK, "observations": ["ee_pos"]}],
-            config=config,
-            observations=["rgb", "ee_pos"],
-        )
-    )
-    seen, info = envs.reset(options={"init_state": 0})
-    assert list(seen) == ["ee_pos"] and list(info["own"][0]) == ["agentview_rgb"]

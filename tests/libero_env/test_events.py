@@ -12,7 +12,7 @@ from libero_env.expert import Expert
 from libero_env.expert.expert import solved_from_events
 from libero_env.perturbations import Perturbation, format_perturbations, parse_perturbations
 from libero_env.tasks import get_task
-from libero_env.tasks.problem import Atom, ForAll
+from libero_env.tasks.expression import Atom, ForAll
 
 TASK = "libero_goal/6"  # the cream cheese into the bowl
 
@@ -131,7 +131,7 @@ def test_another_goal_of_the_scene_is_judged_from_the_event_on():
         env.set_state(0, states[0])  # the goal that an event has changed belongs to the state
         assert env.task_of(0) is other and not env.check_goal(0)[0]
         env.reset(options={"init_state": [0, 1]})
-        assert env.task_of(0) is own and env.event_states == {}
+        assert env.task_of(0) is own and env.perturbed.event_states == {}
 
 
 def test_a_restored_state_has_the_events_that_had_begun():
@@ -188,7 +188,7 @@ def test_a_state_goes_on_to_the_same_bits_in_an_environment_that_has_seen_nothin
 
 def test_an_event_that_did_not_happen_is_tried_again_after_a_state_before_it(monkeypatch):
     monkeypatch.setattr("libero_env.perturbations.episodes.TRIES", 1)
-    monkeypatch.setattr("libero_env.envs.batch.TRIES", 1)
+    monkeypatch.setattr("libero_env.perturbations.hooks.TRIES", 1)
     still = np.zeros((1, 7))
     with BatchEnv(TASK, 1, cameras=(), perturb="object=1@step2") as env:
         env.reset(options={"init_state": [1]})  # whose first draw is valid

@@ -18,7 +18,7 @@ from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose
 from libero_env.sim.predicates import evaluate
 from libero_env.tasks import get_task, make_task
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 pytestmark = pytest.mark.sim
 

@@ -4,6 +4,7 @@ import shutil
 
 import pytest
 
+from libero_cli.main import main
 from libero_env.assets import published
 from libero_env.assets.downloads import DownloadError, git_digest
 from libero_env.assets.original import FAMILIES, OriginalPack
@@ -17,9 +18,8 @@ from libero_env.assets.published import (
     published_digest,
     published_files,
 )
-from libero_env.cli.doctor import check_models
-from libero_env.cli.main import main
 from libero_env.errors import MissingPackageError
+from libero_env.health import check_models
 from lifelong.results.provenance import installed_versions
 
 FILES = {
@@ -243,13 +243,6 @@ def test_the_command_states_both_defaults(site, capsys):
 def test_intact_packages_are_not_installed_again(site, monkeypatch):
     monkeypatch.setattr(published.subprocess, "run", _must_not_run)
     assert install() == _asset(site).parents[1]
-
-
-def test_without_pip_the_message_names_the_alternatives(monkeypatch):
-    monkeypatch.setattr(published.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.setenv("PATH", "")
-    with pytest.raises(MissingPackageError, match=r"has no pip, and there is no uv.*ensurepip.*pip install"):
-        install()
 
 
 def test_without_an_index_the_message_names_the_alternatives(tmp_path, monkeypatch):

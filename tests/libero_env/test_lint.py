@@ -12,15 +12,15 @@ import mujoco
 import numpy as np
 import pytest
 
+from libero_cli import main as cli
 from libero_env.assets.arena import load_workspace
-from libero_env.cli import main as cli
-from libero_env.design.lint.checks import Finding, lint_file, lint_task, lint_text
+from libero_env.design.lint.checks import Finding, lint_file, lint_task, lint_text, lint_yaml
 from libero_env.design.lint.scene import furthest_reach, reach
 from libero_env.init_states.store import load_init_states
 from libero_env.sim.predicates import PREDICATES
 from libero_env.sim.scene import build_scene
-from libero_env.tasks import get_suite, get_task, suite_names
-from libero_env.tasks.problem import KINDS
+from libero_env.tasks import get_suite, get_task, read_task, suite_names
+from libero_env.tasks.rules import KINDS
 from libero_env.workspaces import WORKSPACES
 
 SOUND = get_task("libero_goal/3").bddl_text  # open the top layer of the drawer and put the bowl inside
@@ -105,10 +105,45 @@ def test_a_file_whose_name_is_not_its_instruction_is_reported(tmp_path):
     path.write_text(SOUND)
     (finding,) = [f for f in lint_file(path, starts=0) if f.rule == "language"]
     assert finding.level == "info" and "'my task'" in finding.what
+    assert finding.what.endswith(f"policies receive {read_task(path).language!r}")
+
+
+YAML = """\
+scene: kitchen
+objects: [akita_black_bowl, plate]
+place:
+  akita_black_bowl_1: [0, 0]
+  plate_1: [0.9, 0.2]
+goal:
+  - On akita_black_bowl_1 plate_1
+  - (Not (On plate_1 akita_black_bowl_1))
+  - Open plate_1
+language: put the mug on the plate
+"""
+
+
+@pytest.mark.parametrize("tasks", [False, True])
+def test_lines_of_a_yaml_file_are_those_that_its_user_wrote(tmp_path, tasks):
+    """Also where the file has several tasks, or its scene is another file."""
+    path, at = tmp_path / "mine.yaml", 0
+    path.write_text(YAML)
+    if tasks:
+        (tmp_path / "scene.yaml").write_text("".join(YAML.splitlines(True)[:5]))
+        own = "".join(f"    {line}" for line in path.read_text().splitlines(True)[5:]).replace(
+            "    goal", "  - goal", 1
+        )
+        path.write_text(f"scene: scene.yaml\ntasks:\n{own}")
+        at = -3
+    (findings,) = lint_yaml(path)
+    found = {(f.line, f.rule) for f in findings if f.level != "info"}
+    assert found >= {(1 if tasks else 5, "off-table"), (9 + at, "no-joint"), (10 + at, "instruction")}, (
+        findings
+    )
+    assert {f.file for f in findings} == {str(path)}
 
 
 def test_every_predicate_has_its_kinds():
-    assert set(PREDICATES) - set(KINDS) == {"True", "False"}
+    assert set(PREDICATES) == set(KINDS)
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
@@ -219,7 +254,7 @@ def test_the_command_prints_findings_and_its_status_counts_errors(tmp_path, caps
     cli.main(["tasks", "lint", str(good), str(bad), "--starts", "0", "--level", "error", "--json"])
     assert [one["level"] for one in json.loads(capsys.readouterr().out)] == ["error"]
     cli.main(["tasks", "lint", "libero_object/0", "libero_object-0", "--starts", "0"])
-    assert capsys.readouterr().out.startswith("1 tasks: "), "each once, whatever it is called"
+    assert capsys.readouterr().out.startswith("1 task: "), "each once, whatever it is called"
     assert cli.main(["tasks", "lint", "libero_objet/1"]) == 2
     assert cli.main(["tasks", "lint", str(tmp_path / "none.bddl")]) == 2
 

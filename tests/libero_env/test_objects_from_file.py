@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from libero_env.demos.config import DemoConfig
 from libero_env.design.objects import add_object, register_object_file
 from libero_env.design.objects.collision import boxes_of, collision_pieces, is_closed, volume_filled
@@ -21,7 +21,7 @@ from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.objects import folder, get_object, object_names
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import make_task
-from libero_env.tasks.builder import model_regions
+from libero_env.tasks.merging import model_regions
 
 pytestmark = [pytest.mark.sim, pytest.mark.usefixtures("objects_home")]
 
@@ -420,7 +420,7 @@ def broken(tmp_path: Path, kind: str) -> Path:
     ("large", {"size": 3.0}, "too large"),
     ("large", {"name": "milk"}, "--name my_milk"),
     ("large", {"name": "Red Cup"}, "lower-case letters"),
-    ("large", {"collision": "cubes"}, "expected one of .decompose., .hull. or .boxes."),
+    ("large", {"collision": "cubes"}, "expected .decompose., .hull. or .boxes."),
     ("absent", {}, "no such file"),
 ])  # fmt: skip
 def test_what_cannot_be_used_is_named_with_its_remedy(tmp_path, kind, options, message):

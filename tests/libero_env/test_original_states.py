@@ -39,9 +39,6 @@ def test_torch_reads_what_we_write_and_we_what_torch_writes(tmp_path):
     assert (torch.load(tmp_path / "ours", weights_only=False) == rows).all()
     torch.save(rows, tmp_path / "array")
     assert (read_states(tmp_path / "array") == rows).all()
-    tensor = torch.from_numpy(rows)
-    torch.save(tensor[1:, ::2], tmp_path / "tensor")
-    assert (read_states(tmp_path / "tensor") == rows[1:, ::2]).all()
 
 
 class Malice:
@@ -70,10 +67,10 @@ def test_pickles_that_call_functions_are_errors(tmp_path, zipped):
 
 def test_a_rejected_file_changes_nothing_for_the_next(tmp_path):
     torch = pytest.importorskip("torch")
-    torch.save(torch.arange(12, dtype=torch.float64).reshape(3, 4), tmp_path / "good")
+    torch.save(np.arange(12.0).reshape(3, 4), tmp_path / "good")
     expected = read_states(tmp_path / "good")
     # sets an attribute of what the name stands for
-    evil = b"\x80\x02ctorch\nDoubleStorage\n}X\x05\x00\x00\x00dtypeK\x01sb."
+    evil = b"\x80\x02cnumpy\nndarray\n}X\x05\x00\x00\x00dtypeK\x01sb."
     (tmp_path / "evil").write_bytes(evil)
     with pytest.raises(StateFileError, match="evil"):
         read_states(tmp_path / "evil")
@@ -92,15 +89,13 @@ def memory_peak(path) -> int:
 
 
 def test_small_files_do_not_ask_for_much_memory(tmp_path):
-    torch = pytest.importorskip("torch")
-    torch.save(torch.zeros(1, 1).expand(32768, 32768), tmp_path / "steps of zero")
     # a length of 32 GB; an entry of the memory that would need a table of 4 GB
     (tmp_path / "length").write_bytes(b"\x80\x04\x8e" + (1 << 35).to_bytes(8, "little") + b"x")
     (tmp_path / "entry").write_bytes(b"\x80\x02K\x01r\xff\xff\xff\x0f.")
     (tmp_path / "many").write_bytes(b"\x80\x02" + b"(" * 1_000_000 + b".")
     with zipfile.ZipFile(tmp_path / "packed", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         archive.writestr("x/data.pkl", bytes((1 << 28) + 1))
-    for name in ("steps of zero", "length", "entry", "many", "packed"):
+    for name in ("length", "entry", "many", "packed"):
         assert memory_peak(tmp_path / name) < 20e6, name
 
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from libero_cli.main import main
 from libero_env import Expert, LiberoEnv, make_task
 from libero_env.assets.arena import load_workspace
-from libero_env.cli.main import main
 from libero_env.errors import InvalidInputError, LiberoError, UnknownNameError
 from libero_env.tasks import bddl, write_task
 from libero_env.workspaces import WORKSPACES
@@ -136,11 +136,14 @@ def test_commands_know_own_workspaces(bench, tmp_path, capsys):
 
 @pytest.mark.parametrize(("text", "room", "message"), [
     ("model: room.xml\n", ROOM, "extends is missing"),
-    ("extends: kitchen\n", ROOM, "workspace.yaml:1: extends is 'kitchen'; expected one of 'table', 'kitchen_table'"),
+    ("extends: kitchen\n", ROOM, "workspace.yaml:1: extends is 'kitchen'; expected 'table', 'kitchen_table'"),
     (TABLE + "model: room.xml\n", ROOM, "workspace.yaml:3: it has table and model; expected one of them"),
     (TABLE.replace("0.8]", "0]"), ROOM, "its top is 0 m over the floor"),
-    (TABLE.replace("0.8]", "up]"), ROOM, "workspace.yaml:2: table.pos.2 is 'up'; expected a number"),
-    (TABLE.replace("[0.8, 1.2]", "[0, 1.2]"), ROOM, "workspace.yaml:2: table.size.0 is 0; expected at least 0.3"),
+    (TABLE.replace("0.8]", "up]"), ROOM, "workspace.yaml:2: table.pos.2 is 'up'; expected a valid number"),
+    (TABLE.replace("[0.8, 1.2]", "[0, 1.2]"), ROOM, "2: table.size.0 is 0; expected greater than or equal to 0.3"),
+    (TABLE.replace("[0.05, 0.1, 0.8]", "[9, 9, 9]"), ROOM, "workspace.yaml: the arm, with its base (robot) at ["),
+    (TABLE + "robot: [9, 9, 9]\n", ROOM, "reaches nothing on the table at [0.05, 0.1, 0.8]"),
+    (MODEL, ROOM.replace('pos="0.05 0.1 0.4"', 'pos="0.05 0.1 4"'), "m from its shoulder; expected at most 1 m"),
     (MODEL.replace("room", "hall"), ROOM, "hall.xml is missing"),
     (MODEL.replace("room", "../room"), ROOM, "is outside of the folder"),
     (MODEL, ROOM.replace('"floor"', '"ground"'), "it has no geom 'floor', which a workspace needs"),
@@ -162,6 +165,14 @@ def test_surfaces_of_a_room_of_ones_own_are_not_replaced(bench, closing, perturb
     bench(MODEL)
     with pytest.raises(InvalidInputError, match="bench has no material (floor|wall) of this package"):
         LiberoEnv(task(), cameras=(), perturb=perturb)
+
+
+def test_a_file_of_any_size_beside_a_workspace_is_named(bench):
+    folder = bench(TABLE)
+    with open(folder / "sparse.bin", "wb") as file:
+        file.truncate(200 << 30)
+    with pytest.raises(LiberoError, match=r"sparse\.bin: it is larger than 256 MiB"):
+        task()
 
 
 def test_a_task_without_its_workspace_is_refused(bench, objects_home):

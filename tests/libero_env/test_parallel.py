@@ -12,7 +12,9 @@ from libero_env.parallel import (
     NO_PICTURE_TEXT,
     SilentWorkersError,
     as_finished,
+    run_each,
     spawn_pool,
+    tell_work,
 )
 from tests.harness.drawing import draw
 
@@ -42,6 +44,22 @@ def test_a_pool_whose_first_picture_hangs_is_ended_and_says_why():
     with spawn_pool(1, picture_seconds=100) as pool:
         assert pool.submit(draw, False).result() == 8 * 8 * 3, "the limit ends with the first picture"
         assert pool.submit(_limited).result() is False
+
+
+def _tell(value: int) -> int:
+    for _ in range(value):
+        tell_work(0.25)
+        tell_work(0.75, 1)
+    return value
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_calls_tell_what_is_done_of_them(workers):
+    told: list[tuple[float, int]] = []
+    results = run_each(_tell, [(k,) for k in (1, 2, 3, 30)], workers, on_work=lambda *what: told.append(what))
+    assert sorted(result for _, result in results) == [1, 2, 3, 30]
+    assert sum(work for work, _ in told) == sum(done for _, done in told) == 36
+    tell_work(1.0)  # to nobody
 
 
 def _limited() -> bool:

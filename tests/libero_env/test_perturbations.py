@@ -28,7 +28,7 @@ from libero_env.perturbations.pairing import moved
 from libero_env.sim.appearance import Appearance, CameraView, Light
 from libero_env.sim.predicates import register_predicate
 from libero_env.tasks import get_suite, get_task
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 TASK = "libero_goal/3"
 SMALL = {"camera_size": (32, 32), "cameras": ("agentview",)}

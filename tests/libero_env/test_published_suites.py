@@ -12,7 +12,6 @@ from libero_env import BatchEnv, LiberoEnv
 from libero_env.assets.original import LIBERO_PRO, OriginalPack
 from libero_env.assets.pack import select_pack
 from libero_env.assets.published import installed_folder
-from libero_env.envs.scenes import published_changes
 from libero_env.errors import (
     BDDLError,
     InvalidInputError,
@@ -24,11 +23,11 @@ from libero_env.errors import (
 from libero_env.init_states import store
 from libero_env.init_states.store import load_init_states, load_original_states
 from libero_env.perturbations import Perturbation
+from libero_env.published import camera_pose, joint_pose, published_sizes
+from libero_env.published.suites import PLUS, PRO, find_folder, require_available
 from libero_env.sim.appearance import Appearance, CameraView
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, is_suite, suite_names
-from libero_env.tasks.published import camera_pose, joint_pose, published_sizes
-from libero_env.tasks.published.suites import PLUS, PRO, find_folder, require_available
 from tests.harness.published import BASE, ENDINGS, REWORDED, base_task, write_plus, write_pro
 from tests.harness.published import PRO as PRO_WORDS
 
@@ -142,7 +141,7 @@ def test_a_camera_is_moved_in_pictures_and_nowhere_else(plus):
     for name in before:
         if name != "agentview_rgb":
             np.testing.assert_array_equal(before[name], after[name])
-    (look,) = published_changes(task)
+    (look,) = task.changes()
     pose = camera_pose("table", task.variant.view)
     np.testing.assert_array_equal(look.cameras["agentview"].pos, pose.pos)
     np.testing.assert_array_equal(look.cameras["agentview"].quat, pose.quat_wxyz)

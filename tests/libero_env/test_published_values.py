@@ -8,8 +8,8 @@ import pytest
 
 from libero_env.errors import InvalidInputError, UnknownNameError
 from libero_env.perturbations.corruptions import CORRUPTIONS, SEVERITIES, corrupt
-from libero_env.tasks.published import camera_pose, joint_pose, parse_plus_id
-from libero_env.tasks.published.plus import NOISES, Noise, ViewChange
+from libero_env.published import camera_pose, joint_pose, parse_plus_id
+from libero_env.published.plus import NOISES, Noise, ViewChange
 
 BASE = "put_the_bowl_on_the_plate"
 IDS = {

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from libero_env.sim.back_ends import BatchSimulations, LoopSimulations
 from libero_env.sim.osc import ArmIndex
 from libero_env.sim.scene import build_scene
-from libero_env.sim.simulation import Batch, BatchSimulations, LoopSimulations
+from libero_env.sim.simulation import Batch
 from libero_env.tasks import get_task
 
 pytestmark = pytest.mark.sim

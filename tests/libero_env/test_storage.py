@@ -1,8 +1,10 @@
 """Files and folders that are replaced in one step."""
 
+import shutil
+
 import pytest
 
-from libero_env.storage import atomic_folder, atomic_path, atomic_write_text, create_text
+from libero_env.storage import atomic_folder, atomic_path, atomic_write_text, create_text, files_below
 
 
 @pytest.mark.parametrize("fsync", [False, True])
@@ -67,3 +69,14 @@ def test_a_folder_gets_its_name_when_it_is_complete(tmp_path):
         (temporary / "a").touch()
         raise ValueError
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_folders_that_vanish_while_files_are_looked_for_hold_none(tmp_path):
+    for name in "abc":
+        atomic_write_text(tmp_path / name / "inside" / "file.hdf5", "")
+    found = files_below(tmp_path, "*.hdf5")
+    first = next(found)
+    for folder in tmp_path.iterdir():
+        if folder not in first.parents:
+            shutil.rmtree(folder)
+    assert list(found) == []

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,8 @@ from libero_env.errors import UnknownNameError
 from libero_env.storage import read_yaml
 from libero_env.tasks import bddl, builder, get_suite, get_task, read_task, suite_names
 from libero_env.tasks.builder import build_problem, language_from_name
-from libero_env.tasks.problem import Atom, Not, Or, differences
+from libero_env.tasks.expression import Atom, Not, Or
+from libero_env.tasks.problem import differences
 
 # every task once, whatever number of suites has it
 ALL_TASKS = list({task.id: task for name in suite_names() for task in get_suite(name).tasks}.values())
@@ -64,7 +66,24 @@ def test_a_user_defined_task(tmp_path):
     file.write_text(bddl.write(build_problem(SCENE, TASK)))
     task = read_task(file)
     assert task.problem == build_problem(SCENE, TASK)
-    assert (task.id, task.language, task.bddl_language) == ("file/0", "cook the plate", "cook it")
+    assert (task.id, task.language, task.bddl_language) == ("file/0", "cook it", "cook it")
+
+
+@pytest.mark.parametrize("key", ["libero_goal/8", "libero_90/3", "libero_10/0"])
+def test_only_a_file_of_the_benchmark_is_told_by_its_name(tmp_path, key):
+    """Another name, other words or another goal make it the user's own, which keeps its words."""
+    task = get_task(key)
+    text, own = task.bddl_text, task.bddl_text.replace(task.bddl_language, "do as I say")
+    other = replace(task.problem, goal=Not(task.problem.goal))
+    for name, content, told in (
+        (task.name, text, task.language),
+        ("KITCHEN_SCENE1_abc", text, task.bddl_language),
+        (task.name, own, "do as I say"),
+        (task.name, bddl.write(other), task.bddl_language),
+    ):
+        path = tmp_path / f"{name}.bddl"
+        path.write_text(content)
+        assert read_task(path).language == told
 
 
 def test_suites_and_orders_are_the_originals(shared):

@@ -10,6 +10,8 @@ import pytest
 from libero_env.errors import BrokenFileError
 from libero_env.storage import read_json, write_json
 from libero_env.text import (
+    Cell,
+    Table,
     closest,
     duration,
     flatten,
@@ -20,7 +22,6 @@ from libero_env.text import (
     show_bytes,
     shown,
     suggest,
-    text_table,
 )
 
 
@@ -78,4 +79,8 @@ def test_amounts():
 
 
 def test_columns_are_aligned():
-    assert text_table([["", "n"], ["plate", 10], ["mug", 5]]) == "        n\nplate  10\nmug     5"
+    table = Table(["", "n"], [[Cell("plate", "of wood"), 10], ["mug", 5]])
+    assert str(table) == "        n\nplate  10\nmug     5" and table.csv() == ",n\nplate,10\nmug,5\n"
+    assert table.data() == [{"": "plate", "n": "10"}, {"": "mug", "n": "5"}]
+    heads = Table(["method", Cell("er"), Cell("Er")], []).cells[0]
+    assert [head.text for head in heads] == ["Method", "er", "Er"], "names stay as they are"

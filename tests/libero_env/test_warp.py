@@ -13,16 +13,15 @@ from libero_env.errors import InvalidInputError, LiberoError, SimulationError, U
 from libero_env.expert import Expert, Shapes
 from libero_env.expert.expert import MAX_STEPS
 from libero_env.mujoco_compat import mujoco
-from libero_env.sim import backend as backends
 from libero_env.sim.appearance import Appearance
 from libero_env.sim.backend import Backend
 from libero_env.sim.engine import Goals, make_simulations
 from libero_env.sim.predicates import register_predicate
-from libero_env.tasks.problem import And, Atom, ForAll, Not, Or
+from libero_env.tasks.expression import And, Atom, ForAll, Not, Or
 
 wp = pytest.importorskip("warp")
 mjw = pytest.importorskip("mujoco_warp")
-warp_simulations = pytest.importorskip("libero_env.sim.mjwarp.simulations")
+warp_simulations = pytest.importorskip("libero_env.warp.simulations")
 
 EVERYTHING = os.environ.get("LIBERO_WARP") == "all"  # twenty minutes more on a processor
 TASK = "libero_10/3"  # a bowl into a drawer that is then closed: fixtures, joints, contacts
@@ -342,13 +341,6 @@ def test_a_back_end_that_is_not_valid_is_said(text, error, told):
 def test_a_back_end_is_written_as_it_is_read():
     for text in ("mujoco", "warp", "warp,device=cuda:1", "warp,device=cpu,contacts=256"):
         assert str(Backend.read(text)) == text
-
-
-def test_a_missing_package_is_said_in_one_line(monkeypatch):
-    monkeypatch.setattr(backends.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(LiberoError, match=r"pip install 'libero-lifelong\[warp\]'"):
-        Backend("warp").require_installed()
-    Backend("mujoco").require_installed()
 
 
 def test_demonstrations_name_it(tmp_path):

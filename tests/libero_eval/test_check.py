@@ -6,17 +6,11 @@ import shutil
 import pytest
 import yaml
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from libero_eval.check import examine
+from lifelong.results.cells import measured_tasks
 from lifelong.results.log import ResultLog
-from lifelong.results.records import (
-    EvalRecord,
-    LossRecord,
-    RunEndRecord,
-    TaskEndRecord,
-    from_line,
-    measured_tasks,
-)
+from lifelong.results.records import EvalRecord, LossRecord, RunEndRecord, TaskEndRecord, from_line
 from lifelong.results.run_directory import RunDirectory
 from lifelong.results.summary import write_summary
 from tests.harness.records import evaluation, run_start

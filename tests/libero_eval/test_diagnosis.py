@@ -7,9 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+from torch.distributions import Normal, kl_divergence
 
 from libero_eval.diagnosis import measure
-from libero_eval.diagnosis.measure import diagnose, drift, overlap, parts_of, swap, updates
+from libero_eval.diagnosis.measure import diagnose, divergence, drift, overlap, parts_of, swap, updates
 from libero_eval.diagnosis.page import findings, write_diagnosis
 from libero_eval.relearning import error_on
 from libero_eval.requests import DiagnoseRequest
@@ -19,6 +20,7 @@ from lifelong.algorithms.single_task import SingleTask
 from lifelong.checkpoints import load
 from lifelong.errors import LifelongError
 from lifelong.evaluation.restore import LoadedRun
+from lifelong.nn import GMMHead
 from lifelong.policies.base import copy_weights
 from lifelong.stats.representations import (
     effective_rank,
@@ -147,7 +149,7 @@ def learned(tmp_path, monkeypatch):
                 torch.device("cpu"), None, (), context.data,
             )  # fmt: skip
 
-        def windows(run, task, held_out, config):
+        def windows(run, task, *_):
             return dataset(task), dataset(task).batch(torch.arange(8))
 
         monkeypatch.setattr(measure, "restore", restore)
@@ -167,6 +169,7 @@ def test_a_finished_run_is_diagnosed_and_its_page_written(learned, tab):
     assert {(u.task, u.part) for u in found.updates} == {(2, "encoder"), (2, "temporal"), (2, "head")}, (
         "task 1 kept the weights that it began with, those of its best epoch"
     )
+    assert [m.task for m in found.moved] == [1, 2] and found.moved[0].kl == 0 < found.moved[1].kl
     assert all(0 < o.all <= 1 for o in found.overlaps)
     assert diagnose(request) == found, "the same call gives the same numbers"
     written = write_diagnosis(found, request.run)
@@ -195,6 +198,22 @@ def test_one_adapter_for_all_tasks_has_updates_and_a_frozen_part_no_overlap(lear
     fisher = {name: then[name].square() for name in parts["head"]}
     shared = overlap((0, 1), fisher, fisher, parts)
     assert shared.all == pytest.approx(1) and np.isnan(shared.parts["encoder"])
+
+
+def test_the_divergence_of_single_gaussians_is_that_of_its_formula():
+    torch.manual_seed(0)
+    policy = small_transformer(SPEC, head=partial(GMMHead, hidden=16, modes=1, min_std=0.3))
+    then, batch = copy_weights(policy), dataset(0).batch(torch.arange(20))
+    now = {n: v + 0.3 * torch.randn_like(v) if n.startswith("head.") else v for n, v in then.items()}
+    shape = []
+    for weights in (then, now):
+        with acting_with(policy, weights), torch.no_grad():
+            params = policy.eval().head(policy.over_time(policy.encode(batch.observation)))
+            shape.append(Normal(params["means"].squeeze(-2), params["stds"].squeeze(-2)))
+    expected = kl_divergence(*shape).sum(-1).mean().item()
+    found = divergence(policy, then, now, batch, torch.Generator().manual_seed(0))
+    assert found == pytest.approx(expected, rel=0.08) and expected > 0.3
+    assert divergence(policy, then, then, batch, torch.Generator()) == 0
 
 
 def test_unfinished_runs_say_so_and_missing_checkpoints_are_named(learned):

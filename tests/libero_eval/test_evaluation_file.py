@@ -67,14 +67,18 @@ def with_task(**changes) -> str:
 
 
 @pytest.mark.parametrize(("text", "message"), [
-    (edited(format="libero-evaluation/2"), "libero-evaluation/2; this version reads"),
+    (edited(format="libero-evaluation/2", versions={"libero-lifelong": "0.7.1"}),
+     "libero-evaluation/2, and this program reads libero-evaluation/1: read it with libero-lifelong 0.7.1, which"),
+    (edited(format="libero-evaluation/0", versions={}), "read it with the version of libero-lifelong that wrote it"),
     (edited(format="lerobot/1"), "has the format 'lerobot/1'; expected libero-evaluation/1"),
     (json.dumps({"results": []}), "has no format"),
     (edited()[:300], "broken or incomplete"),
     (edited(tasks=[]), "no tasks"),
+    *((edited(protocol={part: [1]}), rf"protocol\.{part} is \[1\]; expected keys with values")
+      for part in ("world", "episode", "action")),
     (json.dumps({"format": FORMAT}), "evaluated is missing; protocol is missing"),
     (with_task(successes=[True]), "tasks.0: libero_goal/0: successes has 1 entries, init_states has 3"),
-    (with_task(successes=[1, 0, 1]), "tasks.0.successes.0 is 1; expected true or false"),
+    (with_task(successes=[1, 0, 1]), "tasks.0.successes.0 is 1; expected a valid boolean"),
     (with_task(init_states=[0, 1, 1]), "counted twice"),
     (with_task(simulation_errors=[[2, "it has diverged"]]), "counted twice"),
     (with_task(atoms_ever=[[True], [False], []]), "a column for each"),

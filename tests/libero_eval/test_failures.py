@@ -130,12 +130,12 @@ def test_a_policy_whose_costs_and_causes_were_not_seen_is_not_shown_as_one_witho
 
 
 @pytest.mark.parametrize(("costs", "message"), [
-    (5, "costs is 5; expected a list"),
+    (5, "costs is 5; expected a valid array"),
     ([{}], "costs has 1 entries, init_states has 2"),
-    ([{"force": -1}, None], "costs.0.force is -1; expected at least 0"),
+    ([{"force": -1}, None], "costs.0.force is -1; expected greater than or equal to 0"),
     ([{"tilt": float("nan")}, None], "costs.0.tilt is nan; expected a finite number"),
     ([{"heat": 3}, None], "costs.0.heat is an unknown key. Valid: force, shift"),
-    ([None, {"moved": "bowl_1"}], "costs.1.moved is 'bowl_1'; expected a list"),
+    ([None, {"moved": "bowl_1"}], "costs.1.moved is 'bowl_1'; expected a valid array"),
 ])  # fmt: skip
 def test_damaged_costs_of_a_result_are_refused_in_one_line(tmp_path, costs, message):
     path = with_costs(result_of(task_result("libero_goal/0", [True, False])), SPILT).write(

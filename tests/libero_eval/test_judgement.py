@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import yaml
 
-from libero_env.cli.main import main  # noqa: E402
+from libero_cli.main import main  # noqa: E402
 from libero_eval.evaluation_file import Stopped  # noqa: E402
 from libero_eval.judging.comparability import Group, check_comparable, match, settings  # noqa: E402
 from libero_eval.judging.comparison import Comparison, compare_groups, gate, write_comparison  # noqa: E402
 from libero_eval.judging.group_scores import group_scores  # noqa: E402
 from libero_eval.judging.page import forest_figure, gate_text, render  # noqa: E402
+from libero_eval.stats.power import Question, paired_power, shown_difference  # noqa: E402
 from libero_integrations.exports.results import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
 from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
-from lifelong.stats.power import Question, paired_power, shown_difference  # noqa: E402
 from tests.harness.evaluations import evaluate  # noqa: E402
 from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
 
@@ -209,7 +209,9 @@ def test_a_single_task_with_one_start_is_judged():
     only = compare_groups(sides).comparisons[0]
     assert only.total.adjusted == 1.0 and only.suites == () and only.total.difference.over_tasks is None
     interval = only.total.difference.interval
-    assert -1 < interval.low < 0 < interval.high == 1
+    assert interval.value == 1 and np.isnan([interval.low, interval.high]).all(), "one start has no interval"
+    with pytest.raises(ConfigError, match="--gate needs 5 starts that both have, and there are 1"):
+        gate(compare_groups(sides), 0.1)
 
 
 def test_equal_outcomes_of_a_control_arm_are_told():
@@ -360,11 +362,15 @@ def test_exports_to_lerobot(tmp_path):
 
 def test_exports_to_model_cards_are_entries_as_the_hub_documents_them(tmp_path):
     result = result_of(
-        task_result("libero_goal/3", [1, 0, 1]),
+        task_result("libero_goal/3", [1, 0, 1, 0, 1, 1]),
         task_result("libero_object/0", [1, 1, 1, 1]),
         environment=ENVIRONMENT | {"models_digest": "fa0e"},
     )
-    paths = export_eval_results(result, tmp_path, "org/libero", "https://example.org/eval.json")
+    with pytest.raises(
+        ConfigError, match=r"not the whole of the suite: libero_goal \(1 of 10 tasks\); with --partial"
+    ):
+        export_eval_results(result, tmp_path, "org/libero")
+    paths = export_eval_results(result, tmp_path, "org/libero", "https://example.org/eval.json", partial=True)
     assert [str(p.relative_to(tmp_path)) for p in paths] == [
         ".eval_results/libero_goal.yaml", ".eval_results/libero_object.yaml"
     ]  # fmt: skip
@@ -377,16 +383,23 @@ def test_exports_to_model_cards_are_entries_as_the_hub_documents_them(tmp_path):
         "source": {"url": "https://example.org/eval.json", "name": "libero-lifelong"},
         "evaluation_framework": "libero-lifelong",
     }
-    assert "over 3 episodes of 1 tasks, 95 % interval 20.8 to 93.9" in notes
+    assert notes.startswith(
+        "PARTIAL: libero_goal (1 of 10 tasks), success in percent over 6 episodes of 1 task, 95 % "
+    )
     assert "protocol openpi, models builtin fa0e" in notes
+    assert "95 %" not in yaml.safe_load(paths[1].read_text())[0]["notes"].replace("in percent", ""), (
+        "4 episodes"
+    )
     changed = replace(
         result,
         protocol={"name": "libero", "world": {"perturb": "gain=0.5"}, "action": {"clock": "latency=100ms"}},
         stopped=Stopped("width=0.9", "known", 20),
     )
-    (entry, *_) = yaml.safe_load(export_eval_results(changed, tmp_path, "org/libero")[0].read_text())
+    (entry, *_) = yaml.safe_load(
+        export_eval_results(changed, tmp_path, "org/libero", partial=True)[0].read_text()
+    )
     assert (
-        "perturbed by gain=0.5, clock latency=100ms, stopped after 7 of 20; width=0.9: known"
+        "perturbed by gain=0.5, clock latency=100ms, stopped after 10 of 20; width=0.9: known"
         in entry["notes"]
     )
     interval = replace(changed, tasks=changed.tasks[:1]).success  # wider, as that of a stopped evaluation is
@@ -394,7 +407,7 @@ def test_exports_to_model_cards_are_entries_as_the_hub_documents_them(tmp_path):
         f"95 % interval {100 * interval.low:.1f} to {100 * interval.high:.1f}" in entry["notes"]
         and interval.low < 0.2
     )
-    bare = export_eval_results(replace(result, times={}), tmp_path, "org/libero")
+    bare = export_eval_results(replace(result, times={}), tmp_path, "org/libero", partial=True)
     assert not {"date", "source"} & yaml.safe_load(bare[1].read_text())[0].keys()
 
 
@@ -491,7 +504,7 @@ def test_a_gate_judges_a_policy_against_its_own_earlier_result():
     (["compare", "a", "b", "--open"], "--open shows a page, and none was written"),
     (["compare", "a", "nothing"], "nothing does not exist"),
     (["compare", "a", "old"], "the format is libero-evaluation/99"),
-    (["compare", "a", "nan"], "successes.3 is nan; expected true or false"),
+    (["compare", "a", "nan"], "successes.3 is nan; expected a valid boolean"),
     (["compare", "--group", "a"], "--group NAME RESULT"),
     (["power", "--base", "0.9", "--difference", "0.2"], "above 1"),
     (["power", "a"], "takes two results, not 1"),

@@ -27,7 +27,7 @@ from libero_eval.requests import EvalRequest
 from libero_eval.servers.actors import RemoteActor, checked_actions
 from libero_eval.servers.openpi import OPENPI, OpenpiClient
 from libero_eval.servers.policy import ServerPolicy
-from libero_eval.servers.transport import EpisodeStart, Limits, connect, need
+from libero_eval.servers.transport import EpisodeStart, Limits, connect
 from libero_integrations.servers.groot import ACTION, GROOT, GrootClient
 from libero_integrations.servers.vla_eval import VLA_EVAL, VlaEvalClient
 from lifelong.errors import CodecError, ConfigError, ConnectionLost, ProtocolMismatchError, ServerError
@@ -122,14 +122,6 @@ def test_values_and_bytes_that_are_refused(codec):
     for data in (b"", b"\xc1garbage", codec.pack(1) + b"more"):
         with pytest.raises(CodecError, match=f"not a message of {codec.name}"):
             codec.unpack(data)
-
-
-def test_a_missing_package_is_named(monkeypatch):
-    for module in ("msgpack", "zmq", "websockets"):
-        monkeypatch.setitem(sys.modules, module, None)
-        message = rf"{module} is not installed.*pip install 'libero-lifelong\[servers\]'"
-        with pytest.raises(MissingPackageError, match=message):
-            need(module)
 
 
 def test_an_array_that_does_not_fit_its_bytes_is_refused():
@@ -243,6 +235,14 @@ def test_requests_in_flight(in_flight):
     assert most == (in_flight or 5)
 
 
+def deep(count: int) -> bytes:
+    return b"\x81\xa1a" * count + b"\x01"
+
+
+def maps(count: int) -> bytes:
+    return b"\x81\xa7actions\xdd" + struct.pack(">I", count) + b"\x80" * count
+
+
 @pytest.mark.parametrize(("answer", "message"), [
     ({"actions": np.full((4, 7), np.nan)}, "must be finite; entry .* is nan"),
     ({"actions": np.zeros((4, 8))}, r"shape \(4, 8\); expected \(H, 7\) with H >= 2"),
@@ -254,7 +254,13 @@ def test_requests_in_flight(in_flight):
     ([1, 2], "sent a list as actions; expected a map"),
     (b"\xc1\x00garbage", "9 bytes that are not a message of openpi"),
     ("Traceback ...\nValueError: no such key", "(?s)its traceback:.*no such key"),
-])  # fmt: skip
+    *((deep(count), "within each other, more than 30 deep") for count in (31, 500)),
+    (maps(1 << 20), "more than 10000 lists and maps"),
+    ("X" * (1 << 20), r"its traceback:\n\.\.\. X{2000}$"),
+    ({"k" * 100_000: 1}, "without `actions`"),
+    ({str(i): 1 for i in range(10_000)}, "without `actions`"),
+    ({"actions": [["x" * 100_000] * 7] * 2}, "is not a real number"),
+], ids=range(17))  # fmt: skip
 def test_answers_that_are_not_valid_are_named(answer, message):
     with (
         policy_servers.openpi(lambda _: answer) as address,
@@ -262,6 +268,7 @@ def test_answers_that_are_not_valid_are_named(answer, message):
     ):
         ask(address)
     assert address in str(caught.value) and not isinstance(caught.value, ConnectionLost)
+    assert len(str(caught.value)) < 2500
 
 
 def test_single_actions():
@@ -397,32 +404,6 @@ def test_what_openpi_announces_identifies_the_policy_and_is_compared_with_the_pr
         plan_evaluation(changed.request, changed)
 
 
-def deep(count: int) -> bytes:
-    return b"\x81\xa1a" * count + b"\x01"
-
-
-def maps(count: int) -> bytes:
-    return b"\x81\xa7actions\xdd" + struct.pack(">I", count) + b"\x80" * count
-
-
-@pytest.mark.parametrize(("answer", "message"), [
-    (deep(500), "within each other, more than 30 deep"),
-    (deep(31), "within each other, more than 30 deep"),
-    (maps(1 << 20), "more than 10000 lists and maps"),
-    ("X" * (1 << 20), r"its traceback:\n\.\.\. X{2000}$"),
-    ({"k" * 100_000: 1}, "without `actions`"),
-    ({str(i): 1 for i in range(10_000)}, "without `actions`"),
-    ({"actions": [["x" * 100_000] * 7] * 2}, "is not a real number"),
-], ids=["deep", "deeper than allowed", "many maps", "long text", "long key", "many keys", "long values"])  # fmt: skip
-def test_large_answers_end_in_a_short_message(answer, message):
-    with (
-        policy_servers.openpi(lambda _: answer) as address,
-        pytest.raises(ServerError, match=message) as caught,
-    ):
-        ask(address)
-    assert len(str(caught.value)) < 2500
-
-
 @pytest.mark.parametrize("when", ["before the first request", "twice", "at the end"])
 def test_answers_that_nobody_has_asked_for_are_refused(when):
     """They would be taken for the answers to later requests, and every action come late."""
@@ -450,7 +431,7 @@ def test_answers_that_nobody_has_asked_for_are_refused(when):
 
 
 @pytest.mark.parametrize(("hello", "message"), [
-    ({"action_spec": [1]}, r"action_spec is \[1\]; expected keys with values"),
+    ({"action_spec": [1]}, r"action_spec is \[1\]; expected an object"),
     ({"action_spec": "x"}, "action_spec"),
     ({"action_spec": {"position": 5}}, "action_spec.position"),
     ({"observation_params": [1]}, "observation_params"),

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from libero_env.cli import main as cli
+from libero_cli import main as cli
 from libero_env.tasks import get_task
 from libero_eval.protocols.adapter import ProtocolAdapter, axis_angle, axis_angle_float32, axis_angle_positive
 from libero_eval.protocols.clock import ClockedActor
 from libero_eval.protocols.environment import ProtocolEnv
 from libero_eval.protocols.files import load_protocol, protocol_names
-from libero_eval.protocols.protocol import SUITES, EvalProtocol
+from libero_eval.protocols.protocol import EvalProtocol
+from libero_eval.protocols.sections import SUITES
 from libero_eval.user_policy import CallableActor, ProtocolActor
 from lifelong.errors import MissingObservationError, PolicyError, ProtocolError, ProtocolMismatchError
 
@@ -94,6 +95,9 @@ BAD = {
      r"episode\.horizon has no value for libero_spatial, libero_object, libero_10, libero_90"),
     "replan": ("extends: openpi\naction: {chunk: 4}", r"action\.replan is 5, but action\.chunk is 4"),
     "stored and seeded": ("extends: libero\nworld: {env_seed: 7}", r"world\.env_seed is 7, but .* stored"),
+    "success at the end": ("extends: openpi\nepisode: {success: final}", r"episode\.success is 'final'"),
+    "ensembling": ("extends: openpi\naction: {ensembling: act}", r"action\.ensembling is an unknown key"),
+    "changes": ("extends: openpi\nchanges: {episode.horizon: 6}", "changes is a key of results"),
     "order": ("extends: openpi\nepisode: {reset_order: [set_init_state, reset]}",
      r"reset_order is \['set_init_state', 'reset'\]; .* in the order of seed, reset, set_init_state, settle"),
     "settled too early": ("extends: openpi\nepisode: {reset_order: [reset, settle, set_init_state]}",
@@ -305,7 +309,8 @@ def test_protocols_from_the_command_line(tmp_path, capsys):
         "horizon            not stated  # not stated for the" in shown and "20  # default of libero" in shown
     )
     replaced = load_protocol(write(tmp_path, "extends: openpi\nworld: {loads: 3}"))
-    assert "world.loads" not in replaced.sources and "world.robot" in replaced.sources
+    assert replaced.sources["world.loads"] == "mine.yaml's own" and replaced.title.endswith(", changed")
+    assert "requirements.txt" in replaced.sources["world.robot"]
     mine = write(tmp_path, "extends: openpi\naction: {replan: 10}")
     assert cli.main(["protocols", "diff", "openpi", str(mine)]) == 1
     assert capsys.readouterr().out.splitlines()[1].split() == ["action.replan", "5", "10"]

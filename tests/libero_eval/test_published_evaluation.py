@@ -2,7 +2,7 @@
 
 import pytest
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from libero_env.init_states.store import load_init_states
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite

@@ -1,6 +1,7 @@
 """Steps until a forgotten task is back: the measurement, its records, and what reports say."""
 
 import copy
+import os
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -10,27 +11,22 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from libero_env.tasks import get_task
 from libero_eval import relearning
 from libero_eval.cli import runs
 from libero_eval.relearning import Trial, error_on, failure_share, relearn, steps_until
 from libero_eval.requests import DiagnoseRequest, RelearnRequest
+from lifelong import pretraining
 from lifelong.algorithms import Sequential
 from lifelong.checkpoints import load
 from lifelong.data.settings import DataSettings
-from lifelong.errors import ConfigError, DataError, LifelongError
+from lifelong.errors import CheckpointError, ConfigError, DataError, LifelongError
 from lifelong.evaluation.restore import LoadedRun
 from lifelong.evaluation.settings import EvalSettings
 from lifelong.report.page import write_report
 from lifelong.results.log import ResultLog
 from lifelong.results.records import RelearnRecord, from_line, to_line
-from lifelong.results.relearning import (
-    FILE_NAME,
-    by_measure,
-    read_relearning,
-    savings,
-    savings_rows,
-    savings_tables,
-)
+from lifelong.results.relearning import FILE_NAME, by_measure, read_relearning, savings, savings_table
 from lifelong.training.fit import fit
 from lifelong.training.settings import FitSettings
 from lifelong.types import Batch
@@ -40,7 +36,11 @@ from tests.harness.records import run_start
 from tests.harness.sequences import SPEC, dataset, run_context, sequence
 
 FIT = FitSettings(epochs=1, batch_size=10, lr=0.05, warmup_steps=5, weight_decay=0.0, precision="fp32")
-SETTINGS = RelearnRequest(run=Path("run"), steps=200, every=5, tolerance=0.05, held_out=1)
+SETTINGS = RelearnRequest(run=Path(), steps=200, every=5, tolerance=0.05, held_out=1)
+
+
+def tables(records) -> str:
+    return "\n\n".join(str(savings_table(part)) for part in by_measure(records))
 
 
 class Linear(LinearPolicy):
@@ -159,14 +159,14 @@ def test_savings_pair_the_starts_of_each_task() -> None:
         (0, 10, 40, 0.75), (1, 20, 10, -1.0), (2, 0, None, None), (3, None, 10, None),
         (5, None, None, None),
     ]  # fmt: skip
-    assert savings_rows(records)[0] == ("1", "0.100", "0.300", "10", "40", "75 %", "10 steps")
-    assert savings_rows(records)[2][3:] == ("0", "–", "–", "–"), "the first was not measured"
-    assert savings_rows(records)[3][3:] == ("> 10", "10", "–", "10 steps")
-    assert savings_rows(records)[4][3:] == ("> 10", "> 20", "–", "10 steps")
-    assert savings_tables(records).count("\n") == 5
+    assert savings_table(records).rows[0] == (1, "0.100", "0.300", "10", "40", "75 %", "10 steps")
+    assert savings_table(records).rows[2][3:] == ("0", "–", "–", "–"), "the first was not measured"
+    assert savings_table(records).rows[3][3:] == ("> 10", "10", "–", "10 steps")
+    assert savings_table(records).rows[4][3:] == ("> 10", "> 20", "–", "10 steps")
+    assert tables(records).count("\n") == 5
     for odd in ({"learned_error": 0.2}, {"steps": (0, 50)}):  # of other demonstrations, measured less often
         last = replace(record(0, "final", (0.3, 0.1)), **odd)
-        assert savings_rows([*records, last])[0][4:6] == ("–", "–")
+        assert savings_table([*records, last]).rows[0][4:6] == ("–", "–")
 
 
 def test_settings_and_initial_weights_do_not_share_a_table() -> None:
@@ -180,7 +180,7 @@ def test_settings_and_initial_weights_do_not_share_a_table() -> None:
         [(10, 20)],
         [(0, 0)],
     ]
-    text = savings_tables([final, initial, *loose, other])
+    text = tables([final, initial, *loose, other])
     assert text.count("steps again (tolerance 0.05, 5 held out)") == 2
     assert text.count("steps again (tolerance 1, 5 held out)") == 1
     assert text.count("(weights 01234567)") == 2 and text.count("(weights fedcba98)") == 1
@@ -203,8 +203,8 @@ def test_success_is_back_where_it_falls_short_by_the_tolerance_at_most() -> None
     assert needed(0.1, 1.0, 0.2) is None
     assert needed(0.0, 1.0, 0.05) == 10, "a task without failures is back, too"
     found = [record(0, "final", (0.9, 0.1), episodes=20), record(0, "initial", (1.0, 0.5, 0.1), episodes=20)]
-    assert savings_rows(found) == [("1", "90 %", "10 %", "10", "20", "50 %", "10 steps")]
-    text = savings_tables([record(0, "final", (0.3, 0.1)), *found])
+    assert savings_table(found).rows == [(1, "90 %", "10 %", "10", "20", "50 %", "10 steps")]
+    text = tables([record(0, "final", (0.3, 0.1)), *found])
     assert text.index("error just learned") < text.index("success just learned")
     (part,) = by_measure([record(0, "initial", (0.1,)), found[0]])
     assert [s.first for s in savings(part)] == [None], "measures do not mix"
@@ -219,7 +219,7 @@ def test_the_page_of_a_run_shows_them_and_its_records_stay(tmp_path) -> None:
     log.append(record(0, "initial", (0.5, 0.4, 0.1)))
     log.append(record(0, "final", (0.75, 0.1), episodes=20))
     page = write_report([tmp_path]).read_text(encoding="utf-8")
-    assert "<h2>Relearning</h2>" in page and "50 %" in page
+    assert ">Relearning</h2>" in page and "50 %" in page
     assert "Error at the end" in page and "Success at the end" in page and "25 %" in page
     assert (tmp_path / "results.jsonl").read_bytes() == before
 
@@ -374,7 +374,7 @@ def test_initial_weights_are_normalised_as_the_run_was_when_it_met_the_task(
 
     monkeypatch.setattr(relearning, "restore", restore)
     monkeypatch.setattr(relearning, "read_config", lambda *_: config)
-    monkeypatch.setattr(relearning, "find_demos", lambda *_: files)
+    monkeypatch.setattr(relearning, "find_demos", lambda *_, **__: files)
     monkeypatch.setattr(relearning, "DemoDatasets", windows)
     held = partial(Batch.rows, rows=slice(0, 2))
     monkeypatch.setattr(
@@ -420,22 +420,62 @@ def test_demonstrations_are_asked_for_with_all_tasks_as_files_of_all_may_be_name
     class Asked(Exception):
         pass
 
-    def find_demos(tasks, counts, data, progress):
+    def find_demos(tasks, counts, data, progress, **_):
         raise Asked(list(tasks), list(counts))
 
     settings = DataSettings(demos=4, image_size=16, seq_len=1, views=("agentview_rgb",), proprio=())
     monkeypatch.setattr(relearning, "find_demos", find_demos)
-    run = SimpleNamespace(tasks=("a", "b", "c"), group_sizes=())
-    config = SimpleNamespace(build={"data": settings}.get, values={})
+    run = SimpleNamespace(tasks=("a", "b", "c"), group_sizes=(), data=settings)
+    config = SimpleNamespace(values={})
     with pytest.raises(Asked) as asked:
         relearning.task_windows(run, 1, 2, config)
     assert asked.value.args == (["a", "b", "c"], [4, 6, 4])
 
-    def few(*_):
+    def few(*_, **__):
         raise DataError("a.hdf5 has 4 demonstrations and 6 are required")
 
     monkeypatch.setattr(relearning, "find_demos", few)
     with pytest.raises(
-        DataError, match="6 are required; --held-out reads 2 demonstrations more than the run"
+        DataError, match="6 are required.*; --held-out reads 2 demonstrations more than the run"
     ):
         relearning.task_windows(run, 1, 2, config)
+
+
+@pytest.fixture
+def foreign(tmp_path) -> dict[str, Path]:
+    """What a saved configuration may name in place of a file."""
+    names = {kind: tmp_path / kind for kind in ("nothing", "folder", "pipe", "text", "link")}
+    names["folder"].mkdir()
+    os.mkfifo(names["pipe"])
+    names["text"].write_text("text")
+    names["link"].symlink_to(names["nothing"])
+    return names | {"device": Path("/dev/zero")}
+
+
+def test_whatever_is_wrong_with_demonstrations_that_a_run_names_the_option_for_others_is_named(
+    foreign,
+) -> None:
+    wrong = [{"files": (str(path),)} for path in foreign.values()]
+    wrong += [{"folder": str(path)} for kind, path in foreign.items()]
+    for data in wrong:
+        settings = DataSettings(
+            demos=1, image_size=16, seq_len=1, views=("agentview_rgb",), proprio=(), **data
+        )
+        run = SimpleNamespace(tasks=(get_task("libero_goal/0"),), group_sizes=(), data=settings)
+        with pytest.raises(DataError, match="--demos DIR"):
+            relearning.task_windows(run, 0, 0, SimpleNamespace(values={}))
+
+
+def test_whatever_is_wrong_with_the_weights_that_a_run_began_with_the_option_for_others_is_named(
+    foreign, monkeypatch
+) -> None:
+    loaded = SimpleNamespace(policy=SimpleNamespace(spec=None), seed=1)
+    monkeypatch.setattr(pretraining, "restore", lambda *_, **__: loaded)
+    parts = {"pretrain": SimpleNamespace(sequence=lambda: ()), "policy": policy()}
+    for path in foreign.values():
+        config = SimpleNamespace(build=lambda name, **_: parts[name], values={"init_from": str(path)})
+        monkeypatch.setattr(pretraining, "read_config", lambda *_, config=config: config)
+        with pytest.raises(CheckpointError, match="by --initial"):
+            pretraining.initial_policy(Path())
+        with pytest.raises(CheckpointError, match="(?<!by --initial)$"):
+            pretraining.initial_policy(Path(), weights=path)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from libero_eval.evaluation_file import EvaluationResult, TaskResult
-from libero_eval.robustness.page import curves_figure, radar_figure, render, verdict, write_robustness
+from libero_eval.robustness.page import curves_figure, render, verdict, write_robustness
 from libero_eval.robustness.results import (
     Condition,
     Outcomes,
@@ -214,7 +214,7 @@ def test_the_page_and_the_text_say_the_same_numbers(tmp_path, tab) -> None:
     page = write_robustness([policy, expert], tmp_path)
     assert tab.faults_on_a_phone(page) == []
     text = page.read_text()
-    assert "Robustness of sequential" in text and text.count("<svg") == 1, "no radar of two kinds"
+    assert "Robustness of sequential" in text and text.count("<svg") == 1
     assert "camera=1" in text and ">2</td>" in text, "draws that were given up are told"
     assert "camera=1,light=1" in text, "so are interactions"
     assert "130 (sequential), 600 (expert)" in text, "the expert had more time"
@@ -225,18 +225,6 @@ def test_the_page_and_the_text_say_the_same_numbers(tmp_path, tab) -> None:
     camera = next(a for a in record["policies"][0]["axes"] if a["kind"] == "camera")
     assert camera["area"]["value"] == pytest.approx(0.4) and camera["half"]["value"] is not None
     assert np.array(record["policies"][0]["outcomes"]["camera=1"]).sum() == 0
-
-
-def test_the_radar_shows_the_area_of_each_kind_and_a_gap_where_one_was_not_measured(tmp_path) -> None:
-    colour = (("colour", 1.0),)
-    first = Robustness("a", outcomes({(): 10, A: 6, B: 0, C: 8, colour: 4}))
-    second = Robustness("b", outcomes({(): 10, B: 10, C: 0}))
-    (polar,) = radar_figure({"a": first.outcomes.axes, "b": second.outcomes.axes}).axes
-    lines = [(line.get_label(), line.get_ydata().tolist()) for line in polar.get_lines()]
-    assert [text.get_text() for text in polar.get_xticklabels()] == ["camera", "colour", "light"]
-    assert lines[0] == ("a", pytest.approx([55, 70, 90, 55])), "closed, in % of the trapezoids"
-    assert lines[1] == ("b", pytest.approx([100, math.nan, 50, 100], nan_ok=True))
-    assert write_robustness([first, second], tmp_path).read_text().count("<svg") == 2
 
 
 def test_the_legend_names_a_policy_that_was_not_measured_along_the_first_kind() -> None:
@@ -254,5 +242,5 @@ def test_a_policy_that_never_succeeds_has_nothing_to_lose(tmp_path) -> None:
     better = Robustness(
         "none", outcomes({(): 0, B: 5, C: 5, BOTH: 5})
     )  # what is left of nothing is not known
-    assert "camera=1,light=1: 50, expected –, excess –" in render(better).splitlines()
+    assert ["camera=1,light=1", "50", "–", "–"] in [line.split() for line in render(better).splitlines()]
     assert write_robustness([better], tmp_path) and "nan" not in (tmp_path / "robustness.html").read_text()

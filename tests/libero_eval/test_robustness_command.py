@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.requests import KINDS, PAIRS, SEVERITIES, RobustnessRequest
 from libero_eval.robustness.study import conditions_of
@@ -166,11 +166,11 @@ def test_notes_are_said_once(still, capsys) -> None:
 @pytest.mark.parametrize("link", ["robustness", "robustness/conditions", "robustness/conditions/none"])
 def test_nothing_is_removed_where_a_link_leads(still, link, capsys) -> None:
     (still / "mine" / "units").mkdir(parents=True)
-    path = still / "eval" / "still_policy.make" / link
+    path = still / "eval" / "still_policy" / "horizon=2" / link
     path.parent.mkdir(parents=True)
     path.symlink_to(still / "mine")
     assert main(["robustness", *WORDS, *TWO, "--again"]) == 2
-    assert "link that leads out of" in capsys.readouterr().err and (still / "mine" / "units").is_dir()
+    assert "is a link, or is not a folder" in capsys.readouterr().err and (still / "mine" / "units").is_dir()
 
 
 def test_default_kinds_and_pairs_exist() -> None:

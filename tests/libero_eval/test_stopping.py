@@ -11,11 +11,11 @@ from libero_eval.evaluation_file import EvaluationResult, Stopped
 from libero_eval.judging.comparability import Group
 from libero_eval.judging.comparison import compare_groups
 from libero_eval.judging.evaluation_page import write_evaluation_page
+from libero_eval.stats.sequential import anytime_interval, log_evidence, shuffled
 from libero_eval.work.progress import total_rows
 from libero_eval.work.stopping import StoppingRule
 from libero_eval.work.worker import Worker
 from lifelong.errors import ConfigError
-from lifelong.stats.sequential import anytime_interval, log_evidence
 from tests.harness.evaluations import QUICK, TASKS, Countdown, evaluate, evaluation
 from tests.harness.results import result_of, task_result
 
@@ -43,24 +43,33 @@ def rule(text, starts=STARTS):
 
 
 def stopping(out, text, **changes):
-    arguments = {"env": lambda task, count: Always(count), "init_states": STARTS, "until": rule(text)}
+    arguments = {
+        "env": lambda task, count: Always(count),
+        "init_states": STARTS,
+        "until": rule(text),
+        "shuffled": True,
+    }
     return evaluate(out, **(arguments | changes))
 
 
 def test_it_stops_after_the_round_that_makes_the_interval_narrow(tmp_path):
     result = stopping(tmp_path / "it", "width=0.2", unit_starts=1)
     need = next(n for n in itertools.count(1) if anytime_interval(2 * n, 2 * n).low > 0.8)
-    assert result.init_states == STARTS[:need] and {len(task.successes) for task in result.tasks} == {need}
+    looked = shuffled(STARTS)[:need]
+    assert result.init_states == tuple(sorted(looked)) == result.tasks[0].init_states != STARTS[:need]
+    assert {len(task.successes) for task in result.tasks} == {need}
     assert len(list((tmp_path / "it" / "units").iterdir())) == 2 * need, "what follows was not run"
     assert result.success == anytime_interval(2 * need, 2 * need)
     assert set(result.suites.values()) == {result.success}
     assert result.stop_note == f"stopped after {2 * need} of 60; width=0.2: known"
-    assert total_rows(result)[0].endswith(f"({result.stop_note})")
+    assert total_rows(result)[0].endswith(f"libero_goal (2 of 10 tasks)  ({result.stop_note})")
     assert EvaluationResult.read(tmp_path / "it") == result
     assert result.stop_note in write_evaluation_page(result, tmp_path / "it").read_text()
     everything = stopping(tmp_path / "it", "width=0.2", unit_starts=1, until=None)  # it goes on
     assert everything.init_states == STARTS and everything.stopped is None
-    assert everything.tasks[0].of_starts(STARTS[:need]) == result.tasks[0]
+    assert everything.tasks[0].of_starts(looked) == result.tasks[0]
+    plain = evaluate(tmp_path / "plain", env=lambda task, count: Always(count), init_states=STARTS)
+    assert everything.tasks == plain.tasks and everything.outcomes == plain.outcomes
 
 
 def test_rows_of_suites_have_the_interval_of_the_rule_too():

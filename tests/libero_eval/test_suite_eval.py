@@ -14,16 +14,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from libero_cli import main as cli
 from libero_env import LiberoEnv, memory
-from libero_env.cli import main as cli
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task
 from libero_eval.evaluation_file import EvaluationResult, Stopped, overall
-from libero_eval.plan import choose_init_states, plan_evaluation, repeated
+from libero_eval.plan import choose_init_states, plan_evaluation
 from libero_eval.plan import evaluate as evaluate_request
-from libero_eval.protocols.files import load_protocol
+from libero_eval.repeating import repeated
 from libero_eval.requests import EvalRequest
-from libero_eval.servers.serving import ServedPolicy
 from libero_eval.user_policy import (
     ORIGINAL_NAMES,
     CallableActor,
@@ -33,11 +32,9 @@ from libero_eval.user_policy import (
     weights_digest,
 )
 from lifelong.errors import ConfigError, LifelongError, PolicyError, ProtocolError
-from lifelong.evaluation.restore import restore
 from lifelong.results.run_directory import CheckpointFolder
-from lifelong.stats.intervals import wilson_interval
-from tests.harness import policy_servers
-from tests.harness.evaluations import QUICK, TASKS, Countdown, Still, evaluate, evaluation
+from lifelong.stats.intervals import Estimate, wilson_interval
+from tests.harness.evaluations import QUICK, TASKS, Still, evaluate, evaluation
 from tests.harness.results import result_of, task_result
 from tests.harness.runs import make_run
 
@@ -74,26 +71,15 @@ def test_success_with_intervals_overall_and_by_task(tmp_path):
     results = result.tasks
     assert [r.successes for r in results] == [(True, True, True, False)] * 2
     assert results[0].lengths == (3, 4, 9, 10) and results[0].steps == pytest.approx(16 / 3)
-    low, high = wilson_interval(3, 4)
-    assert (results[0].success.low, results[0].success.high) == (low, high)
+    assert np.isnan([results[0].success.low, results[0].success.high]).all(), "of four episodes"
     assert set(policy.instructions) == {t.language for t in TASKS}
     found = json.loads((tmp_path / "eval.json").read_text())
     assert EvaluationResult.read(tmp_path) == result
     assert found["success"]["value"] == 0.75
-    both = overall(results)
-    assert low < both.low < 0.75 < both.high < high, "two tasks tell more than one"
+    low, high = map(float, wilson_interval(6, 8))
+    assert overall(results) == Estimate(0.75, low, high), "of all episodes"
     assert found["predicates"] == {"Turnon": 1.0, "On": 0.75}
     assert found["init_states"] == [3, 4, 9, 20] and found["evaluated"] == {"policy": "still"}
-
-
-def test_tasks_with_results_are_not_evaluated_again(tmp_path):
-    first = evaluate(tmp_path, tasks=TASKS[:1])
-
-    def env(task, count):
-        assert task is TASKS[1], "the first task's results are on disk"
-        return Countdown(count)
-
-    assert evaluate(tmp_path, env=env).tasks[0] == first.tasks[0]
 
 
 @pytest.mark.parametrize("changes", [
@@ -187,12 +173,11 @@ def test_an_option_that_a_policy_does_not_obey_is_refused_by_name(learned, polic
 
 def test_what_moves_relative_to_its_pose_is_refused_absolute_actions(learned, tmp_path):
     (tmp_path / "own.yaml").write_text("extends: libero\nworld: {delta: false}\n")
-    with policy_servers.served(ServedPolicy(restore(learned, device="cpu"))) as address:
-        for policy in ("expert", str(learned), address):
-            with pytest.raises(ConfigError, match="own has absolute actions"):
-                plan_evaluation(
-                    EvalRequest(policy=policy, suite=("libero_goal/0",), protocol=str(tmp_path / "own.yaml"))
-                )
+    for policy in ("expert", str(learned)):
+        with pytest.raises(ConfigError, match="own has absolute actions"):
+            plan_evaluation(
+                EvalRequest(policy=policy, suite=("libero_goal/0",), protocol=str(tmp_path / "own.yaml"))
+            )
 
 
 @pytest.mark.parametrize("changes", [
@@ -327,9 +312,13 @@ def test_the_expert_that_avoids_is_another_policy_and_is_run_again_from_its_resu
     words = ["--suite", "libero_goal/4", "--episodes", "1", "--horizon", "50", "--threads", "1"]
     for name in ("expert", "expert-avoid"):
         assert cli.main(["eval", name, *words]) == 0
-    plain, avoiding = (EvaluationResult.read(f"eval/{name}") for name in ("expert", "expert-avoid"))
+    plain, avoiding = (
+        EvaluationResult.read(f"eval/{name}/horizon=50") for name in ("expert", "expert-avoid")
+    )
     assert avoiding.evaluated["policy"] == "expert-avoid" and plain.actions != avoiding.actions
-    assert cli.main(["eval", "eval/expert-avoid/eval.json", "--threads", "1", "--out", "again"]) == 0
+    assert (
+        cli.main(["eval", "eval/expert-avoid/horizon=50/eval.json", "--threads", "1", "--out", "again"]) == 0
+    )
     assert EvaluationResult.read("again").actions == avoiding.actions
     assert cli.main(["eval", "expert-careful", *words]) == 2 and "expert-careful" in capsys.readouterr().err
 
@@ -380,10 +369,6 @@ def test_selection_and_reporting_states_are_disjoint():
     assert choose_init_states("reporting", 2) == (0, 1) and len(choose_init_states("selection", None)) == 20
     with pytest.raises(ConfigError, match="1 to 15"):
         choose_init_states("selection", 16, range(15))
-
-
-def test_protocols_know_every_suite():
-    assert load_protocol("openpi").steps(TASKS[0]) == 300 and load_protocol("libero").steps(TASKS[0]) == 600
 
 
 def test_names_and_conventions_of_the_original():
@@ -556,7 +541,7 @@ def test_several_workers_of_the_command_line_have_the_result_of_one(module, tmp_
     assert (one.environment["robot"], one.environment["models"]) == ("robosuite-1.4.1", "builtin")
     assert cli.main([*command, "--out", "until", "--workers", "2", "--until", "width=0.6"]) == 0
     until = EvaluationResult.read(tmp_path / "until")
-    assert until.stop_note == "stopped after 6 of 10; width=0.6: known" and until.init_states == (0, 1, 2)
+    assert until.stop_note == "stopped after 6 of 10; width=0.6: known" and until.init_states == (0, 2, 4)
     assert until.tasks == tuple(task.of_starts(until.init_states) for task in one.tasks)
     assert cli.main([*command, "--out", "two", "--unit-starts", "5"]) == 2
     assert "unit_starts is 2 there and 5 here" in capsys.readouterr().err
@@ -598,14 +583,14 @@ def test_a_policy_sees_a_camera_that_it_adds(tmp_path, monkeypatch, capsys):
         "2",
     ]
     assert cli.main([*command, "--threads", "1", "--videos", "1"]) == 0
-    assert EvaluationResult.read(next(tmp_path.glob("eval/*"))).tasks[0].successes == (False, False)
+    assert EvaluationResult.read(next(tmp_path.glob("eval/*/*/eval.json"))).tasks[0].successes == (
+        False,
+        False,
+    )
     card = tmp_path / "mine.yaml"
     card.write_text("extends: libero\ntitle: t\npixels: {cameras: ['top,pos=0 0 2,lookat=0 0 1']}\n")
     assert cli.main([*command, "--protocol", str(card)]) == 2
-    assert (
-        "pixels.cameras.0 is 'top,pos=0 0 2,lookat=0 0 1'; expected one of 'agentview'"
-        in capsys.readouterr().err
-    )
+    assert "pixels.cameras.0 is 'top,pos=0 0 2,lookat=0 0 1'; expected 'agentview'" in capsys.readouterr().err
 
 
 FEELING = """
@@ -746,15 +731,3 @@ class _Slotted:
 def test_weights_that_no_attribute_has_are_part_of_the_digest(make):
     digests = [weights_digest(make(np.full(3, value))) for value in (0.0, 0.0, 1.0)]
     assert digests[0] == digests[1] != digests[2] is not None
-
-
-def test_errors_are_reported_in_one_line(module, tmp_path, capsys):
-    for argv, message in (
-        ([f"{module}:make"], "no tasks are given"),
-        ([f"{module}:make", "--suite", "libero_object/3", "--protocol", "openvla"], "Did you mean 'openvla-oft'?"),
-        ([str(tmp_path / "no_run")], "no_run does not exist; give the directory of a run"),
-        ([str(tmp_path)], "not a run directory"),
-    ):  # fmt: skip
-        assert cli.main(["eval", *argv]) == 2
-        err = capsys.readouterr().err
-        assert message in err and err.count("\n") == 1

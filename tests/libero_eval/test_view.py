@@ -1,26 +1,32 @@
 """The scene in the browser: frames, predicates, perturbations and a policy that acts; the page and its socket."""
 
+import contextlib
 import socket
 import threading
 import time
+import urllib.error
 import urllib.request
 from contextlib import closing
 from dataclasses import replace
 
 import h5py
+import msgpack
 import numpy as np
 import pytest
 import viser
 import zstandard
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from libero_env.envs.env import LiberoEnv
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.perturbations import Perturbation
 from libero_env.tasks import Atom, Not, Then, bddl, get_task
 from libero_eval.requests import ViewRequest
-from libero_integrations.viewer import POLICY, Stage, Viewer
+from libero_integrations.stage import POLICY, Stage
+from libero_integrations.viewer import Viewer
+from libero_integrations.viewer_gate import Gate
 from tests.harness.demos import STEPS, record_wander
 
 pytestmark = pytest.mark.sim
@@ -44,6 +50,13 @@ def recording(tmp_path_factory):
 @pytest.fixture
 def stage(closing):
     return lambda what, **more: closing(Stage(ViewRequest(what=str(what), **more)))
+
+
+@pytest.fixture(scope="module")
+def open_view():
+    with closing(Stage(ViewRequest(what=TASK))) as shown, closing(Viewer(shown, "127.0.0.1", 0)) as view:
+        view.open(shown.initial)
+        yield view
 
 
 @pytest.fixture
@@ -160,6 +173,38 @@ def test_controls_choose_frames_sources_and_perturbations(viewer, recording):
     until(view, lambda: len(view.stage.frames) == 1)
 
 
+def test_a_policy_acts_a_step_at_a_time_and_its_episodes_are_counted(viewer, monkeypatch):
+    view = viewer(TASK)
+    until(view, lambda: view.stage.frames)
+    assert not any(frustum.visible for frustum in view._frustums.values())
+    seen = []
+
+    def press():
+        for wanted in (2, 3):
+            view._on_step(None)
+            while len(view.stage.frames) < wanted:
+                time.sleep(0.01)
+            time.sleep(0.2)
+            seen.append(len(view.stage.frames))
+        view._on_restart(None)
+
+    view._on_step(None)
+    threading.Thread(target=press, daemon=True).start()
+    view.update()  # until it is started again
+    assert seen == [2, 3]
+    until(view, lambda: len(view.stage.frames) == 1)
+    monkeypatch.setattr(view.stage, "act", lambda look: None)
+    for reached in (True, False):
+        view.stage.is_reached[-1] = reached
+        view.play.value = True
+        view.update()
+    assert "1 of 2 episodes of the policy reached the goal" in view.text.content
+    view.cameras.value = True
+    view._on_change()
+    view.update()
+    assert all(frustum.visible for frustum in view._frustums.values())
+
+
 def test_values_that_are_not_offered_do_not_end_it(viewer):
     """Only the page keeps to what is offered; whoever reaches the socket need not."""
     view = viewer(TASK)
@@ -188,6 +233,94 @@ def test_the_page_and_its_socket_are_served_and_a_client_may_come_back(viewer, c
     assert main(["view", TASK, "--port", str(view.port)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"--port {view.port} cannot be listened on: Address already in use" in line
+
+
+def join(view, **more):
+    """Return a client of the page, and the page's own messages so far."""
+    own = f"viser-v{viser.__version__}"
+    return connect(f"ws://127.0.0.1:{view.port}", subprotocols=[own], max_size=None, **more)
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        *(
+            {"Origin": origin}
+            for origin in ("http://evil.example", "null", "", "http://localhost:1", "file://")
+        ),
+        *(
+            {"Host": host}
+            for host in ("evil.example", "127.0.0.1.evil.example:80", "192.168.0.7", "", "[", "a@b")
+        ),
+    ],
+    ids=str,
+)
+def test_pages_of_others_are_not_let_in(open_view, headers):
+    request = urllib.request.Request(f"http://127.0.0.1:{open_view.port}/", headers=headers)
+    with pytest.raises(urllib.error.HTTPError, match="403"):
+        urllib.request.urlopen(request)
+    origin = {"origin": headers["Origin"]} if "Origin" in headers else {}
+    host = {"additional_headers": headers} if "Host" in headers else {}
+    with pytest.raises(InvalidStatus, match="403|400"), join(open_view, **origin, **host):
+        pass
+
+
+BAD = (
+    *(float("nan"), float("inf"), "7", None, True, [], [1], {}, {"a": 1}, b"7", "x" * 5000, 2**63, -(2**63)),
+    *(1e300, -1.0, 49.7, 10_000),
+)
+BROKEN = (
+    *(b"", b"\xc1", b"\x93" * 9, "text", msgpack.packb(7), msgpack.packb({}), msgpack.packb({"type": []})),
+    *(
+        msgpack.packb({"type": "GuiUpdateMessage", **more})
+        for more in ({}, {"uuid": 1}, {"uuid": [], "updates": {}})
+    ),
+    *(
+        msgpack.packb({"type": name, "share_url": 1})
+        for name in ("ShareUrlRequest", "ResetGuiMessage", "X" * 999)
+    ),
+    msgpack.packb({"type": "ViewerCameraMessage", "wxyz": [1e400] * 4, "position": "here"}),
+)
+
+
+def test_values_are_within_what_a_control_offers_before_anybody_hears_of_them(open_view):
+    gate, controls = Gate("127.0.0.1"), open_view.server.gui._gui_input_handle_from_uuid
+    gate.controls = controls.get
+    told = {"type": "GuiUpdateMessage"}
+    for uuid, control in controls.items():
+        low, high, options = (getattr(control, name, None) for name in ("min", "max", "options"))
+        for value in BAD:
+            message = msgpack.packb({**told, "uuid": uuid, "updates": {"value": value}})
+            with contextlib.suppress(ValueError):
+                found = msgpack.unpackb(gate.checked(message))["updates"]["value"]
+                assert type(found) is type(control.value) or isinstance(control.value, tuple)
+                assert (low is None or low <= found) and (high is None or found <= high)
+                assert found in options if options else abs(found) <= 1e6 or isinstance(found, str)
+            for updates in ({"label": value}, {"value": 0, "removed": value}, {}):
+                with pytest.raises(ValueError, match="is not a message"):
+                    gate.checked(msgpack.packb({**told, "uuid": uuid, "updates": updates}))
+    for content in BROKEN:
+        with contextlib.suppress(ValueError):
+            assert gate.checked(content) is None, content
+
+
+@pytest.mark.parametrize("value", [1e300, float("nan"), "7", None])
+def test_what_one_client_says_ends_no_other(open_view, value, capfd, caplog):
+    message = {"type": "GuiUpdateMessage", "uuid": open_view.start._impl.uuid, "updates": {"value": value}}
+    with join(open_view, origin=f"http://127.0.0.1:{open_view.port}") as other:
+        with join(open_view) as client, pytest.raises(ConnectionClosed, match="1008"):
+            for content in (msgpack.packb(message), b"the end"):
+                client.send(content)
+            while True:
+                client.recv(timeout=20)
+        assert open_view.start.value in (0, 49)
+        open_view.start.value = 0
+        for one in (other, stack := join(open_view)):
+            with one, contextlib.suppress(TimeoutError):
+                while one.recv(timeout=2):
+                    pass
+        stack.close()
+    assert "Traceback" not in capfd.readouterr().err + caplog.text
 
 
 def test_perturbations_of_the_protocol_are_shown_unless_others_are_named(stage, tmp_path):

@@ -107,14 +107,6 @@ def test_adapters_grow_by_the_same_number_with_each_task(make):
     assert 0 < sizes[0] < sum(p.numel() for p in policy.parameters())
 
 
-@pytest.mark.parametrize("make", ALL.values(), ids=ALL)
-def test_patterns_without_a_match_are_named(make):
-    algorithm = make()
-    algorithm.adapted, policy = ("wings.*",), make_policy()
-    with pytest.raises(ConfigError, match=r"wings.*which has encoders"):
-        algorithm.begin_task(0, sequences.dataset(0), policy)
-
-
 # --- LoRA
 
 
@@ -494,16 +486,3 @@ def test_dmpel_refuses_more_experts_of_a_task_than_act():
     with pytest.raises(ConfigError, match=r"algo.top_k=3 experts cannot act while the 4 of a task"):
         DMPEL(experts=4)
     assert DMPEL(experts=4, top_k=0).experts == DMPEL(experts=4, top_k=4).experts == 4
-
-
-def test_patterns_of_own_copies_have_to_match():
-    policy = make_policy()
-    with pytest.raises(ConfigError, match=r"algo.own=\['\*baias\*'\] matches no parameter"):
-        learn_frames(LoRA(rank=2, own=("*norm*", "*baias*")), policy, 0, 1)
-
-
-def test_policies_that_dmpel_cannot_route_are_named():
-    policy, algorithm = DeepPolicy(), DMPEL()
-    algorithm.router = small_router(1, 0)
-    with pytest.raises(ConfigError, match="DeepPolicy has no encode"), algorithm.policy_for(0, policy):
-        pass

@@ -7,6 +7,7 @@ import torch
 
 from lifelong import checkpoints
 from lifelong.algorithms import ER, EWC, PackNet
+from lifelong.algorithms.anchor import WeightedDistance
 from lifelong.algorithms.importance import BatchFisher, SampleFisher
 from lifelong.data.memory import ReplayMemory
 from lifelong.seeding import generator
@@ -44,6 +45,25 @@ def test_ewc_penalty_is_zero_at_the_anchor_and_only_there(estimator):
     with torch.no_grad():
         policy.linear.weight[0, 0] += 0.1
     assert algorithm.penalty(policy).item() > 0
+
+
+def test_the_distance_from_an_anchor_is_the_written_out_sum_whatever_lies_how_in_memory():
+    """What a checkpoint holds is contiguous; a resumed run goes on to the same bits."""
+    draws = generator(0)
+    channels_last = {"memory_format": torch.channels_last}
+    shapes = torch.zeros(6, 4, 3, 3).to(**channels_last), torch.zeros(5, 9).T, torch.zeros(7), torch.zeros(())
+    drawn = [[torch.empty_like(t).copy_(torch.rand(t.shape, generator=draws)) for t in shapes] for _ in "abc"]
+    weights, anchors, importance = [t.requires_grad_() for t in drawn[0]], drawn[1], drawn[2]
+
+    def gradients(value):
+        return value, *torch.autograd.grad(3 * value, weights)
+
+    written = sum((o * (w - a).square()).sum() for w, a, o in zip(weights, anchors, importance, strict=True))
+    found = gradients(WeightedDistance.apply(anchors, importance, *weights))
+    torch.testing.assert_close(found, gradients(written))
+    stored = ([t.contiguous() for t in tensors] for tensors in (anchors, importance))
+    resumed = gradients(WeightedDistance.apply(*stored, *weights))
+    assert all(torch.equal(a, b) and a.stride() == b.stride() for a, b in zip(found, resumed, strict=True))
 
 
 def test_fisher_per_sample_is_the_mean_squared_gradient_of_single_windows():

@@ -6,10 +6,8 @@ import torch
 from lifelong.algorithms import Averaging, Sequential
 from lifelong.checkpoints import check
 from lifelong.errors import ConfigError
-from lifelong.settings import build
 from tests.harness import sequences
 from tests.harness.algorithms import learn
-from tests.harness.configs import composed
 from tests.harness.fakes import DeepPolicy, Windows
 
 
@@ -113,8 +111,3 @@ def test_nothing_is_kept_from_task_to_task_but_a_number() -> None:
     learner.begin_task(2, Windows(2), acting)
     assert learner.before is not None
     check(learner.state_dict(), Averaging.state_form, "state", acting)
-
-
-def test_a_share_above_one_is_refused_in_one_line() -> None:
-    with pytest.raises(ConfigError, match=r"share is 2\.0; expected at most 1"):
-        build(composed("algo=averaging", "algo.share=2.0").algo)

@@ -6,14 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 from libero_env.envs.batch import BatchEnv
 from libero_eval.judging.comparability import Group, check_comparable, check_same_back_end
 from libero_eval.judging.comparison import compare_groups
 from libero_eval.protocols.files import load_protocol
-from lifelong.errors import ComparisonError, ConfigError, ProtocolError
+from lifelong.errors import ComparisonError, ProtocolError
 from lifelong.evaluation.rollout import run_episodes
-from lifelong.evaluation.settings import EvalSettings
 from lifelong.report.comparison import compare
 from tests.harness.records import run_start
 from tests.harness.results import PROTOCOL, drawn_result
@@ -66,12 +65,6 @@ def test_runs_of_different_ones_are_not_compared():
 
 def test_the_record_of_a_run_names_it():
     assert run_start(["t"]).backend == "mujoco" and run_start(["t"], backend="warp").backend == "warp"
-
-
-@pytest.mark.parametrize("backend", ["physx", "warp,contacts=none", "mujoco,device=cpu"])
-def test_settings_with_one_that_is_not_valid_are_refused(backend):
-    with pytest.raises(ConfigError, match=r"eval\.backend"):
-        EvalSettings(backend=backend)
 
 
 def test_the_command_names_what_is_not_valid(capsys, tmp_path):

@@ -6,9 +6,7 @@ import dataclasses
 import pytest
 import torch
 
-from libero_env.errors import UnknownNameError
 from lifelong.algorithms.importance import BatchFisher
-from lifelong.composition import compose_run
 from lifelong.errors import ConfigError
 from lifelong.seeding import generator
 from lifelong.settings import build
@@ -205,11 +203,6 @@ def test_packnet_forgets_as_the_original_only(compat):
 
 
 # --- all of them
-
-
-def test_another_choice_is_refused():
-    with pytest.raises(UnknownNameError, match="Valid: libero, none"):
-        compose_run(["algo=er", "compat=robomimic"])
 
 
 def test_the_sequence_sets_the_augmentation_of_its_algorithm(tmp_path):

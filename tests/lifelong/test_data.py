@@ -138,11 +138,6 @@ def test_demonstrations_that_do_not_fit_the_spec_are_refused(change: dict, messa
         SequenceVLDataset.from_demos([demo], spec=PolicySpec(**(base | change)), language=torch.zeros(4))
 
 
-def test_no_demonstrations_are_refused() -> None:
-    with pytest.raises(DataError, match="at least one"):
-        SequenceVLDataset.from_demos([], spec=SPEC, language=torch.zeros(4))
-
-
 @pytest.mark.parametrize("budget", [1, 7, 30, 1000])
 def test_memory_is_never_over_budget_and_splits_it_evenly(budget: int) -> None:
     memory, generator = ReplayMemory(budget), torch.Generator().manual_seed(0)

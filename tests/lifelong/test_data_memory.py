@@ -1,7 +1,6 @@
 """Wherever frames are held, batches are the same to the bit; robomimic reads the same."""
 
 import itertools
-import json
 import multiprocessing
 import os
 from pathlib import Path
@@ -10,10 +9,9 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from filelock import FileLock
 
 from libero_env.demos.read import Episode, demo_lengths, read_demos
-from libero_env.errors import DemoError
+from libero_env.errors import LiberoError
 from lifelong.data import DemoSource, ReplayMemory, frame_cache, loading, open_windows
 from lifelong.data.frame_cache import FrameFile, cache_root
 from lifelong.data.loading import choose_memory
@@ -122,7 +120,7 @@ def test_other_settings_have_other_frames(path: Path) -> None:
         source = DemoSource(expert, SPEC, **kind)
         plain = open_windows(source, language=LANGUAGE, memory="host")
         assert_same(everything(open_windows(source, language=LANGUAGE, memory="disk")), everything(plain))
-    assert len(list(cache_root().glob("other_demo-*"))) == len(kinds)
+    assert len([one for one in cache_root().glob("other_demo-*") if one.is_dir()]) == len(kinds)
 
 
 def test_a_file_that_was_recorded_again_is_read_again(path: Path) -> None:
@@ -136,7 +134,7 @@ def test_a_file_that_was_recorded_again_is_read_again(path: Path) -> None:
     assert_same(everything(after), everything(open_windows(source, language=LANGUAGE, memory="host")))
     assert not torch.equal(after.images.to(CPU), kept)
     assert torch.equal(before.images.to(CPU), kept)  # whoever has the old frames open keeps them
-    assert len(list(cache_root().glob("task_demo-*"))) == 1
+    assert len([one for one in cache_root().glob("task_demo-*") if one.is_dir()]) == 1
 
 
 def test_files_of_a_killed_process_are_not_taken_as_complete(
@@ -161,8 +159,7 @@ def test_files_of_a_killed_process_are_not_taken_as_complete(
 
 @pytest.mark.parametrize(
     ("name", "how"),
-    [*itertools.product(["images.u8", "arrays.npz", "index.json"], ["truncated", "changed"])]
-    + [("images.u8", "missing")],
+    [*itertools.product(["images.u8", "arrays.npz"], ["truncated", "changed"]), ("images.u8", "missing")],
 )
 def test_frames_that_are_broken_are_written_again(path: Path, caplog, name: str, how: str) -> None:
     source = DemoSource(path, SPEC)
@@ -176,9 +173,8 @@ def test_frames_that_are_broken_are_written_again(path: Path, caplog, name: str,
     elif how == "changed":
         file.write_bytes(content[:half] + bytes([content[half] ^ 4]) + content[half + 1 :])
     assert_same(everything(open_windows(source, language=LANGUAGE, memory="disk")), expected)
-    (line,) = [m for m in caplog.messages if "written again" in m]
-    assert line.startswith(str(file.parent)) and line.endswith("written again")
-    assert file.exists()
+    (line,) = [m for m in caplog.messages if "made again" in m]
+    assert line.startswith(str(file.parent)) and file.exists()
 
 
 @pytest.fixture
@@ -246,54 +242,14 @@ def test_the_next_batch_is_read_ahead_in_every_kind_of_dataset(path: Path, monke
     assert expected == [held.frames(second).flatten().tolist()]
 
 
-def test_large_files_of_frames_are_compared_in_parts(path: Path, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(frame_cache, "_BLOCK_BYTES", 32)  # so that the frames are more than all blocks
-    source = DemoSource(path, SPEC)
-    expected = everything(open_windows(source, language=LANGUAGE, memory="disk"))
-    (file,) = cache_root().glob("task_demo-*/images.u8")
-    size = file.stat().st_size
-    assert size > 64 * 32
-    for at in (0, size - 1):
-        with file.open("rb+") as handle:
-            handle.seek(at)
-            byte = handle.read(1)
-            handle.seek(at)
-            handle.write(bytes([byte[0] ^ 1]))
-        assert_same(everything(open_windows(source, language=LANGUAGE, memory="disk")), expected)
-        (file,) = cache_root().glob("task_demo-*/images.u8")
-    assert len(caplog.messages) == 2
-
-
-def test_a_folder_that_cannot_be_written_is_one_line(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("LIBERO_CACHE", str(path))  # a file
-    with pytest.raises(DataError, match=r"cannot be written .* set data\.memory=host") as caught:
-        open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="disk")
-    assert "\n" not in str(caught.value)
-
-
-def test_a_process_that_writes_for_too_long_is_named(path: Path, monkeypatch, caplog) -> None:
-    monkeypatch.setattr(frame_cache, "_PATIENCE", 0.01)
-    monkeypatch.setattr(frame_cache, "_LONGEST_BUILD", 0.01)
-    source = DemoSource(path, SPEC)
-    open_windows(source, language=LANGUAGE, memory="disk")
-    (folder,) = cache_root().glob("task_demo-*")
-    (folder / "index.json").unlink()
-    with (
-        FileLock(folder.with_name(f".{folder.name}.lock")),
-        pytest.raises(DataError, match="another process has written it"),
-    ):
-        open_windows(source, language=LANGUAGE, memory="disk")
-    assert caplog.messages == [f"waiting for another process, which writes {folder}"]
-
-
 def build(path: Path, counter: Path) -> None:
     """Open the frames, in another process, and report if they had to be written."""
     write = frame_cache._write_arrays
 
-    def counted(source: DemoSource, folder: Path) -> tuple[int, ...]:
+    def counted(source: DemoSource, folder: Path) -> None:
         with open(counter, "a") as file:
             file.write("written\n")
-        return write(source, folder)
+        write(source, folder)
 
     frame_cache._write_arrays = counted
     held = open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="disk")
@@ -315,17 +271,9 @@ def test_one_of_several_processes_writes(path: Path, tmp_path: Path) -> None:
 def test_a_full_disk_is_reported_and_leaves_nothing(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = type("Usage", (), {"free": 10})
     monkeypatch.setattr(frame_cache.shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(DataError, match=r"cannot be written.*LIBERO_CACHE.*data\.memory=host"):
+    with pytest.raises(LiberoError, match=r"cannot be made.*free.*LIBERO_CACHE"):
         open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="disk")
     assert [p.suffix for p in cache_root().iterdir()] == [".lock"]
-
-
-def test_broken_files_are_refused_in_all_memories(path: Path) -> None:
-    with h5py.File(path, "a") as file:
-        del file["data/demo_1/obs/gripper_states"]
-    for memory in ("host", "disk"):
-        with pytest.raises(DemoError, match=r"task_demo\.hdf5.*demo_1.*gripper_states"):
-            open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory=memory)
 
 
 @pytest.mark.parametrize(("gpu", "host", "expected"), [
@@ -338,14 +286,6 @@ def test_auto_chooses_by_what_is_free(monkeypatch, gpu, host, expected) -> None:
     monkeypatch.setattr(loading, "host_memory", lambda: tuple(gib * n for n in host))
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda _: tuple(gib * n for n in gpu))
     assert choose_memory(21 * gib, GPU if gpu else CPU) == expected
-
-
-def test_memories_that_do_not_exist_name_the_valid_ones(path: Path) -> None:
-    source = DemoSource(path, SPEC)
-    with pytest.raises(DataError, match="valid: auto, host, pinned, device, disk"):
-        open_windows(source, language=LANGUAGE, memory="tape")
-    with pytest.raises(DataError, match="valid: auto, host, disk"):
-        open_windows(source, language=LANGUAGE, memory="pinned")
 
 
 def test_replay_memory_accepts_windows_held_on_disk(path: Path) -> None:
@@ -362,11 +302,3 @@ def test_lengths_are_those_of_the_demonstrations(path: Path) -> None:
         for limit in (None, 2):
             found: list[Episode] = read_demos(path, [], limit, pairing=pairing)
             assert demo_lengths(path, limit, pairing=pairing) == [len(demo) for demo in found]
-
-
-def test_the_index_states_what_frames_were_made_from(path: Path) -> None:
-    open_windows(DemoSource(path, SPEC, limit=2), language=LANGUAGE, memory="disk")
-    (index,) = cache_root().glob("*/index.json")
-    found = json.loads(index.read_text())
-    assert found["source"] == str(path.resolve()) and found["read"]["limit"] == 2
-    assert found["shape"] == [7, 2, 6, 8, 3]

@@ -1,5 +1,6 @@
 """Which file a task's demonstrations are read from."""
 
+import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,8 +9,13 @@ import h5py
 import numpy as np
 import pytest
 
-from libero_env.demos.config import GENERATOR, DemoConfig
-from libero_env.demos.generate import demo_path
+from libero._adapters.controllers import controller_of
+from libero_env.assets.pack import select_pack
+from libero_env.curating.curate import examine
+from libero_env.demos.agreement import other_control
+from libero_env.demos.config import GENERATOR
+from libero_env.errors import LiberoError
+from libero_env.storage import read_yaml
 from libero_env.tasks import get_suite
 from lifelong.data import demonstrations
 from lifelong.data.settings import DataSettings
@@ -32,8 +38,18 @@ def recorded(monkeypatch):
     return names
 
 
-def settings(folder):
-    return DataSettings(demos=2, image_size=8, seq_len=1, views=["agentview_rgb"], proprio=[], folder=folder)
+def settings(folder, despite=("expert", "labels")):
+    what = {"demos": 2, "image_size": 8, "seq_len": 1, "views": ["agentview_rgb"], "proprio": []}
+    return DataSettings(**what, folder=folder, despite=despite)
+
+
+def models(**changed):
+    pack = select_pack()
+    return json.dumps({"pack": pack.name, "digest": pack.digest} | changed)
+
+
+def made_with(**kwargs):
+    return {"env_args": json.dumps({"env_kwargs": kwargs})}
 
 
 def write_demos(folder, task, demos):
@@ -57,23 +73,98 @@ def test_files_in_the_originals_layout_are_used(tmp_path, recorded, monkeypatch,
     said = f"{human} does not state whose models it shows; policies are evaluated on builtin ones"
     assert said in capsys.readouterr().err
     with h5py.File(human, "a") as file:
-        file["data"].attrs["models"] = '{"pack": "builtin"}'
+        file["data"].attrs["models"] = models()
     demonstrations.find_demos(TASKS, [2, 2, 1], data, False)
     assert "whose models" not in capsys.readouterr().err
 
 
-def own(path, task=TASKS[1], demos=2, size=8, **more):
-    """Write demonstrations of a task under any name."""
+def own(path, task=TASKS[1], demos=2, size=8, intended=range(9), **more):
+    """Write demonstrations of a task under any name; `intended` are the numbers of those with `expert_actions`."""
     stated = {"bddl_file_name": f"x/{task.name}.bddl", "bddl_file_content": task.bddl_text}
-    return write(path, [episode(i, size=size) for i in range(demos)], **stated, **more)
+    episodes = [episode(i, size=size) for i in range(demos)]
+    episodes = [e if i in intended else replace(e, expert_actions=None) for i, e in enumerate(episodes)]
+    return write(path, episodes, **stated, **more)
 
 
-def test_named_files_and_files_of_a_folder_are_found_by_the_task_that_they_state(tmp_path, recorded):
+EXPERT = {"generator": "scripted-expert-3", "disturbed": True, "robot": "libero"}
+
+
+@pytest.mark.parametrize(("name", "second", "both"), [
+    ("expert", EXPERT | {"generator": GENERATOR}, "scripted-expert-3 of {}, " + GENERATOR + " of {}"),
+    ("labels", EXPERT | {"generator": "teleoperation", "intended": ()}, "intended of {}, executed of {}"),
+    ("", EXPERT | {"disturbed": False, "intended": ()}, ""),  # of which the executed actions are the intended ones
+    ("models", EXPERT | {"models": models(digest="0" * 16)}, "0000000000000000"),
+])  # fmt: skip
+def test_what_differs_between_files_is_refused_unless_it_is_allowed(name, second, both, tmp_path, recorded):
+    files = [
+        own(tmp_path / "a.hdf5", TASKS[0], **EXPERT, models=models()),
+        own(tmp_path / "b.hdf5", TASKS[1], **{"models": models(), **second}),
+    ]
+    data = replace(settings(None, ()), files=[*map(str, files)])
+    find = lambda data: demonstrations.find_demos(TASKS[:2], [2, 2], data, False)  # noqa: E731
+    if not name:
+        assert find(data) == files
+        return
+    with pytest.raises(LiberoError, match=re.escape(both.format(*files))) as caught:
+        find(data)
+    allowed = replace(data, despite=re.findall(r"data.despite=\[(.*?)\]", str(caught.value))[0].split(","))
+    assert find(allowed) == files and not recorded
+    if name in ("expert", "labels"):  # what will be recorded is compared before it is
+        with pytest.raises(LiberoError, match=f"{GENERATOR} of what is recorded"):
+            demonstrations.find_demos(
+                TASKS[:1] + TASKS[2:], [2, 2], replace(data, files=[str(files[0])]), False
+            )
+        assert not recorded
+
+
+def test_noise_is_learned_only_where_it_is_asked_for(tmp_path, recorded):
+    path = own(tmp_path / "a.hdf5", **EXPERT, intended=())
+    data = replace(settings(None), files=[str(path)])
+    with pytest.raises(
+        DataError, match="has no expert_actions, and noise in actions; data.labels=executed learns"
+    ):
+        demonstrations.find_demos(TASKS[1:2], [2], data, False)
+    assert demonstrations.find_demos(TASKS[1:2], [2], replace(data, labels="executed"), False) == [path]
+
+
+def test_default_controllers_of_the_original_are_taken(tmp_path, recorded):
+    """Those that its recordings state, this package's and what robosuite 1.4 makes of a name; absent keys, too."""
+    ranges = {"input_max": 1, "input_min": -1, "output_max": [0.05] * 3 + [0.5] * 3}
+    gains = {
+        "kp": 150,
+        "damping_ratio": 1,
+        "impedance_mode": "fixed",
+        "kp_limits": [0, 300],
+        "control_delta": True,
+    }
+    limits = {
+        "damping_ratio_limits": [0, 10],
+        "position_limits": None,
+        "orientation_limits": None,
+        "ramp_ratio": 0.2,
+    }
+    whole = {"type": "OSC_POSE", **ranges, **gains, **limits, "uncouple_pos_ori": True, "interpolation": None}
+    for number, stated in enumerate((
+        whole, [whole], {"type": "OSC_POSE"}, "OSC_POSE", {}, None, {"kp": [150.0] * 6}, controller_of("OSC_POSE"),
+        read_yaml("demos/original_env.yaml")["controller_configs"],
+    )):  # fmt: skip
+        path = own(
+            tmp_path / f"{number}.hdf5", **made_with(controller_configs=stated, robots=["OnTheGroundPanda"])
+        )
+        assert demonstrations.find_demos(
+            TASKS[1:2], [2], replace(settings(None, ()), files=[str(path)]), False
+        )
+        assert other_control(path) == "" and not examine(path).notes
+
+
+def test_named_files_are_found_by_the_task_that_they_state(tmp_path, recorded):
     path = own(tmp_path / "deep" / "whatever.hdf5")
-    for data in (replace(settings(None), files=[str(path)]), settings(str(tmp_path))):
-        assert demonstrations.find_demos(TASKS, [2, 2, 2], data, False)[1] == path
-        assert recorded == [TASKS[0].name, TASKS[2].name]
-        recorded.clear()
+    data = replace(settings(None), files=[str(path)])
+    assert demonstrations.find_demos(TASKS, [2, 2, 2], data, False)[1] == path
+    assert recorded == [TASKS[0].name, TASKS[2].name]
+    with pytest.raises(DataError, match="whatever.hdf5 is not used.*name it in data.files"):
+        demonstrations.find_demos(TASKS, [2, 2, 2], settings(str(tmp_path)), False)
+    path.unlink()
     seeded = replace(settings(str(tmp_path)), seed=5)
     assert demonstrations.find_demos(TASKS[:1], [2], seeded, False)[0].parent.name == "seed5"
 
@@ -114,17 +205,23 @@ def test_a_repeated_task_has_one_file_with_the_most_demonstrations_that_are_requ
     ({"perturb": "light=0.5"}, "was rendered under light=0.5"),
     ({"seed": 2}, "was recorded with seed 2; data.seed is 1"),
     ({"generator": "teleoperation", "robot": "robosuite-1.4.1"}, "data.robot is libero"),
-    ({"models": '{"pack": "moon"}'}, "shows the models moon; those of this run are"),
+    ({"models": models(pack="moon")}, "shows the models moon "),
+    ({"models": models(digest="0" * 16)}, "those of this run are"),
+    ({"generator": "teleoperation", "robot": "libero", "intended": (0,)}, "has no expert_actions in demo_1"),
+    (made_with(controller_configs={"type": "OSC_POSE", "control_delta": False}), "control_delta False"),
+    (made_with(controller_configs="JOINT_POSITION"), "type 'JOINT_POSITION' of the controller; expected 'OSC_POSE'"),
+    (made_with(controller_configs=[{"output_max": 1}]), "output_max 1"),
+    (made_with(controller_configs={"type": "BASIC", "body_parts": {}}), "type 'BASIC'"),
+    (made_with(controller_configs={"input_type": "delta"}), "input_type 'delta' of the controller; expected no such"),
+    (made_with(robots=["Sawyer"]), "the robots ['Sawyer']"),
+    (made_with(control_freq=10), "was recorded at 10 Hz"),
     ({"variation": '{"reserved": true}'}, "stored initial states, from which policies are evaluated"),
 ])  # fmt: skip
 def test_demonstrations_that_do_not_fit_are_refused_by_name(kwargs, words, tmp_path, recorded):
     path = own(tmp_path / "mine.hdf5", **kwargs)
-    for data in (
-        replace(settings(None), files=[str(path)], seed=1),
-        replace(settings(str(tmp_path)), seed=1),
-    ):
-        with pytest.raises(DataError, match=rf"mine.hdf5 .*{re.escape(words)}"):
-            demonstrations.find_demos(TASKS, [2, 2, 2], data, False)
+    data = replace(settings(None), files=[str(path)], seed=1)
+    with pytest.raises(DataError, match=rf"mine.hdf5 .*{re.escape(words)}"):
+        demonstrations.find_demos(TASKS, [2, 2, 2], data, False)
     (tmp_path / "layout" / TASKS[1].suite).mkdir(parents=True)
     file = path.rename(tmp_path / "layout" / TASKS[1].suite / f"{TASKS[1].name}_demo.hdf5")
     with pytest.raises(DataError, match=re.escape(f"data.folder: {file} ") + f".*{re.escape(words)}"):
@@ -133,34 +230,11 @@ def test_demonstrations_that_do_not_fit_are_refused_by_name(kwargs, words, tmp_p
     assert not recorded
 
 
-def test_what_the_expert_recorded_otherwise_is_told_and_recorded_again(tmp_path, recorded, capsys):
-    own(tmp_path / "expert.hdf5", size=16, generator=GENERATOR, robot="libero")
-    demonstrations.find_demos(TASKS[1:2], [2], settings(str(tmp_path)), False)
-    assert recorded == [TASKS[1].name] and "not used" in capsys.readouterr().err
-    demonstrations.find_demos(TASKS[:1], [2], settings(str(tmp_path)), False)
-    assert f"other tasks only, such as {TASKS[1].name}" in capsys.readouterr().err
-
-
 def test_a_file_in_the_layout_is_refused_where_it_states_another_task(tmp_path, recorded):
     (tmp_path / TASKS[1].suite).mkdir()
     own(tmp_path / TASKS[1].suite / f"{TASKS[1].name}_demo.hdf5", TASKS[0])
     with pytest.raises(DataError, match=f"is of '{TASKS[0].name}', not of '{TASKS[1].name}'"):
         demonstrations.find_demos(TASKS, [2, 2, 2], settings(str(tmp_path)), False)
-
-
-def test_a_file_of_the_user_goes_before_what_the_expert_recorded_in_its_folder(tmp_path, recorded):
-    path = demo_path(tmp_path, DemoConfig(TASKS[1], (8, 8)))
-    path.parent.mkdir(parents=True)
-    expert = {"generator": GENERATOR, "robot": "libero"}
-    own(path, **expert)
-    own(tmp_path / "seed5.hdf5", **expert | {"seed": 5})
-    demonstrations.find_demos(TASKS[1:2], [2], settings(str(tmp_path)), False)
-    assert recorded == [TASKS[1].name], "which goes on with its own"
-    (tmp_path / "seed5.hdf5").unlink()
-    for more in ({"generator": "teleoperation"}, {"filter": "without no-ops"}):
-        mine = own(tmp_path / "mine.hdf5", **expert | more)
-        assert demonstrations.find_demos(TASKS[1:2], [2], settings(str(tmp_path)), False) == [mine]
-        mine.unlink()
 
 
 def test_files_of_no_task_of_the_run_or_of_the_same_task_are_refused(tmp_path, recorded):
@@ -172,22 +246,6 @@ def test_files_of_no_task_of_the_run_or_of_the_same_task_are_refused(tmp_path, r
         with pytest.raises(DataError, match=words):
             data = replace(settings(None), files=list(map(str, files)))
             demonstrations.find_demos(tasks, [2] * len(tasks), data, False)
-    with pytest.raises(DataError, match="several files"):
-        demonstrations.find_demos(TASKS, [2, 2, 2], settings(str(tmp_path)), False)
-
-
-def test_links_in_a_folder_are_not_followed_and_told(tmp_path, recorded, capsys):
-    elsewhere, folder = tmp_path / "elsewhere", tmp_path / "folder"
-    elsewhere.mkdir()
-    in_layout = write_demos(elsewhere, TASKS[0], 2)
-    folder.mkdir()
-    (folder / TASKS[0].suite).symlink_to(in_layout.parent)  # is used
-    (folder / "a.hdf5").symlink_to(own(elsewhere / "a.hdf5"))
-    (folder / "more").symlink_to(elsewhere)
-    demonstrations.find_demos(TASKS[:2], [2, 2], settings(str(folder)), False)
-    assert recorded == [TASKS[1].name]
-    links = f"{folder / 'a.hdf5'}, {folder / 'more'}"
-    assert f"not used: links, which are not followed: {links}; see data.files" in capsys.readouterr().err
 
 
 def test_files_may_be_of_tasks_that_are_learned_before_or_after(tmp_path, recorded):
@@ -201,9 +259,3 @@ def test_without_a_folder_recorded_files_are_used(tmp_path, recorded, monkeypatc
     monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path))
     demonstrations.find_demos(TASKS, [1, 1, 1], settings(None), False)
     assert recorded == [task.name for task in TASKS]
-
-
-def test_too_few_demonstrations_are_reported(tmp_path, recorded):
-    write_demos(tmp_path, TASKS[0], 1)
-    with pytest.raises(DataError, match="has 1 demonstrations and 2 are required"):
-        demonstrations.find_demos(TASKS[:1], [2], settings(str(tmp_path)), False)

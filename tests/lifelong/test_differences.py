@@ -8,8 +8,7 @@ import pytest
 from scipy import stats
 
 from libero_eval.judging.power_text import shown, table
-from lifelong.errors import ConfigError
-from lifelong.stats.episodes import (
+from libero_eval.stats.episodes import (
     Counts,
     Pairs,
     bootstrap_starts,
@@ -20,7 +19,7 @@ from lifelong.stats.episodes import (
     score_interval,
     sign_flip_test,
 )
-from lifelong.stats.power import (
+from libero_eval.stats.power import (
     Question,
     discordance_of,
     paired_episodes,
@@ -29,7 +28,8 @@ from lifelong.stats.power import (
     shown_difference,
     unpaired_episodes,
 )
-from lifelong.stats.sequential import log_evidence, rounds, sequential_test
+from libero_eval.stats.sequential import log_evidence, rounds, sequential_test
+from lifelong.errors import ConfigError
 
 
 def pairs(first, second, tasks: int = 1) -> Pairs:
@@ -58,7 +58,7 @@ def test_tangos_interval_has_a_width_where_nothing_differs_and_stays_inside():
     assert same.low == -same.high < 0 < same.high < 0.01
     assert score_interval(Counts(0, 5, 0, 0)).high == 1.0 > score_interval(Counts(0, 5, 0, 0)).low > 0
     assert score_interval(Counts(0, 0, 5, 0)).low == -1.0
-    assert score_interval(Counts(1, 0, 0, 0)).high < 1
+    assert score_interval(Counts(5, 0, 0, 0)).high < 1 and math.isnan(score_interval(Counts(4, 0, 0, 0)).high)
 
 
 def test_mcnemar_is_the_binomial_test_of_the_discordant_pairs():
@@ -81,10 +81,10 @@ def test_sign_flips_of_several_runs_are_exact_for_few_starts():
 
 def test_the_bootstrap_draws_starts_within_tasks():
     """Tasks that differ from each other, but not within, have no spread over starts and much over tasks."""
-    found = pairs([1] * 10 + [0] * 10, [0] * 10 + [1] * 10, tasks=2)
+    found = pairs([1] * 15 + [0] * 15, [0] * 15 + [1] * 15, tasks=6)
     starts, tasks = bootstrap_starts(found, draws=200), bootstrap_tasks(found, draws=200)
     assert (starts.low, starts.high) == (0, 0)
-    assert tasks is not None and (tasks.low, tasks.high) == (-1, 1)
+    assert tasks is not None and tasks.low < -0.5 and tasks.high > 0.5
     assert bootstrap_tasks(pairs([1, 0], [0, 0])) is None
 
 
@@ -137,7 +137,8 @@ def test_looking_at_every_pair_is_rarely_wrong():
 def test_the_sequential_test_goes_round_all_tasks():
     found = pairs([1] * 12, [0] * 12, tasks=3)
     order = rounds(found)
-    assert found.tasks[order].tolist() == [0, 1, 2] * 4 and found.starts[order][:4].tolist() == [0, 0, 0, 1]
+    assert found.tasks[order].tolist() == [0, 1, 2] * 4
+    assert found.starts[order].reshape(4, 3).tolist() == [[start] * 3 for start in (0, 2, 1, 3)]
     test = sequential_test(found)
     # e = 2^n / (n + 1) for n wins in a row: above 20 at n = 8
     assert test.decided_after == 8 and test.first_better is True
@@ -235,12 +236,7 @@ LIBERO_MAX = {
 def test_published_counts_under_events_pass_through_the_arithmetic_of_comparisons(name):
     base, dynamic, loss = LIBERO_MAX[name]
     lost = round(base * loss / 100)
-    cells = (
-        base - lost,
-        lost,
-        dynamic - (base - lost),
-        8000 - dynamic - lost,
-    )  # as in Counts
+    cells = (base - lost, lost, dynamic - (base - lost), 8000 - dynamic - lost)  # as in Counts
     first, second = (
         np.repeat(won, cells)[:, None] for won in ([True, True, False, False], [True, False, True, False])
     )

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from libero_env.sim.causes import Failure
 from libero_env.sim.costs import Costs
-from lifelong.report.tables import failure_table, tally_table
+from lifelong.report.tables import interference_table, tally_tables
 from lifelong.results.failures import (
     QUADRANTS,
     causes_text,
@@ -53,9 +53,10 @@ def test_causes_and_interference_of_a_run():
     }
     # the cheese is that of task 1, the open drawer the goal of task 2, and the bowl that was dropped that of task 0
     assert score.interference == {(0, 1): 1, (0, 2): 1, (1, 0): 1}
-    table = failure_table(score, ["bowl", "cheese", "drawer"])
-    assert table["tables"][0][1][0] == (0, "bowl", [0, 1, 1])
-    assert table["served"] == [(0, "bowl", [0, 1, 1]), (1, "cheese", [1, 0, 0]), (2, "drawer", [0, 0, 0])]
+    names = ["bowl", "cheese", "drawer"]
+    assert tally_tables(score, names)[0].rows[0] == [1, "bowl", 0, 1, 1]
+    served = [[1, "bowl", "", 1, 1], [2, "cheese", 1, "", ""], [3, "drawer", "", "", ""]]
+    assert interference_table(score, names).rows == served
     assert causes_text(ROWS) == "dropped 2, wrong object 2, never reached 1"
     half = failure_score(Results((run_start(["a", "b", "c"]), *ROWS[:3], ROWS[5])))  # its last row has begun
     assert half.by_task == {0: {"wrong object": 1}, 1: {}} and max(half.after) == 1
@@ -64,7 +65,7 @@ def test_causes_and_interference_of_a_run():
 def test_records_keep_failures_and_runs_without_them_have_no_score():
     assert from_line(to_line(ROWS[3])) == ROWS[3]
     assert failure_score(Results((run_start(["a"]), evaluation("matrix", 0, 0, 0, 2)), ())) is None
-    assert failure_table(None, []) is None
+    assert interference_table(None, []) is None
 
 
 def test_safety_of_a_run_by_task_and_after_each():
@@ -79,11 +80,10 @@ def test_safety_of_a_run_by_task_and_after_each():
         "unsafe failure": 1,
     }
     assert score.after[0] == {"safe success": 1, "unsafe success": 0, "safe failure": 1, "unsafe failure": 0}
-    table = tally_table(score, ["bowl", "cheese", "drawer"])
-    assert table["tables"][0][1][0] == (0, "bowl", [0, 0, 1, 1])
+    assert tally_tables(score, ["bowl", "cheese", "drawer"])[0].rows[0] == [1, "bowl", 0, 0, 1, 1]
     assert safety_text(rows[3:4]).endswith("unsafe failure 1 (unsafe by shift 1, hits 1)")
     assert rollout_summary(results)["safety"]["after"][2] == score.after[2]
     assert from_line(to_line(rows[0])) == rows[0]
     after = safety_score(Results((run_start(["a", "b", "c"]), *ROWS[:3], *rows[3:]), ())).after
     assert after[0] == {**dict.fromkeys(QUADRANTS, 0), "not seen": 2} and "not seen" not in after[2]
-    assert safety_score(Results((run_start(["a"]), *ROWS[:1]), ())) is None and tally_table(None, []) is None
+    assert safety_score(Results((run_start(["a"]), *ROWS[:1]), ())) is None and tally_tables(None, []) == []

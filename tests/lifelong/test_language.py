@@ -242,8 +242,3 @@ def test_an_encoder_of_the_configuration_keeps_what_it_computed(
     assert len(list((tmp_path / "language").glob("*.npz"))) == 2
     monkeypatch.setattr(language, "_load", lambda name: pytest.fail("encoded what was cached"))
     assert torch.equal(encoder.embed(TEXTS), made)
-
-
-def test_missing_weights_name_the_remedy(tmp_path: Path) -> None:
-    with pytest.raises(LanguageError, match=r"not available.*hf download.*onehot"):
-        embed(TEXTS, str(tmp_path))

@@ -12,16 +12,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-import libero_env.parallel as parallel
+import libero_env.progress as bars
+from libero_cli.main import main
 from libero_env.assets.robot import robot_assets
-from libero_env.cli.main import main
-from libero_env.errors import LiberoError
-from libero_env.tasks import get_task
 from lifelong import experiment
 from lifelong.errors import ConfigError
 from lifelong.sweeps import read_sweep, sweep_name
-
-FIT = {"_target_": "lifelong.training.settings.FitSettings"}
 
 
 @pytest.fixture
@@ -47,30 +43,29 @@ def own(here) -> Path:
 
 # a command's words, and what its one line of an error has to name
 MISTAKES = {
-    "train.epochs=abc": ("train.epochs", "'abc'", "a whole number"),
+    "train.epochs=abc": ("train.epochs", "'abc'", "a valid integer"),
     "train.epoch=3": ("train.epoch", "Did you mean 'train.epochs'?"),
-    "lr=3e-4": ("unknown key lr", "Did you mean train.lr?"),
-    "temporal.layers=2 policy=bc_rnn_small": ("Did you mean policy.temporal.layers?",),
-    "policy=act": ("'act'", "policy=lerobot policy.type=act"),
+    "lr=3e-4": ("unknown key of the configuration 'lr'", "there is train.lr"),
+    "temporal.layers=2 policy=bc_rnn_small": ("there is policy.temporal.layers",),
+    "policy=act": ("'act'", "lerobot"),
     "policy=mine --config-dir own": ("my_policy.Mine", "neither installed nor in", "No module named 'my_policy'"),
-    "policy=mine policy/head=gmm --config-dir own": ("policy/head", "policy has no group head"),
+    "policy=mine policy/head=gmm --config-dir own": ("policy/head",),
     "--cfg job train.epochs=abc": ("train.epochs", "'abc'"),
     "--cfg job benchmark.tasks=[3,99]": ("libero_goal 99",),
     "--cfg job policy.encoder.width=17": ("17 channels",),
-    "trian.epochs=3": ("trian", "Did you mean train?"),
+    "trian.epochs=3": ("trian.epochs", "Did you mean 'train.epochs'?"),
     "+train.foo=3": ("train.foo", "unknown key", "Valid: epochs"),
     "+foo=3": ("foo", "unknown key", "Valid: seed"),
     "train.epochs": ("train.epochs", "KEY=VALUE"),
     "ewc": ("ewc", "KEY=VALUE"),
-    "lifelong=er": ("lifelong", "Did you mean algo?"),  # as in the original
-    "benchmark_name=LIBERO_GOAL": ("benchmark_name", "Did you mean benchmark?"),
-    "seed.x=1": ("seed.x", "seed=VALUE"),
+    "benchmark_name=LIBERO_GOAL": ("benchmark_name", "Did you mean 'benchmark'?"),
+    "seed.x=1": ("seed.x",),
     "benchmark=LIBERO_OBJECT": ("LIBERO_OBJECT", "Did you mean 'libero_object'?"),
     "benchmark.order=30": ("30", "0 to 20"),
-    "algo.strength=3": ("algo.strength", "algo=sequential has no keys"),
-    "algo=er algo.budget=5": ("algo.budget", "Did you mean 'algo.memory.budget'?"),
-    "foo/bar=x": ("foo/bar", "Valid: algo"),
-    "algo=er algo/estimator=batch": ("algo/estimator", "algo=NAME"),
+    "algo.strength=3": ("algo.strength", "unknown key"),
+    "algo=er algo.budget=5": ("algo.budget", "algo.memory.budget"),
+    "foo/bar=x": ("foo/bar",),
+    "algo=er algo/estimator=batch": ("algo/estimator",),
     "compat=libero algo=ewc algo/estimator=sample": ("algo/estimator has no effect with compat=libero", "BatchFisher"),
     "benchmark.horizon=100": ("benchmark.horizon has no effect with preset=smoke", "set eval.horizon"),
     "policy=bc_rnn_small policy.temporal.dropout=0.1": ("dropout=0.1 acts between layers, and there is one",),
@@ -79,7 +74,7 @@ MISTAKES = {
     "train.lr=${nothing}": ("train.lr", "'nothing' not found"),
     "train.lr=${train.lr}": ("train.lr", "Recursive"),
     "=3": ("cannot be composed",),
-    "~train": ("train", "train=NAME"),
+    "~train": ("train",),
     "device=meta": ("device", "'meta'"),
     "runs_dir=taken": ("taken is a file",),
     "data.folder=demoz": ("demoz", "Did you mean demos?"),
@@ -93,7 +88,7 @@ MISTAKES = {
     "-m algo=ewc, er": ("error",),
     "-m algo=er,ewc --cfg job": ("cannot be composed", "--multirun", "--cfg"),
     "-m algo=er,ewk": ("ewk", "Did you mean 'ewc'?"),
-    "-m algo=ewc,er algo/estimator=batch": ("algo/estimator", "algo=NAME"),
+    "-m algo=ewc,er algo/estimator=batch": ("algo/estimator",),
 }  # fmt: skip
 
 
@@ -117,7 +112,7 @@ def test_a_mistake_is_one_line_and_leaves_nothing_behind(words, own, capsys):
 def test_options_of_a_sweep_stand_anywhere(words, own, monkeypatch, capsys):
     ran = []
 
-    def run(config, names, ranks):
+    def run(config, names, *_):
         ran.append((names["algo"], config.seed))
         raise ConfigError("a run begins")
 
@@ -132,7 +127,7 @@ def test_options_of_a_sweep_stand_anywhere(words, own, monkeypatch, capsys):
 def test_a_sweep_takes_what_hydra_offers_to_name_files(chosen, own, monkeypatch, capsys):
     ran = []
 
-    def run(config, names, ranks):
+    def run(config, names, *_):
         ran.append(names["algo"])
         raise ConfigError("a run begins")
 
@@ -180,7 +175,7 @@ def test_a_package_that_is_not_installed_leaves_no_directory(package, message, h
 
 
 def test_lines_of_the_jobs_of_a_sweep_have_their_names(here, monkeypatch, capsys):
-    def run(config, names, ranks):
+    def run(config, names, *_):
         print("Task 1/2: a\n  epoch 0", end="")
         print(": success 0%", flush=True)
         raise ConfigError("a run begins")
@@ -203,7 +198,7 @@ def test_a_sweep_runs_again_what_is_asked_for_again(word, again, here, monkeypat
         seen.append(again)
         return replace(record, status="failed", exit_status=2)
 
-    monkeypatch.setattr("lifelong.launch.run_job", run)
+    monkeypatch.setattr("lifelong.jobs.run_job", run)
     main(["train", "-m", "seed=1,2", word])
     assert seen == [again] * 2
 
@@ -215,7 +210,7 @@ def test_jobs_of_one_folder_with_other_names_of_their_runs_are_others(here, monk
         keys.append(record.key)
         return replace(record, status="failed", exit_status=2)
 
-    monkeypatch.setattr("lifelong.launch.run_job", run)
+    monkeypatch.setattr("lifelong.jobs.run_job", run)
     for word in ("run_id=a", "run_id=b", "runs_dir=other"):
         main(["train", "-m", "seed=1,2", "hydra.sweep.dir=sweep", word])
     monkeypatch.setattr(experiment, "default_drawing", lambda pack: "faithful")  # as of other models
@@ -226,7 +221,7 @@ def test_jobs_of_one_folder_with_other_names_of_their_runs_are_others(here, monk
 def test_every_job_of_a_sweep_is_checked_for_what_has_no_effect(here, monkeypatch, capsys):
     ran = []
 
-    def run(config, names, ranks):
+    def run(config, names, *_):
         ran.append(config.algo.estimator._target_)
         raise ConfigError("a run begins")
 
@@ -281,20 +276,13 @@ def test_a_reader_that_has_seen_enough_is_no_error(monkeypatch, capfd):
     assert capfd.readouterr().err == ""
 
 
-def test_a_suite_is_no_task():
-    with pytest.raises(
-        LiberoError, match="libero_goal is a suite of 10 tasks, not a task; write libero_goal/0 to"
-    ):
-        get_task("libero_goal")
-
-
 class Terminal(io.StringIO):
     def isatty(self) -> bool:
         return True
 
 
 def test_progress_is_lines_where_there_is_no_terminal(monkeypatch):
-    monkeypatch.setattr(parallel, "LINE_SECONDS", 0.0)
+    monkeypatch.setattr(bars, "LINE_SECONDS", 0.0)
     for stream, progress, expected in [
         (io.StringIO(), None, "demonstrations: 2 of 2, 00:00 passed, 00:00 left\n"),
         (io.StringIO(), False, ""),
@@ -302,27 +290,82 @@ def test_progress_is_lines_where_there_is_no_terminal(monkeypatch):
         (io.StringIO(), True, "demonstrations: 100%"),
     ]:
         monkeypatch.setattr(sys, "stderr", stream)
-        with parallel.progress_bar(total=2, desc="demonstrations", progress=progress, file=stream) as bar:
+        with bars.progress_bar(total=2, desc="demonstrations", progress=progress, file=stream) as bar:
             bar.update(1)
             bar.update(1)
         assert stream.getvalue().endswith(expected) if "%" not in expected else expected in stream.getvalue()
 
 
 def test_quiet_shows_no_progress(monkeypatch):
-    monkeypatch.setattr(parallel, "LINE_SECONDS", 0.0)
+    monkeypatch.setattr(bars, "LINE_SECONDS", 0.0)
     monkeypatch.setenv("LIBERO_QUIET", "1")
     for stream, progress in itertools.product((io.StringIO(), Terminal()), (None, True)):
         monkeypatch.setattr(sys, "stderr", stream)
-        parallel.tell_progress("recording")
-        with parallel.progress_bar(total=1, progress=progress, file=stream) as bar:
+        bars.tell_progress("recording")
+        with bars.progress_bar(total=1, progress=progress, file=stream) as bar:
             bar.update(1)
         assert stream.getvalue() == ""
+
+
+class Clock:
+    now = 0.0
+
+    def time(self) -> float:
+        return self.now
+
+
+def estimates(bar, clock, moments) -> list[tuple[float, str]]:
+    """Return the time left that a bar tells, [s] or ?, at each (time, work, pieces done)."""
+    told = []
+    for now, work, done in moments:
+        clock.now = now
+        if work is not None:
+            bar.add_work(work)
+        bar.update(done)
+        told.append(str(bar).partition(" passed, ")[2].partition(" left")[0])
+    return told
+
+
+def test_the_time_left_is_right_from_its_first_telling_on(monkeypatch):
+    """Told after half a minute, and measured since the first work: what compiles before that does not count."""
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+
+    def bar(total):
+        found, clock = bars.progress_bar(total=total, desc="demonstrations", file=sys.stderr), Clock()
+        found._time, found.start_t, found.last_print_t = clock.time, 0.0, 0.0
+        return found, clock
+
+    # 20 s of compiling, then one each second
+    steady = estimates(*bar(100), [(20.0 + k, None, 1) for k in range(31)])
+    assert steady[:10] == ["?"] * 10 and steady[10] == "01:29" and steady[30] == "01:09"
+    # tens that are simulated together in 5 s and then finished one every half second, after a minute of compiling
+    rounds = [
+        moment
+        for end in (60.0, 70.0, 80.0)
+        for moment in [(end, 5.0, 0), *((end + k / 2, 0.5, 1) for k in range(1, 11))]
+    ]
+    for (now, *_), left in zip(rounds, estimates(*bar(100), rounds), strict=True):
+        assert (left == "?") == (now < 65.5)
+        if left != "?":
+            minutes, seconds = map(int, left.split(":"))
+            assert 0.5 <= (now - 55 + 60 * minutes + seconds) / 100 <= 2.0
+    # episodes that end when they succeed: nothing is told while it could be wrong by more than a factor of two
+    for end in (10, 35, 100):  # steps after which all have ended, of 100 at most, one each second
+        rollouts, clock = bar(100)
+        for step in range(1, end):
+            rollouts.least_total, rollouts.total, clock.now = step, 100, float(step)
+            rollouts.update(1)
+            left = str(rollouts).partition(" passed, ")[2].partition(" left")[0]
+            assert (left == "?") == (step < 30)
+            if left != "?":
+                minutes, seconds = map(int, left.split(":"))
+                assert 0.5 <= (step + 60 * minutes + seconds) / end <= 2.0
 
 
 def test_short_work_prints_no_lines(monkeypatch):
     stream = io.StringIO()
     monkeypatch.setattr(sys, "stderr", stream)
-    assert list(parallel.progress_bar(range(5), file=stream)) == [0, 1, 2, 3, 4]
+    assert list(bars.progress_bar(range(5), file=stream)) == [0, 1, 2, 3, 4]
     assert stream.getvalue() == ""
 
 

@@ -3,24 +3,33 @@
 `make lerobot` makes an environment with LeRobot and runs these tests in it.
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 pytest.importorskip("lerobot")
 
+from libero_env.demos.read import read_demos
+from libero_env.tasks import get_suite
 from libero_eval.user_policy import weights_digest
-from libero_integrations.lerobot_policy import FOLDER, LeRobotPolicy, lerobot_module
+from libero_integrations.exports.layouts import PUBLISHED
+from libero_integrations.imports.demonstrations import lerobot_files
+from libero_integrations.lerobot_modules import lerobot_module
+from libero_integrations.lerobot_policy import FOLDER, LeRobotPolicy
 from lifelong.data.dataset import SequenceVLDataset, last_frames
 from lifelong.data.fake import fake_observation
 from lifelong.data.windows import frame_moments, frames_of
 from lifelong.errors import ConfigError, PolicyError
 from lifelong.settings import build
+from lifelong.training.costs import action_costs
 from lifelong.training.fit import _make_optimizer
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 from tests.harness.configs import composed
+from tests.harness.demos import episode
 
 factory, configs = lerobot_module("policies.factory"), lerobot_module("configs.policies")
 LENGTHS = (9, 14)
@@ -38,7 +47,7 @@ def spec(steps: int = 8) -> PolicySpec:
 
 def policy(type: str = "act", steps: int = 8, **changes) -> LeRobotPolicy:
     given = {
-        "settings": SMALL[type], "act_steps": None, "language": True, "pretrained": None
+        "settings": SMALL.get(type), "act_steps": None, "language": True, "pretrained": None
     }  # fmt: skip
     torch.manual_seed(0)
     return LeRobotPolicy(spec=spec(steps), type=type, **(given | changes))
@@ -137,7 +146,7 @@ def test_a_policy_is_as_it_was_when_its_weights_are_loaded() -> None:
         one.eval().reset(2)
     assert torch.equal(learned.act(seen), again.act(seen))
     assert again.instructions(dataset().language[None]) == ["pick up the soup"]
-    with pytest.raises(PolicyError, match="no task that it has learned"):
+    with pytest.raises(PolicyError, match="has not learned a task of this one"):
         again.instructions(torch.zeros(1, 6))
 
 
@@ -156,10 +165,7 @@ def test_statistics_are_of_the_task_that_was_asked_for() -> None:
         assert torch.allclose(
             found["observation.state"]["std"][:3], expected.proprio["ee_pos"].std(0, correction=0)
         )
-    assert set(policy().lerobot_statistics()) == {
-        "observation.images.image",
-        "observation.images.image2",
-    }
+    assert set(policy().lerobot_statistics()) == {"observation.images.image", "observation.images.image2"}
 
 
 def test_losses_of_windows_and_distillation() -> None:
@@ -232,6 +238,67 @@ def test_algorithms_that_need_other_layers_say_so(algo) -> None:
         algorithm.begin_task(0, dataset(), policy())
 
 
+def make_smolvlm(folder) -> str:
+    """Write the configuration and the words of a vision-language model of two layers, without weights."""
+    transformers, tokenizers = pytest.importorskip("transformers"), pytest.importorskip("tokenizers")
+    special = {
+        "image_token": "<image>", "fake_image_token": "<fake>",
+        "global_image_token": "<global>", "end_of_utterance_token": "<end>",
+    }  # fmt: skip
+    words = [
+        "<unk>",
+        "<pad>",
+        "<s>",
+        "</s>",
+        *special.values(),
+        *["pick", "up", "the", "soup", "cream", "cheese"],
+    ]
+    model = tokenizers.models.WordLevel({word: k for k, word in enumerate(words)}, unk_token="<unk>")
+    tokenizer = tokenizers.Tokenizer(model)
+    tokenizer.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
+    names = {"unk_token": "<unk>", "pad_token": "<pad>", "bos_token": "<s>", "eos_token": "</s>"}
+    fast = transformers.PreTrainedTokenizerFast(
+        tokenizer_object=tokenizer, extra_special_tokens=special, **names
+    )
+    size = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 2}
+    text = {"model_type": "llama", "vocab_size": len(words), "num_key_value_heads": 1, "head_dim": 16}
+    seen = {"image_size": 64, "patch_size": 16}
+    ids = {"image_token_id": words.index("<image>"), "pad_token_id": words.index("<pad>")}
+    config = transformers.SmolVLMConfig(
+        text_config=size | text, vision_config=size | seen, scale_factor=2, **ids
+    )
+    config.save_pretrained(folder)
+    images, videos = transformers.SmolVLMImageProcessor(), transformers.SmolVLMVideoProcessor()
+    transformers.SmolVLMProcessor(images, fast, videos, image_seq_len=4).save_pretrained(folder)
+    return str(folder)
+
+
+def test_smolvla_learns_two_tasks_from_random_weights(tmp_path) -> None:
+    settings = {
+        "vlm_model_name": make_smolvlm(tmp_path), "load_vlm_weights": False, "num_vlm_layers": 2, "num_steps": 2,
+        "resize_imgs_with_padding": [64, 64], "train_expert_only": False, "freeze_vision_encoder": False,
+    }  # fmt: skip
+    one = policy("smolvla", settings=settings, language=False)
+    optimizer, tasks = torch.optim.AdamW(one.parameters(), 3e-3), [dataset(seed=k) for k in range(2)]
+    for task, instruction in zip(tasks, ("pick up the soup", "pick up the cream cheese"), strict=True):
+        one.meet_task(task, instruction)
+        one.normalise(moments(task), once=True)
+        losses = []
+        for _ in range(12):
+            torch.manual_seed(0)  # the same noise
+            losses.append(one.train().loss(task.batch(torch.arange(4))))
+            optimizer.zero_grad()
+            losses[-1].backward()
+            optimizer.step()
+        assert losses[-1] < 0.8 * losses[0]
+        assert action_costs(one, task.language)["flops_per_action"] > 0
+    seen = fake_observation(spec(), 2, torch.Generator().manual_seed(0), steps=1)
+    seen = replace(seen, language=torch.stack([task.language for task in tasks]))
+    one.eval().reset(2)
+    acted = one.act(seen, [torch.Generator().manual_seed(k) for k in range(2)])
+    assert acted.shape == (2, 7) and one.instructions(seen.language)[1] == "pick up the cream cheese"
+
+
 def test_the_configuration_builds_it() -> None:
     words = (
         "policy=lerobot",
@@ -259,3 +326,57 @@ def test_a_chunk_is_what_lerobot_would_execute(type) -> None:
     late.plan(seen[2], [], draws())
     again = plans.plan(seen[3], [1], draws())
     assert torch.equal(again, late.plan(seen[3], [1], draws())) and not torch.equal(again[0], chunk[0])
+
+
+def test_a_run_is_built_from_what_it_saved_where_it_began_with_weights_from_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_ENDPOINT", "http://127.0.0.1:1")
+    saved = policy()
+    saved.save_beside(tmp_path)
+    named = LeRobotPolicy.saved_arguments({"pretrained": "stranger/model"}, tmp_path)["pretrained"]
+    assert named == str(tmp_path / FOLDER)
+    with torch.device("meta"):  # how large it is
+        assert policy(settings={}, pretrained=named).state_dict().keys() == saved.state_dict().keys()
+    built = policy(settings={}, pretrained=named).inner.state_dict()
+    assert all(torch.equal(built[name], value) for name, value in saved.inner.state_dict().items())
+
+
+@pytest.mark.parametrize("kind", ["image", "video"])
+def test_a_data_set_that_lerobot_writes_is_read(kind, tmp_path, monkeypatch) -> None:
+    """In the features of lerobot/libero, so its images are mirrored."""
+    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
+    tasks, episodes = get_suite("libero_object").tasks[:2], [episode(k, 9, 64) for k in range(3)]
+    layout = PUBLISHED["lerobot/libero"]
+    shapes = dict.fromkeys(layout.cameras.values(), (64, 64, 3))
+    kinds = {
+        key: {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
+        for key, shape in shapes.items()
+    }
+    numbers = {layout.state: (8, layout.state_names), layout.action: (7, layout.action_names)}
+    kinds |= {
+        key: {"dtype": "float32", "shape": (n,), "names": list(names)} for key, (n, names) in numbers.items()
+    }
+    ramp = np.linspace(0, 180, 64)[None, :, None] * np.ones((64, 1, 3))  # which videos preserve
+    written = lerobot_module("datasets.lerobot_dataset").LeRobotDataset.create(
+        "me/mine", fps=10, features=kinds, root=tmp_path / "set", use_videos=kind == "video"
+    )
+    for number, one in enumerate(episodes):
+        for step in range(9):
+            state = np.concatenate([one.obs[key][step] for key in ("ee_pos", "ee_ori", "gripper_states")])
+            frame = {
+                layout.state: state.astype(np.float32),
+                layout.action: one.actions[step].astype(np.float32),
+            }
+            frame |= {key: (ramp + 5 * step + number).astype(np.uint8) for key in shapes}
+            written.add_frame(frame | {"task": tasks[number % 2].language})
+        written.save_episode()
+    written.finalize()
+    counts = {tasks[0].id: 2, tasks[1].id: 1}
+    paths = lerobot_files(tmp_path / "set", tasks, counts, "executed")
+    read = [demo for path in paths for demo in read_demos(path)]
+    for demo, number in zip(read, (0, 2, 1), strict=True):
+        np.testing.assert_array_equal(demo.actions, episodes[number].actions.astype(np.float32))
+        np.testing.assert_array_equal(demo.obs["ee_ori"], episodes[number].obs["ee_ori"].astype(np.float32))
+        for step in range(9):
+            shown = (ramp + 5 * step + number).astype(np.uint8).astype(int)[:, ::-1]
+            for key in ("agentview_rgb", "eye_in_hand_rgb"):
+                assert np.abs(demo.obs[key][step] - shown).max() <= (0 if kind == "image" else 12)

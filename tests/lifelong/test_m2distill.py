@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from lifelong.algorithms import ER, M2Distill
-from lifelong.algorithms.m2distill import distances
+from lifelong.algorithms.contrib.m2distill import distances
 from lifelong.data.memory import ReplayMemory
-from lifelong.errors import PolicyError
 from lifelong.nn.augmentation import RandomShift
 from lifelong.policies.history import HistoryPolicy
 from lifelong.seeding import generator
@@ -17,7 +16,6 @@ from lifelong.training.costs import stored_bytes
 from lifelong.training.fit import fit
 from tests.harness import sequences
 from tests.harness.algorithms import POLICIES, SMALL, learn_frames, make_policy
-from tests.harness.fakes import LinearPolicy, Windows
 
 KINDS = {"image", "language", "proprio", "policy"}
 
@@ -144,8 +142,3 @@ def test_it_stores_the_windows_and_one_copy_of_the_weights():
         stored.end_task(0, sequences.dataset(0), policy, generator(0))
     weights = sum(t.nbytes for t in policy.state_dict().values())
     assert stored_bytes(algorithm) == stored_bytes(replay) + weights
-
-
-def test_a_policy_without_features_is_refused_in_a_line():
-    with pytest.raises(PolicyError, match="LinearPolicy has no encode, over_time and head"):
-        M2Distill().begin_task(0, Windows(0), LinearPolicy())

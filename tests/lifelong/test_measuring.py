@@ -1,6 +1,8 @@
 """Rollouts that would repeat others are copied, to the same records; and a run measures what it is told to."""
 
 import json
+import time
+from concurrent.futures import BrokenExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -9,23 +11,31 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.comparisons.episodes import read_episodes
+from libero_env.parallel import spawn_pool
 from libero_eval.check import examine
 from lifelong.algorithms import LoRA, PackNet, Sequential, SingleTask
-from lifelong.errors import ConfigError
+from lifelong.errors import ConfigError, TrainingError
+from lifelong.evaluation.beside import RolloutProcess
 from lifelong.evaluation.environments import EnvPool
 from lifelong.evaluation.settings import EvalSettings
+from lifelong.experiment import with_chosen
 from lifelong.report import write_report
+from lifelong.results.cells import sampled_tasks
 from lifelong.results.log import ResultLog
 from lifelong.results.records import EvalRecord
 from lifelong.results.run_directory import RunDirectory
-from lifelong.results.summary import read_episodes, summarize, write_episodes
+from lifelong.results.summary import summarize, write_episodes
 from lifelong.seeding import seeded
 from lifelong.sequence import is_measured
 from lifelong.sequence.measuring import digest
+from lifelong.sequence.stages import lacks_row
+from lifelong.settings import plain_data
 from lifelong.stats.metrics import lifelong_metrics
+from tests.harness.configs import composed
 from tests.harness.policies import small_transformer
 from tests.harness.records import run_start
-from tests.harness.sequences import SPEC, TASKS, FakeEnv, run_context, sequence
+from tests.harness.sequences import SPEC, TASKS, FakeEnv, assert_same, outcome, run_context, sequence
 
 pytestmark = pytest.mark.usefixtures("uncounted")
 FROZEN = {"packnet": PackNet, "lora": lambda: LoRA(rank=2), "single_task": SingleTask}
@@ -55,7 +65,9 @@ def learn(path, algorithm, *, policy=None, tasks=TASKS, env=Camera, **settings):
     )
     if not context.directory.log.read().records:
         names = [task.name for task in context.tasks]
-        context.directory.log.append(run_start(names, cells=context.eval.cells))
+        cells = {"cells": context.eval.cells, "cells_seed": context.eval.cells_seed}
+        cells |= {"cells_share": context.eval.cells_share} if context.eval.cells == "sampled" else {}
+        context.directory.log.append(run_start(names, **cells))
     sequence(context).run()
     return context, episodes
 
@@ -283,6 +295,37 @@ def test_only_the_cells_that_are_asked_for_are_measured(tmp_path, whole, cells, 
     assert again == [] and "nan" not in capsys.readouterr().out
 
 
+def test_each_seed_samples_cells_of_its_own_and_every_reader_finds_them(tmp_path):
+    """Records without a seed are of the one drawing that all runs had in common."""
+    of_old = {1: [0], 2: [1], 3: [2], 4: [2, 3], 5: [2, 4], 6: [2, 3], 7: [3, 4, 6], 8: [1, 2, 4]}
+    assert {row: sampled_tasks(row, 0.3, None) for row in of_old} == of_old
+    settings, tasks, found = (
+        {"cells": "sampled", "cells_share": 0.3, "curve": "none", "select": "last"},
+        5,
+        {},
+    )
+    for seed in (None, 1, 2, 3):
+        where = tmp_path / str(seed)
+        context, _ = learn(where, Sequential(), tasks=tasks, cells_seed=seed, **settings)
+        results = context.directory.log.read()
+        found[seed] = {(r.learned, r.task) for r in results.of(EvalRecord)}
+        assert found[seed] == {(row, seen) for row in range(tasks) for seen in results.run.row([row])}
+        assert results.learned_tasks() == tasks and is_measured(context, results)
+        assert not [f for f in examine(where).findings if "lacks" in f.text]
+        ((_, table),) = read_episodes(write_episodes(tmp_path / "e.csv", [("sequential", results)]))
+        assert table.run.row([3]) == results.run.row([3]) and table.learned_tasks() == tasks
+        assert learn(where, Sequential(), tasks=tasks, cells_seed=seed, **settings)[1] == []  # nothing anew
+    assert len(set(map(frozenset, found.values()))) > 2
+
+
+@pytest.mark.parametrize(("words", "seed"), [
+    (["eval.cells=sampled"], 5), (["eval.cells=sampled", "eval.cells_seed=0"], 0), ([], None),
+])  # fmt: skip
+def test_a_run_samples_its_cells_by_its_own_seed_unless_it_is_told(words, seed):
+    config = with_chosen(plain_data(composed("seed=5", *words)))
+    assert config["eval"]["cells_seed"] == seed and with_chosen(config) == config
+
+
 def test_trackers_are_told_the_mean_over_all_tasks_or_none(tmp_path):
     told = []
     context = run_context(tmp_path, Sequential)
@@ -320,6 +363,48 @@ def test_rows_go_there_and_back_so_that_open_environments_are_used_again(tmp_pat
     context = replace(context, directory=RunDirectory(tmp_path / "run"), algorithm=Sequential())
     sequence(replace(context, envs=EnvPool(lambda key: built.append(key) or FakeEnv(*key), TASKS - 1))).run()
     assert len(built) == TASKS + 1  # one task too many for the pool, in the last row alone
+
+
+class _Ends(Sequential):
+    """Fails when the last task begins, while what came before is still measured."""
+
+    def begin_task(self, task_index, dataset, policy):
+        if task_index == TASKS - 1:
+            raise RuntimeError("ended here")
+
+
+@pytest.mark.parametrize("interrupted", [False, True])
+def test_rows_beside_training_are_measured_in_another_process_and_recorded_alike(
+    tmp_path, whole, interrupted, monkeypatch
+):
+    """Those of the last row in both; what was not recorded when a run ended is measured when it goes on."""
+    monkeypatch.setattr("lifelong.context.cpu_count", lambda: 2)
+    if interrupted:
+        with pytest.raises(RuntimeError, match="ended here"):
+            learn(tmp_path, _Ends(), beside=True)
+        assert lacks_row(run_context(tmp_path, "sequential"), (1,), RunDirectory(tmp_path).log.read())
+    context, episodes = learn(tmp_path, Sequential(), beside=True)
+    assert outcomes(context) == outcomes(whole)
+    assert_same(
+        outcome(tmp_path, context.directory.log)[1], outcome(whole.directory.path, whole.directory.log)[1]
+    )
+    assert videos(context) == videos(whole)
+    points = 0 if interrupted else (TASKS - 1) * 3 * 2  # of the curves of the first tasks, two episodes each
+    assert len(episodes) == points + 3 * 2 + 3 * (TASKS // 2)
+
+
+def test_what_another_process_cannot_have_is_measured_in_this_one(tmp_path, whole, monkeypatch):
+    monkeypatch.setattr("lifelong.context.cpu_count", lambda: 2)
+    policy = run_context(tmp_path, "sequential").policy
+    policy.head.register_forward_hook(lambda *_: None)
+    context, episodes = learn(tmp_path, Sequential(), policy=policy, beside=True)
+    assert outcomes(context) == outcomes(whole)
+    records = context.directory.log.read().of(EvalRecord)
+    assert len(episodes) == sum(len(r.successes) for r in records if not r.same_as)
+
+
+def videos(context):
+    return {path.name: path.read_bytes() for path in context.directory.videos.iterdir()}
 
 
 @pytest.mark.parametrize(("select", "kept"), [("best", 2), ("first_best", 0)])
@@ -375,3 +460,13 @@ def test_a_lost_evaluation_of_a_task_to_come_is_measured_again(tmp_path, phase, 
     _, again = learn(tmp_path, Sequential(), **settings)
     assert again == [key[1]] * ran
     assert ResultLog(log).read().evaluation(phase, *key).outcome == whole.evaluation(phase, *key).outcome
+
+
+def test_an_error_in_training_does_not_wait_for_rollouts_beside_it():
+    with pytest.raises(TrainingError), RolloutProcess(EnvPool(lambda key: FakeEnv(key, 1))) as process:
+        process._pool = spawn_pool(1)
+        rollouts = process._pool.submit(time.sleep, 3600)
+        while not rollouts.running():
+            time.sleep(0.01)
+        raise TrainingError("the loss is not finite")
+    assert isinstance(rollouts.exception(), BrokenExecutor), "it was killed"

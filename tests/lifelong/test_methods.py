@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 from scipy import stats
+from statsmodels.stats import contingency_tables, power, proportion, weightstats
+from statsmodels.stats.multitest import multipletests
 
 from libero_env.text import json_safe
+from libero_eval.stats.episodes import Counts, mcnemar_exact
 from lifelong.report.comparison import findings
 from lifelong.stats.intervals import holm, wilson_interval
 from lifelong.stats.methods import (
@@ -48,7 +51,6 @@ def test_without_common_seeds_the_test_is_welchs():
 
 
 def test_the_number_of_seeds_is_that_of_the_noncentral_t_distribution():
-    power = pytest.importorskip("statsmodels.stats.power")
     for effect, level in [(0.5, 0.05), (1.2, 0.05), (2.0, 0.01)]:
         expected = power.TTestPower().solve_power(effect, alpha=level, power=0.8)
         assert seeds_needed(-2 * effect, 2.0, level) == np.ceil(expected)
@@ -146,3 +148,33 @@ def test_published_forward_transfer_does_not_mix_with_others():
     apart = [statistics({"a": [MethodRun(s, 1)]})["metrics"]["a"]["fwt"]["mean"] for s in scores]
     mixed = statistics({"a": [MethodRun(scores[0], 1)], "b": [MethodRun(scores[1], 1)]})["metrics"]
     assert apart[0] != apart[1] and mixed["a"]["fwt"]["mean"] == mixed["b"]["fwt"]["mean"] == apart[1]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_intervals_and_tests_are_those_of_statsmodels(seed):
+    """Wilson's interval, Holm's adjustment, McNemar's exact test, Student's and Welch's t, two one-sided tests."""
+    rng, margin = np.random.default_rng(seed), 0.1
+    n = rng.integers(5, 300, 40)
+    s = rng.binomial(n, rng.random(40))
+    for ends, theirs in zip(
+        wilson_interval(s, n), proportion.proportion_confint(s, n, method="wilson"), strict=True
+    ):
+        np.testing.assert_allclose(ends, theirs, atol=1e-12)
+    p = rng.random(12) ** 3
+    np.testing.assert_allclose(holm(p), multipletests(p, method="holm")[1])
+    counts = Counts(*map(int, rng.integers(0, 20, 4)))
+    table = [[counts.both, counts.only_first], [counts.only_second, counts.neither]]
+    assert mcnemar_exact(counts) == pytest.approx(contingency_tables.mcnemar(table, exact=True).pvalue)
+    first, second = rng.normal(0.6, 0.1, 6), rng.normal(0.55, 0.2, 5)
+    gaps = weightstats.DescrStatsW(first[:5] - second)
+    found = paired_difference(first[:5] - second, margin)
+    assert found.p_value == pytest.approx(gaps.ttest_mean(0)[1])
+    assert found.equivalence == pytest.approx(gaps.ttost_mean(-margin, margin)[0])
+    assert (found.estimate.low, found.estimate.high) == pytest.approx(gaps.tconfint_mean(0.05))
+    both = weightstats.CompareMeans(weightstats.DescrStatsW(first), weightstats.DescrStatsW(second))
+    found = welch_difference(first, second, margin)
+    assert found.p_value == pytest.approx(both.ttest_ind(usevar="unequal")[1])
+    assert found.equivalence == pytest.approx(both.ttost_ind(-margin, margin, usevar="unequal")[0])
+    assert (found.estimate.low, found.estimate.high) == pytest.approx(
+        both.tconfint_diff(0.05, usevar="unequal")
+    )

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from lifelong.stats.intervals import combine_intervals, mean_and_standard_error, wilson_interval
+from lifelong.stats.intervals import difference_of, mean_and_standard_error, mean_success, wilson_interval
 from lifelong.stats.metrics import (
     Curve,
     Scores,
@@ -135,14 +135,36 @@ def test_wilson_against_a_published_value_and_its_symmetry():
     assert low == pytest.approx(1 - high[::-1])
     assert (low <= s / n).all() and (s / n <= high).all() and (high - low > 0.1).all()
     assert low[0] == 0 and high[-1] == 1
-    assert [float(x) for x in wilson_interval(0, 0)] == [0, 1]
+    assert np.isnan(wilson_interval(2, 4)).all() and np.isfinite(wilson_interval(2, 5)).all()
 
 
-def test_combining_two_rates_is_newcombes_difference():
+def test_the_difference_of_two_rates_is_newcombes():
     # Newcombe (1998), difference of 56/70 and 48/80, method 10: 0.0524 to 0.3339.
-    low, high = wilson_interval([56, 48], [70, 80])
-    found = combine_intervals([1, -1], [56 / 70, 48 / 80], low, high)
-    assert (found.value, found.low, found.high) == pytest.approx((0.2, 0.0524, 0.3339), abs=5e-5)
+    rates = mean_success([30, 26], [35, 35]), mean_success([48], [80])
+    for share in (1.0, 0.5):
+        found = difference_of(*rates, share)
+        expected = share * np.array([0.2, 0.0524, 0.3339])
+        assert (found.value, found.low, found.high) == pytest.approx(expected, abs=5e-5)
+
+
+@pytest.mark.parametrize("starts", [2, 5, 20, 50])
+@pytest.mark.parametrize(
+    "rates", [np.full(10, 0.95), np.full(10, 0.5), np.linspace(0.8, 1, 10), np.linspace(0, 1, 10)]
+)
+def test_the_interval_of_a_mean_over_tasks_is_that_of_all_episodes_and_covers_it(rates, starts):
+    rng, episodes = np.random.default_rng(0), np.full(10, starts)
+    found = [mean_success(rng.binomial(episodes, rates), episodes) for _ in range(1000)]
+    covered = [e.low <= rates.mean() <= e.high and 0 <= e.low <= e.value <= e.high <= 1 for e in found]
+    assert np.mean(covered) > 0.91, "nearly 95 %: what single tasks' intervals make together covers 87 %"
+    low, high = wilson_interval(round(found[0].value * 10 * starts), 10 * starts)
+    assert (found[0].low, found[0].high) == pytest.approx((float(low), float(high)))
+
+
+def test_tasks_count_alike_whatever_the_number_of_their_episodes():
+    found = mean_success([10, 0], [10, 40])
+    low, high = wilson_interval(16, 32)  # 4 / (1/10 + 1/40) episodes
+    assert (found.value, found.low, found.high) == pytest.approx((0.5, float(low), float(high)))
+    assert np.isnan(mean_success([], []).value) and np.isnan(mean_success([0], [0]).value)
 
 
 def test_a_task_without_a_learning_curve_leaves_the_rest_defined():

@@ -9,18 +9,16 @@ import torch
 
 from lifelong.algorithms import MLR
 from lifelong.algorithms.base import load_algorithm
-from lifelong.algorithms.mlr import adjust, describe, encoded, feature_parameters, similar_pairs
+from lifelong.algorithms.contrib.mlr import adjust, describe, encoded, feature_parameters, similar_pairs
 from lifelong.data.latents import LatentMemory, LatentWindows
-from lifelong.errors import CheckpointError, ConfigError, DataError, PolicyError
+from lifelong.errors import CheckpointError, DataError, PolicyError
 from lifelong.nn.tokens import ProprioScaling
 from lifelong.policies.history import HistoryPolicy
 from lifelong.seeding import generator
-from lifelong.settings import Configuration, plain_data
 from lifelong.streams import StageWindows
 from lifelong.training.costs import step_costs, stored_bytes
 from tests.harness import sequences
 from tests.harness.algorithms import MIXING, POLICIES, learn_frames, make_policy
-from tests.harness.configs import composed
 from tests.harness.fakes import LinearPolicy, Windows
 
 TWO_VIEWS = replace(sequences.SPEC, views=("a", "b"), proprio={"x": 2, "y": 3})
@@ -160,11 +158,6 @@ def test_the_penalty_is_the_loss_of_the_replayed_windows():
     found, exact = algorithm.penalty(policy), 2.0 * policy.loss(both)  # 40 windows are drawn of 40
     assert found.item() == pytest.approx(exact.item(), rel=0.02)
     assert algorithm.penalty(policy) is None  # each draw counts once
-
-
-def test_a_share_of_nothing_is_refused():
-    with pytest.raises(ConfigError, match=r"algo.keep is 0; expected above 0"):
-        Configuration(plain_data(composed("algo=mlr", "algo.keep=0"))).build("algo")
 
 
 @pytest.mark.parametrize(

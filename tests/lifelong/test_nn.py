@@ -87,12 +87,6 @@ def test_flat_readout_reads_every_place_of_the_map() -> None:
     assert (h.grad.abs().sum(1) > 0).all()
 
 
-def test_encoder_takes_either_readout() -> None:
-    images = torch.randint(0, 256, (2, 32, 32, 3), generator=generator(), dtype=torch.uint8)
-    for readout in ("keypoints", "flat"):
-        assert small_encoder(readout=readout)(images, randn(2, 6)).shape == (2, 8)
-
-
 @pytest.mark.parametrize("norm", ["group", "batch", "none"])
 def test_encoder_frames_of_a_window_share_its_language(norm: str) -> None:
     encoder = small_encoder(norm=norm).eval()
@@ -213,13 +207,6 @@ def test_drop_path_skips_whole_feed_forward_networks_and_nothing_in_evaluation()
     skipped = (dropped - mixed).abs().amax((1, 2)) < 1e-6
     assert skipped.float().mean().item() == pytest.approx(0.3, abs=0.03)
     torch.testing.assert_close((dropped - mixed)[~skipped] * 0.7, (plain - mixed)[~skipped])
-
-
-def test_attention_weights_have_a_dropout_of_their_own() -> None:
-    sizes = {"dim": 8, "heads": 2, "head_dim": 4, "mlp_dim": 16}
-    assert TransformerLayer(**sizes, dropout=0.5).dropout == 0.5
-    layer = TransformerLayer(**sizes, dropout=0.5, attention_dropout=0.0)
-    assert (layer.dropout, layer.drop.p) == (0.0, 0.5)
 
 
 def test_a_mixture_acts_by_its_heaviest_component_its_mean_or_samples() -> None:

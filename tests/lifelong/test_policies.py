@@ -445,19 +445,6 @@ def test_wrong_use_is_refused() -> None:
         policy.train().act(step)
 
 
-def test_a_policy_without_predict_is_named() -> None:
-    class Silent(Policy):
-        def window_losses(self, batch):
-            return batch.actions.mean((1, 2))
-
-        def reset(self, num_envs): ...
-
-        def _act(self, observation, generators): ...
-
-    with pytest.raises(PolicyError, match="Silent has no predict"):
-        Silent(SPEC).predict(fake_batch(SPEC, 2, generator()))
-
-
 def test_gradients_of_an_lstm_in_evaluation_mode_do_not_ask_cudnn(monkeypatch):
     """Which has them in training mode only; importances of weights are computed in evaluation mode."""
     asked = []

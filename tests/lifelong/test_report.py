@@ -1,6 +1,7 @@
 """Reports of synthetic runs: self-contained pages, also of unfinished and damaged runs."""
 
 import base64
+import html
 import itertools
 import json
 import os
@@ -17,7 +18,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from omegaconf import DictConfig
 from PIL import Image
 
-from libero_env.cli.main import main
+from experiments.comparisons.episodes import read_episodes
+from libero_cli.main import main
 from libero_env.sim.causes import Failure
 from libero_env.tasks import get_suite
 from libero_env.text import json_safe
@@ -35,8 +37,9 @@ from lifelong.report.figures import (
     storage_figure,
 )
 from lifelong.report.page import comparison_text, write_report
-from lifelong.report.runs import group_runs, load_run, short_labels, unlike
+from lifelong.report.runs import group_runs, load_run, short_labels
 from lifelong.report.tables import triangle
+from lifelong.report.unlike import unlike
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record
 from lifelong.results.records import (
@@ -49,7 +52,7 @@ from lifelong.results.records import (
     TaskEndRecord,
     signed_line,
 )
-from lifelong.results.summary import read_episodes, summarize
+from lifelong.results.summary import summarize
 from lifelong.stats.intervals import Estimate
 from lifelong.stats.methods import MethodRun, statistics
 from lifelong.stats.metrics import METRIC_NAMES, Curve
@@ -99,6 +102,7 @@ def make_run(
             seed=seed,
             data_seed=data_seed,
             preset="laptop",
+            overrides=[f"algo={algo}", "+train.note=a b", "runs_dir=/home/me", "eval.sim_threads=2"],
             tasks=[f"pick_up_the_{n.replace(' ', '_')}_and_place_it_in_the_basket" for n in names],
             instructions=[f"pick up the {n} and place it in the basket" for n in names],
             config=config,
@@ -116,7 +120,8 @@ def make_run(
             "parameters": 1.2e6, "parameters_trained": 1.1e6, "flops_per_step": 3.4e10, "flops_per_action": 5e7
         }  # fmt: skip
         log.append(CostRecord(task=i, costs=counted))
-        log.append(CostRecord(task=i, costs={"end_task_seconds": 0.7, "stored_bytes": 2e6 * (i + 1)}))
+        spent = {"stored_bytes": 2e6 * (i + 1), "kept_share": 100 / (i + 1), "updates": 640, "windows": 999}
+        log.append(CostRecord(task=i, costs={"end_task_seconds": 0.7, **spent}))
         log.append(TaskEndRecord(task=i, best_epoch=best, seconds=float(rng.uniform(200, 260))))
     if done is None:
         log.append(RunEndRecord(seconds=2600.0, finished="2026-01-01T12:00:00+00:00"))
@@ -268,6 +273,10 @@ def test_the_page_describes_the_whole_run(finished: Path):
     assert "Why rollouts failed" in text and "Never reached" in text and "Interference" in text
 
 
+def test_the_page_tells_the_command_but_for_what_changes_no_result(finished: Path):
+    assert "python train.py algo=er &#39;+train.note=a b&#39;<" in write_report([finished]).read_text()
+
+
 def test_the_heatmap_shows_the_matrix(finished: Path):
     run = load_run(finished)
     page = Page((finished / "report.html").read_text())
@@ -328,13 +337,6 @@ def test_invalid_lines_and_a_missing_config_are_noted_on_the_page(tmp_path: Path
     assert "results.jsonl:5: not JSON" in Page(raw).text and "config.yaml is missing" in Page(raw).text
 
 
-@undrawn
-def test_text_of_a_run_is_never_markup(tmp_path: Path):
-    folder = make_run(tmp_path / "run", tasks=2)
-    (folder / "config.yaml").write_text("algo: {note: '<script>alert(1)</script>'}\n")
-    assert "<script" not in write_report([folder]).read_text()
-
-
 def test_several_runs_side_by_side(tmp_path: Path):
     runs = [make_run(tmp_path / f"{a}{s}", a, s, tasks=2) for a in CHARACTERS for s in (1, 2)]
     out = write_report(runs, tmp_path / "compared")
@@ -373,16 +375,17 @@ def test_two_runs_of_one_seed_count_once(tmp_path: Path):
     assert "../partial: a further run of seed 1 of er; it is not counted" in page.text
 
 
-def test_runs_that_differ_in_any_section_are_methods_of_their_own(tmp_path: Path):
-    """Each top-level section of a configuration that decides results is compared."""
+def test_runs_that_differ_in_any_setting_are_methods_of_their_own(tmp_path: Path):
+    """In each top-level section of a configuration that decides results, and in keys like those of machines."""
     sections = {str(key) for key, value in composed().items() if isinstance(value, DictConfig)} - {"tracker"}
-    for name in sorted(sections):
-        runs = [make_run(tmp_path / name / str(n), "er", 1, tasks=2) for n in (1, 2)]
+    keys = ["policy__temporal__drop_path", "stream__perturb_seed", "policy__path", "algo__dir"]
+    for key in [*keys, *(f"{name}__strange" for name in sorted(sections))]:
+        runs = [make_run(tmp_path / key / str(n), "er", 1, tasks=2) for n in (0, 1)]
         for number, run in enumerate(runs):
-            config = yaml.safe_load((run / "config.yaml").read_text())
-            config[name] = {**config.get(name, {}), "strange": number}
-            (run / "config.yaml").write_text(yaml.safe_dump(config))
-        assert len(group_runs([load_run(run) for run in runs])) == 2, name
+            configure(run, **{key: number / 10})
+        assert len(group_runs([load_run(run) for run in runs])) == 2, key
+    configure(runs[1], **{key: 0})
+    assert len(group_runs([load_run(run) for run in runs])) == 1, "0.0 and 0 are one value"
 
 
 @undrawn
@@ -510,10 +513,8 @@ def test_conventions_of_other_papers_are_compared(tmp_path: Path, monkeypatch: p
     alone = np.mean([np.diag(load_run(run).results.success_matrix()[0]) for run in runs[3:]], axis=0)
     learned = np.mean([np.diag(r.success_matrix()[0]) for r in er], axis=0)
     assert found["intransigence"]["mean"] == pytest.approx((alone - learned).mean())
-    assert groups["single_task"]["other_conventions"]["intransigence"] == {
-        "mean": 0,
-        "half_width": 0,
-    }  # by seed
+    own = groups["single_task"]["other_conventions"]["intransigence"]
+    assert own == {"mean": 0, "half_width": 0}  # by seed
     assert "relative nbt" in Page(out.read_text()).text
 
 
@@ -652,8 +653,11 @@ def test_costs_are_in_both_kinds_of_page(compared: tuple[Path, dict], finished: 
     page, found = compared
     assert found["groups"]["er"]["costs"]["stored_bytes"] == 6e6  # after the last of three tasks
     for text in (Page(page.read_text()).text, Page((finished / "report.html").read_text()).text):
-        for message in ("Costs", "34.0 GFLOP", "50.0 MFLOP", "1.20 M", "6.00 MB", "0.7 s"):
+        for message in ("Costs", "34.0 GFLOP", "50.0 MFLOP", "1.20 M", "6.00 MB", "0.7 s", "33.3 %", "640"):
             assert message in text, message
+    assert Page(page.read_text()).text.count("33.3 %") == 2 * len(
+        found["groups"]
+    )  # beside success, and in the costs
 
 
 @undrawn
@@ -674,7 +678,7 @@ def test_subgoals_are_on_the_page_unless_records_are_old(finished: Path, tmp_pat
 @undrawn
 def test_saliency_is_on_the_page(tmp_path: Path):
     folder = make_run(tmp_path / "run", tasks=2)
-    assert "<h2>Saliency</h2>" not in write_report([folder]).read_text()
+    assert ">Saliency</h2>" not in write_report([folder]).read_text()
     (folder / "saliency").mkdir()
     Image.new("RGB", (8, 8)).save(folder / "saliency" / "task_01_after_01.png")
     (folder / "saliency" / "task_01_after_01.txt").write_text("at the cheese")
@@ -738,18 +742,11 @@ def test_runs_of_one_seed_from_two_starts_are_two_in_the_table_of_episodes(tmp_p
     assert again == [[[20]], [[20]]]
 
 
-@pytest.mark.parametrize(
-    "words, message",
-    [
-        (["--reference", "er", "--margin", "0.2"], "--reference, --margin: a single run"),
-        (["--all-pairs"], "--all-pairs: a single run"),
-        (["--other-worlds"], "--other-worlds: a single run"),
-        (
-            ["OTHER", "--all-pairs", "--reference", "er"],
-            "--all-pairs and --reference er name different pairs",
-        ),
-    ],
-)
+@pytest.mark.parametrize("words, message", [
+    (["--reference", "er", "--margin", "0.2"], "--reference, --margin: a single run"),
+    (["--all-pairs", "--other-worlds"], "--all-pairs, --other-worlds: a single run"),
+    (["OTHER", "--all-pairs", "--reference", "er"], "--all-pairs and --reference er name different pairs"),
+])  # fmt: skip
 def test_options_of_a_comparison_without_effect_are_refused(words, message, finished: Path, tmp_path, capsys):
     other = make_run(tmp_path / "ewc", "ewc", tasks=4)
     words = [str(other) if word == "OTHER" else word for word in words]
@@ -769,13 +766,7 @@ def test_no_two_methods_have_one_label(tmp_path: Path):
 
 @undrawn
 def test_runs_that_learned_from_other_demonstrations_are_told(tmp_path: Path):
-    kinds = {
-        "old": ("aa", "bb"),
-        "older": ("aa", "bb"),
-        "new": ("aa", "cc"),
-        "fewer": ("dd", "ee"),
-        "seed": ("ff", "gg"),
-    }
+    kinds = {"old": "ab", "older": "ab", "new": "ac", "fewer": "de", "seed": "fg"}  # digests of two tasks
     runs = []
     for number, (name, digests) in enumerate(kinds.items()):
         data_seed = 2 if name == "seed" else None  # which asks for others
@@ -784,22 +775,48 @@ def test_runs_that_learned_from_other_demonstrations_are_told(tmp_path: Path):
         )
         counts = (10, 10) if name == "fewer" else (50, 50)
         ResultLog(runs[-1] / "results.jsonl").append(
-            DemonstrationsRecord(counts=counts, generators=("expert",) * 2, digests=digests)
+            DemonstrationsRecord(
+                counts=counts, generators=("expert-4", f"expert-{4 + (name == 'new')}"), digests=(*digests,)
+            )
         )
     runs.append(make_run(tmp_path / "unknown", "er", 9, tasks=2))
     page = write_report(runs, tmp_path / "report.html")
     told = [line for line in comparison_text(page) if "other demonstrations" in line]
     second = load_run(runs[0]).record.tasks[1]
+    first = load_run(runs[0]).record.tasks[0]
+    than = "than er seed 1, ewc seed 0 (50 a task by expert-4): a difference between them may be due to that."
     assert told == [
-        f"ewc seed 2 learned from other demonstrations of {second} than er seed 1, ewc seed 0: a difference between "
-        "them may be due to that."
+        f"er seed 3 learned from other demonstrations of {first}, {second} (10 a task by expert-4) {than}",
+        f"ewc seed 2 learned from other demonstrations of {second} (50 a task by expert-5) {than}",
     ]
-    assert told[0] in page.read_text(), (
-        "fewer demonstrations are another setting, and an older record says nothing"
-    )
+    assert told[0] in page.read_text(), "an older record says nothing"
     assert not any(
         "other demonstrations" in line for line in comparison_text(write_report(runs[:2], tmp_path))
     )
+
+
+@undrawn
+def test_a_run_says_in_what_its_demonstrations_differ(tmp_path: Path):
+    """From each other, and from what it was evaluated with."""
+    run = make_run(tmp_path / "run", tasks=2)
+    versions, tasks = load_run(run).record.versions, load_run(run).record.tasks
+    here = f"{versions.get('models')} {versions.get('models_digest')}"
+    known = {"counts": (5, 5), "digests": ("aa", "bb"), "models": (here, here), "labels": ("intended",) * 2}
+    for changed, line in (
+        ({"generators": ("expert-4", "expert-4")}, None),
+        (
+            {"generators": ("expert-4", "")},
+            f"differ in expert: expert-4 of {tasks[0]}, not stated of {tasks[1]}.",
+        ),
+        ({"labels": ("intended", "executed")}, f"labels: intended of {tasks[0]}, executed of {tasks[1]}."),
+        ({"models": (here, "moon 00")}, f"show the models moon 00; it was evaluated on {here}."),
+        ({"models": (), "labels": ()}, None),  # as before they were noted
+    ):
+        values = {"generators": ("expert-4",) * 2, **known, **changed}
+        ResultLog(run / "results.jsonl").append(DemonstrationsRecord(**values))
+        notes = [note for note in load_run(run).notes if "emonstrations" in note]
+        assert (not notes) if line is None else any(line in note for note in notes), notes
+        assert line is None or line in Page(write_report([run], tmp_path / "out.html").read_text()).text
 
 
 def test_runs_of_different_progress_and_length_compare(tmp_path: Path):
@@ -825,7 +842,7 @@ def test_a_run_behind_the_others_of_its_method_is_not_counted(tmp_path: Path):
     assert er["seeds"] == [1] and er["metrics"]["auc"]["values"] == [load_run(runs[0]).metrics.auc.value]
     assert len(read_episodes(page.parent / "episodes.csv.gz")) == 3
     latex = export_runs([tmp_path], "latex", tmp_path / "runs.tex").read_text()
-    assert f"% {line}\n" in latex and "er & 1 & " in latex
+    assert f"% left out, not finished: {runs[-1]}: 1 of 2 tasks learned\n" in latex and "er & 1 & " in latex
     table = load_runs(tmp_path)
     assert [Path(path).name for path in table.path[~table.counted]] == ["er2"]
     told = comparison_text(write_report(runs[1:], tmp_path / "apart"))
@@ -864,6 +881,18 @@ def test_what_differs_between_all_runs_of_two_methods_is_told(
     assert len(lines) == bool(told) and (told or "") in "".join(lines)
 
 
+def test_a_sample_of_cells_that_all_seeds_share_is_told(tmp_path: Path):
+    told = "The same cells are sampled in all runs of er: what NBT and AUC miss by that is in no interval"
+    runs = [load_run(make_run(tmp_path / str(seed), "er", seed, tasks=2)) for seed in (1, 2)]
+    for seeds, same in (((None, None), True), ((7, 7), True), ((1, 2), False)):
+        facts = [{"cells": "sampled", "cells_share": 0.5, "cells_seed": seed} for seed in seeds]
+        found = [replace(run, record=replace(run.record, **of)) for run, of in zip(runs, facts, strict=True)]
+        assert any(line.startswith(told) for line in unlike(group_runs(found))) == same
+    other = replace(found[0], record=replace(found[0].record, algo="ewc", cells_seed=9))
+    against = "The seeds of the sampled cells (eval.cells_seed) differ between methods: er against ewc."
+    assert against in unlike(group_runs([found[0], other]))
+
+
 def test_runs_of_a_method_that_learn_different_tasks_are_told(tmp_path: Path):
     told = "The runs of er learn 2 different sets of tasks."
     first, second = (load_run(make_run(tmp_path / str(n), "er", n, tasks=2, order=n)) for n in (0, 1))
@@ -889,24 +918,15 @@ def test_long_sequences_fit(tmp_path: Path):
 @pytest.mark.parametrize("name", ["nowhere", "empty", "begun"])
 def test_paths_that_are_no_runs_are_named(tmp_path: Path, name: str):
     folder = tmp_path / name
-    message = {"nowhere": "no such run", "empty": "results.jsonl is missing", "begun": "no 'run' record"}[
-        name
-    ]
+    told = {"nowhere": "no such run", "empty": "results.jsonl is missing", "begun": "no 'run' record"}
     if name != "nowhere":
         folder.mkdir()
     if name == "begun":
         (folder / "results.jsonl").write_text("")
-    with pytest.raises(LifelongError, match=f"{re.escape(str(folder))}.*{message}"):
+    with pytest.raises(LifelongError, match=f"{re.escape(str(folder))}.*{told[name]}"):
         write_report([folder])
     with pytest.raises(LifelongError, match="no run directory given"):
         write_report([])
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="root writes anywhere")
-def test_a_folder_that_cannot_be_written_is_named(finished: Path, tmp_path: Path):
-    tmp_path.chmod(0o500)
-    with pytest.raises(LifelongError, match="cannot be written"):
-        write_report([finished], tmp_path / "sub" / "report.html")
 
 
 @undrawn
@@ -915,7 +935,7 @@ def test_media_above_the_limit_are_omitted_by_name(tmp_path: Path, monkeypatch: 
     for name in ("a", "b"):
         add_video(folder, name)
     (folder / "videos" / "a.txt").write_text("the first one")
-    monkeypatch.setattr("lifelong.report.page.MEDIA_LIMIT", (folder / "videos" / "a.gif").stat().st_size)
+    monkeypatch.setattr("lifelong.report.media.MEDIA_LIMIT", (folder / "videos" / "a.gif").stat().st_size)
     raw = write_report([folder]).read_text()
     assert "the first one" in raw and "Omitted: b.gif (it is larger than" in raw
     assert base64.b64encode((folder / "videos" / "a.gif").read_bytes()).decode() in raw
@@ -927,13 +947,6 @@ def test_labels_omit_the_common_words_of_all_instructions():
     assert short_labels(["open the door"]) == ["open the door"]
     assert short_labels(["push it", "push it"]) == ["push it", "push it"]
     assert short_labels(["open the door", "close the window"]) == ["open the door", "close the window"]
-
-
-def test_lines_of_many_methods_are_distinguishable():
-    figure = forgetting_figure([Line(f"method {i}", np.full((1, 3), 0.05 * i)) for i in range(14)])
-    lines = [line for line in figure.axes[0].get_lines() if not line.get_label().startswith("_")]
-    looks = {(x.get_color(), x.get_marker(), x.get_linestyle(), x.get_markerfacecolor()) for x in lines}
-    assert len(looks) == len(lines) == 14
 
 
 HOSTILE = [
@@ -1013,35 +1026,6 @@ def test_records_are_a_regular_file(place, tmp_path: Path):
     for use in (log.read, lambda: log.append(PhaseRecord(phase="demos", seconds=1.0))):
         with pytest.raises(LifelongError, match=r"results\.jsonl"):
             use()
-
-
-def test_records_are_not_appended_to_where_a_link_leads(tmp_path: Path):
-    victim = tmp_path / "victim"
-    victim.write_text("without a newline at its end")
-    (tmp_path / "results.jsonl").symlink_to(victim)
-    with pytest.raises(LifelongError):
-        ResultLog(tmp_path / "results.jsonl").append(PhaseRecord(phase="demos", seconds=1.0))
-    assert victim.read_text() == "without a newline at its end"
-
-
-@pytest.mark.parametrize(
-    "key", ["policy.temporal.drop_path", "stream.perturb_seed", "policy.path", "algo.dir"]
-)
-def test_runs_that_differ_in_any_setting_are_two_methods(key: str, tmp_path: Path):
-    section, _, name = key.rpartition(".")
-    runs = []
-    for value in (0.0, 0.1):
-        run = make_run(tmp_path / str(value), tasks=2)
-        node = {name: value}
-        for part in reversed(section.split(".")):
-            node = {part: node}
-        (run / "config.yaml").write_text(json.dumps(node))
-        runs.append(load_run(run))
-    assert len(group_runs(runs)) == 2
-    (tmp_path / "0.1" / "config.yaml").write_text(
-        (tmp_path / "0.0" / "config.yaml").read_text().replace("0.0", "0")
-    )
-    assert len(group_runs([load_run(run.path) for run in runs])) == 1, "0.0 and 0 are one value"
 
 
 @undrawn
@@ -1171,4 +1155,5 @@ def test_what_methods_lose_under_a_held_out_shift_is_compared(tmp_path: Path) ->
         assert [estimate["value"], estimate["low"], estimate["high"]] == pytest.approx(
             [np.mean(sample), *ends]
         )
-    assert "<h2>Under light=0.5</h2>" in page.read_text() and "less er's" in page.read_text()
+    text = html.unescape(page.read_text())
+    assert ">Under light=0.5</h2>" in text and "Less er's" in text

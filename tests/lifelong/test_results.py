@@ -1,5 +1,6 @@
 """Records stay readable after a killed process or a full disk."""
 
+import gzip
 import json
 import os
 from dataclasses import replace
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from experiments.comparisons.episodes import read_episodes
 from lifelong.errors import ResultsError
 from lifelong.results.log import ResultLog
 from lifelong.results.provenance import start_record
@@ -25,7 +27,7 @@ from lifelong.results.records import (
     to_line,
 )
 from lifelong.results.results import Results
-from lifelong.results.summary import read_episodes, summarize, write_episodes, write_summary
+from lifelong.results.summary import summarize, write_episodes, write_summary
 from lifelong.stats.metrics import metric_values
 from tests.harness.records import run_start
 
@@ -186,10 +188,10 @@ def _signed(text: str) -> str:
 
 @pytest.mark.parametrize(("line", "message"), [
     ("{not json", "not JSON"),
-    ('{"kind": "lost"}', "unknown kind of record 'lost'; valid: run, loss, eval"),
+    ('{"kind": "lost"}', "unknown kind of record 'lost'; valid: run, loss, collection"),
     (_signed('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1}'), "seconds"),
     (_signed('{"kind": "loss", "task": "zero", "epoch": 1, "loss": 0.1, "seconds": 1}'),
-     "a 'loss' record: task is 'zero'; expected a whole number"),
+     "a 'loss' record: task is 'zero'; expected a valid integer"),
     (_signed('{"kind": "task_end", "task": true, "best_epoch": 1, "seconds": 1}'),
      "a 'task_end' record: task is True"),
     ("[1, 2]", "unknown kind"),
@@ -198,7 +200,7 @@ def _signed(text: str) -> str:
     ("\0" * 40, "not JSON"),
     (_signed('{"kind": "cost", "task": 0, "costs": {"bytes": "many"}}'), "costs.bytes is 'many'"),
     (_signed('{"kind": "loss", "task": -1, "epoch": 1, "loss": 0.1, "seconds": 1}'),
-     "task is -1; expected at least 0"),
+     "task is -1; expected greater than or equal to 0"),
     (_signed('{"kind": "loss", "task": 2, "epoch": 1, "loss": 0.1, "seconds": 1}'), "task 2, of 2 from 0 on"),
     ('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1, "seconds": 1e400}', "not JSON compliant"),
     (to_line(RUN[3]).decode().strip().replace("-3.25", "-3.26"), "does not have its checksum"),
@@ -224,12 +226,6 @@ def test_a_full_disk_leaves_whole_lines(log: ResultLog, monkeypatch: pytest.Monk
     with pytest.raises(ResultsError, match="No space left.*is intact"):
         log.append(RUN[3])
     assert log.path.read_bytes() == before
-
-
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")
-def test_a_device_that_is_full_is_an_error_with_the_path():
-    with pytest.raises(ResultsError, match="/dev/full"):
-        ResultLog("/dev/full").append(RUN[3])
 
 
 def test_recorded_evaluations_and_losses_are_found(log: ResultLog):
@@ -308,6 +304,16 @@ def test_the_episodes_of_an_unfinished_run_give_its_numbers_whatever_was_lost(ce
     assert found.learned_tasks() == run.learned_tasks() == 2
     for name, value in metric_values(run.scores()).items():
         assert metric_values(found.scores())[name] == pytest.approx(value, nan_ok=True)
+    text = file.read_text()
+    rows = [line.split(",") for line in text.splitlines()]
+    gone = [",".join([*row[:-2], "", ""] if row[10:13] == ["curve", "1", "0"] else row) for row in rows]
+    assert gone != text.splitlines()
+    file.write_text("\n".join(gone) + "\n")  # no episode of a cell counts
+    assert read_episodes(file)[0][1].learned_tasks() == run.learned_tasks()
+    damaged = tmp_path / "episodes.csv.gz"
+    damaged.write_bytes(gzip.compress(text.encode())[:10] + b"damaged" * 9)
+    with pytest.raises(ResultsError, match="the episodes cannot be read"):
+        read_episodes(damaged)
 
 
 def test_the_summary_is_strict_json_and_complete(log: ResultLog, tmp_path: Path):
@@ -333,3 +339,18 @@ def test_rollouts_before_the_first_task_are_no_cost_of_it() -> None:
     before, after = evaluation("initial", 0, 0, 1, 0), evaluation("matrix", 0, 5, 0, 3)
     results = Results((run_start("ab"), CostRecord(task=0, costs={"parameters": 1.0}), before, after))
     assert results.costs_by_task()[0]["evaluation_seconds"] == after.seconds
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")
+def test_a_device_that_is_full_is_an_error_with_the_path():
+    with pytest.raises(ResultsError, match="/dev/full"):
+        ResultLog("/dev/full").append(RUN[3])
+
+
+def test_records_are_not_appended_to_where_a_link_leads(tmp_path: Path):
+    victim = tmp_path / "victim"
+    victim.write_text("without a newline at its end")
+    (tmp_path / "results.jsonl").symlink_to(victim)
+    with pytest.raises(ResultsError):
+        ResultLog(tmp_path / "results.jsonl").append(RUN[3])
+    assert victim.read_text() == "without a newline at its end"

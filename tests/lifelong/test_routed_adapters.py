@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from lifelong.algorithms import CLARE, DMPEL, IsCiL
-from lifelong.algorithms.clare import BASE
+from lifelong.algorithms.contrib.clare import BASE
 from lifelong.errors import CheckpointError, ConfigError
 from lifelong.nn.experts import adaptable_modules, expert_output
 from lifelong.nn.routing import Discriminator, cluster_centres, groups_of_rows, nearest_key

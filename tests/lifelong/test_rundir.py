@@ -11,7 +11,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from lifelong.errors import ConfigError, LifelongError
 from lifelong.results.run_directory import RunDirectory
-from lifelong.settings import build
 from lifelong.tracking import TensorBoard, Trackio, WandB
 
 CONFIG = {"seed": 1, "train": {"lr": 0.1, "epochs": 3}, "device": "cpu", "runs_dir": "a"}
@@ -69,15 +68,10 @@ def test_a_folder_that_is_a_link_out_of_the_run_is_refused_and_nothing_there_cha
     if target.startswith("run"):
         (directory.path / name).unlink()
         (directory.path / name).symlink_to(directory.path / name)  # in a circle
-    message = f"{name} is not a folder, or is a link that leads out of"
+    message = f"{name} is a link, or is not a folder"
     with pytest.raises(ConfigError, match=message), directory.opened(CONFIG, resume=True):
         pass
     assert (elsewhere / ".a.part").exists()
-    (directory.path / name).unlink()
-    (directory.path / "kept").mkdir()
-    (directory.path / name).symlink_to("kept")
-    with directory.opened(CONFIG, resume=True):
-        pass  # it stays inside
 
 
 def test_starting_again_keeps_the_old_run(tmp_path):
@@ -107,11 +101,6 @@ def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch) -> None:
         directory.opened(CONFIG, resume=True),
     ):
         pass
-
-
-def test_wandb_names_its_modes():
-    with pytest.raises(ConfigError, match="'offline' or 'online'"):
-        build({"_target_": "lifelong.tracking.WandB", "mode": "on"})
 
 
 def test_tensorboard_reads_what_two_starts_of_a_run_logged(tmp_path):

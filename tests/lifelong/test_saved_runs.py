@@ -31,7 +31,8 @@ EVERY = 5  # of the weights' numbers one is stored
 SHORT = (
     *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "data.demos=2", "data.image_size=32",
      "device=cpu", "threads=1", "progress=false"),
-    *("train.epochs=2", "train.steps_per_epoch=4", "train.batch_size=8"),
+    *("train.epochs=2", "train.steps_per_epoch=4", "train.batch_size=8", "train.lr=0.003", "train.warmup_steps=10"),
+    "data.seq_len=2",
     *("eval.episodes=2", "eval.curve_episodes=1", "eval.every=1", "eval.horizon=20", "eval.record_every=0"),
     "eval.select=last",
     *("data.robot=robosuite-1.4.1", "data.drawing=fast"),

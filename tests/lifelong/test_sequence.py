@@ -22,22 +22,12 @@ from tests.harness.algorithms import (
 )
 from tests.harness.configs import CONFIGS, composed
 from tests.harness.gpu_learning import POLICIES, learn
-from tests.harness.sequences import (
-    EVERY,
-    TASKS,
-    assert_same,
-    dataset,
-    run_context,
-    sequence,
-)
+from tests.harness.sequences import EVERY, TASKS, assert_same, dataset, run_context, sequence
 
 pytestmark = pytest.mark.usefixtures("uncounted")  # test_costs counts
 COMPAT = {
     f"{name} of the original": lambda words=words: build(composed(*words, "compat=libero").algo)
-    for name, words in (
-        ("er", ("algo=er", "algo.memory.budget=5")),
-        ("packnet", ("algo=packnet",)),
-    )
+    for name, words in (("er", ("algo=er", "algo.memory.budget=5")), ("packnet", ("algo=packnet",)))
 } | {
     f"lora, {kind}": lambda kind=kind: algos.LoRA(rank=2, alpha=4.0, adapters=kind)
     for kind in ("shared", "averaged")
@@ -109,6 +99,21 @@ def test_the_records_are_complete(quiet, tmp_path, monkeypatch, capsys):
     counted = set(COST_COLUMNS) - {"training_seconds", "evaluation_seconds", "peak_gpu_bytes"}
     assert all(set(results.costs(task)) >= counted for task in range(TASKS))
     assert all(set(r.init_states) == ({0, 1, 2} if r.phase == "matrix" else {48, 49}) for r in evals)
+    # twice two epochs of 20 windows by eight; packnet keeps none
+    assert [results.costs(task)["updates"] for task in range(TASKS)] == [4 * 3] * TASKS
+    assert all(results.costs(task)["kept_share"] == 0 for task in range(TASKS))
+
+
+@pytest.mark.parametrize(("name", "last"), [("er", 20.0), ("multitask", 0.0), ("mlr", 50.0)])
+def test_the_share_of_windows_that_is_kept_is_of_all_tasks_so_far(tmp_path, name, last):
+    sequence(context := run_context(tmp_path, EVERY[name])).run()
+    results = context.directory.log.read()
+    found = [costs["kept_share"] for costs in results.costs_by_task().values()]
+    assert found[-1] == pytest.approx(last)  # of 60: 12, none or 30
+    updates = sum(costs["updates"] for costs in results.costs_by_task().values())
+    assert updates == (
+        16 if name == "multitask" else 18
+    )  # two epochs of 60 windows by eight, or of 20 thrice
 
 
 def test_select_last_keeps_the_last_weights(tmp_path):

@@ -12,31 +12,25 @@ import numpy as np
 import pytest
 import torch
 
-from libero_env.cli.main import main
+from libero_cli.main import main
+from libero_env.curating import rendering
+from libero_env.curating.rendering import RenderJob, ensure_rendered
 from libero_env.demos import generate as recording
-from libero_env.demos import rendering
 from libero_env.demos.config import RenderConfig
 from libero_env.demos.read import read_episodes
-from libero_env.demos.rendering import RenderJob, ensure_rendered
 from libero_env.perturbations import parse_perturbations, reword_task
 from libero_env.tasks import get_suite
 from libero_eval import relearning
 from libero_eval.requests import RelearnRequest
 from lifelong import experiment
 from lifelong.data import demonstrations
+from lifelong.data.demonstrations import DemoDatasets
 from lifelong.errors import ConfigError, DataError
 from lifelong.evaluation.environments import held_out_shift
 from lifelong.evaluation.restore import read_config, restore
 from lifelong.language import LanguageEncoder, encoder
 from lifelong.results.log import ResultLog
-from lifelong.results.records import (
-    DemonstrationsRecord,
-    EvalRecord,
-    RunRecord,
-    from_line,
-    signed_line,
-    to_line,
-)
+from lifelong.results.records import DemonstrationsRecord, RunRecord, from_line, signed_line, to_line
 from lifelong.results.results import Results
 from lifelong.results.shifts import shift_scores
 from lifelong.sequence.learning import TaskSequence
@@ -52,9 +46,10 @@ TASKS = get_suite("libero_object").tasks[:2]
 NAMES = {"policy": "tiny", "benchmark": "libero_object", "algo": "sequential", "preset": "smoke"}
 TINY = (
     *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "algo=sequential", "threads=1"),
-    *("data.demos=2", "data.image_size=32", "train.epochs=1", "train.steps_per_epoch=1", "train.batch_size=2"),
+    *("data.demos=2",
+    "data.seq_len=2", "data.image_size=32", "train.epochs=1", "train.steps_per_epoch=1", "train.batch_size=2"),
     *("eval.horizon=3", "eval.episodes=2", "eval.curve_episodes=1", "eval.record_every=0", "eval.sim_threads=1"),
-    *("policy.encoder.width=4", "policy.head.hidden=8", "progress=false", "augmentation=none"),
+    *("policy.encoder.width=4", "policy.head.hidden=8", "train.warmup_steps=0", "progress=false", "augmentation=none"),
 )  # fmt: skip
 LOOKS = "instruction=0.6,light=0.8"
 
@@ -241,9 +236,9 @@ def made_environments(monkeypatch) -> list:
 @pytest.mark.sim
 def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, tmp_path, quick, monkeypatch):
     seen, read = made_environments(monkeypatch), []
-    opened = experiment.DemoDatasets.__getitem__
+    opened = DemoDatasets.__getitem__
     monkeypatch.setattr(
-        experiment.DemoDatasets,
+        DemoDatasets,
         "__getitem__",
         lambda self, k: read.append((k, self.paths[k], self.languages[k])) or opened(self, k),
     )
@@ -271,7 +266,7 @@ def test_each_task_is_learned_and_evaluated_under_its_own_perturbations(folder, 
     assert (path / "report.html").is_file()
 
     settings, config = RelearnRequest(run=path, held_out=1), read_config(path / "config.yaml", ())
-    training, held_out = relearning.task_windows(loaded, 1, settings.held_out, config)
+    training, held_out = relearning.task_windows(loaded, 1, settings.held_out, config, folder)
     shifted = next(folder.rglob(f"under-instruction=0.6*/{TASKS[1].name}_demo.hdf5"))
     first, other = read_episodes(shifted)  # learned from, and held out
     assert len(training) == len(first) and len(held_out) == len(other)
@@ -298,7 +293,7 @@ def test_held_out_shifts_are_measured_besides(folder, tmp_path, quick, monkeypat
     before = outcomes(plain)
     assert not any(len(key) > 2 for key, _ in seen) and not any(key[1] == "shift" for key in before)
     numbers = json.loads((plain / "results.json").read_text())
-    assert "shifts" not in numbers and "<h2>Under " not in (plain / "report.html").read_text()
+    assert "shifts" not in numbers and ">Under " not in (plain / "report.html").read_text()
     assert run(folder, tmp_path, *stream, shift) == plain
     after = outcomes(plain)
     added = {key: r for key, r in after.items() if key not in before}
@@ -318,7 +313,7 @@ def test_held_out_shifts_are_measured_besides(folder, tmp_path, quick, monkeypat
     assert [one["shift"] for one in with_shifts["shifts"]] == [text]
     for key in ("metrics", "success_matrix", "evaluations", "curves"):
         assert with_shifts[key] == numbers[key]
-    assert f"<h2>Under {text}</h2>" in (plain / "report.html").read_text()
+    assert f">Under {text}</h2>" in (plain / "report.html").read_text()
     capsys.readouterr()
     assert main(["report", str(plain)]) == 0 and f"under {text}: " in capsys.readouterr().out
     assert outcomes(run(folder, tmp_path / "both", *stream, shift)) == after
@@ -339,24 +334,14 @@ def test_forgetting_under_shift_is_just_learned_minus_final():
     names = ("learned", "learned_shifted", "final", "final_shifted")
     assert [score.success(name).value for name in names] == [1.0, 0.625, 0.875, 0.25]
     assert score.forgetting(shifted=False).value == 0.25 and score.forgetting(shifted=True).value == 0.75
-    low, high = score.forgetting(shifted=True).low, score.forgetting(shifted=True).high
-    assert 0 < low < 0.75 < high <= 1.2
+    assert np.isnan(score.forgetting(shifted=True).low), "of four starts"
+    assert 0 < score.success("final").low < 0.875 < score.success("final").high < 1
     (part,) = shift_scores(Results((first, *matrix, shifted[0])))
     assert np.isnan(part.success("final_shifted").value) and np.isnan(part.forgetting(shifted=True).value)
     line = to_line(shifted[0])
     assert from_line(line) == shifted[0]
     with pytest.raises(ValueError, match="has the shift"):
         evaluation("matrix", 0, 1, 0, 1, shift="light=0.5")
-
-
-@pytest.mark.sim
-def test_without_perturbations_nothing_changes(folder, tmp_path, quick):
-    plain, zero = (run(folder, tmp_path / name, *more) for name, more in
-                   (("plain", ()), ("zero", ("stream=shift", "stream.perturb='light=0,camera=0'"))))  # fmt: skip
-    assert outcomes(plain) == outcomes(zero)
-    assert ResultLog(plain / "results.jsonl").read().run.perturbed == ()
-    assert not list(folder.rglob("under-light=0-*")) and not list(folder.rglob("under-camera*"))
-    assert [r.phase for r in ResultLog(plain / "results.jsonl").read().of(EvalRecord)].count("matrix") == 3
 
 
 def test_a_run_of_before_is_restored(tmp_path):
@@ -410,7 +395,12 @@ def test_copies_are_further_windows_of_the_same_actions(folder, tmp_path, quick)
 
 def test_settings_of_copies():
     assert build(composed().data).copies == 0 and build(composed("data.perturb={light:1}").data).copies == 1
-    assert build(composed("data.perturb={light:1}", "data.perturb_copies=0").data).copies == 0
-    for wrong, said in (("{instruction:1}", "instruction"), ("{robot:1}", "changes what happens")):
-        with pytest.raises(ConfigError, match=f"data.perturb.*{said}"):
-            build(composed(f"data.perturb={wrong}").data)
+    for wrong, said in (
+        ("={instruction:1}", "instruction"),
+        ("={robot:1}", "changes what happens"),
+        ("={light:0}", "severities above 0"),
+        ("={}", "severities above 0"),
+        ("_copies=0", "perturb_copies is 0; expected greater than or equal to 1"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            build(composed(f"data.perturb{wrong}").data)

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from libero_env.cli.main import main
-from libero_eval.plan import repeated
+from libero_cli.main import main
+from libero_eval.repeating import repeated
 from libero_eval.requests import EvalRequest
-from lifelong.errors import ConfigError
+from lifelong.errors import CheckpointError, ConfigError
 from lifelong.evaluation.restore import restore
 from lifelong.settings import GROUPS, find_target
 from tests.harness import configs
@@ -24,11 +24,11 @@ HOSTILE = [
     *("lifelong.checkpoints.save", "lifelong.training.precision.subprocess.run",
      "lifelong.results.records.os.system"),
     *("lifelong.nn.heads.torch.load", "lifelong.nn.heads.torch.nn.Linear", "lifelong.data.dataset.Path"),
-    *("libero_env.cli.main.main", "libero_env.cli.__main__.main", "lifelong.algorithms.er.ER.__init__", "lifelong"),
+    *("libero_cli.main.main", "libero_cli.__main__.main", "lifelong.algorithms.er.ER.__init__", "lifelong"),
     *("lifelong.algorithms.er.ER.mro", "lifelong.settings.build", "lifelong.settings.configuration.find_target"),
     *("lifelong.policies.base.Policy.__subclasses__", "lifelong.language.encoder.np.load", "lifelong.nn"),
     *("libero_env.storage.atomic_path", "libero_eval.user_policy.load_callable", "lifelong.data.loading.Path"),
-    *("lifelong.tracking.__builtins__", "lifelong.nn.augmentation.ABC", "lifelong.launch.Job"),
+    *("lifelong.tracking.__builtins__", "lifelong.nn.augmentation.ABC", "lifelong.jobs.Job"),
 ]  # fmt: skip
 
 
@@ -68,7 +68,7 @@ def test_every_target_of_the_configuration_files_may_be_saved():
 
 
 @pytest.mark.parametrize(
-    "group", sorted({*GROUPS} - {"stream", "train", "augmentation", "tracker", "pretrain"})
+    "group", sorted({*GROUPS} - {"stream", "train", "augmentation", "tracker", "pretrain", "learner"})
 )
 @pytest.mark.parametrize("target", ["posix.mkdir", "libero_eval.user_policy.importlib.import_module"])
 def test_a_strangers_run_executes_nothing(group, target, changed, tmp_path, monkeypatch):
@@ -104,6 +104,56 @@ def test_nothing_is_written_into_a_folder_that_a_configuration_names(changed, tm
     assert found.language.cache_dir is None and not (tmp_path / "cache").exists()
 
 
+@pytest.mark.parametrize(
+    ("given", "key"),
+    [
+        ({"pretrained": "stranger/model"}, "pretrained"),
+        ({"pretrained": "/tmp/model"}, "pretrained"),
+        ({"type": "smolvla"}, "type"),
+        ({"type": "a_new_one"}, "type"),
+        ({"settings": {"vlm_model_name": "stranger/model"}}, "settings.vlm_model_name"),
+        ({"settings": {"dim_model": 32, "tokenizer": {"path": ["gpt2"]}}}, "settings.tokenizer"),
+        (
+            {"settings": {"pretrained_backbone_weights": "ResNet18_Weights.DEFAULT"}},
+            "settings.pretrained_backbone",
+        ),
+    ],
+    ids=str,
+)
+def test_what_lerobot_would_load_needs_permission(run, changed, given, key, tmp_path, capsys):
+    """Without it, LeRobot is not even imported: it is in no environment of this package."""
+    policy = {"_target_": "libero_integrations.lerobot_policy.LeRobotPolicy", "type": "act", "settings": {}}
+    more = {"act_steps": None, "language": True, "pretrained": None}
+    path = changed() / "config.yaml"
+    path.write_text(yaml.safe_dump({**yaml.safe_load(path.read_text()), "policy": policy | more | given}))
+    (run / "lerobot").mkdir(exist_ok=True)
+    for command in (["eval"], ["serve"], ["saliency"], ["diagnose"], ["relearn"], ["view"]):
+        assert main([*command, str(run)]) == 2
+        assert f"policy.{key}" in (said := capsys.readouterr().err) and "--allow lerobot" in said
+    (run / "lerobot").rmdir()
+    if "pretrained" in given:
+        with pytest.raises(CheckpointError, match="lerobot is missing, in which the run saved its policy"):
+            restore(run, device="cpu", allow=["lerobot"])
+        (run / "lerobot").symlink_to(tmp_path)
+        with pytest.raises(CheckpointError, match="lerobot is a link"):
+            restore(run, device="cpu", allow=["lerobot"])
+        (run / "lerobot").unlink()
+
+
+def test_a_checkpoint_elsewhere_is_not_the_runs(run, changed, tmp_path, capsys):
+    file = changed() / "checkpoints" / "task_1.safetensors"
+    kept = file.rename(tmp_path / "mine.safetensors")
+    file.symlink_to(kept)
+    try:
+        for command in (["eval", str(run)], ["eval", str(file)], ["serve", str(run)], ["saliency", str(run)]):
+            assert main(command) == 2
+            assert "task_1.safetensors is a link that leads out of" in capsys.readouterr().err
+        assert main(["check", str(run)]) == 1
+        assert "is a link that leads out of" in capsys.readouterr().out
+    finally:
+        kept.replace(file)
+
+
 def test_a_package_can_be_allowed_by_name(changed, tmp_path, monkeypatch):
     """Its own classes, not what it imports."""
     (tmp_path / "mine").mkdir()
@@ -134,7 +184,7 @@ def test_a_saved_policy_that_no_memory_holds_is_refused(changed):
     ({"algo": {"_target_": "lifelong.algorithms.ER",
                "memory": {"_target_": "lifelong.nn.TemporalLSTM", "in_dim": 10**6, "hidden": 10**6}}},
      "algo.memory builds a TemporalLSTM; expected a"),
-    ({"seed": "one"}, "seed is 'one'; expected a whole number"),
+    ({"seed": "one"}, "seed is 'one'; expected a valid integer"),
 ])  # fmt: skip
 def test_a_part_of_another_kind_is_refused_before_it_is_built(run, changed, changes, message):
     path = changed() / "config.yaml"

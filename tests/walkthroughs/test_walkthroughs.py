@@ -1,17 +1,16 @@
 """Two texts that teach the original, block by block: what they tell people to type runs here.
 
-The texts are not part of the repository; docs/walkthroughs.md says which block runs as typed and what others need.
+The texts are not part of the repository; blocks.yaml says which block runs as typed and what others need.
 """
 
 import io
 import subprocess
-from collections import Counter
 from contextlib import redirect_stdout
 from pathlib import Path
 
 import pytest
 
-from tests.walkthroughs.blocks import ROOT, Block, digest, execute, left_out, load_blocks, reindent
+from tests.walkthroughs.blocks import Block, digest, execute, left_out, load_blocks, reindent
 from tests.walkthroughs.checks import CHECKS, Ran
 
 CHAPTERS = list(dict.fromkeys(block.chapter for block in load_blocks()))
@@ -65,18 +64,6 @@ def test_every_block_is_checked_and_every_change_has_its_reason(blocks):
         block.id for block in blocks if (block.given or block.replace or block.helpers) and not block.why
     ]
     assert silent == []
-
-
-def test_the_page_counts_what_runs(blocks):
-    page = " ".join((ROOT / "docs" / "walkthroughs.md").read_text(encoding="utf-8").split())
-    runs = Counter(block.runs for block in blocks)
-    assert (
-        f"Of {len(blocks)} blocks, {runs['as typed']} run as typed. {runs['with names given']} run once"
-        in page
-    )
-    assert (
-        f"{runs['completed']} are sketches" in page and f"{runs['checked']} are there to be looked at" in page
-    )
 
 
 def test_indentation_comes_back():

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from libero_env.envs.config import EnvConfig
-from libero_env.errors import LiberoError, UnknownNameError
+from libero_env.errors import LiberoError, require_known
 from libero_env.tasks import Task, get_suite
 from libero_env.timing import CONTROL_HZ, FREQUENCIES
 
@@ -12,13 +12,7 @@ OBS_TYPES = ("pixels_agent_pos", "pixels")
 CONTROL_MODES = ("relative", "absolute")
 STARTS = ("stored", "original", "new")
 # LeRobot's `lerobot/envs/libero.py`, TASK_SUITE_MAX_STEPS; other suites have 500 there
-MAX_STEPS = {
-    "libero_spatial": 280,
-    "libero_object": 280,
-    "libero_goal": 300,
-    "libero_10": 520,
-    "libero_90": 400,
-}
+MAX_STEPS = {"spatial": 280, "object": 280, "goal": 300, "10": 520, "90": 400}
 OTHER_MAX_STEPS = 500
 # group and name of each entry of `robot_state`, and its shape
 ROBOT_STATE = (
@@ -30,14 +24,7 @@ ROBOT_STATE = (
     ("joints", "pos", (7,)),
     ("joints", "vel", (7,)),
 )
-OBSERVED = (
-    "ee_pos",
-    "ee_quat",
-    "gripper_states",
-    "gripper_velocities",
-    "joint_states",
-    "joint_velocities",
-)
+OBSERVED = "ee_pos ee_quat gripper_states gripper_velocities joint_states joint_velocities".split()  # noqa: SIM905
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,12 +62,8 @@ class Settings:
     assets: str | None = None
 
     def __post_init__(self) -> None:
-        if self.control_mode not in CONTROL_MODES:
-            raise UnknownNameError("control_mode", self.control_mode, CONTROL_MODES)
-        if self.starts not in STARTS:
-            raise UnknownNameError("starts", self.starts, STARTS)
-        if self.fps not in FREQUENCIES:
-            raise UnknownNameError("fps", self.fps, FREQUENCIES)
+        for name, valid in (("control_mode", CONTROL_MODES), ("starts", STARTS), ("fps", FREQUENCIES)):
+            require_known(name, getattr(self, name), valid)
         if not self.cameras or not all(camera.endswith("_image") for camera in self.cameras):
             raise LiberoError(
                 f"camera_name is {','.join(self.cameras)!r}; expected names such as agentview_image,"
@@ -101,7 +84,8 @@ class Settings:
 
     def steps(self, task: Task) -> int:
         """Return the maximum number of steps of the policy on a task."""
-        return MAX_STEPS.get(task.suite, OTHER_MAX_STEPS) if self.max_steps is None else self.max_steps
+        steps = MAX_STEPS.get(task.suite.removeprefix("libero_"), OTHER_MAX_STEPS)
+        return steps if self.max_steps is None else self.max_steps
 
     def env_config(self, task: Task) -> EnvConfig:
         """Return the configuration of the simulations of a task."""

@@ -1,20 +1,25 @@
 """Simulations of one task as the vector environment that LeRobot's rollouts expect."""
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
+import cloudpickle
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from lerobot_env_libero_lifelong.settings import ROBOT_STATE, Settings
 from libero_env.envs.batch import BatchEnv
-from libero_env.envs.subproc import SubprocEnv
+from libero_env.envs.config import EnvConfig
+from libero_env.envs.env import LiberoEnv
 from libero_env.errors import LiberoError, SimulationError
 from libero_env.geometry import quat_to_mat
+from libero_env.images import flip_rows, rotate_180
 from libero_env.init_states.original_resets import OriginalResets
 from libero_env.init_states.store import NUM_INIT_STATES, load_original_states
 from libero_env.sim.controller import get_controller
@@ -64,7 +69,7 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         self.single_action_space = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._envs: BatchEnv | SubprocEnv | None = None
+        self._envs: BatchEnv | AsyncVectorEnv | None = None
         self._starts = np.arange(num_envs)
         self._last: dict[str, np.ndarray] = {}
 
@@ -89,6 +94,8 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         elif self.settings.starts == "original":
             start = {"start": self._original_starts(seed), "outdated_controller": True}
         self._starts = self._starts + self.num_envs
+        if isinstance(envs, AsyncVectorEnv):
+            envs.set_attr("start", start.pop("init_state", np.full(self.num_envs, -1)).tolist())
         with _waiting(envs):
             obs, info = envs.reset(seed=seed, options=start)
             for _ in range(self.settings.wait_steps):
@@ -130,7 +137,8 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         """
         if not self._last:
             raise LiberoError("there is no image before the first reset")
-        return np.ascontiguousarray(self._last[_key(next(iter(self.settings.cameras)))][:, :, ::-1])
+        seen = self._last[_key(next(iter(self.settings.cameras)))]
+        return np.ascontiguousarray(rotate_180(flip_rows(seen, 1), 1))
 
     def close(self, **kwargs: Any) -> None:
         """Free the simulations; a later `reset` builds them again."""
@@ -138,11 +146,16 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
             self._envs.close()
         self._envs, self._last = None, {}
 
-    def _open(self) -> BatchEnv | SubprocEnv:
+    def _open(self) -> BatchEnv | AsyncVectorEnv:
         if self._envs is None:
             config = self.settings.env_config(self._task)
             if self._processes:
-                self._envs = SubprocEnv([{"task": self._task} for _ in range(self.num_envs)], config=config)
+                cloudpickle.register_pickle_by_value(
+                    sys.modules[__name__]
+                )  # processes need not import LeRobot
+                make = partial(_Standing, self._task, config)
+                mode = AutoresetMode.DISABLED
+                self._envs = AsyncVectorEnv([make] * self.num_envs, context="spawn", autoreset_mode=mode)
             else:
                 self._envs = BatchEnv(self._task, self.num_envs, config=config)
         return self._envs
@@ -175,7 +188,7 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         """Return an observation as LeRobot's `LiberoEnv` gives it: lowest row first, quaternions xyzw."""
         self._last = obs
         pixels = {
-            name: np.ascontiguousarray(obs[_key(camera)][:, ::-1])
+            name: np.ascontiguousarray(flip_rows(obs[_key(camera)], 1))
             for camera, name in self.settings.cameras.items()
         }
         if not self.settings.with_state:
@@ -199,8 +212,30 @@ class TaskEnvs(gymnasium.vector.VectorEnv):
         }
 
 
+class _Standing(gymnasium.Wrapper):
+    """A simulation in a process: it starts in the stored state `start`, if any, and stands still when it is over."""
+
+    start = -1
+
+    def __init__(self, task: Task, config: EnvConfig):
+        super().__init__(LiberoEnv(task, config=config))
+        self._last: Any = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        self._last = None
+        return super().reset(seed=seed, options={} if self.start < 0 else {"init_state": self.start})
+
+    def step(self, action: np.ndarray) -> Any:
+        if self._last is None:
+            found = super().step(action)
+            obs, _, *over, info = found
+            self._last = (obs, 0.0, *over, info) if any(over) else None
+            return found
+        return self._last
+
+
 @contextmanager
-def _waiting(envs: BatchEnv | SubprocEnv) -> Iterator[None]:
+def _waiting(envs: BatchEnv | AsyncVectorEnv) -> Iterator[None]:
     """Make actions relative, so that they hold the pose; LeRobot, too, changes to absolute ones after waiting."""
     if not isinstance(envs, BatchEnv):
         yield

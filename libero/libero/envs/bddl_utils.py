@@ -10,7 +10,8 @@ from libero.libero import get_libero_path
 from libero_env.errors import BDDLError
 from libero_env.sim.history import over_time
 from libero_env.tasks import bddl
-from libero_env.tasks.problem import And, Atom, Expression, ForAll, Not, Or, Problem
+from libero_env.tasks.expression import And, Atom, Expression, ForAll, Not, Or
+from libero_env.tasks.problem import Problem
 
 _NO_YAW, _NO_COLOUR = [0, 0], [0, 0, 1, 0]
 

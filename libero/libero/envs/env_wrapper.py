@@ -180,16 +180,3 @@ class SegmentationRenderEnv(OffScreenRenderEnv):
         ids = [self.instance_to_id[name] for name in self.obj_of_interest if name in self.instance_to_id]
         picture[np.isin(segmentation_image, ids)] = 1
         return picture
-
-    def segmentation_to_rgb(self, seg_im: np.ndarray, random_colors: bool = False) -> np.ndarray:
-        """Return a colour for each number, (H, W, 3) uint8: evenly spread hues, or random ones of a fixed seed."""
-        image = np.asarray(seg_im)
-        image = image[..., 0] if image.ndim == 3 else image
-        count = int(max(image.max(initial=0), 0)) + 1
-        if random_colors:
-            colours = np.random.default_rng(0).integers(0, 256, (count, 3))
-        else:
-            hue = (np.arange(count)[:, None] * 0.618034 + (0.0, 1 / 3, 2 / 3)) % 1.0
-            colours = 255 * (0.5 + 0.5 * np.cos(2 * np.pi * hue))
-        colours[0] = 0
-        return colours.astype(np.uint8)[np.maximum(image, 0)]

@@ -9,53 +9,43 @@ from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
-from gymnasium import spaces
 from pydantic import Field
 
 from libero._adapters.workers import (  # noqa: F401 - names of the original
     CloudpickleWrapper,
     DummyEnvWorker,
     EnvWorker,
-    ShArray,
     SubprocEnvWorker,
     WorkerError,
 )
-from libero_env.errors import ClosedEnvironmentError, InvalidInputError, LiberoError
+from libero_env.errors import ClosedEnvironmentError, InvalidInputError
 from libero_env.text import shown
 from libero_env.validation import validate
 
 # Attributes of a vector that are those of its environments, in a list.
 GYM_RESERVED_KEYS = ["metadata", "reward_range", "spec", "action_space", "observation_space"]
 
-gym_old_venv_step_type = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-gym_new_venv_step_type = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
-_Count = Annotated[int, Field(ge=1)]
 _Seconds = Annotated[float, Field(gt=0, le=1e6)]
 Ids = int | Sequence[int] | np.ndarray | None
 
 
 class BaseVectorEnv:
-    """Environments that are stepped together.
-
-    With `wait_num` or `timeout`, `step` returns as soon as that many environments are ready; `info["env_id"]` states
-    which ones, and the others continue in the meantime.
+    """Environments that are stepped together; a step waits for all of them.
 
     Args:
         env_fns: One factory for each environment.
         worker_fn: Function that makes a worker of a factory.
-        wait_num: Number of environments that `step` waits for; None for all.
-        timeout: Seconds that `step` waits for them; None for no limit.
 
     Raises:
-        InvalidInputError: There are no factories, or `wait_num` or `timeout` is out of range.
+        InvalidInputError: There are no factories.
     """
+
+    is_async = False
 
     def __init__(
         self,
         env_fns: Sequence[Callable[[], Any]],
         worker_fn: Callable[[Callable[[], Any]], EnvWorker],
-        wait_num: int | None = None,
-        timeout: float | None = None,
     ):
         env_fns = list(env_fns)
         if not env_fns or not all(map(callable, env_fns)):
@@ -63,16 +53,9 @@ class BaseVectorEnv:
                 f"env_fns={shown(env_fns)}: expected at least one function that makes an environment"
             )
         self.env_num = len(env_fns)
-        self.wait_num = validate(_Count | None, wait_num, prefix=("wait_num",)) or self.env_num
-        if self.wait_num > self.env_num:
-            raise InvalidInputError(f"wait_num={wait_num}: expected 1 to {self.env_num} environments")
-        self.timeout = validate(_Seconds | None, timeout, prefix=("timeout",))
-        self.is_async = self.wait_num != self.env_num or timeout is not None
         self.is_closed = False
         self.workers = [worker_fn(env_fn) for env_fn in env_fns]
         self.worker_class = type(self.workers[0])
-        self.waiting_id: list[int] = []
-        self.ready_id = list(range(self.env_num))
 
     def __getattr__(self, key: str) -> Any:
         """Return the attribute of each environment, of those in `GYM_RESERVED_KEYS`."""
@@ -101,40 +84,19 @@ class BaseVectorEnv:
         return _stack(results)
 
     def step(self, action: Any, id: Ids = None) -> tuple[np.ndarray, ...]:
-        """Act in the environments, actions (k, 7); with `wait_num` or `timeout`, None only waits for those that act.
+        """Act in the environments, actions (k, 7).
 
         Returns:
             Observations, rewards, successes and infos, each (k,); of environments of Gymnasium's interface
-            observations, rewards, terminated, truncated and infos.
+            observations, rewards, terminated, truncated and infos. `info["env_id"]` is the index of the environment.
         """
-        ids = self._ids(id if action is not None else [])
+        ids = self._ids(id)
         failed = self._start("step", ids, [] if action is None else action)
         ids = [i for i in ids if i not in failed]
-        if self.is_async:
-            self.waiting_id += ids
-            self.ready_id = [i for i in self.ready_id if i not in ids]
-            ids = self._wait() if self.waiting_id or not failed else []
-        elif action is None:
-            raise InvalidInputError(
-                "step(None) waits for environments that act; it needs wait_num or timeout"
-            )
-        results = self._each(ids, lambda worker: worker.finish("step"), failed)
+        results = self._each(ids, lambda worker: worker.recv(), failed)
         for i, result in zip(ids, results, strict=True):
             result[-1]["env_id"] = i
         return tuple(map(_stack, zip(*results, strict=True)))
-
-    def _wait(self) -> list[int]:
-        """Wait for some environments, and move them from waiting to ready."""
-        if not self.waiting_id:
-            raise InvalidInputError("no environment is at a step; give some an action first")
-        ready: list[EnvWorker] = []
-        while not ready:
-            waiting = [self.workers[i] for i in self.waiting_id]
-            ready = self.worker_class.wait(waiting, self.wait_num, self.timeout)
-        ids = [i for i in self.waiting_id if self.workers[i] in ready]
-        self.waiting_id = [i for i in self.waiting_id if i not in ids]
-        self.ready_id += ids
-        return ids
 
     def seed(self, seed: int | Sequence[int | None] | None = None) -> list[Any]:
         """Seed the environments: with a list, or with numbers that count up from one."""
@@ -172,7 +134,7 @@ class BaseVectorEnv:
     def _call(self, method: str, ids: Sequence[int], arguments: Any = None, **kwargs: Any) -> list[Any]:
         """Call a method of these environments at once, each with its own argument."""
         failed = self._start(method, ids, arguments, **kwargs)
-        return self._each([i for i in ids if i not in failed], lambda worker: worker.finish(method), failed)
+        return self._each([i for i in ids if i not in failed], lambda worker: worker.recv(), failed)
 
     def _start(self, method: str, ids: Sequence[int], arguments: Any, **kwargs: Any) -> dict[int, str]:
         """Start a call of a method of these environments, each with its own argument; return failures by index."""
@@ -233,13 +195,11 @@ class BaseVectorEnv:
         return chosen
 
     def _assert_id(self, id: Sequence[int]) -> None:
-        if busy := [i for i in id if i in self.waiting_id]:
-            raise LiberoError(f"environments {busy} are still at their last step; call step to wait for them")
+        """Do nothing: no environment is still at its last step."""
 
     def _ids(self, id: Ids) -> list[int]:
         self._assert_is_not_closed()
         ids = self._wrap_id(id)
-        self._assert_id(ids)
         if lost := {i: reason for i in ids if (reason := self.workers[i].why_lost())}:
             raise WorkerError(f"{_named(lost)}\nNothing was done. {self._remedy()}", lost)
         return ids
@@ -248,8 +208,8 @@ class BaseVectorEnv:
 class DummyVectorEnv(BaseVectorEnv):
     """Environments in this process, one after the other."""
 
-    def __init__(self, env_fns: Sequence[Callable[[], Any]], **kwargs: Any):
-        super().__init__(env_fns, DummyEnvWorker, **kwargs)
+    def __init__(self, env_fns: Sequence[Callable[[], Any]]):
+        super().__init__(env_fns, DummyEnvWorker)
 
 
 class SubprocVectorEnv(BaseVectorEnv):
@@ -257,10 +217,9 @@ class SubprocVectorEnv(BaseVectorEnv):
 
     Args:
         env_fns: One factory for each environment; a lambda is allowed.
-        share_memory: Whether the arrays of observations come back through shared memory.
+        share_memory: Without effect, see `SubprocEnvWorker`.
         call_timeout: Seconds after which a worker that does not answer is ended, the start of the processes included;
             None for 600. The environments of other workers go on.
-        kwargs: Further arguments of `BaseVectorEnv`.
     """
 
     def __init__(
@@ -268,11 +227,9 @@ class SubprocVectorEnv(BaseVectorEnv):
         env_fns: Sequence[Callable[[], Any]],
         share_memory: bool = False,
         call_timeout: float | None = None,
-        **kwargs: Any,
     ):
         limit = validate(_Seconds | None, call_timeout, prefix=("call_timeout",))
-        worker_fn = partial(SubprocEnvWorker, share_memory=share_memory, timeout=limit)
-        super().__init__(env_fns, worker_fn, **kwargs)
+        super().__init__(env_fns, partial(SubprocEnvWorker, timeout=limit))
 
 
 def _named(reasons: Mapping[int, str]) -> str:
@@ -288,12 +245,3 @@ def _stack(items: Sequence[Any]) -> np.ndarray:
         for i, item in enumerate(items):
             array[i] = item
         return array
-
-
-def _setup_buf(space: spaces.Space) -> Any:
-    """Return shared memory for observations of a space: an array, or a dictionary or tuple of them."""
-    if isinstance(space, spaces.Dict):
-        return {key: _setup_buf(part) for key, part in space.spaces.items()}
-    if isinstance(space, spaces.Tuple):
-        return tuple(map(_setup_buf, space.spaces))
-    return ShArray(space.dtype, space.shape or ())

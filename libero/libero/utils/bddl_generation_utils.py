@@ -1,6 +1,6 @@
 """Task files from descriptions of a scene and a task, with the original's generator functions.
 
-The parts are values of `libero_env.tasks.problem`; `PDDLDefinition` joins them to the text of a task file.
+The parts are values of `libero_env.tasks.problem`; those in `SUITE_GENERATORS` join them to a task file.
 """
 
 import functools
@@ -17,19 +17,13 @@ from libero.libero.utils.object_utils import get_affordance_regions
 from libero_env.assets.arena import load_workspace
 from libero_env.errors import BDDLError, InvalidInputError
 from libero_env.tasks import bddl
-from libero_env.tasks.problem import And, Atom, Expression, Problem, Region
+from libero_env.tasks.expression import And, Atom, Expression
+from libero_env.tasks.problem import Problem, Region
 
 _OWN_NAMES = ("kitchen_table", "living_room_table", "study_table", "coffee_table", "floor")
 WORKSPACE_CATEGORIES = {"main_table": "table", **{name: name for name in _OWN_NAMES}}  # name -> category
 
 Pair = Sequence[float]
-
-
-class Language(str):
-    """An instruction: one line, single spaces."""
-
-    def __new__(cls, instruction: str) -> "Language":
-        return super().__new__(cls, " ".join(instruction.split()))
 
 
 def get_fixtures(object_dict: Mapping[str, Sequence[str]]) -> dict[str, str]:
@@ -44,46 +38,6 @@ class ObjectDict(dict[str, list[str]]):
     """Category -> names of its instances, in the order in which a task file declares them."""
 
     names = property(get_fixtures, doc="Name -> category.")
-
-
-class RegionWrapper:
-    """Regions by address, each once."""
-
-    def __init__(self, regions: Iterable[Region] = ()):
-        self.regions = {region.address: region for region in regions}
-
-    def add(self, region: Region) -> None:
-        """Add a region, or replace the one of its address."""
-        self.regions[region.address] = region
-
-
-def LogicalState(predicate: str, *args: Any) -> Expression:
-    """Return a condition, `LogicalState("On", "plate_1", "stove_1")`; And, Or and Not take conditions."""
-    return as_expression([predicate, *args])
-
-
-class PDDLDefinition:
-    """Decorator of a function that returns the fields of a `Problem`: it then returns the task file.
-
-    Args:
-        problem_name: Problem class, such as `LIBERO_Kitchen_Tabletop_Manipulation`.
-    """
-
-    def __init__(self, problem_name: str, domain: str = "robosuite"):
-        self.problem_name, self.domain = problem_name, domain
-
-    def __call__(self, facts: Callable[..., Mapping[str, Any]]) -> Callable[..., str]:
-        """Return a function that writes task files; it raises a BDDLError for a name that is not declared."""
-
-        @functools.wraps(facts)
-        def write(*args: Any, **kwargs: Any) -> str:
-            fields = facts(*args, **kwargs)
-            try:
-                return bddl.write(Problem(name=self.problem_name, domain=self.domain, **fields))
-            except InvalidInputError as error:
-                raise BDDLError(str(error)) from None
-
-        return write
 
 
 def object_naming_mapping(category_name: str, object_id: int) -> str:
@@ -101,11 +55,6 @@ def get_object_dict(object_num_info: Mapping[str, int]) -> ObjectDict:
         category = WORKSPACE_CATEGORIES.get(category, category)
         objects[category] = [object_naming_mapping(category, i) for i in range(1, count + 1)]
     return objects
-
-
-def get_objects_of_interest(objects_of_interest: Iterable[str]) -> tuple[str, ...]:
-    """Return the names, each once."""
-    return tuple(dict.fromkeys(objects_of_interest))
 
 
 def get_xy_region(
@@ -142,7 +91,7 @@ def region_module(
     """Return all regions, from arguments of `get_xy_region` and of `get_object_affordance_region`."""
     regions = [get_xy_region(**kwargs) for kwargs in xy_region_kwargs_list or ()]
     regions += [get_object_affordance_region(**kwargs) for kwargs in affordance_region_kwargs_list or ()]
-    return tuple(RegionWrapper(regions).regions.values())
+    return tuple({region.address: region for region in regions}.values())  # each once
 
 
 def get_init_state(init_states: Iterable[Sequence[str]]) -> tuple[Atom, ...]:
@@ -175,7 +124,8 @@ def get_xy_region_kwargs_list_from_regions_info(regions_info: Mapping[str, Mappi
     return [{"region_name": name, **facts} for name, facts in regions_info.items()]
 
 
-def _facts(
+def _task_file(
+    category: str,
     language: str,
     xy_region_kwargs_list: Iterable[Mapping[str, Any]] = (),
     affordance_region_kwargs_list: Iterable[Mapping[str, Any]] = (),
@@ -184,22 +134,23 @@ def _facts(
     objects_of_interest: Iterable[str] = (),
     init_states: Iterable[Sequence[str]] = (),
     goal_states: Sequence[Any] = (),
-) -> dict[str, Any]:
-    """Return the fields of a `Problem`."""
-    return {
-        "language": Language(language),
-        "regions": region_module(xy_region_kwargs_list, affordance_region_kwargs_list),
-        "fixtures": get_fixtures(fixture_object_dict or {}),
-        "objects": get_objects(movable_object_dict or {}),
-        "obj_of_interest": get_objects_of_interest(objects_of_interest),
-        "init": get_init_state(init_states),
-        "goal": get_goal_state(goal_states),
-    }
-
-
-def _task_file(category: str, *args: Any, **kwargs: Any) -> str:
-    """Write the task file of a task on a workspace; arguments as in `_facts`."""
-    return PDDLDefinition(load_workspace(category).problem)(_facts)(*args, **kwargs)
+) -> str:
+    """Write the task file of a task on a workspace; raise a BDDLError for a name that is not declared."""
+    try:
+        problem = Problem(
+            name=load_workspace(category).problem,
+            domain="robosuite",
+            language=" ".join(language.split()),
+            regions=region_module(xy_region_kwargs_list, affordance_region_kwargs_list),
+            fixtures=get_fixtures(fixture_object_dict or {}),
+            objects=get_objects(movable_object_dict or {}),
+            obj_of_interest=tuple(dict.fromkeys(objects_of_interest)),
+            init=get_init_state(init_states),
+            goal=get_goal_state(goal_states),
+        )
+        return bddl.write(problem)
+    except InvalidInputError as error:
+        raise BDDLError(str(error)) from None
 
 
 SUITE_GENERATORS: dict[str, Callable[..., str]] = {

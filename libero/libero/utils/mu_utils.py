@@ -18,7 +18,8 @@ from libero.libero.utils.bddl_generation_utils import (
     get_xy_region_kwargs_list_from_regions_info,
 )
 from libero_env.errors import LiberoError, require_known
-from libero_env.tasks.builder import build_problem, load_scene
+from libero_env.tasks.builder import build_problem
+from libero_env.tasks.merging import load_scene
 from libero_env.tasks.problem import Problem
 
 MU_DICT: dict[str, Any] = {}  # name -> class

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from libero_env.demos.video import write_video
+from libero_env.curating.video import write_video
 from libero_env.errors import LiberoError
+from libero_env.images import flip_rows
 
 Obs = Mapping[str, np.ndarray]
 
@@ -57,7 +58,7 @@ class VideoWriter:
             image = (1 - _TINT_WEIGHT) * self.last_images.get(idx, image) + _TINT_WEIGHT * _TINT
         else:
             self.last_images[idx] = image
-        self.append_image(image[::-1], idx)
+        self.append_image(flip_rows(image), idx)
 
     def append_vector_obs(
         self, obs: Sequence[Obs], dones: Sequence[bool], camera_name: str = "agentview_image"

@@ -14,7 +14,7 @@ from libero._adapters.batches import DictWindows
 from libero._adapters.batches import join_tensors as merge_datas
 from libero._adapters.lookup import alias_modules
 from libero.lifelong.algos.base import REGISTERED_ALGOS, Sequential, get_algo_class, get_algo_list
-from libero.lifelong.metric import evaluate_multitask_training_success
+from libero.lifelong.metric import evaluate_success
 from lifelong import algorithms
 from lifelong.algorithms.importance import BatchFisher
 from lifelong.data.memory import ReplayMemory
@@ -66,15 +66,6 @@ class EWC(Sequential):
             estimator=BatchFisher(windows=0, batch_size=cfg.train.batch_size),
         )
 
-    def get_params(self) -> Tensor:
-        """Return all weights of the policy, (P,)."""
-        return torch.cat([p.reshape(-1) for p in self.policy.parameters()])
-
-    def get_grads(self) -> Tensor:
-        """Return the gradients of all weights, (P,); 0 where there is none."""
-        grads = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.policy.parameters()]
-        return torch.cat([grad.reshape(-1) for grad in grads])
-
     def penalty(self) -> Tensor:
         """Return the penalty on the present weights, without the factor `lifelong.e_lambda`."""
         hooks = copy.copy(self.hooks)
@@ -96,7 +87,7 @@ class PackNet(Sequential):
         self.hooks.begin_phase(retrain, self.policy)
         if epochs := settings.post_prune_epochs:
             self.make_optimizer(epochs)
-            path, measure = self.checkpoint_path(task_id), lambda _: self.measure_success(task_id, benchmark)
+            path, measure = self.checkpoint_path(task_id), self._measure(task_id, benchmark)
             self.train_policy(dataset, epochs, settings.post_eval_every, path, measure, phase=1)
         self.hooks.end_phase(retrain, self.policy)
         self.hooks.end_task(task_id, DictWindows(dataset, task_id), self.policy, self.draws)
@@ -146,20 +137,19 @@ class Multitask(Sequential):
             Success (0 if it is not measured) and loss, as `learn_one_task` returns them.
         """
         self.start_task(-1)
-        tasks, every = list(range(benchmark.n_tasks)), self.cfg.eval.eval_every
+        tasks, measured = (
+            list(range(benchmark.n_tasks)),
+            self.cfg.lifelong.eval_in_train and not self.cfg.pretrain,
+        )
 
-        def measure(number: int) -> float | None:
-            epoch = min(number * every, self.cfg.train.n_epochs)
+        def measure(epoch: int) -> float | None:
             self.save(os.path.join(self.experiment_dir, f"multitask_model_ep{epoch}.pth"))
-            if not self.cfg.lifelong.eval_in_train or self.cfg.pretrain:
-                return None
-            return float(np.mean(evaluate_multitask_training_success(self.cfg, self, benchmark, tasks)))
+            return float(np.mean(evaluate_success(self.cfg, self, benchmark, tasks))) if measured else None
 
         windows, path = ConcatDataset(datasets), os.path.join(self.experiment_dir, "multitask_model.pth")
-        curve = self.train_policy(windows, self.cfg.train.n_epochs, every, path, measure)
+        rates = self.train_policy(windows, self.cfg.train.n_epochs, self.cfg.eval.eval_every, path, measure)
         self.end_task(windows, 0, benchmark)
-        curve.write(os.path.join(self.experiment_dir, "multitask_auc.log"))
-        return curve.means()
+        return rates
 
 
 alias_modules(__name__, "agem er ewc multitask packnet single_task")

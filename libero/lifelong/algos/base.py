@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -25,7 +24,7 @@ from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 
 REGISTERED_ALGOS: dict[str, type["Sequential"]] = {}
-Measure = Callable[[int], float | None]  # number of an evaluation -> success, None where it is not measured
+Measure = Callable[[int], float | None]  # epoch -> success, None where it is not measured
 
 
 def register_algo(algo_class: type["Sequential"]) -> None:
@@ -49,39 +48,6 @@ class AlgoMeta(type):
     def __init__(cls, name: str, bases: tuple, namespace: dict[str, Any]):
         super().__init__(name, bases, namespace)
         register_algo(cast(Any, cls))
-
-
-@dataclass
-class LearningCurve:
-    """Loss and success (0 where not measured) of every `eval_every`-th epoch; the weights of the `best` are kept."""
-
-    losses: list[float] = field(default_factory=list)
-    successes: list[float] = field(default_factory=list)
-    best: int = 0
-    highest: float = -1.0
-
-    def add(self, loss: float, success: float | None, is_point: bool) -> bool:
-        """Compare an epoch, and append it if it is a point of the curve; return whether it is the best so far.
-
-        The best is the first with the highest success, or the last where success is not measured.
-        """
-        is_best = success is None or success > self.highest
-        if is_best:
-            self.best, self.highest = len(self.losses), success or 0.0
-        if is_point:
-            self.losses.append(loss)
-            self.successes.append(success or 0.0)
-        return is_best
-
-    def means(self) -> tuple[float, float]:
-        """Return mean success and mean loss with epochs after the best counted as the best (eq. 3 of the paper)."""
-        held = np.minimum(np.arange(len(self.losses)), self.best)
-        return float(np.array(self.successes)[held].mean()), float(np.array(self.losses)[held].mean())
-
-    def write(self, path: str) -> None:
-        """Write success and loss, as tensors."""
-        points = {"success": self.successes, "loss": self.losses}
-        torch.save({name: torch.tensor(p, dtype=torch.float64) for name, p in points.items()}, path)
 
 
 class Sequential(nn.Module, metaclass=AlgoMeta):
@@ -167,22 +133,23 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
             dataset: Windows of the task, with `task_emb`.
             task_id: Position in the sequence.
             benchmark: Benchmark with the tasks and their embeddings.
-            result_summary: Receives simulator states under `k<task>_e<evaluation>` if `eval.save_sim_states` is set.
+            result_summary: Without effect: no states are kept.
 
         Returns:
-            Success and loss, averaged over the evaluated epochs as forward transfer is defined.
+            Success (0 if it is not measured) and loss, averaged over the evaluated epochs, see `train_policy`.
         """
         self.start_task(task_id)
-
-        def measure(number: int) -> float | None:
-            return self.measure_success(task_id, benchmark, result_summary, f"k{task_id}_e{number}")
-
-        every, path = self.cfg.eval.eval_every, self.checkpoint_path(task_id)
-        curve = self.train_policy(dataset, self.cfg.train.n_epochs, every, path, measure)
+        path = self.checkpoint_path(task_id)
+        rates = self.train_policy(
+            dataset,
+            self.cfg.train.n_epochs,
+            self.cfg.eval.eval_every,
+            path,
+            self._measure(task_id, benchmark),
+        )
         self.end_task(dataset, task_id, benchmark)
         self.save(path)
-        curve.write(os.path.join(self.experiment_dir, f"task{task_id}_auc.log"))
-        return curve.means()
+        return rates
 
     def learn_all_tasks(
         self, datasets: Sequence[Dataset], benchmark: Any, result_summary: Mapping[str, Any]
@@ -211,35 +178,45 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
         """Write the policy, the configuration, and the masks of an algorithm that has them."""
         torch_save_model(self.policy, path, self.cfg, getattr(self, "previous_masks", None))
 
-    def measure_success(
-        self, task_id: int, benchmark: Any, sim_states: Any = None, key: str = ""
-    ) -> float | None:
-        """Return the mean success on a task, or group of tasks, that is being learned; None without evaluation."""
-        if not self.cfg.eval.eval or self.cfg.pretrain:
-            return None
+    def _measure(self, task_id: int, benchmark: Any) -> Measure:
+        """Return a function that returns the success on a task, or group of tasks, None without evaluation."""
         size = int(self.cfg.data.task_group_size)
         tasks = range(task_id * size, (task_id + 1) * size)
-        rates = evaluate_success(self.cfg, self, benchmark, tasks, sim_states, key=key, selecting=True)
-        return float(rates.mean())
+        measured = self.cfg.eval.eval and not self.cfg.pretrain
+        return lambda _: (
+            float(evaluate_success(self.cfg, self, benchmark, tasks).mean()) if measured else None
+        )
 
     def train_policy(
         self, dataset: Dataset, epochs: int, every: int, path: str, measure: Measure, phase: int = 0
-    ) -> LearningCurve:
+    ) -> tuple[float, float]:
         """Train with `lifelong.training.fit`; load the weights of the best evaluation, or the last if none measures.
 
-        Epoch 0, every `every` epochs and the last are evaluated; the best weights so far are written to `path`. The
-        last is a point of the curve only where its turn has come, as scripts of the original expect. `phase` is the
-        number of the training phase within the task, a part of the seed. Unlike the original's loader, `fit` fills up
-        the last batch of an epoch with further windows.
+        Epoch 0, every `every` epochs and the last are evaluated; the first of the highest success is the best, whose
+        weights are written to `path`. The last is a point of the curve, `<name>_auc.log`, only where its turn has come,
+        as scripts of the original expect. Unlike the original's loader, `fit` fills up the last batch of an epoch with
+        further windows.
+
+        Args:
+            measure: Function of the epoch that returns the success, None where it is not measured.
+            phase: Number of the training phase within the task, a part of the seed; the curve is that of the first.
+
+        Returns:
+            Mean success and mean loss, with epochs after the best counted as the best (eq. 3 of the paper).
         """
-        curve, train = LearningCurve(), self.cfg.train
+        train, best = self.cfg.train, (0, -1.0)  # number and success of the best
+        points: list[tuple[float, float]] = []  # success, loss
 
         def evaluate(epoch: int, loss: float) -> None:
+            nonlocal best
             if epoch % every and epoch != epochs:
                 return
-            success = measure(len(curve.losses))
-            if curve.add(loss, success, epoch % every == 0):
+            success = measure(epoch)
+            if success is None or success > best[1]:
+                best = len(points), success or 0.0
                 self.save(path)
+            if epoch % every == 0:
+                points.append((success or 0.0, loss))
             text = "" if success is None else f" | success {success:4.2f}"
             print(f"[info] epoch {epoch:3d} | loss {loss:7.3f}{text}", flush=True)
 
@@ -272,7 +249,11 @@ class Sequential(nn.Module, metaclass=AlgoMeta):
                 load=windows.load,
             )
         self.policy.load_state_dict(torch_load_model(path, map_location=self.cfg.device)[0])
-        return curve
+        successes, losses = torch.tensor(points, dtype=torch.float64).T
+        if phase == 0:
+            torch.save({"success": successes, "loss": losses}, path.replace("_model.pth", "_auc.log"))
+        held = torch.arange(len(points)).clamp(max=best[0])
+        return successes[held].mean().item(), losses[held].mean().item()
 
 
 def _build_torch(node: Any, module: Any, *args: Any, **kwargs: Any) -> Any:

@@ -3,20 +3,8 @@
 from libero._adapters.lookup import alias_modules
 from libero.lifelong.models.base_policy import BasePolicy, get_policy_class, get_policy_list
 from libero.lifelong.models.modules.language_modules import IdentityEncoder, MLPEncoder
-from libero.lifelong.models.modules.rgb_modules import (
-    PatchEncoder,
-    ResnetEncoder,
-    SpatialProjection,
-    SpatialSoftmax,
-)
-from libero.lifelong.models.modules.transformer_modules import (
-    Attention,
-    DropPath,
-    Norm,
-    SinusoidalPositionEncoding,
-    TransformerDecoder,
-    TransformerFeedForwardNN,
-)
+from libero.lifelong.models.modules.rgb_modules import PatchEncoder, ResnetEncoder
+from libero.lifelong.models.modules.transformer_modules import SinusoidalPositionEncoding, TransformerDecoder
 from libero.lifelong.models.native_policy import (
     BCRNNPolicy,
     BCTransformerPolicy,
@@ -25,6 +13,5 @@ from libero.lifelong.models.native_policy import (
     ExtraModalityTokens,
 )
 from libero.lifelong.models.policy_head import DeterministicHead, GMMHead
-from libero.lifelong.models.saliency import PerturbationAttention
 
 alias_modules(__name__, "bc_rnn_policy bc_transformer_policy bc_vilt_policy policy")

@@ -9,18 +9,21 @@ from pathlib import Path
 
 from libero_env.assets.arena import workspace_of_problem
 from libero_env.assets.pack import Pack, select_pack
-from libero_env.design.lint.report import Finding, Level, Report
+from libero_env.design.lint.report import Finding, Level, Report, lines_of_yaml
 from libero_env.design.lint.scene import check_scene
 from libero_env.errors import BDDLError, UnknownNameError
 from libero_env.objects.model import OPPOSITE_STATES
-from libero_env.sim.predicates import PREDICATES
 from libero_env.tasks import Task, bddl
-from libero_env.tasks.builder import FILE, language_from_name
-from libero_env.tasks.problem import PLACING, And, Atom, Expression, Not, Problem, ProblemError
+from libero_env.tasks.benchmark import task_of_file
+from libero_env.tasks.builder import language_from_name
+from libero_env.tasks.expression import And, Atom, Expression, Not
+from libero_env.tasks.problem import Problem, ProblemError
+from libero_env.tasks.rules import PLACING
 from libero_env.tasks.sexpr import parse_tree
+from libero_env.tasks.suites import iter_yaml_tasks
 from libero_env.workspaces import WORKSPACES
 
-__all__ = ["Finding", "lint_file", "lint_task", "lint_text"]
+__all__ = ["Finding", "lint_file", "lint_task", "lint_text", "lint_yaml"]
 
 STARTS = 5  # initial states that are checked by default
 # words of categories that do not name the object
@@ -43,8 +46,19 @@ def lint_task(task: Task, pack: Pack | None = None, *, starts: int = STARTS) -> 
     return lint_text(task.bddl_text, task.id, task, pack, starts=starts)
 
 
+def lint_yaml(path: str | Path, pack: Pack | None = None, *, starts: int = STARTS) -> Iterator[list[Finding]]:
+    """Yield the findings about each task of a YAML file, by its lines; see `lint_task`.
+
+    Raises:
+        LiberoError: A task is not valid.
+    """
+    for task, source in list(iter_yaml_tasks(path)):
+        report = Report(lines_of_yaml(task.problem, source))
+        yield _findings(report, task, pack or select_pack(), starts)
+
+
 def lint_file(path: str | Path, pack: Pack | None = None, *, starts: int = STARTS) -> list[Finding]:
-    """Return the findings about a task file; see `lint_task`.
+    """Return the findings about a BDDL file; see `lint_task`.
 
     Raises:
         OSError: The file cannot be read.
@@ -68,7 +82,6 @@ def lint_text(
         pack: Models to use; None is `select_pack()`.
         starts: Number of initial states to check; 0 simulates nothing.
     """
-    pack = pack or select_pack()
     reader = bddl.Reader(file)
     report = Report(reader)
     try:
@@ -81,12 +94,22 @@ def lint_text(
     except BDDLError as error:
         return [_syntax(error, file)]
     if task is None:
-        name = Path(file).stem
-        task = Task(FILE, 0, name, language_from_name(name), problem.language, problem)
+        task = task_of_file(Path(file).stem, problem)
     for section in problem.unknown_sections:
         report.add("warning", 1, "unknown-section", f"the section {section:.40} has no effect", "remove it")
+    if _words(named := language_from_name(task.name)) != _words(told := task.bddl_language):
+        what = f"the name says {named!r}, and :language {told!r}: policies receive {task.language!r}"
+        remedy = (
+            "the original tells the name; use the instruction as name, words joined by _, for both to agree"
+        )
+        report.add("info", reader.line(":language"), "language", what, remedy)
+    return _findings(report, task, pack or select_pack(), starts)
+
+
+def _findings(report: Report, task: Task, pack: Pack, starts: int) -> list[Finding]:
+    """Return what is in a report, and what is found in a task."""
+    problem = task.problem
     _check_categories(report, problem, pack)
-    _check_atoms(report, problem)
     _check_goal(report, problem)
     _check_regions(report, problem)
     _check_places(report, problem)
@@ -126,14 +149,6 @@ def _check_categories(report: Report, problem: Problem, pack: Pack) -> None:
         what = f"{problem.name} takes place on a {expected}, but the workspace is a {own}"
         remedy = "change one of them; only the workspace has an effect here"
         report.add("warning", 1, "problem-name", what, remedy)
-
-
-def _check_atoms(report: Report, problem: Problem) -> None:
-    """Check that predicates exist."""
-    for atom, line in (*report.init(problem), *report.goal(problem)):
-        if atom.predicate not in PREDICATES:
-            what = f"the predicate of {atom} does not exist"
-            report.add("error", line, "unknown-predicate", what, report.suggest(atom.predicate, PREDICATES))
 
 
 def _check_goal(report: Report, problem: Problem) -> None:
@@ -193,15 +208,11 @@ def _check_places(report: Report, problem: Problem) -> None:
 
 
 def _check_words(report: Report, task: Task, pack: Pack) -> None:
-    """Check the instruction of the file, and that of the task's name where they differ."""
+    """Check the instruction of the file, and that of the task's name where policies receive it."""
     line = report.lines.line(":language")
     texts = {task.bddl_language: ""}
     if _words(task.language) != _words(task.bddl_language):
-        what = f"policies receive {task.language!r}, which is the task's name, and not {task.bddl_language!r}"
-        remedy = "use the instruction as the task's name, words joined by _"
-        report.add("info", line, "language", what, remedy)
-        if task.suite != "file":
-            texts[task.language] = " (of the task's name)"
+        texts[task.language] = " (of the task's name)"
     if not _words(task.bddl_language):
         report.add("error", line, "language", "the instruction is empty", "add it to :language")
         return

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from libero_env.tasks.bddl import Reader
-from libero_env.tasks.problem import Atom, Problem, ProblemError
+from libero_env.tasks.expression import Atom
+from libero_env.tasks.problem import Problem, ProblemError
+from libero_env.tasks.schema import Source
 
 Level = Literal["error", "warning", "info"]
 LEVELS: tuple[Level, ...] = ("error", "warning", "info")  # the most severe first
@@ -34,6 +36,25 @@ class Finding:
 
     def __str__(self) -> str:
         return f"{self.file}:{self.line}: {self.level}: {self.what} [{self.rule}] -> {self.remedy}"
+
+
+def lines_of_yaml(problem: Problem, source: Source) -> Reader:
+    """Return a reader that knows the lines of a task's YAML file; what is from elsewhere has the line of `scene`."""
+    reader = Reader(source.name)
+
+    def line(path: str, label: object = "") -> int:
+        file, _, number = source.places.get(str(label), "").rpartition(":")
+        found = source.line_of((path,)) if source.line_of else None
+        return int(number) if file == source.name else found or 1
+
+    keys = {":init": "place", ":fixtures": "furniture"}
+    sections = (":language", ":fixtures", ":objects", ":obj_of_interest", ":init", ":goal")
+    reader.sections = {section: line(keys.get(section, section[1:])) for section in sections}
+    reader.entities = {name: line("scene", name) for name in (*problem.fixtures, *problem.objects)}
+    reader.regions = {region.address: line("scene", region.address) for region in problem.regions}
+    reader.init = [line("scene", atom) for atom in problem.init]
+    reader.goal = [line("scene", atom) for atom in problem.goal.atoms()]
+    return reader
 
 
 class Report:

@@ -14,14 +14,15 @@ from libero_env.init_states.placement import collision_boxes, sample_start, sett
 from libero_env.init_states.store import load_init_states
 from libero_env.mujoco_compat import mujoco
 from libero_env.objects.model import OPPOSITE_STATES
+from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.history import over_time
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import Scene, build_scene, initial_qpos
-from libero_env.sim.simulation import LoopSimulations
 from libero_env.sim.state import StateView
 from libero_env.tasks import Task
 from libero_env.tasks.builder import FILE
-from libero_env.tasks.problem import And, Atom, ProblemError, Region
+from libero_env.tasks.expression import And, Atom
+from libero_env.tasks.problem import ProblemError, Region
 from libero_env.timing import CONTROL_HZ
 
 # The Panda's dimensions, [m] and [rad]: height of the shoulder above the base, upper arm and forearm (both offset by

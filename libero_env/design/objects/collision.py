@@ -9,11 +9,12 @@ import numpy as np
 
 from libero_env.assets.simplify import decimate
 from libero_env.design.objects.mesh_file import Notify
+from libero_env.errors import install_command
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
 
-INSTALL = "pip install 'libero-lifelong[objects]'"
+INSTALL = install_command("objects")
 _CONCAVITY = 0.05  # CoACD's threshold: deviation of a piece from its hull
 _MAX_PIECES = 24
 _MAX_FACES = 100_000  # that CoACD takes apart within minutes

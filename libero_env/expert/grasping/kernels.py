@@ -7,8 +7,8 @@ ground plans (N, 2), [m].
 
 import numpy as np
 
+from libero_env.compilation import compiled
 from libero_env.expert.arm import GRIPPER
-from libero_env.parallel import compiled
 
 _FINGER_HALF, _OPENING, _HALF_OPENING = GRIPPER.finger_half_width, GRIPPER.max_opening, GRIPPER.half_opening
 _TIP_BELOW, _TIP_THICKNESS, _TAPER = GRIPPER.tip_below, GRIPPER.tip_thickness, GRIPPER.finger_taper
@@ -33,10 +33,20 @@ _FACE_BIN = 0.006  # [m] of a wall's length that is one point of its face
 
 
 @compiled
+def _extent(values: np.ndarray) -> tuple[float, float]:
+    """Return the least and the largest of values (N,), N > 0."""
+    low, high = values[0], values[0]
+    for value in values:
+        low, high = min(low, value), max(high, value)
+    return low, high
+
+
+@compiled
 def central_width(section: np.ndarray, c: float, s: float) -> float:
     """Return the width between the fingers in the middle of a cross-section, [m]."""
     v = section[:, 1] * c - section[:, 0] * s
-    middle = 0.5 * (v.min() + v.max())
+    first, last = _extent(v)
+    middle = 0.5 * (first + last)
     low, high = np.inf, -np.inf
     for i in range(len(section)):
         if abs(v[i] - middle) < _FINGER_HALF:
@@ -59,7 +69,7 @@ def body_grasps(section: np.ndarray, c: float, s: float) -> np.ndarray:
         fingers and close to either of them.
     """
     u, v = section[:, 0] * c + section[:, 1] * s, section[:, 1] * c - section[:, 0] * s
-    low, high = v.min(), v.max()
+    low, high = _extent(v)
     rows = np.empty((3 * len(_SHIFTS), 4))
     count = 0
     for shift in _SHIFTS:
@@ -76,12 +86,12 @@ def body_grasps(section: np.ndarray, c: float, s: float) -> np.ndarray:
         room = max(0.5 * (_OPENING - width) - _SPARE, 0.0)
         for offset in (0.0, room, -room):
             centre = 0.5 * (first + last) + offset
-            rows[count] = centre * c - middle * s, centre * s + middle * c, width, abs(shift) + abs(offset)
+            rows[count, 0], rows[count, 1] = centre * c - middle * s, centre * s + middle * c
+            rows[count, 2], rows[count, 3] = width, abs(shift) + abs(offset)
             count += 1
     return rows[:count]
 
 
-@compiled
 def wall_grasps(section: np.ndarray, column: np.ndarray, height: float, c: float, s: float) -> np.ndarray:
     """Return grasps of walls, such as the rim of a bowl, with room for a finger on either side.
 
@@ -96,13 +106,26 @@ def wall_grasps(section: np.ndarray, column: np.ndarray, height: float, c: float
         Rows (x, y, thickness, cost), (K, 4).
     """
     u, v = section[:, 0] * c + section[:, 1] * s, section[:, 1] * c - section[:, 0] * s
-    order = np.argsort(u, kind="mergesort")
-    u, v = u[order], v[order]
+    order = np.argsort(u, kind="stable")  # NumPy's: numba's takes a second to compile
+    return _wall_grasps(u[order], v[order], column, height, c, s)
+
+
+@compiled
+def _wall_grasps(
+    u: np.ndarray, v: np.ndarray, column: np.ndarray, height: float, c: float, s: float
+) -> np.ndarray:
+    """Return grasps of walls; see `wall_grasps`.
+
+    Args:
+        u: Coordinates of the section between the fingers, ascending, (N,).
+        v: Coordinates across, (N,).
+    """
     column_u = column[:, 0] * c + column[:, 1] * s
     column_v = column[:, 1] * c - column[:, 0] * s
     rows = np.empty((64, 4))
     count = 0
-    for middle in np.arange(v.min() + 0.01, v.max() - 0.009, _WALL_STEP):
+    left, right = _extent(v)
+    for middle in np.arange(left + 0.01, right - 0.009, _WALL_STEP):
         strip = np.flatnonzero(np.abs(v - middle) < _FINGER_HALF)
         if len(strip) < 2:
             continue
@@ -132,8 +155,8 @@ def wall_grasps(section: np.ndarray, column: np.ndarray, height: float, c: float
                 cost = 2.0 * width + 40.0 * max(0.012 - overlap, 0.0) + 6.0 * max(overlap - 0.02, 0.0)
                 if count == len(rows):
                     rows = np.concatenate((rows, np.empty_like(rows)))
-                x, y = centre * c - middle * s, centre * s + middle * c
-                rows[count] = x, y, width, cost + 3.0 * abs(offset) + slope
+                rows[count, 0], rows[count, 1] = centre * c - middle * s, centre * s + middle * c
+                rows[count, 2], rows[count, 3] = width, cost + 3.0 * abs(offset) + slope
                 count += 1
     return rows[:count]
 
@@ -186,7 +209,8 @@ def _face_slope(v: np.ndarray, u: np.ndarray, wall: np.ndarray, sign: float) -> 
     if len(face) < 2:
         return 0.0
     along, out = v[face], sign * u[face]
-    if along.max() - along.min() < 0.008:
+    low, high = _extent(along)
+    if high - low < 0.008:
         return 0.0
     along, out = along - along.mean(), out - out.mean()
     return abs((along * out).sum()) / (along * along).sum()
@@ -196,9 +220,10 @@ def _face_slope(v: np.ndarray, u: np.ndarray, wall: np.ndarray, sign: float) -> 
 def highest_per_cell(points: np.ndarray) -> np.ndarray:
     """Return the highest of the points (N, 3) in each cell of the ground plan, (M, 3)."""
     x, y = np.rint(points[:, 0] / _CELL), np.rint(points[:, 1] / _CELL)
-    x, y = x - x.min(), y - y.min()
-    rows = int(y.max()) + 1
-    best = np.full((int(x.max()) + 1) * rows, -1)
+    (left, right), (near, far) = _extent(x), _extent(y)
+    x, y = x - left, y - near
+    rows = int(far - near) + 1
+    best = np.full((int(right - left) + 1) * rows, -1)
     for i in range(len(points)):
         k = int(x[i]) * rows + int(y[i])
         if best[k] < 0 or points[i, 2] > points[best[k], 2]:
@@ -230,7 +255,7 @@ def pads_meet_upright_faces(points: np.ndarray, pos: np.ndarray, c: float, s: fl
     if count == 0:
         return False
     us, zs = us[:count], zs[:count]
-    first, last = us.min(), us.max()
+    first, last = _extent(us)
     low_side, high_side = -np.inf, -np.inf
     for i in range(count):
         if us[i] - first < _FACE_TOLERANCE:

@@ -10,7 +10,7 @@ from libero_env.sim.history import History
 from libero_env.sim.predicates import contains, evaluate, ground, region_boxes
 from libero_env.sim.scene import Scene
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import And, Atom, Count, Expression, ForAll, Never, Not, Or, Then
+from libero_env.tasks.expression import And, Atom, Count, Expression, ForAll, Never, Not, Or, Then
 
 PLACES = ("On", "In", "Stack")
 

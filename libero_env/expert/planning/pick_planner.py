@@ -12,7 +12,7 @@ from libero_env.expert.planning.place_poses import DOWN, Placement, PlacePose, f
 from libero_env.expert.shapes import Shapes
 from libero_env.geometry import Pose, rotation_about_z
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 _DROP_HEIGHTS = np.array([0.0, 0.02, 0.04, 0.07, 0.10, 0.14, 0.18])  # [m] above the place
 _FEW_HITS = 30  # of a hand's points: one that hits more does not fit into a place entered from a side

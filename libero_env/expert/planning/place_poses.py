@@ -13,7 +13,7 @@ from libero_env.expert.shapes import DENSE, Shapes, pose_of
 from libero_env.geometry import Pose, rotation_about, rotation_about_z
 from libero_env.sim.predicates import Box, contains, is_over, region_boxes
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 DOWN = np.array([0.0, 0.0, -1.0])
 UP = np.array([0.0, 0.0, 1.0])

@@ -9,7 +9,7 @@ from libero_env.expert.skills.skill import Skill, gripper_opening
 from libero_env.expert.variation import MotionStyle
 from libero_env.sim.predicates import region_boxes
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 HOLLOW_RADIUS, MIN_HOLLOW = 0.02, 0.006  # [m] around the origin, and its depth below the rim
 HOVER = 0.07  # [m] of the fingertips over the object on the way to it

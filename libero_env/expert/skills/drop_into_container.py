@@ -19,7 +19,7 @@ from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 MAX_BACK_OFFS = 3
 MAX_REACH_ERROR = 0.005  # of inverse kinematics at the grasp, [m]

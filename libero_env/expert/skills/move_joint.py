@@ -12,7 +12,7 @@ from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_between
 from libero_env.sim.predicates import evaluate, state_bound
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 from libero_env.timing import CONTROL_HZ
 
 ARRIVED, ARRIVED_TURN = 0.008, 0.15  # [m], [rad] from where the fingers close

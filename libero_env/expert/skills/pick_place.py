@@ -16,7 +16,7 @@ from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 MAX_REPLANS = 3  # of the place of what is in the hand
 # wide, so that the fingers close in motion: a clone that creeps up to a threshold never passes it

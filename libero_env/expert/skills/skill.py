@@ -9,7 +9,7 @@ from libero_env.expert.arm import OPEN, action_toward
 from libero_env.expert.variation import MotionStyle
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 from libero_env.timing import CONTROL_HZ
 
 _STILL_HAND = 0.04  # [m/s] below which the hand hardly moves

@@ -14,7 +14,7 @@ from libero_env.expert.variation import MotionStyle
 from libero_env.geometry import Pose, rotation_about, rotation_between
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.state import StateView
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 HAND_RADIUS = 0.05  # [m] around the grip site that has to be free of obstacles
 MAX_SLIP = 0.03  # [m] that an object may move in the hand

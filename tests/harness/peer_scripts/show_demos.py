@@ -8,7 +8,7 @@ import sys
 
 from rerun.chunk import RrdReader
 
-from libero_env.cli.main import main
+from libero_cli.main import main
 
 file, out = sys.argv[1:]
 assert main(["demos", "show", file, "--rerun", out]) == 0

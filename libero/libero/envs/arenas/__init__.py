@@ -1,18 +1,14 @@
-"""Arenas by class: a scene before it is compiled, with the interface of robosuite's arenas."""
+"""A scene before it is compiled, with the interface of robosuite's arenas, and the styles of rooms."""
 
 from collections.abc import Mapping, Sequence
 from operator import attrgetter
-from typing import Any, ClassVar
+from typing import Any
 from xml.etree.ElementTree import Element
 
 from libero._adapters.lookup import alias_modules, lookup
-from libero._adapters.models import facade_pack
-from libero.libero.envs.base_object import class_name
-from libero_env.assets.arena import load_workspace
 from libero_env.assets.original_arena import TEXTURES
-from libero_env.errors import InvalidInputError, LiberoError
+from libero_env.errors import LiberoError
 from libero_env.mujoco_compat import mujoco
-from libero_env.workspaces import BUILTIN_WORKSPACES
 
 STYLE_KINDS = ("floor", "wall")
 STYLE_MAPPING = {kind: dict(TEXTURES[kind]) for kind in STYLE_KINDS}
@@ -64,48 +60,4 @@ class Arena:
         return self.spec.to_xml()
 
 
-class WorkspaceArena(Arena):
-    """The arena of one workspace.
-
-    Args:
-        floor_style, wall_style: Names in `FLOOR_STYLE` and `WALL_STYLE`.
-        scene: Style of the whole scene, such as `warm`.
-
-    Raises:
-        InvalidInputError: Another argument of the original's classes is given, such as `table_full_size`.
-    """
-
-    category: ClassVar[str]
-
-    def __init__(
-        self,
-        floor_style: str | None = None,
-        wall_style: str | None = None,
-        scene: str | None = None,
-        **kwargs: Any,
-    ):
-        if kwargs:
-            raise InvalidInputError(
-                f"{', '.join(kwargs)}: not supported; the {self.category} is that of the benchmark"
-            )
-        spec = mujoco.MjSpec()
-        styles = {"floor": floor_style, "wall": wall_style, "scene": scene}
-        self.workspace = load_workspace(self.category)
-        facade_pack().add_arena(spec, self.workspace, {k: v for k, v in styles.items() if v is not None})
-        super().__init__(spec)
-
-    table_offset = property(attrgetter("workspace.offset"), doc="Origin of the regions, (3,) m.")
-    table_top_abs = property(attrgetter("workspace.offset"), doc="Position of the table top, (3,) m.")
-
-    def configure_location(self) -> None:
-        """Do nothing: tables have the sizes and places of the benchmark."""
-
-
-for _category in BUILTIN_WORKSPACES:
-    _name = "EmptyArena" if _category == "floor" else f"{class_name(_category)}Arena"
-    globals()[_name] = type(_name, (WorkspaceArena,), {"__module__": __name__, "category": _category})
-
-alias_modules(
-    __name__,
-    "base_arena coffee_table_arena empty_arena kitchen_arena living_room_arena study_arena table_arena style",
-)
+alias_modules(__name__, "base_arena style")

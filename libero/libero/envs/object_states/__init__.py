@@ -6,9 +6,8 @@ import numpy as np
 
 from libero._adapters.lookup import alias_modules
 from libero._adapters.observations import quat_xyzw
-from libero._adapters.sim import Domain
 from libero_env.sim.predicates import evaluate
-from libero_env.tasks.problem import Atom
+from libero_env.tasks.expression import Atom
 
 
 class BaseObjectState:
@@ -25,9 +24,7 @@ class BaseObjectState:
 
     object_state_type = "object"
 
-    def __init__(
-        self, env: Domain, object_name: str, parent_name: str | None = None, is_fixture: bool = False
-    ):
+    def __init__(self, env: Any, object_name: str, parent_name: str | None = None, is_fixture: bool = False):
         self.env, self.object_name, self.is_fixture = env, object_name, is_fixture
         self.parent_name: str | None = parent_name or object_name
         self.query_dict: dict[str, Any] = env.fixtures_dict if is_fixture else env.objects_dict
@@ -85,7 +82,7 @@ class BaseObjectState:
 class ObjectState(BaseObjectState):
     """An object or a fixture."""
 
-    def __init__(self, env: Domain, object_name: str, is_fixture: bool = False):
+    def __init__(self, env: Any, object_name: str, is_fixture: bool = False):
         super().__init__(env, object_name, None, is_fixture)
         self.has_turnon_affordance = "turnon" in env.scene.entities[object_name].articulation
 
@@ -100,7 +97,7 @@ class SiteObjectState(BaseObjectState):
 
     object_state_type = "site"
 
-    def __init__(self, env: Domain, object_name: str, parent_name: str | None, is_fixture: bool = False):
+    def __init__(self, env: Any, object_name: str, parent_name: str | None, is_fixture: bool = False):
         super().__init__(env, object_name, parent_name, parent_name in env.fixtures_dict)
         self.parent_name = parent_name
 

@@ -4,13 +4,15 @@ from abc import ABC, abstractmethod
 from collections import UserDict
 from collections.abc import Callable, MutableMapping
 from functools import partial
-from typing import Any, ClassVar
+from operator import methodcaller
+from typing import Any
 
 from libero._adapters.lookup import alias_modules, lookup
 from libero_env.errors import LiberoError
 from libero_env.parallel import send_to_workers
 from libero_env.sim.predicates import PREDICATES, evaluate, register_predicate
-from libero_env.tasks.problem import BUILTIN_PREDICATES, Atom
+from libero_env.tasks.expression import Atom
+from libero_env.tasks.rules import BUILTIN_PREDICATES
 
 
 class Expression(ABC):
@@ -33,70 +35,35 @@ class MultiarayAtomic(Expression):
     """A predicate of any number of object states."""
 
 
-class _Native(Expression):
-    """A predicate of `libero_env`."""
-
-    answer: ClassVar[str]  # its name
-
-    def __call__(self, *args: Any) -> bool:
-        """Return whether it holds for these object states."""
-        return evaluate(Atom(self.answer, tuple(arg.object_name for arg in args)), args[0].env.view)
+def _native(predicate: str, *args: Any) -> bool:
+    """Ask `libero_env` about object states; other arguments are passed as they are."""
+    names = tuple(getattr(arg, "object_name", arg) for arg in args)
+    return evaluate(Atom(predicate, names), next(arg for arg in args if hasattr(arg, "env")).env.view)
 
 
-class _StateMethod(UnaryAtomic):
-    """A predicate that is a method of the object state."""
-
-    answer: ClassVar[str]  # name of the method
-
-    def __call__(self, *args: Any) -> bool:
-        """Return whether it holds for this object state."""
-        (state,) = args
-        return getattr(state, self.answer)()
+def _print_joints(state: Any) -> bool:
+    print(state.get_joint_state())
+    return _native("Printjointstate", state)
 
 
-class TruePredicateFn(MultiarayAtomic):
-    """Always true."""
-
-    def __call__(self, *args: Any) -> bool:
-        """Return True."""
-        return True
-
-
-class FalsePredicateFn(MultiarayAtomic):
-    """Never true."""
-
-    def __call__(self, *args: Any) -> bool:
-        """Return False."""
-        return False
-
-
-class PrintJointState(_Native, UnaryAtomic):
-    """Always true; prints the joint positions."""
-
-    answer = "Printjointstate"
-
-    def __call__(self, *args: Any) -> bool:
-        """Print the joint positions and return True."""
-        print(args[0].get_joint_state())
-        return super().__call__(*args)
-
-
-_TWO, _ONE, _METHOD = (_Native, BinaryAtomic), (_Native, UnaryAtomic), (_StateMethod,)
-_PREDICATES: dict[str, tuple[tuple[type, ...], str, str]] = {  # class -> bases, name of what answers, meaning
-    "InContactPredicateFn": (_TWO, "Incontact", "The two touch."),
-    "In": (_TWO, "In", "The first is in the second, a region."),
-    "On": (_TWO, "On", "The first is on the second."),
-    "Stack": (_TWO, "Stack", "The first is on the second and inside it."),
-    "Up": (_ONE, "Up", "It is at least a metre above the floor."),
-    "Open": (_METHOD, "is_open", "Any joint is in the open range."),
-    "Close": (_METHOD, "is_close", "All joints are in the closed range."),
-    "TurnOn": (_METHOD, "turn_on", "Any joint is in the range of on."),
-    "TurnOff": (_METHOD, "turn_off", "All joints are in the range of off."),
+_ONE, _TWO, _ANY = UnaryAtomic, BinaryAtomic, MultiarayAtomic
+_PREDICATES: dict[str, tuple[type, Callable[..., bool], str]] = {  # class -> base, answer, meaning
+    "TruePredicateFn": (_ANY, lambda *_: True, "Always true."),
+    "FalsePredicateFn": (_ANY, lambda *_: False, "Never true."),
+    "InContactPredicateFn": (_TWO, partial(_native, "Incontact"), "The two touch."),
+    "In": (_TWO, partial(_native, "In"), "The first is in the second, a region."),
+    "On": (_TWO, partial(_native, "On"), "The first is on the second."),
+    "Stack": (_TWO, partial(_native, "Stack"), "The first is on the second and inside it."),
+    "Up": (_ONE, partial(_native, "Up"), "It is at least a metre above the floor."),
+    "Open": (_ONE, methodcaller("is_open"), "Any joint is in the open range."),
+    "Close": (_ONE, methodcaller("is_close"), "All joints are in the closed range."),
+    "TurnOn": (_ONE, methodcaller("turn_on"), "Any joint is in the range of on."),
+    "TurnOff": (_ONE, methodcaller("turn_off"), "All joints are in the range of off."),
+    "PrintJointState": (_ONE, _print_joints, "Always true; prints the joint positions."),
 }
-for _name, (_bases, _answer, _doc) in _PREDICATES.items():
-    globals()[_name] = type(_name, _bases, {"__module__": __name__, "__doc__": _doc, "answer": _answer})
-
-_CLASSES = ("TruePredicateFn", "FalsePredicateFn", *_PREDICATES, "PrintJointState")
+for _name, (_base, _answer, _doc) in _PREDICATES.items():
+    _facts = {"__module__": __name__, "__doc__": _doc, "__call__": staticmethod(_answer)}
+    globals()[_name] = type(_name, (_base,), _facts)
 
 
 class _OfStates:
@@ -135,7 +102,7 @@ class _Predicates(UserDict):
 
 VALIDATE_PREDICATE_FN_DICT = _Predicates()
 VALIDATE_PREDICATE_FN_DICT.data = {  # which are in the table already
-    name.removesuffix("PredicateFn").lower(): globals()[name]() for name in _CLASSES
+    name.removesuffix("PredicateFn").lower(): globals()[name]() for name in _PREDICATES
 }
 send_to_workers(__name__, "VALIDATE_PREDICATE_FN_DICT")
 
@@ -165,11 +132,6 @@ def get_predicate_fn(predicate_fn_name: str) -> Callable[..., bool]:
     if name.lower() not in VALIDATE_PREDICATE_FN_DICT and name in PREDICATES:
         return partial(_native, name)  # registered with libero_env
     return lookup(VALIDATE_PREDICATE_FN_DICT, "predicate", predicate_fn_name)
-
-
-def _native(predicate: str, *args: Any) -> bool:
-    names = tuple(getattr(arg, "object_name", arg) for arg in args)
-    return evaluate(Atom(predicate, names), next(arg for arg in args if hasattr(arg, "env")).env.view)
 
 
 def eval_predicate_fn(predicate_fn_name: str, *args: Any) -> bool:

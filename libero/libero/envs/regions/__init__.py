@@ -1,42 +1,22 @@
-"""Samplers of placements, name -> (pos (3,) m, quat wxyz (4,), object), and of joint positions at the start.
+"""Samplers of placements, name -> (pos (3,) m, quat wxyz (4,), object).
 
 They are for clients that place objects themselves; the environments sample with `libero_env.init_states.placement`.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from libero._adapters.lookup import alias_modules, lookup
-from libero_env.assets.arena import load_workspace
-from libero_env.errors import PlacementError, UnknownNameError
+from libero._adapters.lookup import alias_modules
+from libero_env.errors import PlacementError
 from libero_env.objects.model import rest_quat
-from libero_env.parallel import send_to_workers
-from libero_env.workspaces import BUILTIN_WORKSPACES
 
 Placements = dict[str, tuple[tuple[float, float, float], np.ndarray, Any]]
 _TRIES = 5000
 
 
-class _Sampler:
-    """Base of the samplers: a name in messages, objects, and a generator, by default of NumPy's global seed."""
-
-    def __init__(self, name: str, mujoco_objects: Any, rng: np.random.Generator | None):
-        self.name, self.rng = name, rng or np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
-        self.mujoco_objects: list[Any] = []
-        self.add_objects(() if mujoco_objects is None else mujoco_objects)
-
-    def add_objects(self, mujoco_objects: Any) -> None:
-        """Add objects."""
-        self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
-
-    def reset(self) -> None:
-        """Remove all objects."""
-        self.mujoco_objects = []
-
-
-class MultiRegionRandomSampler(_Sampler):
+class MultiRegionRandomSampler:
     """Samples placements in rectangles, of the x and y ranges of the same index, without overlap.
 
     Args:
@@ -48,7 +28,7 @@ class MultiRegionRandomSampler(_Sampler):
         ensure_valid_placement: Whether objects do not overlap.
         reference_pos: Origin in the world frame, (3,) m.
         z_offset: Height above the origin, m.
-        rng: Generator of the placements.
+        rng: Generator of the placements, by default of NumPy's global seed.
     """
 
     def __init__(
@@ -65,12 +45,22 @@ class MultiRegionRandomSampler(_Sampler):
         z_offset: float = 0.0,
         rng: np.random.Generator | None = None,
     ):
-        super().__init__(name, mujoco_objects, rng)
+        self.name, self.rng = name, rng or np.random.default_rng(np.random.randint(2**31))  # noqa: NPY002
+        self.mujoco_objects: list[Any] = []
+        self.add_objects(() if mujoco_objects is None else mujoco_objects)
         self.rotation, self.rotation_axis = rotation, rotation_axis
         self.x_ranges, self.y_ranges = x_ranges or [(0.0, 0.0)], y_ranges or [(0.0, 0.0)]
         self.whole, self.apart = ensure_object_boundary_in_range, ensure_valid_placement
         self.reference_pos, self.z_offset = np.asarray(reference_pos, np.float64), z_offset
         self.idx = 0  # of the rectangle that is sampled
+
+    def add_objects(self, mujoco_objects: Any) -> None:
+        """Add objects."""
+        self.mujoco_objects += mujoco_objects if isinstance(mujoco_objects, Iterable) else [mujoco_objects]
+
+    def reset(self) -> None:
+        """Remove all objects."""
+        self.mujoco_objects = []
 
     def sample(self, fixtures: Any = None, reference: Any = None, on_top: bool = True) -> Placements:
         """Return placements of all objects, and those of the fixtures.
@@ -104,7 +94,7 @@ class MultiRegionRandomSampler(_Sampler):
         margin = item.horizontal_radius if self.whole else 0.0
         for _ in range(_TRIES):
             self.idx = int(self.rng.integers(len(self.x_ranges)))
-            xy = self._sample_x(margin), self._sample_y(margin)
+            xy = (self._draw(ranges[self.idx], margin) for ranges in (self.x_ranges, self.y_ranges))
             pos = origin + (*xy, height)
             if not self.apart or all(self._clear(item, pos, other) for other in placed.values()):
                 return tuple(pos), self._sample_quat(), item
@@ -112,12 +102,6 @@ class MultiRegionRandomSampler(_Sampler):
             f"{self.name}: no free placement for {item.name} in {_TRIES} tries. (1) Make the ranges larger, (2) use "
             "fewer or smaller objects"
         )
-
-    def _sample_x(self, object_horizontal_radius: float) -> float:
-        return self._draw(self.x_ranges[self.idx], object_horizontal_radius)
-
-    def _sample_y(self, object_horizontal_radius: float) -> float:
-        return self._draw(self.y_ranges[self.idx], object_horizontal_radius)
 
     def _draw(self, limits: Sequence[float], margin: float) -> float:
         low, high = min(limits) + margin, max(limits) - margin
@@ -142,147 +126,4 @@ class MultiRegionRandomSampler(_Sampler):
         return {self.rotation_axis: (min(rotation), max(rotation))}
 
 
-class ObjectBasedSampler(MultiRegionRandomSampler):
-    """Samples placements on another object: pass its name to `sample` as `reference`.
-
-    `rotation` is as objects have it, also axis -> range; see `libero_env.objects.model.rest_quat`. Of a sampler of a
-    workspace, the default of `reference_pos` is the origin of the workspace.
-    """
-
-    category: ClassVar[str | None] = None  # of the workspace
-    whole_object: ClassVar[bool] = True  # default of ensure_object_boundary_in_range
-
-    def __init__(
-        self,
-        object_name: str,
-        mujoco_objects: Any = None,
-        x_ranges: Sequence[Sequence[float]] | None = None,
-        y_ranges: Sequence[Sequence[float]] | None = None,
-        rotation: Any = (np.pi / 2, np.pi / 2),
-        rotation_axis: str = "z",
-        ensure_object_boundary_in_range: bool | None = None,
-        ensure_valid_placement: bool = True,
-        reference_pos: Sequence[float] | None = None,
-        z_offset: float = 0.01,
-        rng: np.random.Generator | None = None,
-    ):
-        whole = ensure_object_boundary_in_range
-        super().__init__(
-            object_name, mujoco_objects, x_ranges, y_ranges, rotation, rotation_axis,
-            self.whole_object if whole is None else whole, ensure_valid_placement, z_offset=z_offset, rng=rng,
-        )  # fmt: skip
-        if reference_pos is None and self.category is not None:
-            reference_pos = load_workspace(self.category).offset
-        if reference_pos is not None:
-            self.reference_pos = np.asarray(reference_pos, np.float64)
-
-    def _sample_quat(self) -> np.ndarray:
-        return rest_quat(self._ranges(), self.rng)
-
-
-class TableRegionSampler(ObjectBasedSampler):
-    """Samples placements on the table; `rotation` as in `ObjectBasedSampler`."""
-
-    category = "table"
-
-
-class Libero100TableRegionSampler(TableRegionSampler):
-    """Samples placements on the tables of LIBERO-100; objects may extend beyond the rectangles."""
-
-    category, whole_object = "kitchen_table", False
-
-
-class SiteRegionRandomSampler(MultiRegionRandomSampler):
-    """Samples placements around a site: pass its position to `sample` as `reference`."""
-
-    _sample_quat = ObjectBasedSampler._sample_quat
-
-
-class InSiteRegionRandomSampler(SiteRegionRandomSampler):
-    """Samples placements in the box of a site."""
-
-
-class SiteSequentialCompositeSampler:
-    """Runs samplers in turn; each gets the placements of those before it."""
-
-    def __init__(self, name: str):
-        self.name = name
-        self.samplers: dict[str, tuple[MultiRegionRandomSampler, dict[str, Any]]] = {}
-
-    def append_sampler(self, sampler: MultiRegionRandomSampler, sample_args: Any = None) -> None:
-        """Add a sampler at the end, with arguments for its `sample`."""
-        self.samplers[sampler.name] = sampler, dict(sample_args or {})
-
-    def sample(self, fixtures: Mapping[str, Any] | None = None, **_: Any) -> Placements:
-        """Return all placements."""
-        placed: Placements = dict(fixtures or {})
-        for sampler, arguments in self.samplers.values():
-            placed = sampler.sample(fixtures=placed, **arguments)
-        return placed
-
-
-class ObjectPropertySampler(_Sampler):
-    """Samples a joint position from a range.
-
-    Args:
-        name: Name of the sampler in messages.
-        state_type: State that the position stands for, such as `open`.
-        joint_ranges: Range (low, high), rad or m.
-
-    Raises:
-        UnknownNameError: The sampler does not have the state.
-    """
-
-    states: Sequence[str] = ()
-
-    def __init__(
-        self,
-        name: str,
-        state_type: str,
-        mujoco_objects: Any = None,
-        joint_ranges: Sequence[float] = (0.0, 0.0),
-        rng: np.random.Generator | None = None,
-    ):
-        if self.states and state_type not in self.states:
-            raise UnknownNameError(f"state of {name}", state_type, self.states)
-        super().__init__(name, mujoco_objects, rng)
-        self.state_type, self.joint_ranges = state_type, tuple(joint_ranges)
-
-    def sample(self) -> float:
-        """Return a position in the range."""
-        return float(self.rng.uniform(min(self.joint_ranges), max(self.joint_ranges)))
-
-
-class OpenCloseSampler(ObjectPropertySampler):
-    """Samples how far an object is open."""
-
-    states = ("open", "close")
-
-
-class TurnOnOffSampler(ObjectPropertySampler):
-    """Samples how far a knob is turned."""
-
-    states = ("turnon", "turnoff")
-
-
-_OF_LIBERO_100 = ("kitchen_table", "living_room_table", "study_table")
-REGION_SAMPLERS: dict[str, dict[str, type]] = {}  # problem -> workspace -> class
-for _category in BUILTIN_WORKSPACES:
-    _base = Libero100TableRegionSampler if _category in _OF_LIBERO_100 else TableRegionSampler
-    _class = type(f"{_base.__name__}_{_category}", (_base,), {"category": _category})
-    REGION_SAMPLERS[load_workspace(_category).problem.lower()] = {_category: _class}
-
-
-def get_region_samplers(problem_name: str, region_sampler_name: str) -> type:
-    """Return the sampler of a workspace in a problem; raise an UnknownNameError if there is none."""
-    samplers = lookup(REGION_SAMPLERS, "problem", problem_name)
-    return lookup(samplers, f"region sampler of {problem_name}", region_sampler_name)
-
-
-def update_region_samplers(problem_name: str, region_sampler_name: str, region_sampler: type) -> None:
-    """Add a sampler or replace one."""
-    REGION_SAMPLERS.setdefault(problem_name, {})[region_sampler_name] = region_sampler
-
-
-send_to_workers(__name__, "REGION_SAMPLERS")
-alias_modules(__name__, "base_region_sampler workspace_region_sampler object_property_sampler")
+alias_modules(__name__, "base_region_sampler")

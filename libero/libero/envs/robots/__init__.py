@@ -10,7 +10,7 @@ import numpy as np
 from libero._adapters.controllers import Controller, controller_of
 from libero._adapters.lookup import Named, alias_modules
 from libero._adapters.observations import quat_xyzw
-from libero._adapters.sim import Domain, MjModel, MjSim
+from libero._adapters.sim import MjModel, MjSim
 from libero_env.assets.robot import ARM_JOINTS, GRIP_SITE, OPEN_FINGERS, REST_QPOS, add_panda
 from libero_env.envs.checks import checked_actions
 from libero_env.errors import LiberoError
@@ -43,7 +43,6 @@ class ModelPart(Named, names=_PART):
     important_sites: Mapping[str, str] = {}
     important_sensors: Mapping[str, str] = {}
     bottom_offset = top_offset = np.zeros(3)
-    rotation_offset = np.array([0.0, 0.0, 0.0, 1.0])
     horizontal_radius: float = 0
     mount: Any = None
 
@@ -90,7 +89,6 @@ class Panda(ModelPart):
 
     Attributes:
         default_mount: Name of the mount; None for the ground.
-        base_xpos_offset: Workspace -> position of the base, (3,) m; for a table a function of its length.
         horizontal_radius: Radius that is kept free around the arm, m.
         init_qpos: Rest pose, (7,) rad.
         mount: Mount below it.
@@ -98,16 +96,10 @@ class Panda(ModelPart):
     """
 
     default_mount: ClassVar[str | None] = None
-    default_gripper: ClassVar[str] = "PandaGripper"
-    default_controller_config: ClassVar[str] = "default_panda"
-    arm_type: ClassVar[str] = "single"
     naming_prefix, root_body, eef_name = "robot0_", "robot0_base", "robot0_right_hand"
-    grip_site: ClassVar[str] = GRIP_SITE
-    base_xpos_offset: ClassVar[dict[str, Any]] = {}
     dof: ClassVar[int] = len(ARM_JOINTS)
     horizontal_radius = _horizontal_radius = 0.5
     top_offset = np.array([0.0, 0.0, 1.0])
-    hand_rotation_offset = np.array([0.0, 0.0, -0.383, 0.924])
 
     def __init__(self, idn: int = 0, sim: MjSim | None = None):
         super().__init__(idn, sim)
@@ -122,33 +114,14 @@ class Panda(ModelPart):
         return [self.mount, *self.grippers.values()]
 
 
-def behind_a_table(x: float, height: float) -> Callable[[float], tuple[float, float, float]]:
-    """Return the position of the base behind a table as a function of the length of the table."""
-    return lambda table_length: (x - table_length / 2, 0.0, height)
-
-
-COMMON_OFFSETS = {"bins": (-0.5, -0.1, 0.0), "empty": (-0.6, 0.0, 0.0), "table": behind_a_table(-0.16, 0.0)}
-
-
 class MountedPanda(Panda):
     """The arm on a pedestal."""
 
     default_mount = "RethinkMount"
-    base_xpos_offset = {
-        **COMMON_OFFSETS,
-        "kitchen_table": behind_a_table(-0.16, 0.0),
-        "study_table": behind_a_table(-0.25, 0.0),
-    }
 
 
 class OnTheGroundPanda(Panda):
     """The arm on the ground."""
-
-    base_xpos_offset = {
-        **COMMON_OFFSETS,
-        "coffee_table": behind_a_table(-0.16, 0.41),
-        "living_room_table": behind_a_table(-0.16, 0.42),
-    }
 
 
 class PandaGripper(ModelPart):
@@ -161,7 +134,6 @@ class PandaGripper(ModelPart):
     dof, speed = 1, GRIPPER_SPEED
     init_qpos = np.array(OPEN_FINGERS)
     naming_prefix, root_body = "gripper0_", "gripper0_right_gripper"
-    rotation_offset = np.array([0.0, 0.0, -0.707107, 0.707107], np.float32)
     important_sites = {
         "grip_site": GRIP_SITE,
         "grip_cylinder": "gripper0_grip_site_cylinder",
@@ -177,7 +149,7 @@ class PandaGripper(ModelPart):
             ("right_fingerpad", 2, ("_pad",)),
         )
     }
-    _env: Domain
+    _env: Any
 
     @property
     def current_action(self) -> np.ndarray:
@@ -215,8 +187,6 @@ _ROBOT: dict[str, Callable[[Any], Any]] = {
     "base_ori": lambda robot: quat_xyzw(robot.sim.data.get_body_xmat("robot0_base")),
     "ee_force": lambda robot: robot.get_sensor_measurement("gripper0_force_ee"),
     "ee_torque": lambda robot: robot.get_sensor_measurement("gripper0_torque_ee"),
-    "gripper_joints": lambda robot: robot.gripper.joints,
-    "js_energy": lambda robot: abs(robot.recent_torques.average / robot.control_freq),
     "robot_joints": lambda robot: robot.robot_model.joints,
     "torque_limits": lambda robot: tuple(robot.sim.model.actuator_ctrlrange[:7].T.copy()),
     "torques": lambda robot: robot.sim.data.ctrl[:7].copy() if robot._env.timestep else None,
@@ -241,9 +211,8 @@ class SingleArm(Named, names=_ROBOT):
     """
 
     idn, dof, has_gripper, gripper_type, mount_type = 0, 8, True, "default", "default"
-    eef_rot_offset = np.array([0.0, 0.0, -0.9241889, 0.3825449], np.float32)
 
-    def __init__(self, env: Domain, config: Any, robots: Any = ("Panda",)):
+    def __init__(self, env: Any, config: Any, robots: Any = ("Panda",)):
         names = [robots] if isinstance(robots, str) else list(robots)
         if len(names) != 1 or not str(names[0]).endswith("Panda"):
             raise LiberoError(f"robots={names}: the benchmark has one arm; pass ['Panda']")

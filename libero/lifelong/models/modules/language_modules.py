@@ -1,6 +1,6 @@
 """Encoders of the instruction's embedding.
 
-Shape legend: B batch, S parts of an instruction, L language embedding, E output.
+Shape legend: B batch, L language embedding, E output.
 """
 
 from collections.abc import Mapping
@@ -34,31 +34,7 @@ class MLPEncoder(nn.Module):
         return self.projection(_embedding(data))
 
 
-class CLIPEncoder(MLPEncoder):
-    """`MLPEncoder` with the sizes of CLIP's embeddings."""
-
-    def __init__(
-        self, input_size: int = 512, hidden_size: int = 128, output_size: int = 128, num_layers: int = 1
-    ):
-        super().__init__(input_size, hidden_size, output_size, num_layers)
-
-
-class RNNEncoder(nn.Module):
-    """GRU over the parts of an instruction, and a linear map of its last state."""
-
-    def __init__(self, input_size: int, hidden_size: int, output_size: int, num_layers: int):
-        super().__init__()
-        self.rnn = nn.GRU(input_size, hidden_size, num_layers, batch_first=True)
-        self.projection = nn.Linear(hidden_size, output_size)
-
-    def forward(self, data: Mapping[str, Tensor] | Tensor) -> Tensor:
-        """Encode (B, S, L), or (B, L) for S = 1, alone or under `task_emb`, as (B, E)."""
-        parts = _embedding(data)
-        states = self.rnn(parts[:, None] if parts.dim() == 2 else parts)[0]
-        return self.projection(states[:, -1])
-
-
-ENCODERS = {kind.__name__: kind for kind in (IdentityEncoder, MLPEncoder, CLIPEncoder, RNNEncoder)}
+ENCODERS = {kind.__name__: kind for kind in (IdentityEncoder, MLPEncoder)}
 
 
 def _embedding(data: Mapping[str, Tensor] | Tensor) -> Tensor:

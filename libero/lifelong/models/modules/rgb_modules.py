@@ -1,6 +1,6 @@
 """Image encoders: the networks of `lifelong.nn`, for images (N, C, H, W) in [0, 1].
 
-Shape legend: N images, C H W image, K keypoints, L language embedding, E latent.
+Shape legend: N images, C H W image, L language embedding, E latent.
 """
 
 from collections.abc import Sequence
@@ -11,41 +11,6 @@ from torch import Tensor, nn
 from libero._adapters.batches import uint8_image
 from lifelong.errors import PolicyError
 from lifelong.nn import vision
-
-
-class SpatialSoftmax(nn.Module):
-    """Expected image position of each heat map; `num_kp` maps are learned, with None each channel is one."""
-
-    def __init__(self, in_c: int, in_h: int, in_w: int, num_kp: int | None = None):
-        super().__init__()
-        self.num_kp = num_kp or in_c
-        self.softmax: Any = vision.SpatialSoftmax(channels=in_c, size=(in_h, in_w), keypoints=self.num_kp)
-        if num_kp is None:
-            self.softmax.heat = nn.Identity()
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map (N, C, H, W) to positions (N, 2 K) in [-1, 1], x to the right and y down."""
-        return self.softmax(x)
-
-
-class SpatialProjection(nn.Module):
-    """Keypoints and one linear map; `out_dim` is even, as a keypoint is two numbers."""
-
-    def __init__(self, input_shape: Sequence[int], out_dim: int):
-        super().__init__()
-        if out_dim % 2:
-            raise PolicyError(f"out_dim is {out_dim}; it must be even: two numbers for each keypoint")
-        self.out_dim = out_dim
-        self.spatial_softmax = SpatialSoftmax(input_shape[0], input_shape[1], input_shape[2], out_dim // 2)
-        self.projection = nn.Linear(out_dim, out_dim)
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Map (N, C, H, W) to (N, out_dim)."""
-        return self.projection(self.spatial_softmax(x))
-
-    def output_shape(self, input_shape: Sequence[int]) -> tuple[int, ...]:
-        """Return the shape of the output, (N, out_dim)."""
-        return (*input_shape[:-3], self.out_dim)
 
 
 class ResnetEncoder(nn.Module):

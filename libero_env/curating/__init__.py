@@ -1,0 +1,1 @@
+"""Demonstration files made of others: filtered, rendered again, as videos."""

@@ -1,0 +1,1 @@
+"""Data sets of other tools as demonstration files of this package."""

@@ -1,0 +1,1 @@
+"""Learning from reward: episodes of the policy itself in place of demonstrations."""
