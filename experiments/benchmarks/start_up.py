@@ -1,6 +1,6 @@
 """How long commands take that do nothing: help, lists, refused words. Processor time, before and after a change.
 
-    python experiments/benchmarks/start_up.py 090fd2e9 HEAD --rounds 3
+    python experiments/benchmarks/start_up.py df545aa9 HEAD --rounds 3
 
 Each command line is a process of its own in a checkout of its commit, without the checkout's own configuration, with
 byte code that a round before has written. The least of the rounds is printed, user and system time, [s], one line for
