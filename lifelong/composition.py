@@ -182,7 +182,7 @@ def swept(words: Sequence[str], folders: Sequence[Path] = ()) -> dict[str, list[
     """
     try:
         overrides = OverridesParser.create().parse_overrides(list(words))
-    except HydraException as error:
+    except (HydraException, ValueError) as error:  # of thousands of digits
         raise ConfigError(
             f"{' '.join(str(error).split())} (an override is KEY=VALUE, such as algo=ewc or seed=1,2)"
         ) from error

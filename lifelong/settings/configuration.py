@@ -230,14 +230,19 @@ def _component(value: Any, hint: Any, at: Path, allowed: Sequence[str] | None) -
             name, expected = (found or type(built)).__name__, " or ".join(kind.__name__ for kind in kinds)
             raise ConfigError(f"{'.'.join(map(str, at))} builds a {name}; expected a {expected}")
         return built
-    if isinstance(value, list | tuple):
+    holds = any(one is Any or _is_instance(value, get_origin(one) or one) for one in options)
+    if isinstance(value, list | tuple) and holds:
         (entry, *_) = [*(get_args(one)[0] for one in options if get_args(one)), Any]
         return [_component(part, entry, (*at, index), allowed) for index, part in enumerate(value)]
-    if isinstance(value, Mapping) and _has_node(value):
+    if isinstance(value, Mapping) and _has_node(value) and holds:
         return {key: _component(part, Any, (*at, str(key)), allowed) for key, part in value.items()}
     if (value is None and NoneType in options) or any(one is Any or is_plain(one) for one in options):
         return value
     return _build(value, at, allowed, {})  # which says what a component is
+
+
+def _is_instance(value: Any, kind: Any) -> bool:
+    return isclass(kind) and isinstance(value, kind)
 
 
 def _other_class(node: Mapping[str, Any], kinds: tuple[type, ...], allowed: Sequence[str] | None) -> Any:

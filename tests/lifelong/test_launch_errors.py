@@ -58,6 +58,7 @@ MISTAKES = {
     "+foo=3": ("foo", "unknown key", "Valid: seed"),
     "train.epochs": ("train.epochs", "KEY=VALUE"),
     "ewc": ("ewc", "KEY=VALUE"),
+    "seed=" + "9" * 5000: ("4300 digits", "KEY=VALUE"),
     "benchmark_name=LIBERO_GOAL": ("benchmark_name", "Did you mean 'benchmark'?"),
     "seed.x=1": ("seed.x",),
     "benchmark=LIBERO_OBJECT": ("LIBERO_OBJECT", "Did you mean 'libero_object'?"),
@@ -92,7 +93,7 @@ MISTAKES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("words", MISTAKES)
+@pytest.mark.parametrize("words", MISTAKES, ids=lambda words: words[:60])
 def test_a_mistake_is_one_line_and_leaves_nothing_behind(words, own, capsys):
     (own / "demos").mkdir()
     (own / "taken").write_text("")

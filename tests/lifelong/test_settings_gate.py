@@ -102,6 +102,8 @@ def test_an_unknown_key_anywhere_is_told_with_the_nearest(whole):
     ({"algo__memory___target_": "lifelong.data.fake.FakeWindows"}, "algo.memory._target_ names"),
     ({"algo__memory___partial_": True}, "algo.memory builds a partial; expected a ReplayMemory"),
     ({"algo___target_": "builtins.dict"}, "algo builds a dict; expected a Algorithm"),
+    ({"policy__encoder": []}, "policy.encoder is []; expected a component"),
+    ({"policy__encoder": {"a": {"_target_": "lifelong.nn.GMMHead", "_partial_": True}}}, "policy.encoder is {'a'"),
     ({"policy__head": "gmm"}, "a file of that group is chosen with policy/head=gmm"),
     ({"policy__temporal___partial_": False}, "policy.temporal._partial_ is False; expected true"),
     ({"policy__temporal___target_": "lifelong.nn.GMMHead"}, "policy.temporal.heads is an unknown key"),
