@@ -2,8 +2,9 @@
 
 import io
 import os
+import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -113,21 +114,31 @@ class Mp4Writer:
         stream.time_base = Fraction(1, self._fps)
         stream.codec_context.options = dict(self._codec.options)
         stream.codec_context.thread_count = 1
-        with _quiet_encoder():
+        with _tame_encoder():
             stream.codec_context.open()
         return stream
 
 
 @contextmanager
-def _quiet_encoder() -> Iterator[None]:
-    """Keep SVT-AV1 from printing its settings; it takes the level of its messages from the environment only."""
+def _tame_encoder() -> Iterator[None]:
+    """Keep SVT-AV1 from printing its settings, and from making this process a real-time one where root runs it.
+
+    It takes the level of its messages from the environment only. To see whether it may, it gives the calling thread
+    the highest real-time priority, and then its own: whatever else runs on the machine waits for them.
+    """
     before = os.environ.get("SVT_LOG")
     os.environ.setdefault("SVT_LOG", "1")  # errors
+    on_linux = sys.platform == "linux"
+    if on_linux:
+        policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         yield
     finally:
         if before is None:
             del os.environ["SVT_LOG"]
+        for thread in os.listdir("/proc/self/task") if on_linux else ():
+            with suppress(ProcessLookupError):  # one that has ended
+                os.sched_setscheduler(int(thread), policy, priority)
 
 
 def check_video_path(path: Path) -> None:

@@ -1,10 +1,13 @@
 """The LeRobot data set: its tables agree with each other, its videos with the pictures, and both with the files."""
 
 import json
+import os
+import sys
 
 import numpy as np
 import pytest
 
+from libero_env.curating.video import AV1, Mp4Writer
 from libero_env.demos.read import read_demos
 from libero_env.errors import DemoError, LiberoError
 from libero_integrations.exports.demonstrations import ORIGIN, export_demos, export_published
@@ -118,6 +121,16 @@ def test_a_full_video_is_continued_in_the_next_file(files, tmp_path):
             if r["videos/observation.images.image/file_index"] == i
         ]
         assert firsts[0] == 0.0 and firsts == sorted(firsts)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="priorities of Linux")
+def test_an_encoder_takes_no_real_time_from_the_machine(tmp_path):
+    """As root, SVT-AV1 makes the thread that opens it, and its own, real-time ones."""
+    before = os.sched_getscheduler(0)
+    with Mp4Writer(tmp_path / "film.mp4", 20, AV1) as film:
+        film.add(np.zeros((2, 64, 64, 3), np.uint8))
+        assert {os.sched_getscheduler(int(thread)) for thread in os.listdir("/proc/self/task")} == {before}
+    assert os.sched_getscheduler(0) == before
 
 
 def test_statistics_cover_every_feature(root, info, episodes):
