@@ -120,6 +120,7 @@ release: docs
 	$(PYTHON) -m venv build/release/try
 	$(TRY)/pip install --constraint constraints.txt "$$(ls dist/*.whl)[train]"
 	$(BIN)/python experiments/algorithms/archive.py build/release/study.zip
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m release
 	cd build/release && try/bin/libero train preset=smoke
 	cd build/release && try/bin/libero eval expert --suite libero_goal/7 --episodes 3
 	@version=$$(basename dist/*.whl | cut -d- -f2); printf '%s\n' "ready: $$(echo dist/*) build/release/study.zip; to publish:" \

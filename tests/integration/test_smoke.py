@@ -93,6 +93,7 @@ def test_smoke_from_the_command_line_to_a_report(home, here, tmp_path, capsys):
     assert "train.lr 0.002 -> 0.5" in told and "run_id=" in told and "Traceback" not in told
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("seed", [2, 3])  # the first: test_docs, by the command of README.md
 def test_the_smallest_preset_learns_both_tasks(seed, home, tmp_path):
     finish(start(home, tmp_path, "preset=smoke", f"seed={seed}", "eval.cells=diagonal"))
