@@ -13,6 +13,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -37,12 +38,16 @@ PAGES = sorted(RECORDS.parent.glob("*/comparison.json"))
 
 
 def imported(tree: ast.AST) -> Iterator[tuple[str, str | None]]:
-    """Yield (module, name) of every import, wherever it stands; name is None where a module is imported."""
+    """Yield (module, name) of every import and of `-m`, wherever it stands; name is None where it is the module."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((alias.name, None) for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield from ((node.module, alias.name) for alias in node.names)
+        elif isinstance(node, ast.List):  # perhaps a command line
+            for flag, module in pairwise(getattr(part, "value", None) for part in node.elts):
+                if flag == "-m" and (spec := importlib.util.find_spec(str(module))) is not None:
+                    yield str(module), "__main__" if spec.submodule_search_locations else None
 
 
 def top_level_names(path: Path) -> set[str]:

@@ -45,7 +45,7 @@ def file_of(run: Planned) -> Path:
 
 def diagnose(run: Planned, directory: Path) -> None:
     """Diagnose a run and keep its numbers; with relearning, if it began with something."""
-    libero = [sys.executable, "-m", "libero_env.cli"]
+    libero = [sys.executable, "-m", "libero_cli"]
     episodes = ["--episodes", "10"] if run.name.startswith("frontier/sequential/") else []
     subprocess.run([*libero, "diagnose", directory, "--held-out", "10", *episodes], check=True)
     file_of(run).parent.mkdir(parents=True, exist_ok=True)
