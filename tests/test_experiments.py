@@ -45,9 +45,13 @@ def imported(tree: ast.AST) -> Iterator[tuple[str, str | None]]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield from ((node.module, alias.name) for alias in node.names)
         elif isinstance(node, ast.List):  # perhaps a command line
-            for flag, module in pairwise(getattr(part, "value", None) for part in node.elts):
-                if flag == "-m" and (spec := importlib.util.find_spec(str(module))) is not None:
-                    yield str(module), "__main__" if spec.submodule_search_locations else None
+            words = [part.value if isinstance(part, ast.Constant) else None for part in node.elts]
+            for flag, module in pairwise(words):
+                if flag == "-m" and str(module).partition(".")[0] in PACKAGES:
+                    is_package = getattr(
+                        importlib.util.find_spec(str(module)), "submodule_search_locations", None
+                    )
+                    yield str(module), "__main__" if is_package else None
 
 
 def top_level_names(path: Path) -> set[str]:
