@@ -137,7 +137,7 @@ def _tame_encoder() -> Iterator[None]:
         if before is None:
             del os.environ["SVT_LOG"]
         for thread in os.listdir("/proc/self/task") if on_linux else ():
-            with suppress(ProcessLookupError):  # one that has ended
+            with suppress(OSError):  # one that has ended, or a container that allows no change
                 os.sched_setscheduler(int(thread), policy, priority)
 
 
