@@ -48,10 +48,8 @@ def imported(tree: ast.AST) -> Iterator[tuple[str, str | None]]:
             words = [part.value if isinstance(part, ast.Constant) else None for part in node.elts]
             for flag, module in pairwise(words):
                 if flag == "-m" and str(module).partition(".")[0] in PACKAGES:
-                    is_package = getattr(
-                        importlib.util.find_spec(str(module)), "submodule_search_locations", None
-                    )
-                    yield str(module), "__main__" if is_package else None
+                    found = importlib.util.find_spec(str(module))
+                    yield str(module), "__main__" if found and found.submodule_search_locations else None
 
 
 def top_level_names(path: Path) -> set[str]:
@@ -98,9 +96,7 @@ def test_what_a_script_imports_exists(script):
 @pytest.mark.parametrize("script", COMMANDS, ids=lambda path: str(path.relative_to(EXPERIMENTS)))
 def test_a_script_explains_itself_and_does_not_start_when_asked_for_help(script):
     modules = {module for module, _ in imported(ast.parse(script.read_text(encoding="utf-8")))}
-    assert modules & {"argparse", "hydra"}, (
-        f"{script} starts its work on --help; parse its arguments, even if none"
-    )
+    assert modules & {"argparse", "hydra"}, f"{script} starts its work on --help; parse its arguments"
 
 
 def printed(page: Path) -> Iterator[tuple[str, list[str]]]:
@@ -110,14 +106,8 @@ def printed(page: Path) -> Iterator[tuple[str, list[str]]]:
     for command in (block for block in blocks if re.search(r"python\S* experiments/\S+\.py", block)):
         words = shlex.split(re.sub(r"[;&|].*|[\[\]]", "", command), comments=True)
         at = next(i for i, word in enumerate(words) if word.startswith("experiments/"))
-        yield (
-            words[at],
-            [
-                str(file.relative_to(EXPERIMENTS.parent)) if "*" in word else str(file)
-                for word in words[at + 1 :]
-                for file in (sorted(EXPERIMENTS.parent.glob(word)) if "*" in word else [word])
-            ],
-        )
+        found = [sorted(EXPERIMENTS.parent.glob(word)) if "*" in word else [word] for word in words[at + 1 :]]
+        yield words[at], [str(f).removeprefix(f"{EXPERIMENTS.parent}/") for files in found for f in files]
 
 
 PRINTED = sorted({(script, *words) for page in EXPERIMENTS.rglob("*.md") for script, words in printed(page)})
@@ -206,10 +196,8 @@ def test_commands_of_the_study_run_and_its_archive_is_read_by_what_is_in_it(tmp_
     archive = ["experiments/algorithms/archive.py", str(tmp_path / "study.zip"), "--runs", str(tmp_path)]
     run_one_by_one(*shortened("algorithms"), archive)
     zipfile.ZipFile(tmp_path / "study.zip").extractall(tmp_path)
-    told = subprocess.run(
-        [sys.executable, "-I", "read.py"], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
-    found = {line.split()[0]: line.split()[1:] for line in told.stdout.splitlines()}
+    told = subprocess.check_output([sys.executable, "-I", "read.py"], cwd=tmp_path, text=True)
+    found = {line.split()[0]: line.split()[1:] for line in told.splitlines()}
     for name, told in found.items():
         record = json.loads((tmp_path / "records" / f"{name}.json").read_text())["records"]
         (tmp_path / "results.jsonl").write_text(record)
@@ -220,12 +208,10 @@ def test_commands_of_the_study_run_and_its_archive_is_read_by_what_is_in_it(tmp_
 
 
 def test_what_is_held_out_is_not_learned():
-    spec = importlib.util.spec_from_file_location("learn", EXPERIMENTS / "laptop" / "learn.py")
-    script = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(script)
-    script.find_demos = None  # nothing is read or recorded
+    learn = runpy.run_path(str(EXPERIMENTS / "laptop" / "learn.py"))["learn"]
+    learn.__globals__["find_demos"] = None  # nothing is read or recorded
     with pytest.raises(SystemExit, match="data.demos=80 and 30 held out are more than --demos 109"):
-        script.learn([], "libero_object", 0, 1, 109)
+        learn([], "libero_object", 0, 1, 109)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.parent.name)

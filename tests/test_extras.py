@@ -20,6 +20,7 @@ from libero_env.errors import EXTRAS
 from tests.harness.policy_servers import openpi
 from tests.harness.results import drawn_result
 from tests.harness.runs import make_run
+from tests.harness.scenes import write_box
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -30,8 +31,6 @@ REFUSED = (  # rather than hours
     *("relearn", "diagnose"),  # whose run has no demonstrations
 )
 TASK, RUN, SAVED, DEMOS = "libero_object/0", "run", "saved", "demos/*/*/*_demo.hdf5"
-FACES = ["f 1 3 4 2", "f 5 6 8 7", "f 1 2 6 5", "f 3 7 8 4", "f 1 5 7 3", "f 2 4 8 6"]
-CUBE = "\n".join([*(f"v {x} {y} {z}" for x in (0, 1) for y in (0, 1) for z in (0, 1)), *FACES])
 WORDS = {
     "tasks list": "libero_object",
     "tasks show": TASK,
@@ -136,12 +135,9 @@ def required(extras: list[str]) -> set[str]:
 def hidden(extras: list[str]) -> set[str]:
     """Names of the installed packages that an installation with some extras does not have."""
     kept = required(extras) | {"libero-lifelong", "packaging", "pip", "setuptools"}
-    return {
-        name
-        for name, owners in packages_distributions().items()
-        if not any(canonicalize_name(owner) in kept for owner in owners)
-        and name not in sys.stdlib_module_names
-    }
+    owners = packages_distributions().items()
+    owned = {name for name, found in owners if kept & {*map(canonicalize_name, found)}}
+    return {name for name, _ in owners} - owned - sys.stdlib_module_names
 
 
 def test_the_table_of_extras_names_what_they_install():
@@ -150,19 +146,16 @@ def test_the_table_of_extras_names_what_they_install():
         names = required([extra])
         for package in packages:
             owners = packages_distributions().get(package, ())
-            assert extra in optional and (not owners or {canonicalize_name(one) for one in owners} & names), (
-                package
-            )
+            installed = not owners or {canonicalize_name(one) for one in owners} & names
+            assert extra in optional and installed, package
 
 
 def run_all(lines: list[str], extras: list[str], folder: Path) -> list[tuple[int, str, str]]:
     """Return how each command ends in an installation with some extras: status, output and errors."""
     (folder / "site-packages").mkdir()
     (folder / "site-packages" / "sitecustomize.py").write_text(HIDING)
-    environment = os.environ | {
-        "HIDDEN_PACKAGES": " ".join(hidden(extras)),
-        "PYTHONPATH": os.pathsep.join([str(folder / "site-packages"), str(ROOT)]),
-    }
+    path = os.pathsep.join([str(folder / "site-packages"), str(ROOT)])
+    environment = os.environ | {"HIDDEN_PACKAGES": " ".join(hidden(extras)), "PYTHONPATH": path}
     process = subprocess.run(
         [sys.executable, "-m", "tests.harness.commands"], input=json.dumps([line.split() for line in lines]),
         text=True, capture_output=True, env=environment, cwd=folder, timeout=1800, check=False,
@@ -203,7 +196,7 @@ def test_every_command_works_or_names_an_extra(extras, tmp_path):
     make_run(tmp_path / RUN, "algo=er")
     drawn_result(0.5, 1).write(tmp_path / "judged" / "eval.json")
     shutil.copytree(ROOT / "tests" / "lifelong" / "data" / "saved_runs" / "er", tmp_path / SAVED)
-    (tmp_path / "cube.obj").write_text(CUBE)
+    write_box(tmp_path / "cube.obj", 0.5)
     ended = run_all([f"{name} {own}" for name, own in WORDS.items()], extras, tmp_path)
     for name, (status, _, err) in zip(WORDS, ended, strict=True):
         one_line = err.count("error: ") == err.count("\nerror: ") + err.startswith("error: ") == 1

@@ -20,15 +20,14 @@ from libero_cli.main import ALL
 
 ROOT = Path(__file__).parents[1]
 NEEDS_EXTRA = "libero_env.warp."  # modules of the back end `warp`, whose package looks for GPUs
-ENV_SIDE = sorted(
-    module.name
-    for module in pkgutil.walk_packages(libero_env.__path__, "libero_env.")
-    if not module.name.startswith(NEEDS_EXTRA)
-)
-COMMAND = sorted(m.name for m in pkgutil.walk_packages(libero_cli.__path__, "libero_cli."))
-FACADE = sorted(module.name for module in pkgutil.walk_packages(libero.__path__, "libero."))
-LEARNING_SIDE = sorted(module.name for module in pkgutil.walk_packages(lifelong.__path__, "lifelong."))
-JUDGING_SIDE = sorted(module.name for module in pkgutil.walk_packages(libero_eval.__path__, "libero_eval."))
+MODULES = {  # package -> its modules
+    package.__name__: sorted(
+        module.name
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
+        if not module.name.startswith(NEEDS_EXTRA)
+    )
+    for package in (libero_env, libero, libero_cli, libero_eval, lifelong)
+}
 
 # What other packages do when they are imported: matplotlib lists the fonts once per machine, gymnasium silences pygame.
 THEIRS = re.compile(r"/matplotlib|/\.(config|cache)$")
@@ -106,33 +105,21 @@ with LiberoEnv("libero_object/0", cameras=()) as env:
 
 def import_in_fresh_process(home: Path, *groups: list[str]) -> list[dict]:
     """What importing each group of modules did in a process that knew nothing."""
-    env = {
-        "PATH": os.environ["PATH"], "HOME": str(home), "PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"
-    }  # fmt: skip
-    command = [sys.executable, "-W", "error", "-c", _PROBE, json.dumps(groups)]
-    done = subprocess.run(
-        command, env=env, cwd=home, capture_output=True, text=True, timeout=300, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    env = {"PATH": os.environ["PATH"], "HOME": str(home), "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-B", "-W", "error", "-c", _PROBE, json.dumps(groups)]
+    done = subprocess.run(command, env=env, cwd=home, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.count("\n") == 1, f"importing printed: {done.stdout}"
     return json.loads(done.stdout)
 
 
 @pytest.fixture(scope="module")
 def imported(tmp_path_factory) -> dict[str, dict]:
-    groups = {
-        "libero_env": ENV_SIDE,
-        "libero": FACADE,
-        "libero_cli": COMMAND,
-        "libero_eval": JUDGING_SIDE,
-        "lifelong": LEARNING_SIDE,
-    }
-    found = import_in_fresh_process(tmp_path_factory.mktemp("home"), *groups.values())
-    return dict(zip(groups, found, strict=True))
+    found = import_in_fresh_process(tmp_path_factory.mktemp("home"), *MODULES.values())
+    return dict(zip(MODULES, found, strict=True))
 
 
-@pytest.mark.parametrize("package", ["libero_env", "libero", "libero_cli", "lifelong", "libero_eval"])
+@pytest.mark.parametrize("package", MODULES)
 def test_importing_does_nothing(package, imported):
     done = imported[package]
     theirs = {f"set {name}" for name in THEIR_VARIABLES}
@@ -144,8 +131,8 @@ def test_importing_does_nothing(package, imported):
 @pytest.mark.sim
 def test_nothing_needs_what_windows_lacks(tmp_path):
     env = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    names = json.dumps(ENV_SIDE + FACADE + LEARNING_SIDE + JUDGING_SIDE)
-    command = [sys.executable, "-c", _WITHOUT_POSIX, names]
+    names = [name for package, found in MODULES.items() if package != "libero_cli" for name in found]
+    command = [sys.executable, "-c", _WITHOUT_POSIX, json.dumps(names)]
     subprocess.run(command, env=env, cwd=tmp_path, timeout=300, check=True)
 
 
@@ -193,16 +180,13 @@ MAY = {
 
 
 def test_commands_say_what_they_are_and_what_is_wrong_before_they_load_anything_heavy(tmp_path):
-    lines = {f"{name} --help": (0, set()) for name in ALL} | {
-        line: (0, MAY.get(line, set())) for line in LISTS
-    }
+    lines = {f"{name} --help": (0, set()) for name in ALL}
+    lines |= {line: (0, MAY.get(line, set())) for line in LISTS}
     lines |= {line: (2, MAY.get(kind, set())) for kind, refused in REFUSED.items() for line in refused}
     env = {**os.environ, "HOME": str(tmp_path), "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", _COMMANDS, json.dumps([*lines])]
     done = subprocess.run(command, env=env, cwd=tmp_path, capture_output=True, text=True, timeout=600)
     ended = dict(zip(lines, map(json.loads, done.stdout.splitlines()), strict=True))
-    assert {line: status for line, (status, _) in ended.items()} == {
-        n: status for n, (status, _) in lines.items()
-    }
+    assert {line: ended[line][0] for line in lines} == {line: status for line, (status, _) in lines.items()}
     loaded = {line: HEAVY & {*names} - lines[line][1] for line, (_, names) in ended.items()}
     assert not {line: names for line, names in loaded.items() if names}

@@ -13,9 +13,7 @@ import pytest
 
 PACKAGES = ("libero_env", "lifelong", "libero_eval")
 ARRAYS = re.compile(r"\b(ndarray|NDArray|Tensor|ArrayLike|Floats)\b")
-SHAPE = re.compile(
-    r"\((?:[\w+.]+, ?)+[\w+.]*\)|\bscalar\b|\bshape|\b(?:as|see|of) `"
-)  # (B, 7), (7,), (..., 4)
+SHAPE = re.compile(r"\((?:[\w+.]+, ?)+[\w+.]*\)|\bscalar\b|\bshape|\b(?:as|see|of) `")  # (B, 7), (..., 4)
 UNITS = re.compile(
     r"\[(?:m|s|rad|Hz|control steps|m, rad)[^\]]*\]|\bin [\[(]0|\b(?:share|rate|probability|level|margin|factor|scale|"
     r"weight|strength|success|severity|reward|seconds|norm|quaternion|moments)\b",
@@ -41,11 +39,8 @@ def members(one: Any) -> Iterator[tuple[str, Any]]:
     for name, value in vars(one).items():
         value = value.__func__ if isinstance(value, classmethod | staticmethod) else value
         value = value.fget if isinstance(value, property) else value
-        if (
-            not name.startswith("_")
-            and inspect.isfunction(value)
-            and value.__qualname__.startswith(one.__name__)
-        ):
+        own = inspect.isfunction(value) and value.__qualname__.startswith(one.__name__)
+        if own and not name.startswith("_"):
             yield name, value
 
 
@@ -89,16 +84,14 @@ def test_a_public_name_is_described(one, of_class):
         bases = [inspect.getdoc(base) or "" for base in one.__mro__ if base.__module__.startswith(PACKAGES)]
         entries = {k: v for d in bases for s in ("Attributes", "Args") for k, v in described(d, s).items()}
     else:
-        entries = {n: doc for n in types if re.search(rf"\b{n}\b|\b{n.rstrip('s')}", doc)} | described(
-            doc, "Args"
-        )
+        entries = {n: doc for n in types if re.search(rf"\b{n}\b|\b{n.rstrip('s')}", doc)}
+        entries |= described(doc, "Args")
     returns = "" if inspect.isclass(one) else str(function.__annotations__.get("return"))
     missing = [name for name in types if not entries.get(name)]
     assert not missing, "each argument is described"
     assert not [n for n, t in types.items() if ARRAYS.search(t) and not SHAPE.search(entries[n])], "shapes"
-    assert not [n for n, t in types.items() if re.search(r"\bfloat\b", t) and not UNITS.search(entries[n])], (
-        "units"
-    )
+    floats = [n for n, t in types.items() if re.search(r"\bfloat\b", t)]
+    assert not [n for n in floats if not UNITS.search(entries[n])], "units"
     assert not ARRAYS.search(returns) or SHAPE.search(doc), "the shape of what is returned"
     if inspect.isfunction(function) and not dataclasses.is_dataclass(one):
         said = described(doc, "Raises") | described(of_class, "Raises")

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import matplotlib
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from libero_env.storage import atomic_path
 from libero_env.text import quantity
+from lifelong.results.records import CollectionRecord
 from lifelong.stats.intervals import Estimate, mean_and_half_width, wilson_interval
 from lifelong.stats.metrics import Curve
 
@@ -117,6 +119,7 @@ def learning_figure(
     losses: Mapping[int, tuple[NDArray[np.int64], NDArray[np.float64]]],
     labels: Sequence[str],
     kept: Mapping[int, int],
+    drawn: Mapping[int, Sequence[CollectionRecord]] = MappingProxyType({}),
 ) -> Figure:
     """Draw for each task its success (with Wilson's 95 % band, the kept epoch circled) above its training loss.
 
@@ -125,6 +128,7 @@ def learning_figure(
         losses: Epochs and mean training losses of each task.
         labels: K short task names.
         kept: Epoch whose weights are kept, of each task that is learned.
+        drawn: Iterations of each task that is learned from reward, whose success is dashed.
     """
     tasks = sorted(curves.keys() | losses.keys())
     columns = min(5, len(tasks))
@@ -143,6 +147,9 @@ def learning_figure(
         above, below = (figure.add_axes(box) for box in boxes)
         above.set_title(f"{task + 1}  {shorten(labels[task], 24)}", loc="left", fontsize=8.5)
         _draw_curve(above, curves.get(task), kept.get(task))
+        if found := drawn.get(task):
+            rates = [100 * r.successes / max(1, r.episodes) for r in found]
+            above.plot([r.epoch for r in found], rates, "--", color=LINE_COLOURS[2], lw=1)
         if task in losses:
             marker = "o" if len(losses[task][0]) < 4 else None
             below.plot(*losses[task], color=LINE_COLOURS[1], lw=1.2, marker=marker, ms=2.6)

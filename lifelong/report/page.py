@@ -29,6 +29,7 @@ from lifelong.report.runs import Group, Run, group_runs, load_run, short_labels
 from lifelong.report.tables import (
     COST_COLUMNS,
     atom_table,
+    collection_table,
     cost_table,
     interference_table,
     mean_heatmap,
@@ -139,7 +140,7 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
     record, labels = run.record, short_labels(run.record.instructions)
     rates, _ = run.results.success_matrix()
     save(heatmap_figure([Panel(f"{record.algo}, {record.benchmark}", rates, labels)]), folder / "heatmap")
-    curves, losses = run.results.curves(), run.results.losses()
+    curves, losses, drawn = run.results.curves(), run.results.losses(), run.results.collections()
     average = run.results.average_success()[None]
     times = {k: v for k, v in run.results.seconds_by_phase().items() if v > 0}
     return {
@@ -155,7 +156,10 @@ def _single_run(run: Run, folder: Path) -> dict[str, Any]:
         "published": _published(run),
         "bar_low": min(0.0, run.metrics.nbt.value) if run.metrics else 0.0,
         "heatmaps": [run_heatmap(run.results, labels)],
-        "learning": as_svg(learning_figure(curves, losses, labels, _kept(run))) if curves or losses else None,
+        "learning": as_svg(learning_figure(curves, losses, labels, _kept(run), drawn))
+        if curves or losses
+        else None,
+        "collections": collection_table(drawn, labels),
         "forgetting": as_svg(forgetting_figure([Line("", average)])) if run.learned > 1 else None,
         "tasks": _task_rows(run, rates),
         "times": [(name, duration(s), 100 * s / sum(times.values())) for name, s in times.items()],

@@ -16,6 +16,7 @@ from lifelong.report.comparison import costs_of
 from lifelong.report.figures import cell_colours
 from lifelong.report.runs import Run, stage_of
 from lifelong.results.failures import FailureScore, Tally
+from lifelong.results.records import CollectionRecord
 from lifelong.results.results import Results
 from lifelong.results.shifts import ShiftScore
 from lifelong.results.subgoals import AtomRates, Subgoals
@@ -154,6 +155,25 @@ def atom_table(found: Subgoals, labels: Sequence[str]) -> Table:
     end = Cell("Held", title="held when the episode ended")
     heads = (Cell("Just learned", title=ever[0]), end, Cell("At the end", title=ever[1]), end, "forgotten")
     return Table(("#", "task", "atom", *heads), rows, left=3)
+
+
+def collection_table(iterations: Mapping[int, Sequence[CollectionRecord]], labels: Sequence[str]) -> Table:
+    """Return what each task that is learned from reward was learned from, and how that changed."""
+    rows: list[list[object]] = []
+    for task, found in iterations.items():
+        ends = found[0], found[-1]
+        numbers = [quantity(sum(getattr(r, name) for r in found)) for name in ("episodes", "steps")]
+        numbers += [f"{percent(r.successes / max(1, r.episodes), 0)} %" for r in ends]
+        numbers += [f"{np.mean([r.groups for r in found]):.1f}", *(f"{r.entropy:.2f}" for r in ends)]
+        rows.append([task + 1, labels[task], *numbers, duration(sum(r.seconds for r in found))])
+    heads = (
+        Cell("Drawn, first", title="success of drawn actions in the first iteration"),
+        Cell("Last", title="and in the last one"),
+        Cell("Spread", title="mean number of groups with successes and failures"),
+        Cell("Entropy, first", title="of the drawn actions in the first iteration, nat"),
+        Cell("Last", title="and in the last one"),
+    )
+    return Table(("#", "task", "episodes", "control steps", *heads, "time"), rows, left=2)
 
 
 def most_forgotten(atoms: Iterable[AtomRates], threshold: float = 0.005) -> list[AtomRates]:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from lifelong.errors import ResultsError
 from lifelong.results.records import (
+    CollectionRecord,
     CostRecord,
     DemonstrationsRecord,
     EvalRecord,
@@ -163,6 +164,13 @@ class Results:
             for group in self.run.groups
             if all(task in curves for task in group)
         }
+
+    def collections(self) -> dict[int, list[CollectionRecord]]:
+        """Return the iterations of each task that was learned from reward."""
+        found: dict[int, list[CollectionRecord]] = {}
+        for r in self.of(CollectionRecord):
+            found.setdefault(r.task, []).append(r)
+        return found
 
     def losses(self) -> dict[int, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """Return the epochs and mean training losses of each task."""

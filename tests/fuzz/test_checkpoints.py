@@ -14,6 +14,7 @@ from lifelong import checkpoints
 from lifelong.results.run_directory import CheckpointFolder
 from tests.harness.checkpoints import write_forged
 from tests.harness.fuzz import examples, survive
+from tests.harness.mutations import damaged
 from tests.harness.sequences import assert_same
 
 TREE = {
@@ -31,8 +32,6 @@ def written(tree=TREE) -> bytes:
 
 
 WHOLE, OTHER = written(), written(TREE | {"task": 2})
-PLACE = st.integers(0, len(WHOLE) - 1)
-HEADER = int.from_bytes(WHOLE[:8], "little") + 8
 VALUES = st.recursive(
     st.none()
     | st.booleans()
@@ -50,34 +49,6 @@ VALUES = st.recursive(
 )
 
 
-@st.composite
-def damaged(draw) -> bytes:
-    """A checkpoint of which some bytes are changed, moved, lost or another file's."""
-    content = bytearray(WHOLE)
-    for _ in range(draw(st.integers(1, 3))):
-        start, length = draw(PLACE), draw(st.integers(1, 200))
-        kind = draw(st.sampled_from(["flip", "header", "zero", "cut", "drop", "repeat", "other", "length"]))
-        if kind == "flip" and start < len(content):
-            content[start] ^= 1 << draw(st.integers(0, 7))
-        elif kind == "header":
-            content[draw(st.integers(0, HEADER - 1)) % max(1, len(content))] = draw(st.integers(0, 255))
-        elif kind == "zero":
-            content[start : start + length] = bytes(len(content[start : start + length]))
-        elif kind == "cut":
-            del content[start:]
-        elif kind == "drop":
-            del content[start : start + length]
-        elif kind == "repeat":
-            content[start:start] = content[start : start + length]
-        elif kind == "other":
-            content[start : start + length] = OTHER[start : start + length]
-        elif kind == "length":
-            content[:8] = draw(st.integers(0, 2**64 - 1)).to_bytes(8, "little")
-        if not content:
-            break
-    return bytes(content)
-
-
 def load(content: bytes):
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "task_1.safetensors")
@@ -85,7 +56,7 @@ def load(content: bytes):
         return CheckpointFolder(Path(folder)).load_task(path)
 
 
-@given(damaged())
+@given(damaged(WHOLE, OTHER))
 @examples(short=250, long=4000)
 def test_damage_is_found_or_does_no_harm(content):
     found = survive("checkpoints", lambda: load(content))

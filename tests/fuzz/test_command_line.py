@@ -103,10 +103,8 @@ def test_any_words_are_run_or_refused_in_a_line(words, tmp_path_factory, monkeyp
 def test_any_text_is_drawn_and_written(texts):
     def attempt() -> None:
         matrix = heatmap_figure([Panel(texts[0], np.eye(2), texts)])
-        (
-            as_svg(matrix),
-            as_svg(forgetting_figure([Line(texts[0], np.ones((1, 2))), Line(texts[1], np.ones((1, 2)))])),
-        )
+        for figure in (matrix, forgetting_figure([Line(text, np.ones((1, 2))) for text in texts])):
+            as_svg(figure)
         page = page_template("page.html").environment.from_string("<p>{{ t }}</p>").render(t=texts[0])
         assert page.count("<") == 2
 

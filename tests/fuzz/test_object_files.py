@@ -17,6 +17,7 @@ from libero_env.design.objects.mjcf_file import store_mjcf
 from libero_env.limited import limited_process
 from libero_env.objects.folder import read_spec
 from tests.harness.fuzz import examples, survive
+from tests.harness.mutations import damaged
 
 pytestmark = pytest.mark.sim
 
@@ -90,24 +91,6 @@ def mutate(text: str, steps) -> bytes:
     return ET.tostring(root)
 
 
-@st.composite
-def cuts(draw, data: bytes) -> bytes:
-    """Bytes with some changed, removed or repeated."""
-    changed = bytearray(data)
-    for _ in range(draw(st.integers(0, 4))):
-        at, length = draw(st.integers(0, max(len(changed) - 1, 0))), draw(st.sampled_from([1, 1, 2, 4, 50]))
-        kind = draw(st.sampled_from(["set", "remove", "repeat", "end"]))
-        if kind == "set":
-            changed[at : at + length] = draw(st.binary(min_size=length, max_size=length))
-        elif kind == "remove":
-            del changed[at : at + length]
-        elif kind == "repeat":
-            changed[at:at] = changed[at : at + length] * draw(st.sampled_from([1, 3, 200]))
-        elif draw(st.integers(0, 3)) == 0:
-            del changed[at:]
-    return bytes(changed)
-
-
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
     """A folder with what the models name, `secret` beside it."""
@@ -159,7 +142,7 @@ def convert(place: Path, path: Path, whole: bool) -> None:
 def test_mutations_of_models_are_converted_or_refused(place, model, steps, data, share):
     text = mutate(model, steps)
     if share % 5 == 0:
-        text = data.draw(cuts(text))
+        text = data.draw(damaged(text))
     path = place / "own" / "model.xml"
     path.write_bytes(text)
     survive("object files", lambda: convert(place, path, whole=share == 0))
@@ -177,7 +160,7 @@ def test_mutations_of_meshes_are_converted_or_refused(place, kind, data, share):
         exported = mesh.export(file_type=kind)
         text = exported.encode() if isinstance(exported, str) else exported
     path = place / "own" / f"model.{kind}"
-    path.write_bytes(data.draw(cuts(text)))
+    path.write_bytes(data.draw(damaged(text)))
     survive("object files", lambda: convert(place, path, whole=share == 0))
 
 
@@ -188,7 +171,7 @@ def test_mutations_of_the_files_of_models_are_converted_or_refused(place, name, 
     before = whole.read_bytes()
     (place / "own" / "model.xml").write_text(model)
     try:
-        whole.write_bytes(data.draw(cuts(before)))
+        whole.write_bytes(data.draw(damaged(before)))
         survive("object files", lambda: convert(place, place / "own" / "model.xml", whole=False))
     finally:
         whole.write_bytes(before)

@@ -4,7 +4,6 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from libero_env.envs import EnvConfig
 from libero_env.perturbations import KINDS, Perturbation, format_perturbations, parse_perturbations
 from libero_env.perturbations.instructions import edit_distance, reword
 from libero_env.tasks import get_suite
@@ -32,16 +31,6 @@ def test_texts(text):
     if found:
         again = parse_perturbations(format_perturbations(found))
         assert [one.kind for one in again] == [one.kind for one in found if one.severity]
-
-
-@given(
-    value=st.one_of(
-        VALUE, st.lists(VALUE, max_size=3), st.dictionaries(st.text(max_size=3), VALUE, max_size=2)
-    )
-)
-@examples(60, 3000)
-def test_values_of_a_configuration(value):
-    survive("perturbations of a configuration", lambda: EnvConfig(perturb=value))
 
 
 @given(kind=st.one_of(st.sampled_from(list(KINDS)), st.text(max_size=4)), severity=VALUE, seed=VALUE)

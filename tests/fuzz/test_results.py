@@ -22,6 +22,7 @@ from lifelong.results.records import (
 from lifelong.results.summary import summarize
 from lifelong.stats.metrics import lifelong_metrics
 from tests.harness.fuzz import examples, survive
+from tests.harness.mutations import damaged
 from tests.harness.records import evaluation, run_start
 
 NAMES = ["first", "second"]
@@ -67,24 +68,12 @@ def edited_line(draw) -> bytes:
         return json.dumps(values).encode() + b"\n"
 
 
-@st.composite
-def damaged_line(draw) -> bytes:
-    """A line some of whose bytes are changed or lost."""
-    line = bytearray(draw(st.sampled_from(LINES)))
-    for _ in range(draw(st.integers(1, 2))):
-        place = draw(st.integers(0, len(line) - 2))
-        match draw(st.sampled_from(["set", "zero", "cut", "drop"])):
-            case "set":
-                line[place] = draw(st.integers(0, 255))
-            case "zero":
-                line[place : place + 20] = bytes(len(line[place : place + 20]))
-            case "cut":
-                del line[place:-1]
-            case "drop":
-                del line[place : place + 3]
-        if len(line) < 3:
-            break
-    return bytes(line).rstrip(b"\n") + b"\n"
+# lines some of whose bytes are changed or lost
+DAMAGED = (
+    st.sampled_from(LINES)
+    .flatmap(lambda line: damaged(line[:-1]))
+    .map(lambda b: b.replace(b"\n", b"") + b"\n")
+)
 
 
 def read(content: bytes):
@@ -103,7 +92,7 @@ def read(content: bytes):
         return results
 
 
-@given(st.lists(damaged_line(), min_size=1, max_size=3), st.data())
+@given(st.lists(DAMAGED, min_size=1, max_size=3), st.data())
 @examples(short=120, long=3000)
 def test_damaged_lines_cost_themselves(lines, data):
     content = list(LINES)

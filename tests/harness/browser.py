@@ -53,11 +53,7 @@ class Browser:
         return found["result"].get("value")
 
     def until(self, expression: str) -> Any:
-        """Return an expression's value as soon as it is true.
-
-        Raises:
-            TimeoutError: It is not within a minute.
-        """
+        """Return an expression's value as soon as it is true; raise a TimeoutError after a minute."""
         end = time.monotonic() + PATIENCE
         while not (value := self.evaluate(expression)):
             if time.monotonic() > end:
@@ -70,13 +66,8 @@ class Browser:
         assert page.is_file(), page
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.call("Emulation.setEmulatedMedia", features=[scheme])
-        self.call(
-            "Emulation.setDeviceMetricsOverride",
-            width=width,
-            height=900,
-            deviceScaleFactor=1,
-            mobile=width < 600,
-        )
+        size = {"width": width, "height": 900, "deviceScaleFactor": 1}
+        self.call("Emulation.setDeviceMetricsOverride", **size, mobile=width < 600)
         self.call("Page.navigate", url="about:blank")
         self.until("location.href == 'about:blank'")
         self.call("Page.navigate", url=page.resolve().as_uri())
@@ -85,14 +76,10 @@ class Browser:
     def screenshot(self, out: Path, height: int | None = None) -> None:
         """Write a picture of the page from its top, as high as the page unless told."""
         size = self.call("Page.getLayoutMetrics")["cssContentSize"]
-        clip = {
-            "x": 0,
-            "y": 0,
-            "width": self.evaluate("innerWidth"),
-            "height": height or size["height"],
-            "scale": 1,
-        }
-        picture = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)
+        clip = {"x": 0, "y": 0, "width": self.evaluate("innerWidth"), "height": height or size["height"]}
+        picture = self.call(
+            "Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip | {"scale": 1}
+        )
         out.write_bytes(base64.b64decode(picture["data"]))
 
     def faults_on_a_phone(self, page: Path) -> list[str]:
@@ -104,11 +91,7 @@ class Browser:
 
 
 def program() -> str:
-    """Return the path of an installed browser.
-
-    Raises:
-        FileNotFoundError: There is none.
-    """
+    """Return the path of an installed browser; raise a FileNotFoundError if there is none."""
     found = next(filter(None, map(shutil.which, (*NAMES, MAC))), None)
     if found is None:
         raise FileNotFoundError(

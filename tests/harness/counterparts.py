@@ -17,13 +17,7 @@ def counterpart(
     """Return the Python of an environment with these distributions; it is made once and kept.
 
     Environments lie in `LIBERO_COUNTERPARTS`, by default `~/.cache/libero-lifelong/counterparts`. Where the packages
-    cannot be had, the test is skipped with pip's last line.
-
-    Args:
-        requirements: Distributions as pip takes them, with what they depend on.
-        no_deps: Distributions without what they depend on.
-        python: Interpreter of the environment.
-        build: Whether it is made where it is not there yet; otherwise the test is skipped.
+    cannot be had, or are not there and `build` is false, the test is skipped.
     """
     default = Path.home() / ".cache" / "libero-lifelong" / "counterparts"
     base = Path(os.environ.get("LIBERO_COUNTERPARTS", default))

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
@@ -41,6 +42,25 @@ def write(path, episodes, **more):
     for i, one in enumerate(episodes):
         writer.write(i, one)
     return writer.finish()
+
+
+def write_noise(path, spec, lengths, *, pairing=None, labels=False, seed=0):
+    """Write a file of noise in the original's layout, images upside down; `labels` adds `expert_actions`."""
+    rng = np.random.default_rng(seed)
+    with h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        if pairing is not None:
+            data.attrs["pairing"] = pairing
+        for number, steps in enumerate(lengths):
+            group = data.create_group(f"demo_{number}")
+            group.attrs["num_samples"] = steps
+            for key in ("actions", "expert_actions")[: 1 + labels]:
+                group[key] = rng.uniform(-1, 1, (steps, spec.action_dim))
+            for view in spec.views:
+                group[f"obs/{view}"] = rng.integers(0, 256, (steps, *spec.image_size, 3), dtype=np.uint8)
+            for name, size in spec.proprio.items():
+                group[f"obs/{name}"] = rng.normal(size=(steps, size))
+    return path
 
 
 def generate(task, n, *, path, camera_size=(128, 128), workers=0, progress=None, **options):

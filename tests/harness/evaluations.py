@@ -14,9 +14,8 @@ from libero_eval.work.evaluation import Evaluation
 from libero_eval.work.worker import Worker
 
 TASKS = get_suite("libero_goal").tasks[:2]
-QUICK = load_protocol("libero").changed(
-    {"episode.horizon": 10, "episode.settle_steps": 0, "episode.settle_action": None}
-)
+_SHORT = {"episode.horizon": 10, "episode.settle_steps": 0, "episode.settle_action": None}
+QUICK = load_protocol("libero").changed(_SHORT)
 
 
 class Countdown:
@@ -38,9 +37,8 @@ class Countdown:
     def step(self, actions):
         self.steps += 1
         reached = self.steps == self.goal
-        return (
-            {"x": np.zeros((self.num_envs, 1))}, reached, reached, np.zeros(self.num_envs, bool), self._info()
-        )  # fmt: skip
+        obs, truncated = {"x": np.zeros((self.num_envs, 1))}, np.zeros(self.num_envs, bool)
+        return obs, reached, reached, truncated, self._info()
 
     def close(self):
         pass
@@ -72,3 +70,22 @@ def evaluation(out: Path, policy=None, **changes) -> Evaluation:
 def evaluate(out: Path, policy=None, **changes) -> EvaluationResult:
     """Evaluate in this process, quietly."""
     return Worker(evaluation(out, policy, **changes), on_error=lambda _: None).run()
+
+
+def write_policy(path: Path, predicted: str, *own: str) -> None:
+    """Write a module whose `make` is a policy with lines of its own; it notes what it is told in told.txt."""
+    lines = "\n    ".join(own or ("pass",))
+    path.write_text(f"""
+import numpy as np
+
+
+class make:
+    {lines}
+
+    def reset(self, instruction, num_envs):
+        with open("told.txt", "a") as file:
+            print(instruction, file=file)
+
+    def predict(self, observations):
+        return {predicted}
+""")

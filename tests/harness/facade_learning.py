@@ -13,20 +13,10 @@ from libero_env.demos.write import DemoWriter
 
 SIZE, LANGUAGE = 32, 16
 TINY = (
-    "device=cpu",
-    "policy.image_encoder.network_kwargs.remove_layer_num=5",
-    "policy.policy_head.network_kwargs.hidden_size=16",
-    "data.seq_len=3",
-    f"data.img_h={SIZE}",
-    f"data.img_w={SIZE}",
-    "train.n_epochs=1",
-    "train.batch_size=4",
-    "train.num_workers=0",
-    "eval.num_workers=0",
-    "eval.n_eval=1",
-    "eval.num_procs=1",
-    "eval.max_steps=4",
-    "eval.eval_every=1",
+    *("device=cpu", "data.seq_len=3", f"data.img_h={SIZE}", f"data.img_w={SIZE}", "train.num_workers=0"),
+    *("policy.image_encoder.network_kwargs.remove_layer_num=5", "train.n_epochs=1", "train.batch_size=4"),
+    *("policy.policy_head.network_kwargs.hidden_size=16", "eval.num_workers=0", "eval.n_eval=1"),
+    *("eval.num_procs=1", "eval.max_steps=4", "eval.eval_every=1"),
 )
 TINY_TRANSFORMER = (
     "policy.embed_size=8", "policy.transformer_num_layers=1", "policy.transformer_num_heads=2",
@@ -53,14 +43,10 @@ def write_demos(path: Path, lengths: tuple[int, ...] = (5, 4), seed: int = 0, si
     rng = np.random.default_rng(seed)
     writer = DemoWriter(path, {"pairing": "aligned"})
     for index, steps in enumerate(lengths):
-        obs = {
-            "agentview_rgb": rng.integers(0, 255, (steps, size, size, 3), np.uint8),
-            "eye_in_hand_rgb": rng.integers(0, 255, (steps, size, size, 3), np.uint8),
-            "joint_states": rng.normal(size=(steps, 7)),
-            "gripper_states": rng.normal(size=(steps, 2)),
-            "ee_pos": rng.normal(size=(steps, 3)),
-            "ee_ori": rng.normal(size=(steps, 3)),
-        }
+        views, readings = ("agentview_rgb", "eye_in_hand_rgb"), {"joint_states": 7, "gripper_states": 2}
+        obs = {view: rng.integers(0, 255, (steps, size, size, 3), np.uint8) for view in views}
+        readings |= {"ee_pos": 3, "ee_ori": 3}
+        obs |= {name: rng.normal(size=(steps, count)) for name, count in readings.items()}
         actions = rng.uniform(-1, 1, (steps, 7))
         writer.write(index, Episode(actions, np.zeros((steps, 5)), None, obs))
     return writer.finish()

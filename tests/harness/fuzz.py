@@ -36,12 +36,7 @@ class SurprisingError(AssertionError):
 
 
 def examples(short: int, long: int) -> settings:
-    """Return hypothesis's settings of a test.
-
-    Args:
-        short: Number of inputs in the test suite.
-        long: Number of inputs of `make fuzz`.
-    """
+    """Return hypothesis's settings of a test by its numbers of inputs, in the test suite and for `make fuzz`."""
     return settings(
         max_examples=long if FOLDER else short,
         derandomize=SEED == 0,
@@ -54,15 +49,7 @@ def examples(short: int, long: int) -> settings:
 
 
 def survive(surface: str, attempt: Callable[[], Any], *, allowed: tuple[type[Exception], ...] = ()) -> Any:
-    """Call a function on a hostile input.
-
-    Args:
-        surface: Name of the kind of input, under which it is counted.
-        attempt: Function without arguments.
-        allowed: Errors besides `LiberoError` that are a clean answer here.
-
-    Returns:
-        What the function returned; None where it refused the input.
+    """Return what a function gives for a hostile input; None where it refuses it by an error that is ours or allowed.
 
     Raises:
         SurprisingError: The function raised another error, took too long or asked for too much memory.
@@ -95,10 +82,8 @@ def _limits() -> Iterator[None]:
     with open("/proc/self/statm") as file:
         used = int(file.read().split()[0]) * resource.getpagesize()
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    timers = (
-        (signal.SIGALRM, signal.ITIMER_REAL, WALL_SECONDS),
-        (signal.SIGPROF, signal.ITIMER_PROF, SECONDS),
-    )
+    wall = (signal.SIGALRM, signal.ITIMER_REAL, WALL_SECONDS)
+    timers = (wall, (signal.SIGPROF, signal.ITIMER_PROF, SECONDS))
     before = {number: signal.signal(number, end) for number, _, _ in timers}
     for _, timer, seconds in timers:
         signal.setitimer(timer, seconds)

@@ -93,13 +93,7 @@ class Learned:
 
 @dataclass
 class Asked:
-    """What one training step asks of a GPU.
-
-    Attributes:
-        launches: Number of kernels, the augmentation's included.
-        waits: Where the host waits.
-        launches_of_augmentation: Number of kernels with which 32 windows are augmented.
-    """
+    """Kernels of one training step, where the host waits in it, and kernels with which 32 windows are augmented."""
 
     launches: int
     waits: list[str]
@@ -112,6 +106,8 @@ class Watch:
     def __init__(self, device: torch.device, warned: list[warnings.WarningMessage]):
         pretended = sys.modules.get("tests.harness.pretended_gpu")
         self._warned, self._seen = warned, pretended and pretended.SEEN
+        self.unsafe: list[str] = self._seen.unsafe if self._seen else []
+        self.uploads: list[str] = self._seen.uploads if self._seen else []
         if device.type == "cuda" and not pretended:
             torch.cuda.set_sync_debug_mode("warn")
 
@@ -125,14 +121,6 @@ class Watch:
             return self._seen.waits
         return [f"{w.filename}:{w.lineno}" for w in self._warned if "synchronizing" in str(w.message)]
 
-    @property
-    def unsafe(self) -> list[str]:
-        return self._seen.unsafe if self._seen else []
-
-    @property
-    def uploads(self) -> list[str]:
-        return self._seen.uploads if self._seen else []
-
 
 @contextmanager
 def watched(device: torch.device) -> Iterator[Watch]:
@@ -142,10 +130,6 @@ def watched(device: torch.device) -> Iterator[Watch]:
         yield Watch(device, warned)
 
 
-class Killed(BaseException):
-    """Stands for a killed process."""
-
-
 def learn(algorithm: str, policy: str, device: torch.device) -> Learned:
     """Learn two tasks with an algorithm and act; the first policy is killed in the last task, and resumes."""
     found, kept = Learned(algorithm, policy), slice(-2, None)
@@ -153,7 +137,7 @@ def learn(algorithm: str, policy: str, device: torch.device) -> Learned:
         _count(found, watch, stack)
         if policy == next(iter(POLICIES)):
             stack.enter_context(patch.object(Recovery, "is_due", lambda _: True))
-            with patch.object(Recovery, "save_progress", _save_and_die), suppress(Killed):
+            with patch.object(Recovery, "save_progress", _save_and_die), suppress(sequences.Killed):
                 _sequence(Path(folder), algorithm, policy, device).run()
                 raise AssertionError("it was not killed")
             del found.waits[:-1]
@@ -161,7 +145,7 @@ def learn(algorithm: str, policy: str, device: torch.device) -> Learned:
         last = _sequence(Path(folder), algorithm, policy, device)
         last.run()
         losses = [r for r in last.log.read().of(LossRecord) if r.task == TASKS - 1]
-    found.losses, found.waits, found.unsafe = [r.loss for r in losses], found.waits[kept], list(watch.unsafe)
+    found.losses, found.waits, found.unsafe = [r.loss for r in losses], found.waits[kept], watch.unsafe
     return found
 
 
@@ -171,7 +155,7 @@ def _save_and_die(
     if task == TASKS - 1:
         save(self, task, phase, fit)
     if task == TASKS - 1 and fit is not None and fit["epoch"] == 1:
-        raise Killed
+        raise sequences.Killed
 
 
 def _sequence(folder: Path, algorithm: str, policy: str, device: torch.device) -> sequences.TaskSequence:
@@ -264,9 +248,8 @@ def differing_memories(device: torch.device, repeats: int = 1) -> int:
     frames = {"images": batch.observation.images[:, 0], "actions": batch.actions[:, 0]}
     proprio = {name: reading[:, 0] for name, reading in batch.observation.proprio.items()}
     last = torch.full((24,), 23)
-    plain = SequenceVLDataset(
-        **frames, proprio=proprio, last=last, language=torch.zeros(384), task_id=0, seq_len=4
-    )
+    facts = {"language": torch.zeros(384), "task_id": 0, "seq_len": 4}
+    plain = SequenceVLDataset(**frames, proprio=proprio, last=last, **facts)
     kept, there = compress(plain, order, 10**8, 60), plain.to(device)
     busy = torch.rand(8192, 8192, device=device) if repeats > 1 else None
     for _ in range(repeats):

@@ -17,12 +17,7 @@ KEPT = (
     "LIBERO_ORIGINAL_SOURCE", "LIBERO_ORIGINAL_PYTHON", "LIBERO_PYTHON", "LIBERO_NOTEBOOKS_OUT", "LIBERO_BUILD",
     "LIBERO_LEROBOT", "LIBERO_TFDS", "LIBERO_OPENPI"
 )  # fmt: skip
-OURS = (
-    "robot",
-    "meshes",
-    "assets_checked",
-    "assets",
-)  # the robot's files and simplified meshes; the original's models
+OURS = ("robot", "meshes", "assets_checked", "assets")  # the robot and its meshes; the original's models
 OTHERS = ("matplotlib", "numba", "huggingface")  # fonts, compiled code, models of language
 
 
@@ -38,16 +33,11 @@ def move_in() -> Path:
     os.environ["HOME"] = str(home)
     if pip is not None:
         os.environ.setdefault("PIP_CONFIG_FILE", str(pip))  # where packages are fetched from
-    shared = {
-        "LIBERO_COUNTERPARTS": "libero-lifelong/counterparts",
-        "PIP_CACHE_DIR": "pip",
-    }  # environments, wheels
+    shared = {"LIBERO_COUNTERPARTS": "libero-lifelong/counterparts", "PIP_CACHE_DIR": "pip"}  # and wheels
     for name, folder in (shared | {"MESA_SHADER_CACHE_DIR": "mesa_shader_cache"}).items():
         os.environ.setdefault(name, str(caches / folder))
-    for source, target in [
-        *((ours / name, home / ".cache" / "libero" / name) for name in OURS),
-        *((caches / name, home / ".cache" / name) for name in OTHERS),
-    ]:
+    linked = {ours / name: home / ".cache" / "libero" / name for name in OURS}
+    for source, target in (linked | {caches / name: home / ".cache" / name for name in OTHERS}).items():
         if source.is_dir():
             shutil.copytree(source, target, symlinks=True, copy_function=_link)
     return home

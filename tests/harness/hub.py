@@ -11,14 +11,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
 class Hub(ThreadingHTTPServer):
-    """A server of one data set.
-
-    Args:
-        repo: Name of the data set.
-        revision: The commit that it has.
-        files: Name -> content.
-        large: Names of the files that are stored by their SHA-256; others are git blobs.
-    """
+    """A server of one data set; the `large` files are stored by their SHA-256, others are git blobs."""
 
     daemon_threads = True
 

@@ -56,9 +56,7 @@ def names_of(item, asked=()):
 def inventory(path, asked=None):
     """Return the names and values behind an environment of a task file, after four steps from a given pose.
 
-    Args:
-        path: Task file.
-        asked: Names to ask for besides those that are listed, by part.
+    `asked` are names by part besides those that are listed.
     """
     from libero.libero.envs.env_wrapper import ControlEnv
 
@@ -85,9 +83,8 @@ def inventory(path, asked=None):
             parts |= {kind: item, f"state of {kind}": domain.object_states_dict[name]}
     found = {part: names_of(item, (asked or {}).get(part, ())) for part, item in parts.items()}
     model = env.sim.model
-    found["elements"] = {
-        kind: list(getattr(model, f"{kind}_names")) for kind in ("joint", "site", "sensor", "camera")
-    }
+    kinds = ("joint", "site", "sensor", "camera")
+    found["elements"] = {kind: list(getattr(model, f"{kind}_names")) for kind in kinds}
     robots = ("robot0_", "gripper0_", "mount0_")
     found["elements"]["robot"] = [name for name in model.geom_names if (name or "").startswith(robots)]
     found["step"] = {name: plain(value) for name, value in step[0].items() if name.startswith("robot0_")}
@@ -96,7 +93,5 @@ def inventory(path, asked=None):
 
 
 if __name__ == "__main__":
-    text = json.dumps(
-        {Path(path).stem: inventory(path) for path in sys.argv[2:]}, indent=None, sort_keys=True
-    )
-    Path(sys.argv[1]).write_text(text + "\n")
+    made = {Path(path).stem: inventory(path) for path in sys.argv[2:]}
+    Path(sys.argv[1]).write_text(json.dumps(made, sort_keys=True) + "\n")

@@ -34,11 +34,8 @@ def mutated(draw: Callable, originals: Sequence[Any], most: int = 3) -> Any:
                 del parent[key]
             case 1:
                 other, at = draw(st.sampled_from(spots))
-                if (
-                    other is not holder and at in range(len(other))
-                    if isinstance(other, list)
-                    else at in other
-                ):
+                known = at in other if isinstance(other, dict) else other is not holder and at < len(other)
+                if known:
                     parent[key] = copy.deepcopy(other[at])
             case 2 if isinstance(parent, dict):
                 name = draw(st.sampled_from(WORDS) | st.sampled_from(list(parent)) | st.just(3))
@@ -46,15 +43,13 @@ def mutated(draw: Callable, originals: Sequence[Any], most: int = 3) -> Any:
             case 3 if isinstance(parent, list) and parent is not holder:
                 parent.insert(key, copy.deepcopy(parent[key]))
             case 4:
-                parent[key] = draw(
-                    st.sampled_from([[parent[key]], {"at": parent[key]}, {str(key): parent[key]}])
-                )
+                wrapped = [[parent[key]], {"at": parent[key]}, {str(key): parent[key]}]
+                parent[key] = draw(st.sampled_from(wrapped))
             case 5 if isinstance(parent[key], str):
                 parent[key] = draw(changed_text(parent[key]))
             case 6 if isinstance(parent[key], int | float):
-                parent[key] = draw(
-                    st.sampled_from([-parent[key], str(parent[key]), parent[key] * 1000, *NUMBERS])
-                )
+                changed = [-parent[key], str(parent[key]), parent[key] * 1000, *NUMBERS]
+                parent[key] = draw(st.sampled_from(changed))
             case _:
                 parent[key] = copy.deepcopy(draw(hostile))
     return holder[0]
@@ -87,3 +82,36 @@ def _spots(node: Any):
         yield node, key
         if isinstance(node[key], dict | list):
             yield from _spots(node[key])
+
+
+@st.composite
+def damaged(draw: Callable, content: bytes, other: bytes = b"") -> bytes:
+    """Draw bytes with up to four changes, near an end more often: some changed, lost, moved, repeated or of another."""
+    data = bytearray(content)
+    for _ in range(draw(st.integers(0, 4))):
+        last = max(len(data) - 1, 0)
+        at = draw(
+            st.integers(0, last) | st.integers(0, min(last, 400)) | st.integers(max(last - 400, 0), last)
+        )
+        length = draw(st.sampled_from((1, 1, 2, 4, 8, 50, 200)))
+        part = data[at : at + length]
+        match draw(st.integers(0, 8)):
+            case 0 if part:
+                data[at] ^= 1 << draw(st.integers(0, 7))
+            case 1:
+                data[at : at + length] = bytes(len(part))
+            case 2:
+                data[at : at + length] = b"\xff" * len(part)
+            case 3:
+                data[at : at + 8] = draw(st.integers(0, 2**64 - 1)).to_bytes(8, "little")
+            case 4:
+                del data[at:]
+            case 5:
+                del data[at : at + length]
+            case 6:
+                data[at:at] = part * draw(st.sampled_from((1, 3, 200)))
+            case 7:
+                data[:] = data[at:] + data[:at]
+            case _:
+                data[at : at + length] = other[at : at + length] or draw(st.binary(max_size=length))
+    return bytes(data)

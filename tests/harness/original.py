@@ -90,12 +90,8 @@ def name_map(policy: Policy, name: str) -> list[Entry]:
         entries += _linear("spatial_language.linear", "language_encoder_spatial.projection.0")
         entries += _linear("spatial.project", "spatial_down_sample", rows)
         entries += _layers("spatial", "spatial_transformer", 7, None)
-        parts = (
-            ("read", "spatial_token"),
-            ("positions", "patch_pos_embed"),
-            ("modalities", "modality_embed"),
-        )
-        for ours, there in parts:
+        parts = {"read": "spatial_token", "positions": "patch_pos_embed", "modalities": "modality_embed"}
+        for ours, there in parts.items():
             entries.append(Entry(f"spatial.{ours}", there, shape=(1, -1, 128)))
     return entries + _head(policy, TOKEN)
 
@@ -132,9 +128,8 @@ def _encoder(policy: Policy, name: str, view: int) -> Iterator[Entry]:
             yield from _norm(f"{block}.shortcut.1", f"{there}.downsample.1")
         channels = 64 if number < 2 else 128
         swapped = torch.arange(2 * channels).roll(channels)
-        yield from _linear(
-            f"{ours}.films.{number}.project", f"{theirs}.lang_proj{number + 1}", ((0, swapped),)
-        )
+        film = f"{ours}.films.{number}.project"
+        yield from _linear(film, f"{theirs}.lang_proj{number + 1}", ((0, swapped),))
     softmax = f"{theirs}.projection_layer.spatial_softmax._spatial_conv"
     yield from _linear(f"{ours}.readout.heat", softmax, shape=(32, 128, 1, 1))
     orders: tuple = ((1, halves(64).roll(32)),)  # rows are y, columns x
@@ -159,14 +154,8 @@ def _layers(ours: str, theirs: str, count: int, order: Tensor | None) -> list[En
 
 
 def _rnn(policy: Policy) -> list[Entry]:
-    images, language, readings = 128, 32, 9
-    order = torch.cat(
-        [
-            torch.arange(images),
-            torch.arange(images + language, images + language + readings),
-            torch.arange(images, images + language),
-        ]
-    )
+    images, language, readings = torch.arange(128 + 32 + 9).split([128, 32, 9])
+    order = torch.cat([images, readings, language])
     names = [n for n, _ in policy.named_parameters() if n.startswith("rnn.")]
     return [Entry(n, n, ((1, order),) if n == "rnn.weight_ih_l0" else ()) for n in names]
 
@@ -219,12 +208,6 @@ def smooth_batch(spec: PolicySpec, number: int, windows: int = 2, steps: int | N
 
     The first seeds were chosen for gradients that float32 determines: computed with other kernels they are the same to
     1e-4. Where a unit is at the kink of a ReLU, rounding decides about its share of the gradient.
-
-    Args:
-        spec: Sizes of all of them.
-        number: Seed.
-        windows: Number of windows.
-        steps: Number of frames; None for the spec's `seq_len`.
     """
     draws, steps = np.random.RandomState(106 + number), steps or spec.seq_len
     coarse = torch.from_numpy(draws.random_sample((windows * 2, 3 * steps, 8, 8)))
@@ -244,13 +227,6 @@ def smooth_batch(spec: PolicySpec, number: int, windows: int = 2, steps: int | N
 def with_images(batch: Batch, images: Tensor) -> Batch:
     """Return a batch with other pictures."""
     return replace(batch, observation=replace(batch.observation, images=images))
-
-
-def episode_frame(batch: Batch, step: int) -> Observation:
-    """Return a frame of the windows, as a policy that acts sees it."""
-    seen = batch.observation
-    readings = {name: value[:, step : step + 1] for name, value in seen.proprio.items()}
-    return Observation(seen.images[:, step : step + 1], readings, seen.language)
 
 
 def our_algorithm(name: str) -> Algorithm:
@@ -273,14 +249,9 @@ def original() -> tuple[Path, Path]:
 def run_original(
     policy: Policy, name: str, parts: str, given: Mapping[str, Batch], **values: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Run parts of `original_learning.py` with a policy's weights, and return what it found.
+    """Run parts of `original_learning.py`, its functions, with a policy's weights; return what it found.
 
-    Args:
-        policy: Policy whose weights and running statistics are given to theirs.
-        name: Name of the policy here.
-        parts: Functions of the script, with blanks between them.
-        given: Batches, by the names that the parts have for them.
-        values: What else the parts need.
+    `given` are batches by the names that the parts have for them, and `values` what else they need.
     """
     python, source = original()
     tensors = policy.state_dict()
@@ -307,10 +278,7 @@ def run_original(
 def in_our_names(policy: Policy, name: str, found: Mapping[str, np.ndarray], kind: str) -> dict[str, Tensor]:
     """Return their tensors of a kind under our names, in our shapes and orders."""
     shapes = {n: t.shape for n, t in policy.state_dict().items()}
-    return {
-        entry.ours: entry.to_ours(
-            torch.from_numpy(np.asarray(found[f"{kind}/{entry.theirs}"])), shapes[entry.ours]
-        )
-        for entry in name_map(policy, name)
-        if f"{kind}/{entry.theirs}" in found
-    }
+    start = f"{kind}/"
+    given = {n.removeprefix(start): torch.as_tensor(t) for n, t in found.items() if n.startswith(start)}
+    entries = [entry for entry in name_map(policy, name) if entry.theirs in given]
+    return {entry.ours: entry.to_ours(given[entry.theirs], shapes[entry.ours]) for entry in entries}

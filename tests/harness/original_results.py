@@ -19,6 +19,7 @@ from lifelong.training.settings import FitSettings
 from lifelong.training.step import Step
 from lifelong.types import Batch
 from tests.harness import original
+from tests.harness.algorithms import frame
 from tests.harness.configs import composed
 
 Found = dict[str, Tensor]
@@ -33,12 +34,8 @@ def fit_settings() -> FitSettings:
 def one_step(policy: Policy, batch: Batch, algorithm: Algorithm) -> float:
     """Make one step as training does, at the first learning rate; return the policy's loss."""
     settings = fit_settings()
-    optimizer = torch.optim.AdamW(
-        algorithm.trained(policy),
-        lr=settings.lr,
-        betas=tuple(settings.betas),
-        weight_decay=settings.weight_decay,
-    )
+    sizes = {"lr": settings.lr, "betas": tuple(settings.betas), "weight_decay": settings.weight_decay}
+    optimizer = torch.optim.AdamW(algorithm.trained(policy), **sizes)
     algorithm.mode_train(policy)
     loss, _ = Step(policy, algorithm, optimizer, settings)(batch, generator(0))
     return loss.item()
@@ -46,9 +43,8 @@ def one_step(policy: Policy, batch: Batch, algorithm: Algorithm) -> float:
 
 def gradients(policy: Policy) -> Found:
     """Return copies of all gradients; zero where there is none."""
-    return {
-        n: torch.zeros_like(p) if p.grad is None else p.grad.clone() for n, p in policy.named_parameters()
-    }
+    named = policy.named_parameters()
+    return {n: torch.zeros_like(p) if p.grad is None else p.grad.clone() for n, p in named}
 
 
 def weights(policy: Policy) -> Found:
@@ -105,7 +101,7 @@ def acts(policy: Policy, episode: Batch) -> Found:
     """Return the distribution of the action at each frame, as the policy acts."""
     policy.eval().reset(len(episode))
     steps = episode.actions.shape[1]
-    params = [policy.step(original.episode_frame(episode, step)) for step in range(steps)]
+    params = [policy.step(frame(episode.observation, step)) for step in range(steps)]
     joined = {name: torch.stack([p[name] for p in params], 1) for name in params[0]}
     return {
         "act_means": joined["means"].flatten(0, 1).view(len(episode), -1, *joined["means"].shape[-2:]),
@@ -169,11 +165,8 @@ def ewc(policy: Policy, first: Batch, second: Batch) -> dict:
             p.mul_(1.01)
     penalty = algorithm.penalty(policy)
     loss = one_step(policy, first, algorithm)
-    return found | {
-        "penalty": penalty.detach(),
-        "ewc_loss": torch.tensor(loss),
-        "ewc_clipped": gradients(policy),
-    }
+    found |= {"penalty": penalty.detach(), "ewc_loss": torch.tensor(loss)}
+    return found | {"ewc_clipped": gradients(policy)}
 
 
 def packnet(policy: Policy, first: Batch, second: Batch) -> dict:

@@ -26,37 +26,17 @@ _START = (
 
 @dataclass(frozen=True)
 class Peer:
-    """An environment with another package.
-
-    Attributes:
-        python: Its interpreter.
-        path: Folders that are searched after its own.
-    """
+    """An environment with another package: its interpreter, and folders that are searched after its own."""
 
     python: Path
     path: tuple[str, ...]
 
     def run(self, script: str, *arguments: object, cwd: Path, timeout: float = 300, **variables: str) -> dict:
-        """Run a script of `peer_scripts` and return the JSON object that it prints last.
-
-        Args:
-            script: Its file name.
-            *arguments: Arguments.
-            cwd: Working directory.
-            timeout: Largest time, [s].
-            **variables: Environment variables.
-        """
+        """Run a script of `peer_scripts` and return the JSON object that it prints last; `variables` are its own."""
         known = {"HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1", "PEER_PATH": os.pathsep.join(self.path)}
         command = [str(self.python), "-c", _START, str(SCRIPTS / script), *map(str, arguments)]
-        done = subprocess.run(
-            command,
-            cwd=cwd,
-            env={**os.environ, **known, **variables},
-            capture_output=True,
-            text=True,
-            timeout=timeout,
-            check=False,
-        )
+        env = {**os.environ, **known, **variables}
+        done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=timeout)
         assert done.returncode == 0, f"{script}:\n{done.stdout[-3000:]}\n{done.stderr[-6000:]}"
         return json.loads(done.stdout.strip().splitlines()[-1])
 
@@ -78,9 +58,7 @@ def lerobot() -> Peer:
     """Return LeRobot's environment with the plug-in; 5.4 GB, so it is made only where LIBERO_BUILD_LEROBOT is set."""
     python = os.environ.get("LIBERO_PYTHON312") or shutil.which("python3.12")
     if python is None:
-        pytest.skip(
-            "LeRobot 0.6 needs Python 3.12, and there is no python3.12; LIBERO_PYTHON312 names another"
-        )
+        pytest.skip("LeRobot 0.6 needs Python 3.12, and there is none; LIBERO_PYTHON312 names another")
     needed = ("numba", "lazy_loader", "h5py", "fast-simplification", "trimesh", "cloudpickle", "hatchling")
     found = counterpart(
         "lerobot[evaluation,dataset]==0.6.1",
@@ -98,11 +76,8 @@ def lerobot() -> Peer:
 def _installed(python: Path, name: str) -> str:
     """Return a folder with one of our distributions as pip installs it: its metadata are what others look for."""
     folder = python.parents[1] / "integrations"
-    command = [
-        str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--upgrade"
-    ]  # fmt: skip
-    done = subprocess.run(
-        [*command, "--target", str(folder), str(INTEGRATIONS / name)], capture_output=True, text=True
-    )
+    pip = [str(python), "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--upgrade"]
+    command = [*pip, "--target", str(folder), str(INTEGRATIONS / name)]
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return str(folder)

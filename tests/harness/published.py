@@ -23,12 +23,7 @@ def base_task() -> Task:
 
 
 def write_plus(folder: Path, states: np.ndarray) -> Path:
-    """Write a folder of LIBERO-Plus with one variant of each ending.
-
-    Args:
-        folder: Folder to write.
-        states: Published initial states of the base task, and in its first row that of the moved variant.
-    """
+    """Write a folder of LIBERO-Plus with one variant of each ending; the first state is that of the moved one."""
     text = base_task().bddl_text
     long = "Libero_Tabletop_Manipulation_tabletop_table_" + "CliffDesert006_COL_VAR2_HIRES_bg_" * 4
     moved = text.replace("(0.04 -0.03 0.060000000000000005 -0.01)", "(0.1 0.02 0.12 0.04)")
@@ -72,16 +67,11 @@ def write_pro(folder: Path, states: np.ndarray) -> Path:
 
 def _swapped(text: str) -> str:
     """Return a task file with bowl and plate in each other's place."""
-    bowl, plate = (
-        "On akita_black_bowl_1 main_table_akita_black_bowl_region",
-        "On plate_1 main_table_plate_region",
-    )
-    assert bowl in text and plate in text
-    return (
-        text.replace(bowl, "@")
-        .replace(plate, "On plate_1 main_table_akita_black_bowl_region")
-        .replace("@", "On akita_black_bowl_1 main_table_plate_region")
-    )
+    bowl, plate = ("akita_black_bowl", "plate")
+    places = {f"On {one}_1 main_table_{one}_region": other for one, other in ((bowl, plate), (plate, bowl))}
+    assert all(place in text for place in places)
+    turn = lambda found: found[0].replace(f"{found[1]}_region", f"{places[found[0]]}_region")  # noqa: E731
+    return re.sub(rf"On ({bowl}|{plate})_1 main_table_\1_region", turn, text)
 
 
 def _write(folder: Path, suite: str, files: dict[str, str]) -> None:

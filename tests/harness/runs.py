@@ -4,7 +4,6 @@ from pathlib import Path
 
 import torch
 import yaml
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from lifelong import checkpoints
@@ -14,7 +13,7 @@ from lifelong.results.run_directory import CheckpointFolder
 from lifelong.seeding import generator, seeded
 from lifelong.settings import build
 from lifelong.types import PolicySpec
-from tests.harness.configs import CONFIGS
+from tests.harness.configs import composed
 
 TINY = (
     *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "device=cpu", "data.image_size=32"),
@@ -27,16 +26,13 @@ def make_windows(task: int, spec: PolicySpec) -> SequenceVLDataset:
     observation, draws = fake_observation(spec, 1, generator(task), steps=8), generator(task)
     proprio = {name: value[0] for name, value in observation.proprio.items()}
     actions = 2 * torch.rand(8, spec.action_dim, generator=draws) - 1
-    last = torch.full((8,), 7)
-    return SequenceVLDataset(
-        observation.images[0], proprio, actions, last, observation.language[0], task, spec.seq_len
-    )
+    images, language, last = observation.images[0], observation.language[0], torch.full((8,), 7)
+    return SequenceVLDataset(images, proprio, actions, last, language, task, spec.seq_len)
 
 
 def make_run(folder: Path, *overrides: str):
     """Write the files of a run with two learned tasks that loading needs; return the policy after each."""
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        config = compose("config", [*TINY, *overrides])
+    config = composed(*TINY, *overrides)
     folder.mkdir(parents=True)
     plain = OmegaConf.to_container(config, resolve=True)
     (folder / "config.yaml").write_text(yaml.safe_dump(plain))

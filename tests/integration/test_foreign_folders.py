@@ -14,24 +14,12 @@ from lifelong.results.provenance import config_digest
 pytestmark = [pytest.mark.sim, pytest.mark.slow]
 
 TINY = (
-    *(
-        "preset=smoke",
-        "benchmark=libero_object",
-        "benchmark.tasks=2",
-        "threads=1",
-        "data.demos=2",
-        "data.seq_len=2",
-        "device=cpu",
-    ),
-    *("train.epochs=1", "train.steps_per_epoch=4", "train.batch_size=4", "eval.horizon=4", "eval.episodes=1"),
-    *(
-        "eval.curve_episodes=1",
-        "policy.encoder.width=4",
-        "algo=sequential",
-        "data.image_size=32",
-        "train.warmup_steps=0",
-    ),
+    *("preset=smoke", "benchmark=libero_object", "benchmark.tasks=2", "threads=1", "data.demos=2"),
+    *("data.seq_len=2", "device=cpu", "train.epochs=1", "train.steps_per_epoch=4", "train.batch_size=4"),
+    *("eval.horizon=4", "eval.episodes=1", "eval.curve_episodes=1", "policy.encoder.width=4"),
+    *("algo=sequential", "data.image_size=32", "train.warmup_steps=0"),
 )
+EXPORT = ("results", "export", "RESULT", "--as")
 SHORT = ("--episodes", "1", "--horizon", "4", "--suite", "libero_object/0")
 # every command that writes into a folder which it is given; RUN is a run and RESULT an evaluation
 WRITERS = {
@@ -44,18 +32,9 @@ WRITERS = {
     "checkpoint": ("eval", "RUN/checkpoints/task_0.safetensors", *SHORT),
     "robustness": ("robustness", "RUN", *SHORT, "--kinds", "light", "--severities", "1", "--pairs"),
     "again": ("eval", "RESULT"),
-    "eval-results": (
-        "results",
-        "export",
-        "RESULT",
-        "--as",
-        "eval-results",
-        "--partial",
-        "--dataset",
-        "org/name",
-    ),
-    "lerobot": ("results", "export", "RESULT", "--as", "lerobot"),
-    "vla-eval": ("results", "export", "RESULT", "--as", "vla-eval"),
+    "eval-results": (*EXPORT, "eval-results", "--partial", "--dataset", "org/name"),
+    "lerobot": (*EXPORT, "lerobot"),
+    "vla-eval": (*EXPORT, "vla-eval"),
     "check": ("check", "RUN"),
 }
 

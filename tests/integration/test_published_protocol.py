@@ -34,14 +34,7 @@ WORDS = [
     "[CLS]",
     "[SEP]",
     "[MASK]",
-    "pick",
-    "up",
-    "the",
-    "and",
-    "place",
-    "it",
-    "in",
-    "basket",
+    *["pick", "up", "the", "and", "place", "it", "in", "basket"],
 ]
 
 
@@ -89,18 +82,8 @@ def test_every_part_of_the_published_protocol_runs(tmp_path, monkeypatch):
         return replace(done, episodes=tuple(replace(e, success=epoch in (1, 2)) for e in done.episodes))
 
     monkeypatch.setattr(measuring, "rollout", succeeds_after)
-    assert (
-        main(
-            [
-                "train",
-                *SMALL,
-                f"runs_dir={tmp_path / 'runs'}",
-                f"language.cache_dir={tmp_path}",
-                f"data.files=[{','.join(files)}]",
-            ]
-        )
-        == 0
-    )
+    folders = f"runs_dir={tmp_path / 'runs'}", f"language.cache_dir={tmp_path}"
+    assert main(["train", *SMALL, *folders, f"data.files=[{','.join(files)}]"]) == 0
 
     (log,) = (tmp_path / "runs").rglob("results.jsonl")
     found = json.loads((log.parent / "results.json").read_text())
@@ -113,11 +96,8 @@ def test_every_part_of_the_published_protocol_runs(tmp_path, monkeypatch):
     phases = 2 * 2  # training and retraining of each task
     steps = phases * 3
     assert calls["SharedJitter.images"] >= steps and calls["SharedShift._corners"] >= steps
-    assert (
-        calls["PackNet._prune"] > 2
-        and calls["fit._adapt_statistics"] == 2
-        and calls["transformer.drop_samples"] >= steps
-    )
+    assert calls["PackNet._prune"] > 2 and calls["transformer.drop_samples"] >= steps
+    assert calls["fit._adapt_statistics"] == 2
 
     after = checkpoints.load(log.parent / "checkpoints" / "task_1.safetensors")
     owners = after["algorithm"]["owner"]

@@ -136,9 +136,7 @@ def test_another_policy_behind_the_same_address_gets_nothing_of_the_first(card, 
         assert "answers a fixed observation otherwise" in capsys.readouterr().err
         height[0] = 1.0
         assert on_server(address, out, path, "--name", "other") == 2
-        assert "evaluated.name is lift there and other here" in capsys.readouterr().err.replace(
-            '"', ""
-        ).replace("'", "")
+        assert 'evaluated.name is "lift" there and "other" here' in capsys.readouterr().err
     assert (out / "eval.json").read_text() == whole
 
 
@@ -225,14 +223,14 @@ def test_a_groot_server_under_a_protocol(card, tmp_path, capsys):
     assert found["evaluated"]["announced"]["action"]["modality_keys"][-1] == "gripper"
 
 
-def test_what_a_server_does_wrong_ends_the_evaluation(tmp_path, capsys):
-    assert cli.main(["eval", "http://localhost:1", *EPISODES]) == 2
-    assert "no kind of server has http; write ws://localhost:1" in capsys.readouterr().err
-    assert cli.main(["eval", "localhost:8000", *EPISODES]) == 2
-    assert "an address without the kind of its server: write ws://localhost:8000" in capsys.readouterr().err
-    assert cli.main(["eval", "ftp://localhost:1", *EPISODES]) == 2
-    assert "unknown kind of server 'ftp'. Valid: gr00t, vla-eval, ws, wss" in capsys.readouterr().err
-    with pytest.raises(SystemExit, match="2"):
-        cli.main(["eval", "ws://localhost:1", "--in-flight", "0"])
-    assert "--in-flight 0" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("http://localhost:1", "no kind of server has http; write ws://localhost:1"),
+        ("localhost:8000", "an address without the kind of its server: write ws://localhost:8000"),
+        ("ftp://localhost:1", "unknown kind of server 'ftp'. Valid: gr00t, vla-eval, ws, wss"),
+    ],
+)
+def test_addresses_of_no_kind_of_server_are_refused(address, message, capsys):
+    assert cli.main(["eval", address, *EPISODES]) == 2
+    assert message in capsys.readouterr().err

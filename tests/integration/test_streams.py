@@ -49,6 +49,4 @@ def test_streams_from_the_command_line(tmp_path, demos, monkeypatch, capsys):
 
     assert train(tmp_path, "algo=sequential", "init_from=nowhere", "run_id=none") == 2
     assert "no checkpoint at nowhere" in capsys.readouterr().err
-    assert not (
-        tmp_path / "runs" / "libero_object" / "sequential" / "bc_transformer_small_seed1_none"
-    ).exists()
+    assert not list((tmp_path / "runs" / "libero_object" / "sequential").glob("*_none"))

@@ -25,8 +25,8 @@ def make_env(suite):
 
     made = []
 
-    def make(cls=ControlEnv, task=0, **kwargs):
-        made.append(cls(bddl_file_name=suite.get_task_bddl_file_path(task), **kwargs))
+    def make(cls=ControlEnv, file=None, **kwargs):
+        made.append(cls(bddl_file_name=file or suite.get_task_bddl_file_path(0), **kwargs))
         return made[-1]
 
     yield make

@@ -19,8 +19,6 @@ POSES = [[-0.62, -0.02, 0.2], [-0.58, 0.02, 0.43]]
 JOINTS = [[-0.1, -0.3, -0.1, -2.5, -0.1, 2.2, 0.7], [0.1, 0.1, 0.1, -2.4, 0.1, 2.3, 0.8]]
 # Configuration, further arguments, and the joints after the eight actions of `drive`.
 CONTROLLERS = [
-    ({"type": "OSC_POSE"}, {}, [0.045811, -0.206146, 0.079682, -2.384369, 0.14384, 2.233065, 0.724085]),
-    ({"type": "OSC_POSE", "kp": 50}, {}, [0.02091, -0.185888, 0.048174, -2.401574, 0.106976, 2.212147, 0.704053]),
     ({"type": "OSC_POSE", "kp": [50, 100, 150, 80, 90, 100], "damping_ratio": 0.5}, {},
      [0.053119, -0.214735, 0.13284, -2.370691, 0.185774, 2.236571, 0.714162]),
     ({"type": "OSC_POSE", "output_max": [0.1, 0.1, 0.1, 0.2, 0.2, 0.2],
@@ -32,7 +30,6 @@ CONTROLLERS = [
      [0.090672, -1.40287, 0.024151, -3.072589, 0.088565, 1.53543, 0.748592]),
     ({"type": "OSC_POSITION", "output_max": 0.1, "output_min": -0.1, "kp": 80}, {},
      [0.026134, -0.221252, 0.091565, -2.374993, 0.025562, 2.13831, 0.886254]),
-    ({"type": "JOINT_POSITION"}, {}, [0.011573, -0.162087, -0.002751, -2.421788, 0.002546, 2.22256, 0.793262]),
     ({"type": "JOINT_POSITION", "kp": [30, 40, 50, 60, 70, 80, 90], "damping_ratio": 0.7, "output_max": 0.1,
      "output_min": -0.1}, {}, [0.022585, -0.160099, -0.006575, -2.380718, 0.007707, 2.212318, 0.808013]),
     ({"type": "JOINT_POSITION", "qpos_limits": JOINTS}, {},
@@ -44,8 +41,6 @@ CONTROLLERS = [
      [0.017369, -0.14285, -0.012691, -2.367325, 0.008638, 2.212301, 0.816814]),
     ({"type": "OSC_POSE"}, {"control_freq": 10},
      [0.061666, -0.240983, 0.138981, -2.332332, 0.252187, 2.280223, 0.694333]),
-    ({"type": "OSC_POSE"}, {"control_freq": 40},
-     [0.02402, -0.183429, 0.04872, -2.422032, 0.057421, 2.230847, 0.758028]),
     ({"type": "OSC_POSE"}, {"control_freq": 30},
      [0.032213, -0.191202, 0.060192, -2.411076, 0.083726, 2.231566, 0.748523]),
     ({"type": "JOINT_VELOCITY"}, {"control_freq": 10},
@@ -66,19 +61,12 @@ def test_configurations_of_controllers_move_the_arm_as_in_the_original(make_env,
     env = make_env(controller=config, **arguments, **BLIND)
     env.reset()
     np.testing.assert_allclose(drive(env), joints, atol=1.5e-6)
-
-
-def test_frequencies_have_the_original_number_of_physics_steps(make_env):
-    env = make_env(**BLIND, control_freq=30)
-    env.reset()
-    drive(env)
-    assert np.isclose(env.sim.data.time, 0.256)
-    assert np.isclose(env.env.cur_time, 8 / 30)
+    assert np.isclose(env.env.cur_time, 8 / arguments.get("control_freq", 20))
 
 
 def test_the_native_environment_moves_at_10_hz_as_the_original_does(make_env):
     hz = 10
-    joints = next(q for config, more, q in CONTROLLERS if "kp" not in config and more == {"control_freq": hz})
+    joints = next(q for config, more, q in CONTROLLERS if config["type"][:3] == "OSC" and hz in more.values())
     env = make_env(**BLIND, control_freq=hz)
     env.reset()
     start, bodies = env.sim.get_state().flatten(), env.env.simulations.read_fixtures()
@@ -123,19 +111,6 @@ def test_the_rest_pose_and_absolute_poses_of_a_controller(make_env):
     for name in ("impedance_mode", "uncoupling", "orientation_limits", "interpolator_pos"):
         with pytest.raises(AttributeError, match=name):
             setattr(env.robots[0].controller, name, 3)
-
-
-def test_scales_of_joint_controllers_are_of_seven_joints(make_env):
-    for name, scale, gain in (
-        ("JOINT_POSITION", 0.05, 50.0),
-        ("JOINT_VELOCITY", 0.5, [480.0] * 5 + [72.0] * 2),
-    ):
-        controller = make_env(controller=name, **BLIND).robots[0].controller
-        assert controller.output_max.tolist() == [scale] * 7
-        assert controller.output_min.tolist() == [-scale] * 7
-        np.testing.assert_allclose(controller.kp, np.broadcast_to(gain, 7))
-    with pytest.raises(LiberoError, match="JOINT_VELOCITY: its gains are those of the configuration"):
-        controller.kp = 1.0
 
 
 @pytest.mark.parametrize("hard_reset", [True, False])
@@ -283,28 +258,17 @@ def test_rooms_of_the_arguments(make_env):
     ("arguments", "message"),
     [
         ({"controller": {"type": "OSC_POSE", "impedance_mode": "variable"}}, "impedance_mode='variable': not supp"),
-        ({"controller": {"type": "OSC_POSE", "uncouple_pos_ori": False}}, "uncouple_pos_ori=False: not supported"),
-        ({"controller": {"type": "OSC_POSE", "orientation_limits": [[0] * 3] * 2}}, "orientation_limits"),
-        ({"controller": {"type": "OSC_POSE", "interpolation": "linear"}}, "interpolation='linear': not supported"),
         ({"controller": {"type": "OSC_POSE", "kd": 3}}, "unknown key of the controller OSC_POSE 'kd'"),
         ({"controller": {"type": "JOINT_POSITION", "output_max": [0.1] * 6}}, "output_max=.*; expected .* 7 numbers"),
-        ({"controller": {"type": "OSC_POSE", "kp": "high"}}, "kp='high'; expected a number, or 6 numbers"),
         ({"controller": {"type": "OSC_POSE", "position_limits": 1.0}}, "position_limits=1.0; expected two rows of 3"),
         ({"controller": "IK_POSE"}, "unknown controller 'IK_POSE'"),
         ({"control_freq": 0}, "control_freq=0; expected a number above 0"),
         ({"control_freq": "20"}, "control_freq='20'; expected a number above 0"),
         ({"gripper_types": None}, "gripper_types=None: not supported"),
-        ({"gripper_types": "NoSuchGripper"}, "gripper_types='NoSuchGripper': not supported"),
-        ({"mount_types": "NullMount"}, "mount_types='NullMount': not supported"),
-        ({"render_collision_mesh": True}, "render_collision_mesh=True: not supported"),
-        ({"renderer": "nvisii"}, "renderer='nvisii': not supported"),
-        ({"object_property_initializers": [3]}, "object_property_initializers"),
-        ({"scene_xml": "does/not/exist.xml"}, "scene_xml='does/not/exist.xml': not supp.* scenes/libero_f"),
-        ({"scene_xml": "scenes/libero_tabletop_base_style.xml"}, "scene_xml"),
+        ({"scene_xml": "scenes/libero_tabletop_base_style.xml"}, "scene_xml=.*: not supp.* scenes/libero_f"),
         ({"scene_properties": {"floor_style": "lava"}}, "unknown floor style 'lava'"),
         ({"scene_properties": {"roof_style": "dark"}}, "unknown scene property 'roof'"),
         ({"initialization_noise": {"magnitude": 0.1, "type": "pink"}}, "initialization_noise=.*; expected 'default'"),
-        ({"initialization_noise": 0.1}, "initialization_noise=0.1; expected 'default'"),
     ],
 )  # fmt: skip
 def test_what_is_not_obeyed_is_refused_by_name(suite, arguments, message):
@@ -316,6 +280,8 @@ def test_the_problem_classes_have_the_original_default_controller(suite):
     env = TASK_MAPPING["libero_floor_manipulation"](suite.get_task_bddl_file_path(0), **BLIND)
     assert env.robots[0].controller.name == "JOINT_VELOCITY"
     np.testing.assert_allclose(env.robots[0].controller.kp, [4.8] * 5 + [0.72] * 2)
+    with pytest.raises(LiberoError, match="JOINT_VELOCITY: its gains are those of the configuration"):
+        env.robots[0].controller.kp = 1.0
     env.close()
 
 
@@ -324,3 +290,5 @@ def test_a_controller_of_robosuite_is_taken_with_what_its_robot_adds(make_env):
     env = make_env(controller=[{"type": "OSC_POSITION", **DEFAULTS["OSC_POSITION"], **added}], **BLIND)
     assert "sim" not in env.robots[0].controller_config
     assert env.env.action_dim == 4
+    env.reset()
+    env.step(np.zeros(7))  # as long as that of OSC_POSE

@@ -14,11 +14,11 @@ from libero._adapters.models import model_of
 from libero.libero.envs import ControlEnv, OffScreenRenderEnv
 from libero.libero.envs.base_object import OBJECTS_DICT, MujocoXMLObject, register_object
 from libero.libero.envs.objects import ArticulatedObject, get_object_fn
-from libero.libero.utils.mu_utils import InitialSceneTemplates, register_mu
 from libero.libero.utils.object_utils import get_affordance_regions
 from libero.libero.utils.task_generation_utils import generate_bddl_from_task_info, register_task_info
 from libero_env.errors import LiberoError
 from libero_env.objects import get_object
+from tests.harness.scenes import register_scene, write_box
 
 pytestmark = pytest.mark.sim
 
@@ -58,15 +58,6 @@ DRAWER = """
 """
 
 
-def write_box(path, half, offset=0.0):
-    """A box of 12 triangles as OBJ, its middle `offset` m up."""
-    corners = [(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
-    lines = ["v {} {} {}".format(*np.multiply(c, half) + (0, 0, offset)) for c in corners]
-    quads = ((1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4))
-    lines += [f"f {a} {b} {c}\nf {a} {c} {d}" for a, b, c, d in quads]
-    path.write_text("\n".join(lines))
-
-
 @pytest.fixture
 def assets(tmp_path, monkeypatch):
     """The folder `custom_assets` of the walkthrough, here."""
@@ -79,105 +70,52 @@ def assets(tmp_path, monkeypatch):
     return tmp_path
 
 
-class CustomObjects(MujocoXMLObject):
-    def __init__(self, custom_path, name, obj_name, joints=[dict(type="free", damping="0.0005")]):  # noqa: B006, C408
-        assert os.path.isabs(custom_path), "Custom path must be an absolute path"
-        assert custom_path.endswith(".xml"), "Custom path must be an xml file"
-        super().__init__(
-            custom_path, name=name, joints=joints, obj_type="all", duplicate_collision_geoms=False
-        )
+class CustomObject(MujocoXMLObject):
+    def __init__(self, name, obj_name):
+        path = os.path.abspath(os.path.join("./", "custom_assets", obj_name, f"{obj_name}.xml"))
+        joints = [{"type": "free", "damping": "0.0005"}]
+        super().__init__(path, name=name, joints=joints, obj_type="all", duplicate_collision_geoms=False)
         self.category_name = "_".join(re.sub(r"([A-Z])", r" \1", self.__class__.__name__).split()).lower()
         self.object_properties = {"vis_site_names": {}}
 
 
 def register_mugs():
     @register_object
-    class LiberoMug(CustomObjects):
+    class LiberoMug(CustomObject):
         def __init__(self, name="libero_mug", obj_name="libero_mug"):
-            super().__init__(
-                custom_path=os.path.abspath(
-                    os.path.join("./", "custom_assets", "libero_mug", "libero_mug.xml")
-                ),
-                name=name,
-                obj_name=obj_name,
-            )
+            super().__init__(name, obj_name)
             self.rotation = {"x": (-np.pi / 2, -np.pi / 2), "y": (-np.pi, -np.pi), "z": (np.pi, np.pi)}
             self.rotation_axis = None
 
     @register_object
-    class LiberoMugYellow(CustomObjects):
+    class LiberoMugYellow(CustomObject):
         def __init__(self, name="libero_mug_yellow", obj_name="libero_mug_yellow"):
-            super().__init__(
-                custom_path=os.path.abspath(
-                    os.path.join("./", "custom_assets", "libero_mug_yellow", "libero_mug_yellow.xml")
-                ),
-                name=name,
-                obj_name=obj_name,
-            )
-            self.rotation = (0.0, 0.0)
-            self.rotation_axis = "z"
+            super().__init__(name, obj_name)
+            self.rotation, self.rotation_axis = (0.0, 0.0), "z"
 
-    return LiberoMug, LiberoMugYellow
-
-
-def kitchen_demo_scene():
-    @register_mu(scene_type="kitchen")
-    class KitchenDemoScene(InitialSceneTemplates):
-        def __init__(self):
-            fixture_num_info = {"kitchen_table": 1, "wooden_cabinet": 1}
-            object_num_info = {"libero_mug": 1, "libero_mug_yellow": 1, "plate": 1}
-            super().__init__(
-                workspace_name="kitchen_table",
-                fixture_num_info=fixture_num_info,
-                object_num_info=object_num_info,
-            )
-
-        def define_regions(self):
-            places = {"libero_mug": (0.0, 0.0), "libero_mug_yellow": (0.2, 0.0), "plate": (-0.2, 0.0)}
-            for name, middle in places.items():
-                self.regions.update(
-                    self.get_region_dict(
-                        region_centroid_xy=middle,
-                        region_name=f"{name}_init_region",
-                        target_name=self.workspace_name,
-                        region_half_len=0.025,
-                    )
-                )
-            self.regions.update(
-                self.get_region_dict([0.0, -0.3], "wooden_cabinet_init_region", self.workspace_name, 0.01)
-            )
-
-        @property
-        def init_states(self):
-            names = ("libero_mug", "libero_mug_yellow", "plate", "wooden_cabinet")
-            return [("On", f"{name}_1", f"kitchen_table_{name}_init_region") for name in names]
+    return LiberoMug
 
 
 def test_the_walkthrough_from_class_to_environment(assets):
-    mug, _ = register_mugs()
+    mug = register_mugs()
     assert get_object_fn("libero_mug") is mug
-    kitchen_demo_scene()
+    places = {"libero_mug": (0.0, 0.0), "libero_mug_yellow": (0.2, 0.0), "plate": (-0.2, 0.0)}
+    register_scene("KitchenDemoScene", "wooden_cabinet", **places)
 
     @register_task_info
     class KitchenDemoScenePutMugsOnPlate:
-        def __init__(self):
-            self.task_name = "KITCHEN_DEMO_SCENE_put_both_mugs_on_the_plate"
-            self.scene_name = "KitchenDemoScene"
-            self.language_instruction = "put the libero mug and yellow mug on the plate"
-
-        @property
-        def goal(self):
-            return [("On", "libero_mug_1", "plate_1"), ("On", "libero_mug_yellow_1", "plate_1")]
+        task_name = "KITCHEN_DEMO_SCENE_put_both_mugs_on_the_plate"
+        scene_name = "KitchenDemoScene"
+        language_instruction = "put the libero mug and yellow mug on the plate"
+        goal = [("On", "libero_mug_1", "plate_1"), ("On", "libero_mug_yellow_1", "plate_1")]
 
     path = generate_bddl_from_task_info(KitchenDemoScenePutMugsOnPlate(), output_dir="./custom_pddl")
     env = OffScreenRenderEnv(bddl_file_name=path, camera_heights=64, camera_widths=64)
     env.seed(1)
-    obs = env.reset()
+    before = env.reset()["libero_mug_1_pos"]
     shown = env.env.objects_dict["libero_mug_1"]
-    assert type(shown) is mug
-    assert shown.joints == ["libero_mug_1_joint0"]
-    assert np.allclose(obs["libero_mug_1_pos"][:2], (0.0, 0.0), atol=0.03)
-    before = obs["libero_mug_1_pos"]
+    assert type(shown) is mug and shown.joints == ["libero_mug_1_joint0"]
+    assert np.allclose(before[:2], (0.0, 0.0), atol=0.03)
     for _ in range(5):
         obs, _, done, _ = env.step([0.0] * 7)
     assert np.allclose(obs["libero_mug_1_pos"], before, atol=0.005), "it is at rest on the table"
@@ -200,9 +138,7 @@ def test_offsets_missing_in_a_plain_file_are_measured(assets):
     assert np.allclose([model.bottom_offset[2], model.top_offset[2]], [-0.02, 0.04], atol=1e-6)
     assert model.horizontal_radius == pytest.approx(0.03)
     compiled = model.spec.compile()
-    assert compiled.body_mass[1] == pytest.approx(1000 * 0.06**3, rel=1e-6), (
-        "by volume, at the density of water"
-    )
+    assert compiled.body_mass[1] == pytest.approx(1000 * 0.06**3, rel=1e-6), "that of water"
 
 
 def test_invalid_files_are_reported(tmp_path):
@@ -238,26 +174,9 @@ def test_user_defined_articulated_objects(tmp_path):
 
     assert get_affordance_regions(["tool_box"]) == {"tool_box": ["inner_region"]}
 
-    @register_mu(scene_type="kitchen")
-    class Workshop(InitialSceneTemplates):
-        def __init__(self):
-            super().__init__("kitchen_table", {"kitchen_table": 1, "tool_box": 1}, {"butter": 1})
-
-        def define_regions(self):
-            for name, middle in (("tool_box", (0.0, 0.25)), ("butter", (0.0, -0.1))):
-                self.regions.update(self.get_region_dict(middle, f"{name}_region", self.workspace_name, 0.01))
-
-        @property
-        def init_states(self):
-            return [
-                ("On", "tool_box_1", "kitchen_table_tool_box_region"),
-                ("On", "butter_1", "kitchen_table_butter_region"),
-            ]
-
+    register_scene("Workshop", "tool_box", butter=(0.0, 0.1))
     info = register_task_info("open the box", "workshop", goal_states=[("Open", "tool_box_1_inner_region")])
-    env = OffScreenRenderEnv(
-        bddl_file_name=generate_bddl_from_task_info(info, tmp_path), camera_heights=32, camera_widths=32
-    )
+    env = ControlEnv(bddl_file_name=generate_bddl_from_task_info(info, tmp_path), use_camera_obs=False)
     env.seed(0)
     env.reset()
     box = env.env.fixtures_dict["tool_box_1"]
@@ -291,11 +210,9 @@ print(f"{model.horizontal_radius:.3f}", sorted(model.rotation), model.joint_damp
 
 
 def test_subclasses_of_robosuites_own_class(assets):
-    root = Path(__file__).parents[2]
-    env = {**os.environ, "PYTHONPATH": str(root)}
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", ROBOSUITE], env=env, cwd=assets, capture_output=True, text=True
-    )
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, "-W", "ignore", "-c", ROBOSUITE]
+    done = subprocess.run(command, env=env, cwd=assets, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.strip().splitlines()[-2:]
     assert first == "['libero_mug_1_joint0'] -0.020 0.030"
@@ -328,22 +245,10 @@ BRICK = """
 """
 
 
-def test_an_object_from_an_mjcf_file(tmp_path, suite):
+@pytest.fixture
+def brick(tmp_path):
     (tmp_path / "brick.xml").write_text(BRICK)
-
-    @register_object
-    class RedBrick(MujocoXMLObject):
-        def __init__(self, name="red_brick", obj_name="red_brick"):
-            joints = [{"type": "free", "damping": "0.001"}]
-            super().__init__(str(tmp_path / "brick.xml"), name=name, joints=joints)
-            self.rotation, self.rotation_axis = (0.0, 0.0), "z"
-
-    assert OBJECTS_DICT["red_brick"](name="red_brick_1").joints == ["red_brick_1_joint0"]
-    env = ControlEnv(bddl_file_name=task_with("red_brick", suite, tmp_path), use_camera_obs=False)
-    assert "red_brick_1_pos" in env.reset()
-    assert env.env.objects_dict["red_brick_1"].horizontal_radius == 0.03
-    assert env.sim.model.body_mass[env.sim.model.body_name2id("red_brick_1_main")] == pytest.approx(0.048)
-    env.close()
+    return str(tmp_path / "brick.xml")
 
 
 def task_with(category, suite, folder):
@@ -373,25 +278,25 @@ def test_objects_that_robosuite_generates(tmp_path, suite):
         assert env.env.get_object(f"{category}_1").bottom_offset[2] == bottom
         body = env.sim.model.body_name2id(f"{category}_1_main")
         assert env.sim.model.body_mass[body] == pytest.approx(mass)
-        assert env.env.check_contact(env.env.get_object(f"{category}_1")), (
-            "its geoms have their names in the scene"
-        )
+        assert env.env.check_contact(env.env.get_object(f"{category}_1")), "its geoms have their names there"
         env.close()
 
 
-def test_offsets_of_a_class_are_those_of_placement(tmp_path, suite):
-    (tmp_path / "brick.xml").write_text(BRICK)
-
+def test_offsets_of_a_class_are_those_of_placement(brick, tmp_path, suite):
     @register_object
     class WideBrick(MujocoXMLObject):
         horizontal_radius, bottom_offset = 0.09, np.array([0.0, 0.0, -0.05])
 
         def __init__(self, name="wide_brick", obj_name="wide_brick"):
-            super().__init__(str(tmp_path / "brick.xml"), name=name)
+            super().__init__(brick, name=name, joints=[{"type": "free", "damping": "0.001"}])
 
     model = get_object("wide_brick")
     assert (model.horizontal_radius, model.bottom_offset) == (0.09, (0.0, 0.0, -0.05))
     assert model.top_offset == (0.0, 0.0, 0.03), "of the file"
+    env = ControlEnv(bddl_file_name=task_with("wide_brick", suite, tmp_path), use_camera_obs=False)
+    assert "wide_brick_1_pos" in env.reset()
+    assert env.env.objects_dict["wide_brick_1"].joints == ["wide_brick_1_joint0"]
+    env.close()
 
 
 def test_subclasses_of_the_benchmarks_classes_have_its_models(tmp_path, suite):
@@ -409,14 +314,12 @@ def test_subclasses_of_the_benchmarks_classes_have_its_models(tmp_path, suite):
             self.rotation, self.rotation_axis = (0.5, 0.5), "y"
 
     OBJECTS_DICT["blue_can"] = lambda name: ketchup(name=name)
-    OBJECTS_DICT["carton"] = milk
     assert get_object("red_can").rotation == get_object("milk").rotation
     assert get_object("small_can").rotation == {"y": (0.5, 0.5)}
     for category, cls, model in (
         ("red_can", RedCan, "milk"),
         ("small_can", SmallCan, "ketchup"),
         ("blue_can", ketchup, "ketchup"),
-        ("carton", milk, "milk"),
     ):
         path = task_with(category, suite, tmp_path)
         path.write_text(path.read_text().replace("butter_1 - butter", f"butter_1 - {model}"))
@@ -429,10 +332,9 @@ def test_subclasses_of_the_benchmarks_classes_have_its_models(tmp_path, suite):
         env.close()
 
 
-def test_a_class_of_the_benchmark_can_be_replaced(tmp_path, suite):
-    (tmp_path / "brick.xml").write_text(BRICK)
+def test_a_class_of_the_benchmark_can_be_replaced(brick, suite):
     family, mass = get_object_fn("milk").__base__, get_object("milk").spec.compile().body_mass[1]
-    for file, expected in (("milk", mass), (str(tmp_path / "brick.xml"), 0.048)):
+    for file, expected in (("milk", mass), (brick, 0.048)):
 
         @register_object
         class Milk(family):

@@ -21,11 +21,8 @@ from libero.lifelong.datasets import (
 from libero_env.errors import LiberoError
 from tests.harness.facade_learning import LANGUAGE, SIZE, tiny, write_demos
 
-MODALITY = {
-    "rgb": ["agentview_rgb", "eye_in_hand_rgb"],
-    "depth": [],
-    "low_dim": ["gripper_states", "joint_states"],
-}
+VIEWS, LOW_DIM = ["agentview_rgb", "eye_in_hand_rgb"], ["gripper_states", "joint_states"]
+MODALITY = {"rgb": VIEWS, "depth": [], "low_dim": LOW_DIM}
 
 
 @pytest.fixture(scope="module")
@@ -35,11 +32,11 @@ def file(tmp_path_factory):
 
 def test_windows_hold_the_frames_of_the_file(file):
     dataset, shape_meta = get_dataset(file, MODALITY, seq_len=3)
+    window = dataset[3]  # the last but one of five: one step is repeated
     assert (len(dataset), dataset.n_demos, dataset.total_num_sequences) == (9, 2, 9)
     assert shape_meta["ac_dim"] == 7 and shape_meta["use_images"]
     assert shape_meta["all_shapes"]["agentview_rgb"] == (3, SIZE, SIZE)
-    assert shape_meta["all_obs_keys"] == [*MODALITY["rgb"], *MODALITY["low_dim"]]
-    window = dataset[3]  # the last but one of five: one step is repeated
+    assert shape_meta["all_obs_keys"] == [*VIEWS, *LOW_DIM] == list(window["obs"])
     with h5py.File(file) as stored:
         demo = stored["data/demo_0"]
         image, joints, actions = (demo[k][()] for k in ("obs/agentview_rgb", "obs/joint_states", "actions"))
@@ -49,12 +46,6 @@ def test_windows_hold_the_frames_of_the_file(file):
     assert (seen.permute(0, 2, 3, 1).numpy() == image[frames]).all(), "as stored, bottom row first"
     assert np.allclose(window["obs"]["joint_states"], joints[frames], atol=1e-6)
     assert np.allclose(window["actions"], actions[frames], atol=1e-6)
-    assert {k: tuple(v.shape) for k, v in window["obs"].items()} == {
-        "agentview_rgb": (3, 3, SIZE, SIZE),
-        "eye_in_hand_rgb": (3, 3, SIZE, SIZE),
-        "gripper_states": (3, 2),
-        "joint_states": (3, 7),
-    }
 
 
 def test_frame_stack_adds_earlier_frames(file):
@@ -83,9 +74,8 @@ def test_datasets_with_instructions_grouped_and_truncated(file):
     embs = torch.randn(2, LANGUAGE)
     instructed = SequenceVLDataset(dataset, embs[0])
     assert (instructed.n_demos, instructed.total_num_sequences, len(instructed)) == (2, 9, 9)
-    assert (instructed[1]["task_emb"] == embs[0]).all() and (
-        instructed[1]["actions"] == dataset[1]["actions"]
-    ).all()
+    assert (instructed[1]["task_emb"] == embs[0]).all()
+    assert (instructed[1]["actions"] == dataset[1]["actions"]).all()
     assert "task_emb" not in dataset[1]
     group = GroupedTaskDataset([dataset, dataset], embs)
     assert (len(group), group.n_demos, group.total_num_sequences) == (18, 4, 18)
@@ -113,18 +103,11 @@ def test_seeds_and_devices(monkeypatch):
 def test_checkpoints_hold_data_only(tmp_path):
     model, path = nn.Linear(2, 3), tmp_path / "sub" / "model.pth"
     cfg = load_config("seed=5")
-    utils.torch_save_model(
-        model, path, cfg=cfg, previous_masks={"weight": torch.ones(3, 2, dtype=torch.uint8)}
-    )
+    masks = {"weight": torch.ones(3, 2, dtype=torch.uint8)}
+    utils.torch_save_model(model, path, cfg=cfg, previous_masks=masks)
     weights, loaded, masks = utils.torch_load_model(path, map_location="cuda")
     assert torch.equal(weights["weight"], model.weight) and masks["weight"].sum() == 6
-    assert (
-        isinstance(loaded, Config) and loaded == cfg and loaded.train.optimizer.kwargs.betas == [0.9, 0.999]
-    )
-
-    class Foreign:
-        pass
-
+    assert isinstance(loaded, Config) and loaded == cfg
     torch.save({"state_dict": {}, "cfg": None, "evil": nn.Linear}, tmp_path / "evil.pth")
     for broken in (tmp_path / "evil.pth", tmp_path / "absent.pth"):
         with pytest.raises(LiberoError, match=broken.name):
@@ -161,9 +144,8 @@ def test_task_embeddings():
 def test_experiment_folders_are_numbered(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     cfg = tiny("lifelong=er", "seed=7")
-    assert (
-        utils.create_experiment_dir(cfg) == "experiments/LIBERO_SPATIAL/ER/BCTransformerPolicy_seed7/run_001"
-    )
+    first = "experiments/LIBERO_SPATIAL/ER/BCTransformerPolicy_seed7/run_001"
+    assert utils.create_experiment_dir(cfg) == first
     assert cfg.experiment_name == "LIBERO_SPATIAL_ER_BCTransformerPolicy_seed7_run_001"
     utils.create_experiment_dir(cfg)
     assert cfg.experiment_dir.endswith("run_002")

@@ -76,9 +76,8 @@ def test_every_key_is_read_or_listed(group):
 @pytest.mark.parametrize("file", PARTS, ids=str)
 def test_modules_bind(file):
     node = yaml.safe_load((CONFIGS / "policy" / file).read_text())
-    inspect.signature(NETWORKS[node["network"]]).bind_partial(
-        **node["network_kwargs"], **node.get("loss_kwargs", {})
-    )
+    signature = inspect.signature(NETWORKS[node["network"]])
+    signature.bind_partial(**node["network_kwargs"], **node.get("loss_kwargs", {}))
 
 
 def test_names_are_of_classes():

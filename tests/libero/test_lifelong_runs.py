@@ -86,11 +86,8 @@ def test_every_key_of_the_original_is_one_of_a_run():
             for part in place.split("."):
                 node = node[part]
             assert node == expected, key
-    assert (config.runs_dir, config.language.model, config.eval.select) == (
-        "experiments",
-        "minilm",
-        "first_best",
-    )
+    chosen = (config.runs_dir, config.language.model, config.eval.select)
+    assert chosen == ("experiments", "minilm", "first_best")
 
 
 def test_lists_options_and_robots_of_the_original(tmp_path, monkeypatch, capsys):
@@ -119,17 +116,8 @@ def test_errors_are_printed_on_one_line(word, message, monkeypatch, capsys):
 def test_an_evaluation_names_a_run_of_main(monkeypatch, capsys):
     asked = []
     monkeypatch.setattr("libero_cli.main.main", lambda words: asked.append(words) or 0)
-    named = [
-        "--benchmark",
-        "LIBERO_GOAL",
-        "--task_id",
-        "2",
-        "--policy",
-        "bc_rnn_policy",
-        "--seed",
-        "7",
-        "--algo",
-    ]
+    named = ["--benchmark", "LIBERO_GOAL", "--task_id", "2", "--policy", "bc_rnn_policy"]
+    named += ["--seed", "7", "--algo"]
     assert evaluate.main([*named, "base", "--load_task", "5", "--device_id", "1", "--save_videos"]) == 0
     assert evaluate.main([*named, "multitask"]) == 0
     run = "experiments/libero_goal/{}/bc_rnn_seed7 --suite libero_goal/2"
@@ -155,12 +143,17 @@ def acting(folder, tmp_path_factory):
     return algos.Sequential(2, cfg), cfg, suite
 
 
+def record_starts(monkeypatch, run):
+    """Return a list of the starts of the next calls."""
+    begun = []
+    replaced = lambda a, e, rows, **k: begun.append(list(rows)) or run(a, e, rows, **k)  # noqa: E731
+    monkeypatch.setattr(metric, "run_episodes", replaced)
+    return begun
+
+
 def test_success_is_measured_from_the_first_states(acting, monkeypatch):
     algo, cfg, suite = acting
-    begun, real = [], metric.run_episodes
-    monkeypatch.setattr(
-        metric, "run_episodes", lambda a, e, rows, **k: begun.append(list(rows)) or real(a, e, rows, **k)
-    )
+    begun = record_starts(monkeypatch, metric.run_episodes)
     rate = metric.evaluate_one_task_success(cfg, algo, suite.get_task(1), suite.get_task_emb(1), 1)
     assert (rate, begun) == (0.0, [[0, 1], [2]])
     monkeypatch.setitem(cfg.eval, "use_mp", False)
@@ -174,10 +167,7 @@ def test_success_is_measured_from_the_first_states(acting, monkeypatch):
 
 def test_all_states_of_a_users_folder_count(acting, monkeypatch, tmp_path):
     algo, cfg, suite = acting
-    begun = []
-    monkeypatch.setattr(
-        metric, "run_episodes", lambda a, e, rows, **k: begun.append(list(rows)) or Rollouts((), 0.0)
-    )
+    begun = record_starts(monkeypatch, lambda *_, **__: Rollouts((), 0.0))
     task, states = suite.get_task(0), suite.get_task_init_states(0)
     monkeypatch.setitem(cfg, "init_states_folder", str(tmp_path))
     monkeypatch.setitem(cfg.eval, "n_eval", 60)
@@ -191,9 +181,7 @@ def test_all_states_of_a_users_folder_count(acting, monkeypatch, tmp_path):
 def test_rollouts_read_what_the_configuration_names_or_refuse(acting, monkeypatch):
     algo, cfg, suite = acting
     monkeypatch.setitem(cfg.data.obs_key_mapping, "joint_states", "robot0_joint_vel")
-    with pytest.raises(
-        ConfigError, match=r"obs_key_mapping.joint_states is robot0_joint_vel: rollouts read robot0_joint_pos"
-    ):
+    with pytest.raises(ConfigError, match="joint_states is robot0_joint_vel: rollouts read robot0_joint_pos"):
         metric.evaluate_success(cfg, algo, suite, [0])
     monkeypatch.setitem(cfg.data.obs_key_mapping, "joint_states", "robot0_joint_pos")
     monkeypatch.setitem(cfg.data.obs_key_mapping, "unused", "robot0_joint_vel")
@@ -252,9 +240,8 @@ def test_user_defined_states_and_tasks(acting, tmp_path, monkeypatch):
     moved[:, 1] += 0.3  # the first joint
     write_states(tmp_path / task.problem_folder / task.init_states_file, moved)
     seen, act = [], algo.policy.get_action
-    monkeypatch.setattr(
-        algo.policy, "get_action", lambda data: seen.append(data["obs"]["joint_states"]) or act(data)
-    )
+    replaced = lambda data: seen.append(data["obs"]["joint_states"]) or act(data)  # noqa: E731
+    monkeypatch.setattr(algo.policy, "get_action", replaced)
     for folder in (None, str(tmp_path)):
         monkeypatch.setitem(cfg, "init_states_folder", folder)
         metric.evaluate_one_task_success(cfg, algo, task, suite.get_task_emb(0), 0)

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
@@ -22,25 +20,6 @@ from libero_env.init_states.pickles import read_states, write_states
 from libero_env.tasks import bddl, get_suite
 
 
-def test_importing_neither_writes_nor_prompts(tmp_path):
-    code = (
-        "import libero.libero, libero.libero.benchmark, libero.libero.envs, libero.libero.utils.video_utils"
-    )
-    env = {
-        "HOME": str(tmp_path), "PATH": "", "PYTHONPATH": str(Path(__file__).parents[2]), "NUMBA_CACHE_DIR": "/tmp"
-    }  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        env=env,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
-    assert not list(tmp_path.iterdir())
-
-
 def test_configured_paths(tmp_path, monkeypatch):
     import libero.libero
 
@@ -53,6 +32,10 @@ def test_configured_paths(tmp_path, monkeypatch):
         assert get_libero_path("bddl_files") == str(tmp_path / "here" / "bddl_files")
     with pytest.raises(UnknownNameError, match="Did you mean 'bddl_files'"):
         get_libero_path("bddl_file")
+    monkeypatch.delenv("LIBERO_CONFIG_PATH")
+    monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path / "none"))
+    with pytest.warns(UserWarning, match="none, the default, does not exist"):
+        get_libero_path("datasets")
 
 
 def test_task_files_are_those_of_the_suites():
@@ -104,9 +87,8 @@ def test_recordings_are_linked_where_the_original_has_them(tmp_path, monkeypatch
     get_libero_path("datasets")
     assert found.read_text() == "newer"
     task = get_suite("libero_object").tasks[0]
-    default, reserved = (
-        demo_path(tmp_path, DemoConfig(task, variation=Variation(reserved=yes))) for yes in (False, True)
-    )
+    variations = [Variation(reserved=reserved) for reserved in (False, True)]
+    default, reserved = (demo_path(tmp_path, DemoConfig(task, variation=v)) for v in variations)
     reserved.parent.mkdir()
     with h5py.File(reserved, "w") as file:
         file.create_group("data").attrs["variation"] = json.dumps({"reserved": True})
@@ -127,12 +109,6 @@ def test_recordings_are_linked_where_the_original_has_them(tmp_path, monkeypatch
     found.unlink()
     found.symlink_to("../blob")
     assert Path(get_libero_path("datasets"), name).read_text().startswith("a link of the user's")
-
-
-def test_a_warning_names_the_configuration_only_where_it_exists(tmp_path, monkeypatch):
-    monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path / "none"))
-    with pytest.warns(UserWarning, match="none, the default, does not exist"):
-        get_libero_path("datasets")
 
 
 def test_init_states_of_a_configured_folder(tmp_path, monkeypatch):

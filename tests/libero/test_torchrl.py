@@ -61,7 +61,6 @@ def test_the_group_of_the_page_has_advantages_and_gradients():
     returns = group["next", "reward"].sum(1)
     expected = (returns - returns.mean()) / returns.std()
     assert returns.std() > 0
-    torch.testing.assert_close(
-        group["advantage"], expected[:, None].expand(-1, steps, -1), rtol=1e-3, atol=1e-3
-    )
+    expected = expected[:, None].expand(-1, steps, -1)
+    torch.testing.assert_close(group["advantage"], expected, rtol=1e-3, atol=1e-3)
     assert any(p.grad is not None and p.grad.any() for p in names["network"].parameters())

@@ -45,6 +45,8 @@ def echo(number, pause=0.005, size=3):
                 return [number, self.steps, self.value]
 
             def step(self, action):
+                if action == -1:
+                    raise ValueError("no such action")
                 time.sleep(pause)
                 self.steps, self.value = self.steps + 1, float(action)
                 values = np.resize([number, self.steps, self.value], size)
@@ -60,9 +62,8 @@ def echo(number, pause=0.005, size=3):
 
 def call(env, method, ids, value):
     """What each environment answers, by its number, and the error of those that do not."""
-    arguments = {"seed": [int(value)], "get_env_attr": ["value"], "step": [[value] * len(ids)]}.get(
-        method, []
-    )
+    known = {"seed": [int(value)], "get_env_attr": ["value"], "step": [[value] * len(ids)]}
+    arguments = known.get(method, [])
     chosen = {} if method in ("seed", "render") else {"id": ids}
     try:
         answers, error = getattr(env, method)(*arguments, **chosen), None
@@ -72,6 +73,15 @@ def call(env, method, ids, value):
     if method == "step":
         answers = {i: (answer[0]["all"].tolist(), float(answer[1])) for i, answer in answers.items()}
     return {i: str(answer) for i, answer in answers.items()}, error
+
+
+def test_an_error_is_reported_and_its_worker_goes_on():
+    env = SubprocVectorEnv([echo(0), echo(1)])
+    env.reset()
+    with pytest.raises(WorkerError, match="no such action"):
+        env.step([-1.0, 1.0])
+    assert [one["all"].tolist() for one in env.step([2.0, 2.0])[0]] == [[0.0, 1.0, 2.0], [1.0, 2.0, 2.0]]
+    env.close()
 
 
 @pytest.mark.parametrize("methods", [("seed", "step", "reset"), ("render", "get_env_attr", "step")])
@@ -171,10 +181,8 @@ def test_after_close_every_call_says_so(make):
     env.reset()
     env.close()
     env.close()
-    calls = [
-        env.reset, env.render, lambda: env.step([1.0]), lambda: env.get_env_attr("value"), env.check_success
-    ]  # fmt: skip
-    for use in [*calls, env.workers[0].reset, lambda: env.workers[0].step(1.0), lambda: env.action_space]:
+    calls = [env.reset, lambda: env.step([1.0]), lambda: env.get_env_attr("value"), env.check_success]
+    for use in [*calls, env.workers[0].reset, lambda: env.action_space]:
         with pytest.raises(ClosedEnvironmentError, match="closed"):
             use()
 

@@ -41,9 +41,8 @@ class Viewer:
 def test_a_window_shows_what_render_draws(make_env, monkeypatch):
     opened = []
     monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr(
-        mujoco.viewer, "launch_passive", lambda *a, **k: opened.append(Viewer(*a, **k)) or opened[-1]
-    )
+    launch = lambda *a, **k: opened.append(Viewer(*a, **k)) or opened[-1]  # noqa: E731
+    monkeypatch.setattr(mujoco.viewer, "launch_passive", launch)
     env = make_env(has_renderer=True, render_camera="agentview", **BLIND)
     env.reset()
     env.env.render()

@@ -14,13 +14,10 @@ from libero_env.workspaces import WORKSPACES
 
 pytestmark = pytest.mark.sim
 
-MEASURED = {  # fixture category -> its entry in the original's figures
-    "floor": "libero_floor_manipulation",
-    "table": "libero_tabletop_manipulation",
-    "kitchen_table": "libero_kitchen_tabletop_manipulation",
-    "living_room_table": "libero_living_room_tabletop_manipulation",
-    "study_table": "libero_study_tabletop_manipulation",
-}
+MEASURED = {  # fixture category -> its entry in the original's figures, before `_manipulation`
+    "floor": "floor", "table": "tabletop", "kitchen_table": "kitchen_tabletop",
+    "living_room_table": "living_room_tabletop", "study_table": "study_tabletop"
+}  # fmt: skip
 
 
 def compiled(category, properties=None, mount=False):
@@ -29,55 +26,45 @@ def compiled(category, properties=None, mount=False):
     add_arena(spec, load_workspace(category), properties or {})
     if mount:
         add_mount(spec, load_workspace(category))
-    return spec.compile()
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return model, data
 
 
-def collides(model, geom):
-    return bool(model.geom_contype[geom] or model.geom_conaffinity[geom])
+def solid(model):
+    collides = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    return {model.geom(g).name: g for g in collides}
 
 
 @pytest.fixture(params=MEASURED)
 def measured(request, measured_workspaces):
-    return request.param, measured_workspaces[MEASURED[request.param]]
+    return request.param, measured_workspaces[f"libero_{MEASURED[request.param]}_manipulation"]
 
 
-def test_collision_geometry_is_the_originals(measured):
+def test_collision_geometry_and_named_visuals_are_the_originals(measured):
     category, figures = measured
-    model = compiled(category)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    mine = [g for g in range(model.ngeom) if collides(model, g)]
-    wanted = [g for g in figures["arena_geoms"] if g["collides"]]
-    assert len(mine) == len(wanted)
-    for geom in wanted:
-        at = np.linalg.norm(data.geom_xpos[mine] - geom["pos_world"], axis=1) + np.linalg.norm(
-            model.geom_size[mine] - geom["size"], axis=1
-        )
-        g = mine[int(at.argmin())]
-        assert model.geom(g).name == geom["name"]
-        assert model.body(int(model.geom_bodyid[g])).name == geom["body"]
+    model, data = compiled(category)
+    mine = np.flatnonzero(model.geom_contype | model.geom_conaffinity)
+    assert len(mine) == sum(geom["collides"] for geom in figures["arena_geoms"])
+    for geom in figures["arena_geoms"]:
+        if geom["collides"]:
+            apart = [data.geom_xpos[mine] - geom["pos_world"], model.geom_size[mine] - geom["size"]]
+            g = mine[int(np.linalg.norm(apart, axis=2).sum(axis=0).argmin())]
+            assert model.geom(g).name == geom["name"] and model.geom_group[g] == geom["group"]
+            assert model.body(int(model.geom_bodyid[g])).name == geom["body"]
+            np.testing.assert_allclose(model.geom_friction[g], geom["friction"], atol=1e-6)
+        elif geom["type"] != "mesh" and geom["name"]:
+            g = model.geom(geom["name"]).id
+        else:
+            continue
         np.testing.assert_allclose(data.geom_xpos[g], geom["pos_world"], atol=1e-4)
         np.testing.assert_allclose(model.geom_size[g], geom["size"], atol=1e-4)
-        np.testing.assert_allclose(model.geom_friction[g], geom["friction"], atol=1e-6)
-        assert model.geom_group[g] == geom["group"]
-
-
-def test_named_visuals_are_where_the_originals_are(measured):
-    category, figures = measured
-    model = compiled(category)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    names = {model.geom(g).name for g in range(model.ngeom)}
-    for geom in figures["arena_geoms"]:
-        if geom["type"] != "mesh" and geom["name"] and not geom["collides"]:
-            assert geom["name"] in names
-            np.testing.assert_allclose(data.geom(geom["name"]).xpos, geom["pos_world"], atol=1e-4)
-            np.testing.assert_allclose(model.geom(geom["name"]).size, geom["size"], atol=1e-4)
 
 
 def test_cameras_lights_and_robot_are_the_originals(measured):
     category, figures = measured
-    model = compiled(category)
+    model, _ = compiled(category)
     fixed = {name: camera for name, camera in figures["cameras"].items() if camera["body"] == "world"}
     assert {model.camera(i).name for i in range(model.ncam)} == set(fixed)
     for name, camera in fixed.items():
@@ -98,20 +85,17 @@ def test_cameras_lights_and_robot_are_the_originals(measured):
 @pytest.mark.parametrize("category", WORKSPACES)
 def test_objects_stand_on_the_surface(category):
     """A ray from above meets the table or the floor at the height that placement uses."""
-    workspace, model = load_workspace(category), compiled(category)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    hit = np.zeros(1, np.int32)
+    workspace, (model, data), hit = load_workspace(category), compiled(category), np.zeros(1, np.int32)
     start = np.array([*workspace.offset[:2], 1.4])
     groups = np.array([1, int(category == "floor"), 0, 0, 0, 0], np.uint8)
     distance = mujoco.mj_ray(model, data, start, np.array([0.0, 0.0, -1.0]), groups, 1, -1, hit)
     assert start[2] - distance == pytest.approx(workspace.offset[2] + workspace.region_height, abs=1e-4)
-    assert collides(model, hit[0])
+    assert model.geom_contype[hit[0]] or model.geom_conaffinity[hit[0]]
 
 
 @pytest.mark.parametrize("category", WORKSPACES)
 def test_rooms_are_light(category):
-    model = compiled(category, mount=True)
+    model, _ = compiled(category, mount=True)
     drawn = model.geom_dataid[(model.geom_group == 1) & (model.geom_dataid >= 0)]
     assert model.mesh_facenum[drawn].sum() <= 2000
     assert model.ngeom <= 30
@@ -120,14 +104,12 @@ def test_rooms_are_light(category):
 
 @pytest.mark.parametrize("category", WORKSPACES)
 def test_every_style_compiles_and_changes_visuals_only(category):
-    styles = load_styles()
-    plain = compiled(category)
-    solid = [plain.geom(g).name for g in range(plain.ngeom) if collides(plain, g)]
-    seen = set()
+    styles, seen = load_styles(), set()
+    plain, _ = compiled(category)
     wanted = [{kind: name} for kind in styles for name in styles[kind]]
     for properties in [*wanted, {"floor_style": "dark", "wall_style": "white", "scene": "coffee"}]:
-        model = compiled(category, properties)
-        assert [model.geom(g).name for g in range(model.ngeom) if collides(model, g)] == solid
+        model, _ = compiled(category, properties)
+        assert [*solid(model)] == [*solid(plain)]
         seen.add(bytes(model.tex_data) + model.mat_rgba.tobytes())
     assert len(seen) >= len(styles["floor"]) + len(styles["wall"]) - 1
 
@@ -149,16 +131,14 @@ def test_styles_differ_and_repeat_without_a_seam():
             step = lambda a, b: np.abs(a.astype(float) - b).mean()  # noqa: E731
             inside = max(step(image[i], image[i + 1]) for i in range(len(image) - 1))
             assert step(image[-1], image[0]) <= inside
-        assert abs(image.mean((0, 1)) / 255 - style["colours"][0]).max() < 0.06, (
-            "about the colour it is called by"
-        )
+        assert abs(image.mean((0, 1)) / 255 - style["colours"][0]).max() < 0.06, "the colour of its name"
 
 
 def test_a_scene_gives_way_to_what_is_named():
-    blue = compiled("table", {"scene": "blue"})
-    same = compiled("table", {"scene": "warm", "floor": "white-marble", "wall": "light-blue"})
+    blue, _ = compiled("table", {"scene": "blue"})
+    same, _ = compiled("table", {"scene": "warm", "floor": "white-marble", "wall": "light-blue"})
     assert bytes(blue.tex_data) == bytes(same.tex_data)
-    assert compiled("floor", {"scene": "coffee"}).ngeom == compiled("floor").ngeom + 1, "seats"
+    assert compiled("floor", {"scene": "coffee"})[0].ngeom == compiled("floor")[0].ngeom + 1, "seats"
 
 
 def test_problems_and_workspaces_belong_together(shared):
@@ -172,18 +152,13 @@ def test_problems_and_workspaces_belong_together(shared):
 
 
 def test_the_pedestal_stands_on_the_floor_under_the_arm():
-    model = compiled("kitchen_table", mount=True)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
+    model, data = compiled("kitchen_table", mount=True)
     base = np.array(load_workspace("kitchen_table").robot_base_pos)
     np.testing.assert_allclose(data.body("mount0_base").xpos, base + [0, 0, 0.01], atol=1e-9)
-    solid = {model.geom(g).name for g in range(model.ngeom) if collides(model, g)} - {
-        "floor",
-        "table_collision",
-    }
-    assert solid == {"mount0_controller_box_col", "mount0_pedestal_feet_col", "mount0_pedestal_col"}
-    feet = model.geom("mount0_pedestal_feet_col")
-    assert data.geom("mount0_pedestal_feet_col").xpos[2] - feet.size[2] == pytest.approx(0.0, abs=0.02)
+    feet = "mount0_pedestal_feet_col"
+    mount = {"mount0_controller_box_col", feet, "mount0_pedestal_col"}
+    assert solid(model).keys() - {"floor", "table_collision"} == mount
+    assert data.geom(feet).xpos[2] - model.geom(feet).size[2] == pytest.approx(0.0, abs=0.02)
     for category in ("floor", "living_room_table", "coffee_table"):
         assert load_workspace(category).mount is None
-        assert compiled(category, mount=True).ngeom == compiled(category).ngeom
+        assert compiled(category, mount=True)[0].ngeom == compiled(category)[0].ngeom

@@ -1,25 +1,20 @@
-"""Selection of the pack, and download of the original's files."""
+"""Selection of the pack, and download of the original's files, whose servers are not trusted."""
 
 from pathlib import Path
 
 import pytest
 
 from libero_cli.main import main
-from libero_env.assets import downloads
-from libero_env.assets.downloads import REPO, REVISION, DownloadError, download, read_manifest
+from libero_env.assets import BuiltinPack, chosen_assets, downloads, select_pack
+from libero_env.assets.downloads import DownloadError, checked_listing, download, read_manifest
 from libero_env.assets.original import FAMILIES, OriginalPack
-from libero_env.assets.pack import BuiltinPack, chosen_assets, select_pack
-from libero_env.errors import UnknownNameError
 from tests.harness.hub import serve_hub
 
 LARGE = bytes(range(256)) * 4096  # 1 MiB
-FILES = {
-    "README.md": b"# Assets\n",
-    "scenes/room.xml": b"<mujoco/>\n",
-    "articulated_objects/a.xml": b"<mujoco model='a'/>\n",
-    "articulated_objects/mesh.msh": LARGE,
-}
+FILES = {"README.md": b"# Assets\n", "scenes/room.xml": b"<mujoco/>\n"}
+FILES |= {"articulated_objects/a.xml": b"<mujoco model='a'/>\n", "articulated_objects/mesh.msh": LARGE}
 STORED_LARGE = {"articulated_objects/mesh.msh"}
+FILE = ("a/b.hdf5", 3, "a" * 64)  # name, size, digest
 
 
 @pytest.fixture(autouse=True)
@@ -27,7 +22,7 @@ def alone(monkeypatch, tmp_path):
     """No setting of the machine: its variables and configuration file are out of sight."""
     for variable in ("LIBERO_ASSETS", "HF_ENDPOINT", "HF_HUB_OFFLINE"):
         monkeypatch.delenv(variable, raising=False)
-    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path / "config"))
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "cache"))
 
 
@@ -37,15 +32,10 @@ def _folder(path: Path) -> Path:
     return path
 
 
-def _write_config(tmp_path, text):
-    (tmp_path / "config").mkdir(exist_ok=True)
-    (tmp_path / "config" / "config.yaml").write_text(text)
-
-
 def test_argument_then_variable_then_file_then_builtin(tmp_path, monkeypatch):
     argument, variable, file = (_folder(tmp_path / name) for name in ("argument", "variable", "file"))
     assert select_pack() == BuiltinPack()
-    _write_config(tmp_path, f"assets: {file}\nbddl_files: /nowhere\n")
+    (tmp_path / "config.yaml").write_text(f"assets: {file}\nbddl_files: /nowhere\n")
     assert select_pack() == OriginalPack(str(file))
     monkeypatch.setenv("LIBERO_ASSETS", str(variable))
     assert select_pack() == OriginalPack(str(variable))
@@ -55,30 +45,14 @@ def test_argument_then_variable_then_file_then_builtin(tmp_path, monkeypatch):
 
 
 def test_a_folder_that_the_file_names_but_nobody_filled_means_builtin(tmp_path):
-    _write_config(tmp_path, f"assets: {tmp_path / 'never_made'}\n")
+    (tmp_path / "config.yaml").write_text(f"assets: {tmp_path / 'never_made'}\n")
     assert select_pack() == BuiltinPack()
-
-
-def test_packs_are_hashable_and_named(tmp_path):
-    packs = [BuiltinPack(), OriginalPack("/a"), OriginalPack("/a", 500), OriginalPack("/b")]
-    assert len(set(packs)) == 4
-    assert [pack.name for pack in packs] == ["builtin", "original", "original-lod500", "original"]
-
-
-def test_builtin_builds_what_it_lists():
-    pack = BuiltinPack()
-    assert pack.build("milk").category == "milk"
-    with pytest.raises(UnknownNameError):
-        pack.build("nothing")
-
-
-# --- download -------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def hub(monkeypatch):
     pytest.importorskip("huggingface_hub")
-    with serve_hub(REPO, REVISION, FILES, STORED_LARGE) as server:
+    with serve_hub(downloads.REPO, downloads.REVISION, FILES, STORED_LARGE) as server:
         monkeypatch.setenv("HF_ENDPOINT", server.url)
         yield server
 
@@ -89,17 +63,9 @@ def _contents(folder):
 
 def test_all_files_are_downloaded_and_recorded(hub, tmp_path):
     folder = download()
-    assert folder == tmp_path / "cache" / "assets"
-    assert _contents(folder) == FILES
+    assert folder == tmp_path / "cache" / "assets" and _contents(folder) == FILES
     revision, files = read_manifest(folder)
-    assert revision == REVISION and set(files) == set(FILES)
-
-
-def test_complete_files_are_not_downloaded_again(hub, tmp_path):
-    folder = download(tmp_path / "there")
-    hub.got.clear()
-    assert download(folder) == folder
-    assert hub.got == []
+    assert revision == downloads.REVISION and set(files) == set(FILES)
 
 
 def test_an_interrupted_download_resumes(hub, tmp_path, monkeypatch):
@@ -112,8 +78,7 @@ def test_an_interrupted_download_resumes(hub, tmp_path, monkeypatch):
 
 def test_a_file_that_arrives_changed_is_downloaded_again(hub, tmp_path):
     hub.corrupt["articulated_objects/a.xml"] = 1
-    folder = download(tmp_path / "there")
-    assert _contents(folder) == FILES
+    assert _contents(download(tmp_path / "there")) == FILES
 
 
 def test_a_server_that_changes_files_is_found_out(hub, tmp_path):
@@ -152,8 +117,7 @@ def test_the_command_downloads_and_prints_how_to_use_it(hub, tmp_path, capsys):
 
 
 def test_the_command_prints_which_models_are_used(tmp_path, monkeypatch, capsys):
-    assert main(["assets", "info"]) == 0
-    assert "builtin" in capsys.readouterr().out
+    assert main(["assets", "info"]) == 0 and "builtin" in capsys.readouterr().out
     monkeypatch.setenv("LIBERO_ASSETS", str(_folder(tmp_path / "assets")))
     assert main(["assets", "info"]) == 0
     told = capsys.readouterr().out
@@ -164,3 +128,38 @@ def test_command_lists_what_is_missing(tmp_path, capsys):
     assert main(["assets", "check", str(_folder(tmp_path / "assets"))]) == 1
     told = capsys.readouterr().out
     assert "FAIL  milk:" in told and "libero assets download" in told
+
+
+@pytest.mark.parametrize(
+    "name", ["../up", "/abs", "a/../../up", "a\\..\\b", "C:x", "a//b", "a\nb", "x" * 600]
+)
+def test_names_that_lead_elsewhere_are_refused(name):
+    with pytest.raises(DownloadError, match="do not trust it"):
+        checked_listing([(name, *FILE[1:])], "here")
+
+
+@pytest.mark.parametrize(("files", "message"), [
+    ([("a", -1, "a" * 64)], r"a\.size is -1; expected greater than or equal to 0"),
+    ([("a", 1 << 60, "a" * 64)], "expected less than or equal to"),
+    ([("a", "3", "a" * 64)], "size is '3'"),
+    ([("a", 3, "../x")], "digest is '../x'"),
+    ([(3, 3, "a" * 64)], "name"),
+    ([FILE, ("A/B.HDF5", *FILE[1:])], "are the same file"),
+    ([FILE, ("a", *FILE[1:])], "both a file and a folder"),
+    ([FILE] * 100_001, "more than 100000"),
+])  # fmt: skip
+def test_listings_that_lie_are_refused(files, message):
+    with pytest.raises(DownloadError, match=message) as caught:
+        checked_listing(files, "here")
+    assert "\n" not in str(caught.value) and len(str(caught.value)) < 600
+
+
+def test_models_of_ones_own_are_not_replaced_by_a_download(tmp_path, monkeypatch):
+    """Only those of an earlier download are, which a record beside them shows."""
+    pytest.importorskip("huggingface_hub")
+    monkeypatch.setattr("libero_env.assets.downloads._list_files", lambda *_: checked_listing([FILE], "here"))
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "b.hdf5").write_text("my own")
+    with pytest.raises(DownloadError, match="exists with other contents"):
+        download(tmp_path)
+    assert (tmp_path / "a" / "b.hdf5").read_text() == "my own" and read_manifest(tmp_path) is None

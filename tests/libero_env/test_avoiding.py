@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from libero_env.envs.batch import BatchEnv
-from libero_env.expert import Expert
+from libero_env import BatchEnv, Expert
 from libero_env.expert.guard import Guard
 from libero_env.expert.planning.detour import Detour
 from libero_env.mujoco_compat import mujoco

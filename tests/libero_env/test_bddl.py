@@ -7,8 +7,7 @@ import pickle
 import pytest
 
 from libero_env.errors import BDDLError
-from libero_env.tasks import bddl, get_task
-from libero_env.tasks.expression import And, Atom, ForAll, Not, Or
+from libero_env.tasks import And, Atom, ForAll, Not, Or, bddl, get_task
 from libero_env.tasks.problem import Problem, Region, differences, same_meaning
 from libero_env.tasks.rules import KINDS
 from libero_env.tasks.sexpr import number
@@ -59,10 +58,6 @@ def assert_round_trip(problem: Problem):
     assert differences(problem, again) == []
 
 
-def test_round_trip():
-    assert_round_trip(bddl.parse(GOOD))
-
-
 def test_words_are_separated_by_one_blank():
     words = {"language": " put  both pots\u2003on the stove", "scene_properties": {"wall": "red  brick"}}
     problem = dataclasses.replace(bddl.parse(GOOD), **words)
@@ -85,10 +80,7 @@ def test_a_problem_travels_between_processes():
 
 @pytest.mark.parametrize(("change", "line", "message"), [
     (("(0 0 1 1)", "(0 0 1)"), 7, "(0 0 1) in :ranges; expected a list of 4 numbers"),
-    (("-pi/2", "__import__('os')"), 7, "expected"),
     (("-pi/2", "exit"), 7, "exit is not a number; expected a finite number such as 0.25 or -pi/4"),
-    (("-pi/2", "1e999"), 7, "1e999 is not a number"),
-    (("-pi/2", "1/0"), 7, "1/0 is not a number"),
     (("(:target stove_1)", ""), 8, "region cook_region has no target; expected (:target NAME)"),
     (("plate_1 - plate", "pot_1 - plate"), 12, "pot_1 is declared twice"),
     (("pot_3 - moka_pot", "pot_3"), 13, "pot_3 has no category; expected NAME NAME - CATEGORY"),
@@ -97,7 +89,6 @@ def test_a_problem_travels_between_processes():
     (("(turnon stove_1)", "turnon"), 16, "not an atom: turnon; expected (PREDICATE NAME ...)"),
     (("(:language", "(:languish"), 5, "unknown section ':languish'; expected one of :domain, "),
     (("(:domain robosuite)", "(:goal)"), 17, "a second :goal; expected one (the first is on line 3)"),
-    (("(:init", "(:obj_of_interest"), 16, "a second :obj_of_interest"),
     (("(Not (Turnon stove_1))", "(Not)"), 18, "(Not); expected (Not EXPRESSION)"),
     (("(:rgba (0 0 1 0.5))", "(:target table)"), 8, "a second :target in a region; expected one"),
     (("(cook_region (:target stove_1)", "(pot_region (:target table)"), 8, "table_pot_region is declared twice"),
@@ -138,10 +129,8 @@ def test_numbers_are_arithmetic_and_nothing_else():
     assert number("6*pi/7 - pi/100") == 6 * math.pi / 7 - math.pi / 100
     assert number("1 - 2*-3/4 + +1") == 1 - 2 * -3 / 4 + 1
     assert number("-2.5e-3") == -0.0025
-    words = (
-        "open", "pi()", "[1]", "'a'", "1j", "True", "a.b", "2**9", "", "*1", "1 2", "1_0", "0x1", "٣", "nan"
-    )  # fmt: skip
-    for text in (*words, "1e999", "1e300*1e300", "pi/0", "9" * 5000, "-" * 100_000 + "1"):
+    words = "open pi() [1] 'a' 1j True a.b 2**9 *1 1_0 0x1 ٣ nan __import__('os') 1e999 1e300*1e300 pi/0"
+    for text in (*words.split(), "", "1 2", "9" * 5000, "-" * 100_000 + "1"):
         with pytest.raises(ValueError):
             number(text)
 
@@ -155,19 +144,16 @@ def test_numbers_are_arithmetic_and_nothing_else():
 ])  # fmt: skip
 def test_differences_are_found(change, where):
     problem = bddl.parse(GOOD)
-    found = differences(problem, dataclasses.replace(problem, **change))
-    assert any(line.startswith(where) for line in found)
-    assert not same_meaning(problem, dataclasses.replace(problem, **change))
-    assert problem != dataclasses.replace(problem, **change)
+    changed = dataclasses.replace(problem, **change)
+    assert any(line.startswith(where) for line in differences(problem, changed))
+    assert problem != changed and not same_meaning(problem, changed)
 
 
 def test_order_without_meaning_does_not_count():
     problem = bddl.parse(GOOD)
-    parts = problem.goal.parts
-    turned = dataclasses.replace(
-        problem, init=problem.init[::-1], regions=problem.regions[::-1], goal=And(parts[::-1])
-    )
-    assert same_meaning(problem, turned)
+    turned = {"init": problem.init[::-1], "regions": problem.regions[::-1]}
+    turned["goal"] = And(problem.goal.parts[::-1])
+    assert same_meaning(problem, dataclasses.replace(problem, **turned))
 
 
 def test_sections_and_words_of_others_are_kept(monkeypatch):

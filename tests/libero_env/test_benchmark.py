@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 
 from libero_env.assets.pack import select_pack
+from libero_env.init_states import load_init_states, start_errors
 from libero_env.init_states.pickles import read_states
-from libero_env.init_states.placement import start_errors
-from libero_env.init_states.store import load_init_states
 from libero_env.sim.back_ends import LoopSimulations
 from libero_env.sim.predicates import evaluate
 from libero_env.sim.scene import build_scene
 from libero_env.sim.state import StateView
-from libero_env.tasks import Task, get_suite, get_task, read_task, suite_names
-from libero_env.tasks.expression import Atom
+from libero_env.tasks import Atom, get_suite, get_task, suite_names
 
 pytestmark = pytest.mark.sim
 
@@ -22,11 +20,6 @@ TASKS = sorted({task.id for name in suite_names() for task in get_suite(name).ta
 PREDICATE_RECORDINGS = (
     "libero_10-03", "libero_10-08", "libero_90-01", "libero_90-70", "libero_goal-01", "libero_object-00",
     "libero_spatial-02"
-)  # fmt: skip
-MOTION_RECORDINGS = (
-    "libero_10-00-grasp", "libero_10-04-grasp", "libero_10-09-random", "libero_90-20-random", "libero_90-60-grasp",
-    "libero_90-85-random", "libero_goal-00-random", "libero_goal-02-grasp", "libero_object-00-random",
-    "libero_object-03-grasp", "libero_spatial-00-grasp", "libero_spatial-07-random"
 )  # fmt: skip
 IDLE_STEPS = 10
 STILL = 0.005  # m, what may move in the idle steps
@@ -106,39 +99,3 @@ def test_predicates_agree_with_recordings(shared, recording, original):
         told.append([evaluate(goal, view) for goal in goals])
     agree = np.array(told) == truth.astype(bool)
     assert np.mean(agree) > 0.999 and agree[:, in_regions].all()
-
-
-@pytest.mark.parametrize("recording", MOTION_RECORDINGS)
-def test_free_motion_agrees_with_recordings(shared, recording):
-    with np.load(shared / "parity" / f"{recording}.npz") as z:
-        states, commands, touch = z["states"], z["actions"], z["robot_contact"]
-        poses, key = json.loads(str(z["fixtures"])), f"{z['suite']}/{int(z['task_id'])}"
-        joints = json.loads(str(z["joint_names"]))
-    scene = build_scene(get_task(key).problem)
-    model = scene.model
-    assert [model.joint(j).name for j in range(model.njnt)] == joints
-    fixtures = np.array([poses[name] for name in scene.fixtures]).reshape(1, -1, 7)
-    simulations = LoopSimulations(model, 1, scene.fixture_bodies)
-    simulations.reset([0], states[:1, 1 : 1 + model.nq], states[:1, 1 + model.nq :], fixtures=fixtures)
-    free = max(int(np.argmax(touch)) - 6, 1) if touch.any() else len(commands)
-    for t in range(free):
-        simulations.step([0], commands[t : t + 1])
-        np.testing.assert_allclose(simulations.fields["qpos"][0, :9], states[t + 1, 1:10], atol=1e-6, rtol=0)
-
-
-def test_starts_of_a_file_follow_its_regions(tmp_path, monkeypatch):
-    """States that are generated on demand are cached for the text of the task."""
-    monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
-    monkeypatch.setattr(Task, "num_starts", 2)
-    text = get_task("libero_goal/8").bddl_text
-    region = "(0.04 -0.03 0.060000000000000005 -0.01)"
-    assert region in text
-    found = []
-    for where in (region, "(0.14 -0.03 0.16 -0.01)"):
-        file = tmp_path / "plate.bddl"
-        file.write_text(text.replace(region, where))
-        task = read_task(file)
-        scene = build_scene(task.problem)
-        qpos, _, _ = scene.split_states(load_init_states(task, scene))
-        found.append(qpos[0, scene.model.joint("plate_1_joint0").qposadr[0]])
-    assert found[1] - found[0] > 0.07

@@ -1,11 +1,12 @@
 """Why an episode failed: every branch of the decision tree, and what is seen of constructed episodes."""
 
+from copy import deepcopy
+
 import numpy as np
 import pytest
 
-from libero_env.envs.batch import BatchEnv
-from libero_env.expert import Expert
-from libero_env.sim.causes import CAUSES, Failure, Missing, Trace, explain
+from libero_env import BatchEnv, Expert
+from libero_env.sim.causes import Failure, Missing, Trace, explain
 from libero_env.sim.watch import LIFTED, EpisodeWatch, over
 from libero_env.tasks.expression import Atom
 
@@ -18,7 +19,6 @@ OWN = ["milk"]
         (Trace(), Missing("milk"), "never reached", ""),
         (Trace(lifted={"soup": None}), Missing("milk"), "wrong object", "soup"),
         (Trace(touched={"milk"}), Missing("milk"), "missed grasp", ""),
-        (Trace(touched={"milk"}, lifted={"soup": None}), Missing("milk"), "wrong object", "soup"),
         (Trace(impacts=[(3, "table", 150.0), (4, "shelf", 90.0)]), Missing("milk"), "collided", "table"),
         (Trace(held={"milk": 9}, touched={"milk"}, impacts=[(3, "table", 150.0)]), Missing("milk"), "missed grasp", ""),
         (Trace(held={"milk": 9}, impacts=[(12, "table", 150.0)]), Missing("milk"), "collided", "table"),
@@ -31,12 +31,9 @@ OWN = ["milk"]
         (Trace(in_hand="milk"), Missing("milk"), "out of time", ""),
         (Trace(in_hand="milk"), Missing("milk", is_over=True), "not released", ""),
         (Trace(slipped={"milk": False}), Missing("milk", has_held=True, place="table"), "undone", "table"),
-        (Trace(shut_at={"milk": None}), Missing("milk"), "missed grasp", ""),
         (Trace(), Missing("milk"), "wrong object", "soup", ["shelf", "soup"]),
         (Trace(shut_at={"milk": None}), Missing("milk"), "missed grasp", "", ["soup"]),
-        (Trace(touched={"milk"}), Missing("milk"), "missed grasp", "", ["soup"]),
         (Trace(lifted={"soup": None}), Missing("milk"), "wrong object", "soup", ["shelf"]),
-        (Trace(impacts=[(3, "table", 150.0)]), Missing("milk"), "collided", "table", ["soup"]),
     ]],
 )  # fmt: skip
 def test_each_branch_of_the_decision_tree(trace, missing, cause, what, astray):
@@ -49,7 +46,6 @@ def test_of_several_missing_atoms_the_one_that_came_furthest_is_named():
     trace = Trace(slipped={"soup": True})
     assert explain(trace, [Missing("milk"), Missing("soup")], ["milk", "soup"]).of == "soup"
     assert explain(trace, [], []) == Failure("out of time"), "such as a goal with Not"
-    assert len(set(CAUSES)) == 11
 
 
 @pytest.fixture(scope="module")
@@ -68,8 +64,6 @@ def lifting():
 
 def failed(lifting, actions, state=None):
     """Return the failure after actions from where the object is in the hand."""
-    from copy import deepcopy
-
     env, watch, held, _ = lifting
     kept = deepcopy(watch.traces[0])
     env.set_state(0, held if state is None else state)
@@ -115,12 +109,12 @@ def test_another_goal_that_was_reached_instead_is_named(lifting):
 
 def test_a_hard_press_on_the_table_is_a_collision_and_watching_moves_no_bit(lifting):
     env, watch, _, before = lifting
-    press, ends = [0, 0, -1, 0, 0, 0, 1], []
+    ends = []
     for watched in (False, True):
         env.set_state(0, before)
         watch.begin(0)
         for _ in range(45):
-            env.step(np.array([[0, 0.4, *press[2:]]], float))
+            env.step(np.array([[0, 0.4, -1, 0, 0, 0, 1]], float))
             if watched:
                 watch.look(0)
         ends.append(env.get_state(0))
@@ -152,9 +146,7 @@ def put(env, state, name, place):
     ("chocolate_pudding_1", "wrong object", "chocolate_pudding_1"),
     (None, "never reached", ""),
 ])  # fmt: skip
-def test_fingers_that_shut_beside_an_object_have_missed_it_or_gone_for_the_wrong_one(
-    butter, below, cause, what
-):
+def test_fingers_that_shut_beside_an_object_missed_it_or_went_for_another(butter, below, cause, what):
     env, before, watch = butter
     env.set_state(0, before)
     expert, view = Expert(env.task, np.random.default_rng(0)), env.views[0]
@@ -178,9 +170,7 @@ def test_what_was_held_or_pushed_without_the_goals_object_is_the_wrong_one(butte
     env, before, _ = butter
     env.set_state(0, before)
     expert, view = Expert(env.task, np.random.default_rng(0)), env.views[0]
-    goal = Atom(
-        "In", ("chocolate_pudding_1", "basket_1_contain_region")
-    )  # while the expert is after the butter
+    goal = Atom("In", ("chocolate_pudding_1", "basket_1_contain_region"))  # the expert is after the butter
     watch = EpisodeWatch(env.views, [goal])
     side = view.eef_mat[:, 0]  # on which a finger is
 

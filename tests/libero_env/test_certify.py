@@ -13,7 +13,7 @@ from libero_env.design import certify as module
 from libero_env.design.certify import Certificate, Outcome, certify, markdown_table, results
 from libero_env.errors import LiberoError
 from libero_env.objects import ObjectModel, register_object
-from libero_env.tasks import Task, get_suite, get_task, make_task, read_task
+from libero_env.tasks import Task, find_tasks, get_suite, get_task, make_task, read_task
 
 TASKS = get_suite("libero_object").tasks[:2]
 
@@ -109,8 +109,6 @@ def test_the_exit_status_tells_whether_each_task_reaches_the_rate(tried, tmp_pat
 
 
 def test_tasks_are_named_once(tmp_path):
-    from libero_env.tasks import find_tasks
-
     files = [tmp_path / "a.bddl", tmp_path / "b.bddl"]
     for file in files:
         file.write_text(TASKS[0].bddl_text)
@@ -128,14 +126,10 @@ def test_an_outcome_depends_on_its_start_alone():
 
 @pytest.mark.sim
 def test_a_start_from_which_no_skill_reaches_the_goal_fails_alone():
-    task = make_task(
-        scene="kitchen",
-        objects=["plate", "butter"],
-        place={"plate_1": (0.05, 0.2), "butter_1": {"at": (0.1, -0.1), "half": 0.05}},
-        regions={"kitchen_table": {"mat": {"ranges": [[0.05, -0.15, 0.1, -0.05]]}}},
-        goal="(And (On butter_1 plate_1) (Never (On butter_1 kitchen_table_mat)))",
-        language="put the butter on the plate",
-    )
+    places = {"plate_1": (0.05, 0.2), "butter_1": {"at": (0.1, -0.1), "half": 0.05}}
+    facts = {"scene": "kitchen", "objects": ["plate", "butter"], "place": places, "language": "put it there"}
+    facts["regions"] = {"kitchen_table": {"mat": {"ranges": [[0.05, -0.15, 0.1, -0.05]]}}}
+    task = make_task(goal="(And (On butter_1 plate_1) (Never (On butter_1 kitchen_table_mat)))", **facts)
     outcomes = module.attempt(task, range(6), BuiltinPack(), False)
     broken = [o.state for o in outcomes if "is broken, and no skill takes that back" in o.reason]
     assert 0 < len(broken) < 6 and [o.state for o in outcomes if not o.success] == broken
@@ -147,9 +141,8 @@ def test_a_changed_object_is_tried_in_the_scene_that_has_it():
         spec = mujoco.MjSpec()
         box = {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [width, width, 0.02], "mass": 0.05, "group": 0}
         spec.worldbody.add_body(name="main").add_geom(name="g0", **box)
-        return ObjectModel(
-            "block", spec, bottom_offset=(0, 0, -0.02), top_offset=(0, 0, 0.02), horizontal_radius=width
-        )
+        ends = {"bottom_offset": (0, 0, -0.02), "top_offset": (0, 0, 0.02)}
+        return ObjectModel("block", spec, horizontal_radius=width, **ends)
 
     places = {"block_1": (0, 0), "plate_1": (0.05, 0.2)}
     facts = {"scene": "kitchen", "objects": ["block", "plate"], "place": places, "language": "lift it"}

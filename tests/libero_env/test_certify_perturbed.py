@@ -9,14 +9,13 @@ import pytest
 from PIL import Image
 
 from libero_cli.main import main
-from libero_env import LiberoEnv
+from libero_env import LiberoEnv, LiberoError, get_suite, get_task
 from libero_env.design import certify_perturbed
 from libero_env.design.certify_perturbed import REDRAWS, attempt_perturbed, shares_table
-from libero_env.errors import LiberoError
+from libero_env.design.preview import compare_starts
 from libero_env.objects import builtin, catalog, register_object
 from libero_env.perturbations import Perturbation, kinds
 from libero_env.sim.scene import build_scene
-from libero_env.tasks import get_suite, get_task
 
 pytestmark = pytest.mark.sim
 TASK = get_task("libero_goal/3")
@@ -38,7 +37,7 @@ def expert(monkeypatch):
     return seen
 
 
-def test_what_the_expert_does_not_solve_is_drawn_again_for_that_start(expert):
+def test_what_the_expert_does_not_solve_is_drawn_again_for_that_start(expert, closing):
     first = attempt_perturbed(TASK, ROBOT, range(3))
     assert first.solved == {"0": 0, "1": 0, "2": 0} and first.at_first == 3 and first.redraws == 0
     failing = expert.joints[0][1]
@@ -47,15 +46,13 @@ def test_what_the_expert_does_not_solve_is_drawn_again_for_that_start(expert):
     assert found.solved == {"0": 0, "1": 1, "2": 0} and found.redraws == 1 and found.at_first == 2
     name = ROBOT.sample_name(TASK.id, 1)
     assert {key: n for key, n in found.attempts(ROBOT).items() if n} == {name: 1}
-
-    env = LiberoEnv(TASK, cameras=(), perturb=[ROBOT])
-    with kinds.trying(found.attempts(ROBOT)):
-        observation, info = env.reset(options={"init_state": 1})
-    assert info["attempts"].tolist() == [1] and not np.array_equal(observation["joint_states"], failing)
-    assert np.array_equal(observation["joint_states"], expert.joints[-1][0])
-    observation, info = env.reset(options={"init_state": 1})
-    assert info["attempts"].tolist() == [0] and np.array_equal(observation["joint_states"], failing)
-    env.close()
+    env = closing(LiberoEnv(TASK, cameras=(), perturb=[ROBOT]))
+    for attempts, attempt, joints in ((found.attempts(ROBOT), 1, expert.joints[-1][0]), ({}, 0, failing)):
+        with kinds.trying(attempts):
+            observation, info = env.reset(options={"init_state": 1})
+        assert info["attempts"].tolist() == [attempt]
+        np.testing.assert_array_equal(observation["joint_states"], joints)
+    assert not np.array_equal(expert.joints[-1][0], failing)
 
 
 def test_a_task_that_is_mostly_not_solved_is_drawn_again_as_a_whole(expert):
@@ -70,30 +67,23 @@ def test_a_task_that_is_mostly_not_solved_is_drawn_again_as_a_whole(expert):
 
 
 def test_results_are_on_disk_and_are_not_run_again(expert, tmp_path, capsys, monkeypatch):
-    before = {ROBOT.sample_name("libero_goal/3"): 3, "libero_goal/4 robot=0.4@0 1": 2}
-    (tmp_path / "draws.json").write_text(json.dumps(before))
-    monkeypatch.setattr(kinds, "attempts_file", lambda: tmp_path / "draws.json")
-    words = [
-        "perturb", "certify", "libero_goal/3", "--kinds", "robot", "gain", "--severities", "0.4", "--starts", "2"
-    ]  # fmt: skip
-    words += ["--jobs", "1", "--out", str(tmp_path)]
+    other, file = {"libero_goal/4 robot=0.4@0 1": 2}, tmp_path / "draws.json"
+    file.write_text(json.dumps({ROBOT.sample_name("libero_goal/3"): 3} | other))
+    monkeypatch.setattr(kinds, "attempts_file", lambda: file)
+    words = ["perturb", "certify", "libero_goal/3", "--kinds", "robot", "gain", "--severities", "0.4"]
+    words += ["--starts", "2", "--jobs", "1", "--out", str(tmp_path)]
     expert.solves = lambda row: len(expert.joints) > 1
     assert main([*words, "--keep"]) == 0
-    text = capsys.readouterr().out
-    assert "robot=0.4                   2      0.0%      100.0%        2" in text
-    kept = json.loads((tmp_path / "draws.json").read_text())
+    assert "robot=0.4                   2      0.0%      100.0%        2" in capsys.readouterr().out
     now = {ROBOT.sample_name("libero_goal/3", start): 1 for start in (0, 1)}
-    assert kept == now | {"libero_goal/4 robot=0.4@0 1": 2}, (
-        "of this task the first draw of the whole is solved now"
-    )
+    assert json.loads(file.read_text()) == now | other, "the first draw of the whole task is solved now"
     count = len(expert.joints)
-    capsys.readouterr()
     assert main([*words, "--json"]) == 0 and len(expert.joints) == count
     rows = json.loads(capsys.readouterr().out)
     assert [row["perturbation"] for row in rows] == ["robot=0.4", "gain=0.4"]
     assert rows[0]["solved"] == {"0": 1, "1": 1}
-    (file,) = tmp_path.glob("*/*/robot*.json")
-    file.write_text("{}")
+    (result,) = tmp_path.glob("*/*/robot*.json")
+    result.write_text("{}")
     assert main(words) == 2 and "not a certificate" in capsys.readouterr().err
 
 
@@ -131,16 +121,11 @@ def test_a_task_that_cannot_be_perturbed_is_told(expert):
 
 
 def test_a_picture_shows_both(tmp_path):
-    out = tmp_path / "a.png"
-    assert (
-        main(["perturb", "show", "libero_goal/1", "--perturb", "light=1", "--size", "32", "--out", str(out)])
-        == 0
-    )
+    out, words = tmp_path / "a.png", ["--perturb", "light=1", "--size", "32", "--out"]
+    assert main(["perturb", "show", "libero_goal/1", *words, str(out)]) == 0
     picture = np.asarray(Image.open(out))
     assert picture.shape == (64, 64, 3) and not np.array_equal(picture[:, :32], picture[:, 32:])
-    words = ["perturb", "show", "libero_goal", "--perturb", "light=1", "--out", str(tmp_path / "b.png")]
-    assert main(words) == 2 and not (tmp_path / "b.png").exists()
+    assert main(["perturb", "show", "libero_goal", *words, str(tmp_path / "b.png")]) == 2
+    assert not (tmp_path / "b.png").exists()
     with pytest.raises(LiberoError, match="ends in"):
-        from libero_env.design.preview import compare_starts
-
         compare_starts(TASK, [], tmp_path / "a.txt")

@@ -1,6 +1,7 @@
 """Leaving out what a camera cannot show changes no bit of an image."""
 
 import copy
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -38,35 +39,38 @@ MIRRORS = """
 """
 
 
-def render_both(model, cameras, states, faithful):
-    """Images of each state and all cameras, with nothing left out and with what cannot be seen left out."""
-    data = mujoco.MjData(model)
-    with (
-        Renderer(model, SIZE, SIZE, faithful=faithful, cull=False) as whole,
-        Renderer(model, SIZE, SIZE, faithful=faithful) as culled,
-    ):
+def random_qpos(model, rng):
+    """The arm anywhere, objects anywhere around the table, drawers and doors anywhere in their range."""
+    qpos = model.qpos0.copy()
+    for joint in range(model.njnt):
+        at = model.jnt_qposadr[joint]
+        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
+            qpos[at : at + 3] = rng.uniform([-0.6, -0.6, 0.0], [0.4, 0.6, 1.3])
+            qpos[at + 3 : at + 7] = rng.normal(size=4)
+        elif model.jnt_limited[joint]:
+            qpos[at] = rng.uniform(*model.jnt_range[joint])
+    return qpos
+
+
+def assert_unchanged(model, cameras, states, faithful):
+    """Compare the images of all cameras where nothing is left out with those where what cannot be seen is."""
+    data, make = mujoco.MjData(model), partial(Renderer, model, SIZE, SIZE, faithful=faithful)
+    with make(cull=False) as whole, make() as culled:
         for qpos in states:
             data.qpos[:] = qpos
             mujoco.mj_forward(model, data)
-            yield [images(renderer, data, cameras) for renderer in (whole, culled)]
+            pairs = zip(images(whole, data, cameras), images(culled, data, cameras), strict=True)
+            for one, other in pairs:
+                assert np.array_equal(one, other)
 
 
 def images(renderer, data, cameras):
     shape = (len(cameras), SIZE, SIZE)
-    rgb, depth = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32)
-    elements = np.zeros(shape, np.int32)
-    targets = [
-        RenderTarget(renderer.camera_id(camera), rgb[k], depth[k], segmentation=elements[k])
-        for k, camera in enumerate(cameras)
-    ]
+    arrays = np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+    ids = map(renderer.camera_id, cameras)
+    targets = [RenderTarget(*views[:3], segmentation=views[3]) for views in zip(ids, *arrays, strict=True)]
     renderer.render(data, targets)
-    return rgb, depth, elements
-
-
-def assert_equal(pairs):
-    for whole, culled in pairs:
-        for one, other in zip(whole, culled, strict=True):
-            assert np.array_equal(one, other)
+    return arrays
 
 
 def left_out(model, data, camera, mirrors):
@@ -92,23 +96,19 @@ def test_geoms_are_left_out():
 @pytest.mark.parametrize("faithful", [True, False])
 def test_mirrors_show_what_the_camera_does_not(faithful):
     model = mujoco.MjModel.from_xml_string(MIRRORS)
-    rng = np.random.default_rng(0)
-    states = rng.normal(size=(60, 4))
-    assert_equal(
-        render_both(model, ["eye", "still"], states / np.linalg.norm(states, axis=1, keepdims=True), faithful)
-    )
+    states = np.random.default_rng(0).normal(size=(60, 4))
+    states /= np.linalg.norm(states, axis=1, keepdims=True)
+    assert_unchanged(model, ["eye", "still"], states, faithful)
 
 
-@pytest.mark.parametrize(
-    ("key", "drawing"),
-    [("libero_goal/0", FAITHFUL), ("libero_goal/0", FAST), ("libero_10/3", FAST), ("libero_90/70", FAST)],
-)
+@pytest.mark.parametrize(("key", "drawing"), [
+    ("libero_goal/0", FAITHFUL), ("libero_goal/0", FAST), ("libero_10/3", FAST), ("libero_90/70", FAST)
+])  # fmt: skip
 def test_random_states_of_tasks(key, drawing):
     model = copy.copy(build_scene(get_task(key).problem, drawing=drawing).model)
     rng = np.random.default_rng(0)
     states = [random_qpos(model, rng) for _ in range(4)]
-    cameras = ["agentview", "robot0_eye_in_hand"]
-    assert_equal(render_both(model, cameras, states, drawing == FAITHFUL))
+    assert_unchanged(model, ["agentview", "robot0_eye_in_hand"], states, drawing == FAITHFUL)
 
     def moving():  # the agent's camera anywhere above and below the table, and close to it
         for _ in range(6):
@@ -116,51 +116,27 @@ def test_random_states_of_tasks(key, drawing):
             model.cam_quat[model.camera("agentview").id] = rng.normal(size=4)
             yield states[0]
 
-    assert_equal(render_both(model, ["agentview"], moving(), drawing == FAITHFUL))
+    assert_unchanged(model, ["agentview"], moving(), drawing == FAITHFUL)
 
 
-def left_out_of(model, camera, change=lambda data: None):
-    """Names of the geoms that a camera does not show in the state in which all joints are zero."""
-    data = mujoco.MjData(model)
+def left_out_of(model, pos=None, mat=None):
+    """Names of the geoms that the agent's camera, which may be moved, does not show where all joints are zero."""
+    data, camera = mujoco.MjData(model), model.camera("agentview").id
     mujoco.mj_forward(model, data)
-    change(data)
+    if pos is not None:
+        data.cam_xpos[camera], data.cam_xmat[camera] = pos, np.ravel(mat)
     return {model.geom(geom).name for geom, _ in left_out(model, data, camera, mirrors=False)}
 
 
 def test_a_table_hides_its_legs_unless_it_is_transparent():
     model = copy.copy(build_scene(get_task("libero_goal/0").problem, drawing=FAST).model)
     legs = {f"table_leg{k}_visual" for k in (1, 2, 3, 4)}
-    assert legs <= left_out_of(model, "agentview")
-
-    def look_down(data):
-        at = model.camera("agentview").id
-        data.cam_xpos[at], data.cam_xmat[at] = (0, 0, 1.2), np.eye(3).ravel()
-
-    assert {"floor", *legs} <= left_out_of(model, "agentview", look_down), "the table is all that is seen"
-
-    def look_from_below(data):
-        at = model.camera("agentview").id
-        data.cam_xpos[at], data.cam_xmat[at] = (
-            (1.5, 0, 0.4),
-            np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]).ravel(),
-        )
-
+    assert legs <= left_out_of(model)
+    down, from_below = ((0, 0, 1.2), np.eye(3)), ((1.5, 0, 0.4), [[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    assert {"floor", *legs} <= left_out_of(model, *down), "the table is all that is seen"
     far = {"table_leg2_visual", "table_leg3_visual"}  # the near ones are beside the view
-    assert not far & left_out_of(model, "agentview", look_from_below)
+    assert not far & left_out_of(model, *from_below)
     table = model.geom("table_visual")
     model.geom_rgba[table.id, 3] = model.mat_rgba[table.matid, 3] = 0.5
-    assert not far & left_out_of(model, "agentview")
-    assert "floor" not in left_out_of(model, "agentview", look_down)
-
-
-def random_qpos(model, rng):
-    """The arm anywhere, objects anywhere around the table, drawers and doors anywhere in their range."""
-    qpos = model.qpos0.copy()
-    for joint in range(model.njnt):
-        at = model.jnt_qposadr[joint]
-        if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE:
-            qpos[at : at + 3] = rng.uniform([-0.6, -0.6, 0.0], [0.4, 0.6, 1.3])
-            qpos[at + 3 : at + 7] = rng.normal(size=4)
-        elif model.jnt_limited[joint]:
-            qpos[at] = rng.uniform(*model.jnt_range[joint])
-    return qpos
+    assert not far & left_out_of(model)
+    assert "floor" not in left_out_of(model, *down)

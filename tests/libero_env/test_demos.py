@@ -1,7 +1,6 @@
 """Demonstration files: what is written is read back; what is broken is named; what was recorded survives a kill."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -11,9 +10,8 @@ import h5py
 import numpy as np
 import pytest
 
+from libero_env.demos import DemoWriter, demo_origin, read_demos
 from libero_env.demos.generate import _recording_lock
-from libero_env.demos.read import demo_origin, read_demos
-from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
 from tests.harness.demos import episode, header, write
 
@@ -64,21 +62,15 @@ def test_the_origin_names_what_is_learned_and_not_how_it_looks(path, tmp_path):
 def test_file_has_the_originals_layout(path):
     with h5py.File(path) as handle:
         data = handle["data"]
-        assert {
-            "env_name", "problem_info", "macros_image_convention", "bddl_file_name", "bddl_file_content", "env_args",
-            "num_demos", "total", "tag"
-        } <= set(data.attrs)  # fmt: skip
+        assert {"macros_image_convention", "bddl_file_name", "bddl_file_content", "env_args"} <= {*data.attrs}
         assert data.attrs["num_demos"] == 3 and data.attrs["total"] == 33 and data.attrs["tag"] == "libero-v1"
         assert data.attrs["env_name"] == "Libero_Floor_Manipulation"
         info = json.loads(data.attrs["problem_info"])
-        assert (
-            info["problem_name"] == "libero_floor_manipulation" and "butter" in info["language_instruction"]
-        )
+        assert info["problem_name"] == "libero_floor_manipulation"
+        assert "butter" in info["language_instruction"]
         demo = data["demo_0"]
-        types = {
-            "actions": "float64", "states": "float64", "robot_states": "float64", "rewards": "uint8",
-            "dones": "uint8", "obs/agentview_rgb": "uint8", "obs/ee_states": "float64"
-        }  # fmt: skip
+        types = dict.fromkeys(("actions", "states", "robot_states", "obs/ee_states"), "float64")
+        types |= dict.fromkeys(("rewards", "dones", "obs/agentview_rgb"), "uint8")
         assert {key: str(demo[key].dtype) for key in types} == types
         np.testing.assert_array_equal(demo["obs/agentview_rgb"][()], episode(0).obs["agentview_rgb"][:, ::-1])
         np.testing.assert_array_equal(demo.attrs["init_state"], demo["states"][0])
@@ -135,23 +127,6 @@ def test_a_broken_part_is_recorded_again(tmp_path):
     assert writer.recorded() == {0}
 
 
-def test_a_full_disk_leaves_what_was_recorded(tmp_path, monkeypatch):
-    writer = DemoWriter(tmp_path / "x.hdf5", header())
-    writer.write(0, episode(0))
-
-    def full(*args):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(DemoError, match="No space left"):
-        writer.write(1, episode(1))
-    with pytest.raises(DemoError, match="No space left"):
-        writer.finish()
-    monkeypatch.undo()
-    assert len(read_demos(writer.parts)) == 1 and len(list(writer.parts.iterdir())) == 1
-    assert len(read_demos(writer.finish())) == 1
-
-
 def test_a_recording_follows_no_link_out_of_its_folder(tmp_path):
     victim, path = tmp_path / "victim.hdf5", tmp_path / "own" / "x.hdf5"
     victim.write_text("precious, and no demonstration")
@@ -162,11 +137,8 @@ def test_a_recording_follows_no_link_out_of_its_folder(tmp_path):
         with pytest.raises(DemoError, match=r"x\.hdf5\.parts is a link, or is not a folder"):
             use()
     (path.parent / ".recording.lock").symlink_to(victim)
-    with (
-        pytest.raises(DemoError, match="demonstrations cannot be recorded there"),
-        _recording_lock(path.parent),
-    ):
-        pass
+    with pytest.raises(DemoError, match="demonstrations cannot be recorded there"):
+        _recording_lock(path.parent).__enter__()
     assert victim.read_text() == "precious, and no demonstration"
 
 
@@ -184,7 +156,7 @@ except Exception as error:
 """
 
 
-@pytest.mark.parametrize("limit", [0, 1, 3_000, 40_000, 262_144, 300_000])
+@pytest.mark.parametrize("limit", [0, 3_000, 40_000, 300_000])
 def test_a_disk_that_is_full_ends_in_one_line_and_loses_nothing(tmp_path, limit):
     path = tmp_path / "x.hdf5"
     command = [sys.executable, "-c", FULL_DISK, str(path), str(limit)]

@@ -2,6 +2,8 @@
 
 import resource
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -10,13 +12,12 @@ import pytest
 from libero_env import memory
 from libero_env.curating.curate import describe, examine, filter_demos
 from libero_env.curating.video import check_video_path, write_video
-from libero_env.demos import hdf5
+from libero_env.demos import DemoWriter, hdf5
 from libero_env.demos.contents import read_header
 from libero_env.demos.observe import recorded_robot, recorded_task
 from libero_env.demos.read import demo_lengths, iter_demos, read_demos, read_episodes
 from libero_env.demos.replay import rerun_actions
 from libero_env.demos.stored_model import read_fixture_poses
-from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError, LiberoError
 from libero_integrations.exports.demonstrations import export_demos
 from tests.harness.demos import episode, header, write
@@ -48,14 +49,20 @@ def refused(path, *words, read=read_demos):
     assert "\n" not in message and all(word in message for word in (path.name, *words)), message
 
 
-def put(key, value, **options):
+def put(key, value):
     def change(handle):
         if key in handle:
             del handle[key]
-        if isinstance(value, np.ndarray):
-            handle.create_dataset(key, data=value, **options)
-        else:
-            handle[key] = value
+        handle[key] = value
+
+    return change
+
+
+def created(key, *shape, **options):
+    def change(handle):
+        if key in handle:
+            del handle[key]
+        handle.create_dataset(key, *shape, **options)
 
     return change
 
@@ -65,43 +72,22 @@ def without(*keys):
 
 
 def attribute(key, value, group="data"):
-    def change(handle):
-        handle[group].attrs[key] = value
-
-    return change
-
-
-def external_storage(handle):
-    del handle["data/demo_0/obs/agentview_rgb"]
-    handle["data/demo_0/obs"].create_dataset(
-        "agentview_rgb", (4, 8, 8, 3), np.uint8, external=[("/etc/passwd", 0, 768)]
-    )
+    return lambda handle: handle[group].attrs.__setitem__(key, value)
 
 
 def virtual(handle):
     layout = h5py.VirtualLayout((4, 7), np.float64)
     layout[:] = h5py.VirtualSource("elsewhere.hdf5", "x", (4, 7))
-    del handle["data/demo_0/actions"]
-    handle.create_virtual_dataset("data/demo_0/actions", layout)
-
-
-def loop(handle):
-    handle["data/demo_0/obs/again"] = handle["data"]
-
-
-def deep(handle):
-    handle.create_group("/".join(["x"] * 40))
+    handle.create_virtual_dataset("data/demo_0/x", layout)
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    (put("data/demo_1/actions", h5py.SoftLink("/data/demo_0/actions")), ("data/demo_1/actions", "soft link")),
     (put("data/demo_1", h5py.SoftLink("/nowhere")), ("data/demo_1", "soft link")),
-    (put("data/demo_1", h5py.ExternalLink("/etc/passwd", "/data")), ("data/demo_1", "another file")),
     (put("mask", h5py.ExternalLink("other.hdf5", "/data")), ("mask", "another file")),
-    (external_storage, ("data/demo_0/obs/agentview_rgb", "other files")),
-    (virtual, ("data/demo_0/actions", "other files")),
-    (loop, ("data/demo_0/obs/again", "within itself")),
-    (deep, ("too deep",)),
+    (created("data/demo_0/x", (4, 8), np.uint8, external=[("/etc/passwd", 0, 32)]), ("demo_0/x", "other files")),
+    (virtual, ("data/demo_0/x", "other files")),
+    (lambda handle: handle["data"].__setitem__("again", handle["data"]), ("data/again", "within itself")),
+    (lambda handle: handle.create_group("/".join(["x"] * 40)), ("too deep",)),
     (put("data/demo_0/kind", np.dtype("f8")), ("data/demo_0/kind", "named type")),
 ])  # fmt: skip
 def test_a_file_stands_for_itself(path, change, words):
@@ -110,62 +96,30 @@ def test_a_file_stands_for_itself(path, change, words):
         refused(path, *words, read=read)
 
 
-def huge(handle):
-    del handle["data/demo_0/obs/agentview_rgb"]
-    handle["data/demo_0/obs"].create_dataset(
-        "agentview_rgb", (4, 1 << 19, 1 << 19, 3), np.uint8, chunks=(1, 64, 64, 3)
-    )
-
-
-def huge_fill(handle):
-    del handle["data/demo_0/states"]
-    handle.create_dataset("data/demo_0/states", (4, 1 << 40), np.float64, chunks=(4, 16), fillvalue=7.0)
-
-
-def huge_chunks(handle):
-    del handle["data/demo_0/states"]
-    handle.create_dataset("data/demo_0/states", (4, 9), np.float64, maxshape=(4, None), chunks=(4, 1 << 26))
-
-
-def references(handle):
-    put("data/demo_0/actions", np.full((4, 7), handle["data"].ref, h5py.ref_dtype))(handle)
-
-
-def ragged(handle):
-    del handle["data/demo_0/actions"]
-    handle.create_dataset("data/demo_0/actions", (4, 7), h5py.vlen_dtype(float))
-
-
 @pytest.mark.parametrize(("change", "words"), [
-    (huge, ("obs/agentview_rgb", "3.3 TB", "not complete")),
-    (huge_fill, ("demo_0/states", "35.2 TB", "not complete")),
-    (huge_chunks, ("demo_0/states", "chunks of 2.1 GB")),
-    (references, ("demo_0/actions", "float")),
-    (ragged, ("demo_0/actions", "float")),
-    (put("data/demo_0/actions", np.zeros((4, 7), [("x", float)])), ("demo_0/actions", "float")),
-    (put("data/demo_0/actions", np.zeros((4, 7), complex)), ("demo_0/actions", "float")),
+    (created("data/demo_0/obs/agentview_rgb", (4, 1 << 19, 1 << 19, 3), np.uint8, chunks=(1, 64, 64, 3)),
+     ("obs/agentview_rgb", "3.3 TB", "not complete")),
+    (created("data/demo_0/states", (4, 1 << 40), float, chunks=(4, 16), fillvalue=7.0),
+     ("demo_0/states", "35.2 TB", "not complete")),
+    (created("data/demo_0/states", (4, 9), float, maxshape=(4, None), chunks=(4, 1 << 26)),
+     ("demo_0/states", "chunks of 2.1 GB")),
+    (lambda handle: put("data/demo_0/actions", np.full((4, 7), handle["data"].ref, h5py.ref_dtype))(handle),
+     ("demo_0/actions", "float")),
+    (created("data/demo_0/actions", (4, 7), h5py.vlen_dtype(float)), ("demo_0/actions", "float")),
     (put("data/demo_0/actions", np.zeros((4, 7), np.longdouble)), ("demo_0/actions", "64 bits")),
-    (put("data/demo_0/actions", np.zeros((4, 7), np.int64)), ("demo_0/actions", "float")),
-    (put("data/demo_0/actions", np.zeros((0, 7))), ("demo_0/actions", "empty")),
-    (put("data/demo_0/actions", 1.0), ("demo_0/actions", "empty")),
     (put("data/demo_0/actions", h5py.Empty("f8")), ("demo_0/actions", "empty")),
     (put("data/demo_0/obs/agentview_rgb", np.zeros((4, 8, 8, 3), np.uint16)), ("agentview_rgb", "8 bits")),
     (put("data/demo_01", h5py.Empty("f8")), ("demo_01", "demo_1", "same number")),
     (without("data"), ("data", "missing")),
-    (without("data/demo_1/actions"), ("demo_1/actions", "missing")),
     (without("data/demo_1/obs/agentview_rgb"), ("demo_1/obs/agentview_rgb", "missing", "eye_in_hand_rgb")),
-    (without("data/demo_0/obs"), ("demo_0/obs", "missing")),
     (without("data/demo_0", "data/demo_1"), ("no demonstrations",)),
-    (put("data/demo_1/actions", np.zeros((4, 6))), ("demo_1/actions", "(4, 6)", "(4, 7)")),
     (put("data/demo_1/states", np.zeros((3, 30))), ("demo_1/states", "(3, 30)", "(4, any)")),
-    (put("data/demo_1/obs/eye_in_hand_rgb", np.zeros((4, 8, 8, 3))), ("eye_in_hand_rgb", "float64", "un")),
     (put("data/demo_1/obs/eye_in_hand_rgb", np.zeros((4, 4, 4, 3), np.uint8)), ("demo_1", "(8, 8, 3)")),
 ])  # fmt: skip
 def test_shapes_types_and_sizes_are_checked_before_memory_is_asked_for(path, change, words):
     damaged(path, change)
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    with open("/proc/self/statm") as file:
-        used = int(file.read().split()[0]) * resource.getpagesize()
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30), hard))
     try:
         refused(path, *words)
@@ -185,7 +139,7 @@ def test_a_filter_of_a_plugin_is_refused(path):
     refused(damaged(path, change), "demo_0/actions", "filter 32001", "h5repack")
 
 
-@pytest.mark.parametrize("name", ["demo_\u00b2", "demo_x", "demo_", "demo_1_", "demo_" + "9" * 5000, "other"])
+@pytest.mark.parametrize("name", ["demo_\u00b2", "demo_x", "demo_1_", "demo_" + "9" * 5000, "other"])
 def test_groups_of_other_names_are_no_demonstrations(path, name):
     damaged(path, lambda handle: handle["data"].create_group(name))
     assert [demo.name for demo in read_demos(path)] == ["demo_0", "demo_1"] and demo_lengths(path) == [4, 4]
@@ -200,10 +154,8 @@ def test_thousands_of_demonstrations_are_read_in_the_order_of_their_numbers(tmp_
     assert demo_lengths(path) == [1 + k % 3 for k in range(1200)] and time.process_time() - start < 10
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
-@pytest.mark.parametrize(
-    "key", ["actions", "expert_actions", "states", "obs/ee_pos", "obs/joint_states", "obs/ee_states"]
-)
+@pytest.mark.parametrize("bad", [np.nan, -np.inf, 1e30])
+@pytest.mark.parametrize("key", ["actions", "expert_actions", "states", "obs/ee_pos", "obs/ee_states"])
 def test_values_that_are_no_measurements_name_file_demonstration_key_and_step(path, key, bad):
     damaged(path, lambda handle: handle[f"data/demo_1/{key}"].__setitem__((2, 1), bad))
     labels = "executed" if key == "actions" else "expert"
@@ -223,16 +175,14 @@ def test_floats_of_other_widths_and_byte_orders_are_the_same_numbers(path, dtype
         np.testing.assert_array_equal(found, values.astype(float))
 
 
-@pytest.mark.parametrize("stated", ["aligned", b"aligned", np.bytes_(b"libero"), "libero"])
+@pytest.mark.parametrize("stated", [b"aligned", np.bytes_(b"libero"), "libero"])
 def test_a_pairing_may_be_stored_as_bytes(path, stated):
     damaged(path, attribute("pairing", stated))
     expected = stated if isinstance(stated, str) else stated.decode()
     assert {demo.pairing for demo in read_demos(path)} == {expected}
 
 
-@pytest.mark.parametrize(
-    "stated", ["bogus", b"bogus", "", b"\xff\xfe", 1, [1.0, 2.0], ["aligned"], h5py.Empty("f8")]
-)
+@pytest.mark.parametrize("stated", ["bogus", "", b"\xff\xfe", 1, ["aligned"], h5py.Empty("f8")])
 def test_an_unknown_pairing_is_refused(path, stated):
     damaged(path, attribute("pairing", stated))
     for read in (read_demos, iter_demos, read_header, lambda p: demo_lengths(p, pairing="aligned")):
@@ -241,10 +191,8 @@ def test_an_unknown_pairing_is_refused(path, stated):
 
 @pytest.mark.parametrize(("key", "value", "words"), [
     ("robot", "sawyer", ("robot", "sawyer", "libero")),
-    ("robot", 3, ("robot",)),
     ("drawing", "crayon", ("drawing", "crayon")),
     ("total", "many", ("total", "many")),
-    ("bddl_file_content", 7, ("bddl_file_content",)),
     ("models", np.zeros(3), ("models",)),
     ("anything", h5py.Reference(), ("anything", "neither text nor numbers")),
     ("anything", b"\xff\xfe", ("anything", "damaged")),
@@ -275,10 +223,6 @@ def test_attributes_of_a_demonstration_are_checked(path, key, value):
     refused(path, "demo_1", key, read=read_episodes)
 
 
-class _Scene:
-    fixtures = ("stove",)
-
-
 @pytest.mark.parametrize(("xml", "words"), [
     ("<mujoco", "not XML"),
     ('<x><body name="stove_main" pos="a b c"/></x>', "expected numbers"),
@@ -291,20 +235,15 @@ class _Scene:
 ])  # fmt: skip
 def test_fixtures_of_a_stored_model_are_poses(xml, words):
     with pytest.raises(DemoError, match=words):
-        read_fixture_poses(xml, _Scene(), "x.hdf5: demo_0/model_file")
-
-
-def heap_zeroed(path):
-    """Zero the first object of the heap of texts, on which the HDF5 library would run for ever."""
-    content = bytearray(path.read_bytes())
-    start = content.index(b"GCOL")
-    content[start + 16 : start + 48] = bytes(32)
-    path.write_bytes(content)
-    return path
+        read_fixture_poses(xml, SimpleNamespace(fixtures=("stove",)), "x.hdf5: demo_0/model_file")
 
 
 def test_a_damaged_heap_of_texts_is_refused_instead_of_read_for_ever(path):
-    refused(heap_zeroed(path), "texts", "damaged")
+    content = bytearray(path.read_bytes())
+    start = content.index(b"GCOL")
+    content[start + 16 : start + 48] = bytes(32)  # the first object of the heap
+    path.write_bytes(content)
+    refused(path, "texts", "damaged")
 
 
 def test_a_heap_within_data_is_no_heap(path):
@@ -321,11 +260,12 @@ def test_more_than_the_free_memory_is_refused(path, monkeypatch):
     refused(path, "demo_0", "are free", read=read_episodes)
 
 
-def test_a_file_that_cannot_be_opened_now_is_not_called_broken(path, monkeypatch):
-    def busy(*args):
-        raise BlockingIOError(11, "unable to lock file")
+def denied(*_):
+    raise PermissionError(13, "denied")
 
-    monkeypatch.setattr(h5py, "File", busy)
+
+def test_a_file_that_cannot_be_opened_now_is_not_called_broken(path, monkeypatch):
+    monkeypatch.setattr(h5py, "File", denied)
     with pytest.raises(DemoError, match="being written") as caught:
         read_demos(path)
     assert not isinstance(caught.value, hdf5.BrokenDemoError)
@@ -335,7 +275,7 @@ def test_a_part_that_cannot_be_opened_now_is_kept(tmp_path, monkeypatch):
     writer = DemoWriter(tmp_path / "x.hdf5", header())
     part = writer.write(0, episode(0))
     with monkeypatch.context() as patch:
-        patch.setattr(h5py, "File", lambda *args: (_ for _ in ()).throw(PermissionError(13, "denied")))
+        patch.setattr(h5py, "File", denied)
         with pytest.raises(DemoError, match="denied"):
             writer.recorded()
     assert part.exists() and writer.recorded() == {0}
@@ -349,12 +289,6 @@ def test_parts_of_another_file_do_not_get_into_a_filtered_one(path, tmp_path):
     assert len(filter_demos(path, target).lengths) == 2
     with pytest.raises(DemoError, match="exists"):
         rerun_actions(path, target)
-
-
-def test_a_demonstration_that_is_no_group_is_named_by_the_writer(path):
-    damaged(path, put("data/demo_1", 1.0))
-    with pytest.raises(DemoError, match="demo_1 is not a group"):
-        DemoWriter(path, {}).recorded()
 
 
 @pytest.mark.parametrize("name", ["file/x.gif", "x.mp3", "x.hdf5"])
@@ -382,7 +316,7 @@ def test_a_file_that_is_joined_again_keeps_its_permissions(path):
 
 
 def test_the_task_of_a_stranger_may_be_named_anything(path):
+    damaged(path, attribute("bddl_file_content", ""))
     for name in ("../../../etc/passwd", "\u202e", "x" * 10_000, "/", "libero_object/none.bddl"):
         damaged(path, attribute("bddl_file_name", name))
-        damaged(path, attribute("bddl_file_content", ""))
         refused(path, "bddl", read=recorded_task)

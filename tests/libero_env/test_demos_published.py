@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from libero_env.demos.config import RenderConfig
+from libero_env.demos import DemoWriter, RenderConfig
 from libero_env.demos.contents import read_header
 from libero_env.demos.observe import StateRenderer, recorded_task
 from libero_env.demos.read import read_demos, read_episodes
-from libero_env.demos.write import DemoWriter
 from libero_env.errors import DemoError
 from libero_env.tasks import get_task
 from libero_integrations.exports.demonstrations import ORIGIN, export_demos, export_published
@@ -29,12 +28,11 @@ parquet = pytest.importorskip("pyarrow.parquet")
 pytestmark = pytest.mark.sim
 
 HOW = Regeneration(settle_steps=0, labels="executed", assets="builtin", drawing="fast")
+SMALL = replace(HOW, size=(16, 16))
 CHECKED = (0, 20, 40)  # frames that are compared
 NUMBER = {"shape": [1], "names": None}
 IMAGE = {"shape": [256, 256, 3], "names": ["height", "width", "channel"]}
-INDICES = {
-    key: {"dtype": "int64", **NUMBER} for key in ("frame_index", "episode_index", "index", "task_index")
-}
+INDICES = dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), {"dtype": "int64", **NUMBER})
 VIDEO = {
     "dtype": "video",
     **IMAGE,
@@ -175,29 +173,17 @@ def test_steps_that_do_nothing_are_left_out(file, episode, exported, tmp_path):
 
     def pause(one):
         idle = np.concatenate([np.full(6, 1e-6), one.actions[30, 6:]])
-        actions = np.insert(one.actions, [31, 31], idle, axis=0)
         repeat = np.insert(np.arange(len(one)), [31, 31], 30)
-        obs = {key: values[repeat] for key, values in one.obs.items()}
-        return replace(
-            one,
-            actions=actions,
-            states=one.states[repeat],
-            obs=obs,
-            expert_actions=None,
-            robot_states=one.robot_states[repeat],
-        )
+        paused = one.select(repeat)
+        return replace(paused, actions=np.insert(one.actions, [31, 31], idle, axis=0), expert_actions=None)
 
-    paused = _rewrite(file, tmp_path / file.name, pause)
-    name = "physical-intelligence/libero"
-    small = replace(HOW, size=(16, 16))
-    _, frames, _ = export_published([paused], tmp_path / "set", name, small, progress=False)
+    paused, name = _rewrite(file, tmp_path / file.name, pause), "physical-intelligence/libero"
+    _, frames, _ = export_published([paused], tmp_path / "set", name, SMALL, progress=False)
     assert frames == len(episode)
-    tables = [
-        parquet.read_table(r / "data/chunk-000/episode_000000.parquet")
-        for r in (exported[name], tmp_path / "set")
-    ]
+    where = "data/chunk-000/episode_000000.parquet"
+    one, other = (parquet.read_table(root / where) for root in (exported[name], tmp_path / "set"))
     for key in ("state", "actions"):
-        assert tables[0][key].to_pylist() == tables[1][key].to_pylist()
+        assert one[key].to_pylist() == other[key].to_pylist()
 
 
 def test_the_rule_of_no_ops():
@@ -212,13 +198,12 @@ def test_the_rule_of_no_ops():
 
 def test_failures_are_left_out_and_named(file, tmp_path):
     lost = _rewrite(file, tmp_path / f"lost_{file.name}", lambda one: replace(one, actions=one.actions * 0.5))
-    small = replace(HOW, size=(16, 16))
     name = "physical-intelligence/libero"
-    episodes, _, failed = export_published([lost, file], tmp_path / "set", name, small, progress=False)
+    episodes, _, failed = export_published([lost, file], tmp_path / "set", name, SMALL, progress=False)
     assert episodes == 1 and failed == [f"{lost}: demo_0"]
     assert json.loads((tmp_path / "set" / ORIGIN).read_text())["left_out"] == 1
     with pytest.raises(DemoError, match=r"lost_.*demo_0: neither this demonstration nor any other"):
-        export_published([lost], tmp_path / "none", name, small, progress=False)
+        export_published([lost], tmp_path / "none", name, SMALL, progress=False)
     assert not (tmp_path / "none").exists()
 
 
@@ -236,26 +221,18 @@ def test_each_set_says_which_way_round_its_images_are(file, exported, tmp_path):
 
 def test_a_recording_that_ends_too_early_is_continued(file, episode, tmp_path):
     """The expert's last action, letting go, is repeated until the goal holds; in other files nothing is added."""
-    expected_frames = len(episode)
-
-    def cut(one):
-        steps = expected_frames - 3
-        obs = {key: values[:steps] for key, values in one.obs.items()}
-        robot_states, labels = one.robot_states[:steps], one.labels[:steps]
-        arrays = {"actions": one.actions[:steps], "states": one.states[:steps], "expert_actions": labels}
-        return replace(one, obs=obs, robot_states=robot_states, **arrays)
-
-    short, small = _rewrite(file, tmp_path / "short.hdf5", cut), replace(HOW, size=(16, 16))
-    (continued,) = regenerate(short, small)
-    assert continued.success and expected_frames - 3 < len(continued.actions) <= expected_frames + 7
-    (stopped,) = regenerate(short, replace(small, extra_steps=0))
-    assert not stopped.success and len(stopped.actions) == expected_frames - 3
+    steps = len(episode) - 3
+    short = _rewrite(file, tmp_path / "short.hdf5", lambda one: one.select(np.arange(steps)))
+    (continued,) = regenerate(short, SMALL)
+    assert continued.success and steps < len(continued.actions) <= steps + 10
+    (stopped,) = regenerate(short, replace(SMALL, extra_steps=0))
+    assert not stopped.success and len(stopped.actions) == steps
     original = {k: v for k, v in read_header(short).items() if k != "generator"}
     for name, header in {"original": original, "by_hand": original | {"generator": "teleoperation"}}.items():
         human = DemoWriter(tmp_path / f"{name}.hdf5", header)
         human.write(0, next(read_episodes(short)))
-        (left,) = regenerate(human.finish(), small)
-        assert not left.success and len(left.actions) == expected_frames - 3
+        (left,) = regenerate(human.finish(), SMALL)
+        assert not left.success and len(left.actions) == steps
 
 
 def test_a_task_that_the_states_do_not_fit_is_refused(file, tmp_path):

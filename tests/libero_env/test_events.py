@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from libero_env import BatchEnv, Expert, get_task
 from libero_env.demos.config import RenderConfig
-from libero_env.envs.batch import BatchEnv
 from libero_env.errors import InvalidInputError, UnknownNameError
-from libero_env.expert import Expert
 from libero_env.expert.expert import solved_from_events
 from libero_env.perturbations import Perturbation, format_perturbations, parse_perturbations
-from libero_env.tasks import get_task
 from libero_env.tasks.expression import Atom, ForAll
 
 TASK = "libero_goal/6"  # the cream cheese into the bowl
@@ -35,10 +33,8 @@ def matched():
     return episode("")[0]
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["camera=0.5", "noise=1", "gain=1", "object=1", "receptacle=1", "distractor=1", "obstacle=0.5", "goal=1"],
-)
+@pytest.mark.parametrize("kind", ["camera=0.5", "noise=1", "gain=1", "object=1", "receptacle=1", "distractor=1",
+    "obstacle=0.5", "goal=1"])  # fmt: skip
 @pytest.mark.parametrize("trigger", ["step10", "10%"])
 def test_all_before_an_event_is_the_matched_episode_to_the_bit_and_nothing_after_it(matched, kind, trigger):
     (pictures, positions), info, env = episode(f"{kind}@{trigger}")
@@ -46,10 +42,9 @@ def test_all_before_an_event_is_the_matched_episode_to_the_bit_and_nothing_after
     np.testing.assert_array_equal(positions[:10], matched[1][:10])
     assert info["began"].tolist() == [[10], [10]]
     one = env.config.perturb[0]
-    assert (positions[10] != matched[1][10]).any(axis=-1).all() == (
-        one.definition.physical and one.kind != "goal"
-    )
-    assert (pictures[10] != matched[0][10]).any() == (one.kind != "goal")
+    acts, moves = one.kind != "goal", one.definition.physical and one.kind != "goal"
+    assert (positions[10] != matched[1][10]).any(axis=-1).all() == moves
+    assert (pictures[10] != matched[0][10]).any() == acts
     assert info["moved"].tolist() == [False, False], "it has just begun in the step before only"
     (alone, where), _, _ = episode(f"{kind}@{trigger}", starts=(1,))
     np.testing.assert_array_equal(alone[:, 0], pictures[:, 1])  # whatever runs beside it
@@ -61,9 +56,7 @@ def test_an_object_is_moved_so_far_and_draws_that_are_not_valid_are_counted(matc
     address = env.scene.pose_address("cream_cheese_1")
     moved = positions[10, :, address : address + 2] - matched[1][10, :, address : address + 2]
     np.testing.assert_allclose(np.linalg.norm(moved, axis=-1), 0.1, atol=2e-3)
-    assert info["attempts"].tolist() == [[1], [0]], (
-        "the first draw of start 0 would stand inside another object"
-    )
+    assert info["attempts"].tolist() == [[1], [0]], "that of start 0 would stand inside another object"
 
 
 def test_an_event_whose_moment_never_comes_changes_nothing(matched):
@@ -138,20 +131,15 @@ def test_a_restored_state_has_the_events_that_had_begun():
     perturb, action = "camera=0.5@step3,noise=1@step8", np.tile([0.0, 0.2, -0.5, 0.0, 0.0, 0.0, 1.0], (2, 1))
     with BatchEnv(TASK, 2, cameras=("agentview",), camera_size=(32, 32), perturb=perturb) as env:
         env.reset(options={"init_state": [0, 0]})
-        states = [env.get_state(0)]
-        for _ in range(12):
-            seen = env.step(action)[0]["agentview_rgb"][0]
-            states.append(env.get_state(0))
-        assert states[5][-2:].tolist() == [3, -1]
-        env.set_state(0, states[2])
-        for k in range(2, 12):
-            again, *_, info = env.step(action)
-            np.testing.assert_array_equal(env.get_state(0), states[k + 1])
-        np.testing.assert_array_equal(again["agentview_rgb"][0], seen)
-        env.set_state(1, states[5])  # of another simulation: only the camera has moved
-        assert env.perturbed.began[1].tolist() == [3, -1] and info["began"][0].tolist() == [3, 8]
+        for step in range(12):
+            info = env.step(action)[-1]
+            if step == 4:
+                state = env.get_state(0)
+        assert state[-2:].tolist() == [3, -1] and info["began"][0].tolist() == [3, 8]
+        env.set_state(1, state)  # of another simulation: only the camera has moved
+        assert env.perturbed.began[1].tolist() == [3, -1]
         with pytest.raises(InvalidInputError, match="ends with its number of steps, those before each event"):
-            env.set_state(0, np.append(states[5][:-1], 0.5))
+            env.set_state(0, np.append(state[:-1], 0.5))
 
 
 def roll(env, actions):
@@ -212,13 +200,15 @@ def test_objects_that_a_quantifier_stands_for_are_those_that_the_goal_is_about()
     """The same goal, said of each object of a category: triggers, draws, causes and progress are the same."""
     task = get_task(TASK)
     (atom,) = task.problem.goal.atoms()
+    with BatchEnv(TASK, 1, cameras=()) as env:
+        starts = env.init_states[:1]
     every = ForAll((("?x", task.problem.objects[atom.args[0]]),), Atom("On", ("?x", atom.args[1])))
     seen = []
     for goal in (task.problem.goal, every):
         said = replace(task, problem=replace(task.problem, goal=goal))
         perturb = "light=1@touched,camera=0.2@over_goal,object=1@step5,obstacle=0.5@step6"
         with BatchEnv(said, 1, cameras=(), horizon=300, perturb=perturb) as env:
-            env.reset(options={"start": get_starts()})
+            env.reset(options={"start": starts})
             expert, infos = Expert(task, np.random.default_rng(0)), []
             while env.running[0]:
                 infos.append(env.step(expert.act(env.views[0])[None])[-1])
@@ -228,11 +218,6 @@ def test_objects_that_a_quantifier_stands_for_are_those_that_the_goal_is_about()
             seen.append([[info[key].tolist() for info in infos] for key in ("began", "progress", "success")])
             assert env.watch.wanted(0) == ["cream_cheese_1"]
     assert seen[0] == seen[1]
-
-
-def get_starts():
-    with BatchEnv(TASK, 1, cameras=()) as env:
-        return env.init_states[:1]
 
 
 def test_the_expert_tells_whether_the_rest_can_be_solved():
@@ -255,24 +240,23 @@ def test_the_text_of_events():
     assert format_perturbations(found) == "camera=0.1@3,camera=0.5@lifted@7,noise=1@25%"
 
 
-@pytest.mark.parametrize(
-    ("text", "error", "message"),
-    [
-        ("camera=0.5@lift", UnknownNameError, "unknown trigger 'lift'. Did you mean 'lifted'?"),
-        ("camera=0.5@100%", UnknownNameError, "unknown trigger '100%'"),
-        ("camera=0.5@step", UnknownNameError, "unknown trigger 'step'"),
-        ("layout=1@step4", InvalidInputError, "layout cannot begin during an episode"),
-        ("goal=1@step4,goal=1@lifted", InvalidInputError, "goal cannot be combined with goal"),
-        ("object=1@lifted", InvalidInputError, "the robot touches the object then, so that it is not moved"),
-        ("robot=1@lifted", InvalidInputError, "robot cannot begin during an episode"),
-        ("light=1@lifted,light=0.5@lifted", InvalidInputError, "light is named twice"),
-        ("light=1@lifted@x", InvalidInputError, "expected KIND=SEVERITY"),
-    ],
-)
+@pytest.mark.parametrize(("text", "error", "message"), [
+    ("camera=0.5@lift", UnknownNameError, "unknown trigger 'lift'. Did you mean 'lifted'?"),
+    ("camera=0.5@100%", UnknownNameError, "unknown trigger '100%'"),
+    ("camera=0.5@step", UnknownNameError, "unknown trigger 'step'"),
+    ("layout=1@step4", InvalidInputError, "layout cannot begin during an episode"),
+    ("goal=1@step4,goal=1@lifted", InvalidInputError, "goal cannot be combined with goal"),
+    ("object=1@lifted", InvalidInputError, "the robot touches the object then, so that it is not moved"),
+    ("light=1@lifted,light=0.5@lifted", InvalidInputError, "light is named twice"),
+    ("light=1@lifted@x", InvalidInputError, "expected KIND=SEVERITY"),
+])  # fmt: skip
 def test_what_is_no_event_is_refused_in_one_line(text, error, message):
     with pytest.raises(error) as found:
         parse_perturbations(text, events=True)
     assert message in str(found.value) and "\n" not in str(found.value)
+
+
+def test_where_there_are_no_episodes_there_are_no_events():
     with pytest.raises(InvalidInputError, match="expected KIND=SEVERITY"):
         parse_perturbations("camera=0.5@lifted")  # where there are no episodes, such as in certifying
     with pytest.raises(InvalidInputError, match="camera=0.5@lifted"):
@@ -283,18 +267,14 @@ def test_what_is_no_event_is_refused_in_one_line(text, error, message):
 def test_an_obstacle_stands_between_an_object_and_its_place(severity, aside):
     with BatchEnv("libero_object/0", 1, cameras=(), perturb=f"obstacle={severity}@step2") as env:
         env.reset(options={"init_state": [3]})
-        before = {
-            name: env.simulations.fields["qpos"][0, env.scene.pose_address(name) :][:2].copy()
-            for name in env.scene.objects
-        }
+        qpos, address = env.simulations.fields["qpos"][0], env.scene.pose_address
+        places = {name: slice(address(name), address(name) + 2) for name in env.scene.objects}
+        before = qpos.copy()
         for _ in range(3):
             *_, info = env.step(np.zeros((1, 7)))
-        after = {
-            name: env.simulations.fields["qpos"][0, env.scene.pose_address(name) :][:2].copy()
-            for name in env.scene.objects
-        }
-    (moved,) = (name for name in before if np.linalg.norm(after[name] - before[name]) > 0.02)
-    way, to = before["basket_1"] - before["alphabet_soup_1"], after[moved] - before["alphabet_soup_1"]
+        (moved,) = (at for at in places.values() if np.linalg.norm(qpos[at] - before[at]) > 0.02)
+        soup = before[places["alphabet_soup_1"]]
+        way, to = before[places["basket_1"]] - soup, qpos[moved] - soup
     length = np.linalg.norm(way)
     assert abs(way[0] * to[1] - way[1] * to[0]) / length == pytest.approx(aside, abs=2e-3)
     assert 0.39 < to @ way / length**2 < 0.61 and info["began"].tolist() == [[2]]

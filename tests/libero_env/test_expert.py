@@ -6,24 +6,16 @@ import mujoco
 import numpy as np
 import pytest
 
+from libero_env import BatchEnv, LiberoEnv, get_suite, get_task
 from libero_env.assets.robot import FINGER_JOINTS
 from libero_env.demos.config import DemoConfig
 from libero_env.demos.record import DemoRecorder
-from libero_env.envs.batch import BatchEnv
-from libero_env.envs.env import LiberoEnv
 from libero_env.expert import ActionNoise, Expert, MotionStyle, Shapes, UnsupportedGoalError, plan_goal
 from libero_env.expert.arm import GRIPPER, action_toward, downward, limit_elbow_extension
 from libero_env.expert.clearance import overhang
 from libero_env.expert.expert import run_experts
-from libero_env.expert.grasping.grasps import (
-    Grasp,
-    GraspError,
-    choose_grasp,
-    find_grasps,
-    finger_offset,
-    grip_cost,
-)
-from libero_env.expert.grasping.kernels import open_hand_collision_depth
+from libero_env.expert.grasping import grasps
+from libero_env.expert.grasping.grasps import Grasp, choose_grasp, grip_cost
 from libero_env.expert.planning.pick_plan import SEARCH, FailedAttempt
 from libero_env.expert.planning.pick_planner import plan_pick, plan_place
 from libero_env.expert.skills.drop_into_container import DropIntoContainer
@@ -31,18 +23,17 @@ from libero_env.expert.skills.pick_place import PickPlace
 from libero_env.expert.skills.transport import Move, Transport
 from libero_env.geometry import Pose, rotation_between, surface_points
 from libero_env.sim.predicates import contains, evaluate, is_over, region_boxes
-from libero_env.tasks import get_suite, get_task
 from libero_env.tasks.expression import And, Atom, Not, Or
 
 X_AXIS = np.array([1.0, 0.0, 0.0])
 NOTHING = np.zeros((0, 3))
+pytestmark = pytest.mark.sim
 
 
 def box(half, spacing=0.003):
     """Points on a box that stands on the floor."""
-    model = mujoco.MjModel.from_xml_string(
-        f"<mujoco><worldbody><body><geom type='box' size='{' '.join(map(str, half))}'/></body></worldbody></mujoco>"
-    )
+    geom = f"<geom type='box' size='{' '.join(map(str, half))}'/>"
+    model = mujoco.MjModel.from_xml_string(f"<mujoco><worldbody><body>{geom}</body></worldbody></mujoco>")
     return surface_points(model, 1, spacing) + [0, 0, half[2]]
 
 
@@ -82,11 +73,10 @@ def test_a_box_is_grasped_across_its_narrow_side(angle):
     assert 0.012 < grasp.pos_world[2] < 0.03
 
 
-def test_the_hand_rotates_as_little_as_possible():
-    cube = box((0.02, 0.02, 0.02))
-    for yaw in (0.1, -0.4, 1.2):
-        axis = np.array([np.cos(yaw), np.sin(yaw), 0.0])
-        assert between(choose_grasp(cube, NOTHING, 0.0, axis).yaw, yaw) <= np.pi / 4 + 0.06
+@pytest.mark.parametrize("yaw", [0.1, -0.4, 1.2])
+def test_the_hand_rotates_as_little_as_possible(yaw):
+    axis = np.array([np.cos(yaw), np.sin(yaw), 0.0])
+    assert between(choose_grasp(box((0.02, 0.02, 0.02)), NOTHING, 0.0, axis).yaw, yaw) <= np.pi / 4 + 0.06
 
 
 def test_the_palm_stays_above_what_is_tall():
@@ -102,7 +92,7 @@ def test_fingers_keep_out_of_neighbours():
 
 
 def test_what_is_too_wide_is_refused_with_its_width():
-    with pytest.raises(GraspError, match=r"crate cannot be grasped.*1[0-9]\.[0-9] cm wide") as caught:
+    with pytest.raises(grasps.GraspError, match=r"crate cannot be grasped.*1[0-9]\.[0-9] cm wide") as caught:
         choose_grasp(box((0.06, 0.07, 0.03), 0.005), NOTHING, 0.0, X_AXIS, "crate")
     assert f"{100 * GRIPPER.max_opening:.0f} cm" in str(caught.value)
 
@@ -110,14 +100,9 @@ def test_what_is_too_wide_is_refused_with_its_width():
 def test_the_grip_cost_is_low_with_much_between_the_pads_and_parallel_faces():
     cloud = box((0.03, 0.008, 0.03))
     middle = np.array([0.0, 0.0, 0.04])
-    firm, corner, edge = (
-        grip_cost(cloud, Grasp(pos, downward(yaw, X_AXIS), 0.016, 0.0))
-        for pos, yaw in (
-            (middle, np.pi / 2),
-            (middle + [0.03, 0, 0], 0.9),
-            (middle + [0, 0, 0.022], np.pi / 2),
-        )
-    )
+    held = ((middle, np.pi / 2), (middle + [0.03, 0, 0], 0.9), (middle + [0, 0, 0.022], np.pi / 2))
+    grasps_ = [Grasp(pos, downward(yaw, X_AXIS), 0.016, 0.0) for pos, yaw in held]
+    firm, corner, edge = (grip_cost(cloud, grasp) for grasp in grasps_)
     assert firm < 0.02 < min(corner, edge)
     assert grip_cost(cloud, Grasp(middle + [0.2, 0, 0], downward(0.0, X_AXIS), 0.0, 0.0)) > 0.5  # of nothing
 
@@ -126,8 +111,8 @@ def test_the_grip_cost_is_low_with_much_between_the_pads_and_parallel_faces():
 def test_the_finger_offset_is_that_of_the_body_between_the_pads(aside):
     cloud, mat = box((0.03, 0.01, 0.02)), downward(np.pi / 2, X_AXIS)
     pos = np.array([0.0, 0.0, 0.02]) + aside * mat[:, 0]
-    assert finger_offset(cloud, pos, mat) == pytest.approx(-aside, abs=1e-6)
-    assert finger_offset(cloud, pos + [0.2, 0, 0], mat) == 0.0  # nothing there
+    assert grasps.finger_offset(cloud, pos, mat) == pytest.approx(-aside, abs=1e-6)
+    assert grasps.finger_offset(cloud, pos + [0.2, 0, 0], mat) == 0.0  # nothing there
 
 
 def test_actions_point_at_the_goal_and_stay_in_range():
@@ -138,25 +123,9 @@ def test_actions_point_at_the_goal_and_stay_in_range():
         action = action_toward(pos, mat, goal, goal_mat, velocity=np.zeros(3), gripper=1.0)
         assert (np.abs(action) <= 1.0).all() and action[6] == 1.0
         assert action[:3] @ (goal - pos) > 0
-        cross = action[0] * (goal - pos)[1] - action[1] * (goal - pos)[0]
-        assert abs(cross) < 1e-9  # a straight line over the ground
+        assert abs(np.linalg.det([action[:2], (goal - pos)[:2]])) < 1e-9  # a straight line over the ground
     still = action_toward(goal, mat, goal, mat, velocity=np.zeros(3), gripper=-1.0)
     np.testing.assert_allclose(still, [0, 0, 0, 0, 0, 0, -1], atol=1e-7)
-
-
-def test_rotations():
-    for yaw in (-2.0, 0.4, 1.3):
-        mat = downward(yaw, X_AXIS)
-        np.testing.assert_allclose(mat @ mat.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(mat) == pytest.approx(1.0) and mat[2, 2] == -1.0
-        assert mat[:, 0] @ X_AXIS >= 0  # the nearer of the two ways round
-    turn = rotation_between(downward(0.0, X_AXIS), downward(0.5, X_AXIS))
-    np.testing.assert_allclose(turn, [0, 0, 0.5], atol=1e-9)
-
-
-def test_motion_styles_depend_on_the_generator_alone():
-    first, second, other = (MotionStyle.sample(np.random.default_rng(seed)) for seed in (3, 3, 4))
-    assert first == second != other
 
 
 def test_action_noise_leaves_the_gripper_alone_and_can_be_switched_off():
@@ -179,7 +148,6 @@ def view_of(closing):
     return open_
 
 
-@pytest.mark.sim
 def test_a_goal_without_a_skill_is_refused(view_of):
     view = view_of("libero_object/0")
     with pytest.raises(UnsupportedGoalError, match=r"\(Up butter_1\).*In OBJECT"):
@@ -188,21 +156,15 @@ def test_a_goal_without_a_skill_is_refused(view_of):
         plan_goal(Not(Not(Atom("In", ("butter_1", "basket_1_contain_region")))), view)
 
 
-@pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.parametrize("suite", ["libero_spatial", "libero_goal", "libero_10", "libero_90"])
 def test_every_goal_of_a_suite_has_a_plan(suite, view_of):
-    seen = set()
-    for task in get_suite(suite).tasks:
-        if task.problem.goal in seen:
-            continue
-        seen.add(task.problem.goal)
-        view = view_of(task.id)
-        atoms = {step.atom for step in plan_goal(task.problem.goal, view)}
-        assert {atom for atom in task.problem.goal.atoms() if not evaluate(atom, view)} <= atoms
+    for goal, key in {task.problem.goal: task.id for task in get_suite(suite).tasks}.items():
+        view = view_of(key)
+        atoms = {step.atom for step in plan_goal(goal, view)}
+        assert {atom for atom in goal.atoms() if not evaluate(atom, view)} <= atoms
 
 
-@pytest.mark.sim
 def test_a_drawer_is_opened_before_and_closed_after(view_of):
     view = view_of("libero_goal/3")
     bowl = Atom("In", ("akita_black_bowl_1", "wooden_cabinet_1_top_region"))
@@ -211,7 +173,6 @@ def test_a_drawer_is_opened_before_and_closed_after(view_of):
     assert order[:2] == [("Open", "wooden_cabinet_1_top_region"), ("In", "akita_black_bowl_1")]
 
 
-@pytest.mark.sim
 def test_an_object_is_placed_before_what_it_carries(view_of):
     view = view_of("libero_90/63")
     goal = get_task("libero_90/63").problem.goal
@@ -219,28 +180,14 @@ def test_an_object_is_placed_before_what_it_carries(view_of):
         assert [step.atom.predicate for step in plan_goal(written, view)] == ["In", "On"]
 
 
-@pytest.mark.sim
 def test_of_alternatives_the_one_with_less_to_do_is_planned(view_of):
     view = view_of("libero_goal/7")
-    hard = And(
-        (Atom("On", ("plate_1", "flat_stove_1_cook_region")), Atom("Open", ("wooden_cabinet_1_top_region",)))
-    )
-    easy = Atom("Turnon", ("flat_stove_1",))
+    on, easy = Atom("On", ("plate_1", "flat_stove_1_cook_region")), Atom("Turnon", ("flat_stove_1",))
+    hard = And((on, Atom("Open", ("wooden_cabinet_1_top_region",))))
     assert [step.atom for step in plan_goal(Or((hard, easy)), view)] == [easy]
     assert plan_goal(Not(easy), view) == ()
 
 
-@pytest.mark.sim
-def test_a_bowl_is_grasped_by_its_wall(view_of):
-    view = view_of("libero_goal/1")
-    cloud = Shapes(view.scene).cloud(view, "akita_black_bowl_1")
-    for grasp in find_grasps(cloud, 0.9, X_AXIS)[:5]:
-        across = grasp.mat.T @ (view.body_pos("akita_black_bowl_1") - grasp.pos_world)
-        assert 0.03 < np.hypot(across[0], across[1]) < 0.09  # beside the middle
-        assert grasp.width < 0.03
-
-
-@pytest.mark.sim
 @pytest.mark.parametrize("task_id", ["libero_goal/1", "libero_goal/9", "libero_90/73", "libero_90/55"])
 def test_at_a_place_the_atom_would_hold(task_id, view_of):
     view = view_of(task_id)
@@ -251,7 +198,6 @@ def test_at_a_place_the_atom_would_hold(task_id, view_of):
     assert any(test(box, plan.place.pos + [0, 0, 0.003]) for box in region_boxes(view, step.atom.args[1]))
 
 
-@pytest.mark.sim
 def test_a_failed_grasp_is_not_planned_again(view_of):
     view = view_of("libero_goal/1")
     shapes, atom = Shapes(view.scene), Atom("On", ("akita_black_bowl_1", "wooden_cabinet_1_top_side"))
@@ -265,7 +211,6 @@ def test_a_failed_grasp_is_not_planned_again(view_of):
     assert np.linalg.norm(plan_pick(view, shapes, atom).grasp.pos_world - first.grasp.pos_world) == 0.0
 
 
-@pytest.mark.sim
 def test_of_a_round_object_the_side_that_is_nearer_to_its_place_is_grasped(closing):
     """A choice that small differences make is one that a clone averages over."""
     task = get_task("libero_goal/1")
@@ -279,7 +224,6 @@ def test_of_a_round_object_the_side_that_is_nearer_to_its_place_is_grasped(closi
         assert (plan.grasp.pos_world - bowl)[:2] @ (plan.place.pos - bowl)[:2] > 0
 
 
-@pytest.mark.sim
 def test_another_place_is_found_for_what_is_in_the_hand(view_of):
     view = view_of("libero_goal/1")
     shapes, atom = Shapes(view.scene), Atom("On", ("akita_black_bowl_1", "wooden_cabinet_1_top_side"))
@@ -290,10 +234,7 @@ def test_another_place_is_found_for_what_is_in_the_hand(view_of):
     assert np.linalg.norm(first.place.pos - other.place.pos) > 0.01 or turn > 0.3
 
 
-@pytest.mark.sim
-def test_a_bowl_stands_on_the_floor_of_a_drawer_and_one_in_a_stretched_hand_goes_where_the_arm_reaches(
-    view_of,
-):
+def test_a_bowl_stands_on_the_floor_of_a_drawer_and_one_in_a_stretched_hand_goes_where_it_reaches(view_of):
     view = view_of("libero_10/3")
     shapes, atom = Shapes(view.scene), get_task("libero_10/3").problem.goal.parts[1]
     (box,) = region_boxes(view, atom.args[1])
@@ -302,7 +243,7 @@ def test_a_bowl_stands_on_the_floor_of_a_drawer_and_one_in_a_stretched_hand_goes
     assert place.pos[2] + bottom < box.centre[2] - 0.015  # the drawer closes over it
     state = view.simulations.physics_state(0)
     state[1:8] = stretched = [0.28, 1.14, -0.05, -0.49, -0.15, 1.37, 2.27]
-    address = 1 + view.scene.model.jnt_qposadr[view.scene.model.body("akita_black_bowl_1_main").jntadr[0]]
+    address = 1 + view.scene.pose_address("akita_black_bowl_1")
     state[address : address + 7] = 0.02, 0.141, 1.107, 0.83, 0.0, 0.0, -0.56
     view.simulations.set_physics_state(0, state)
     plan = plan_place(view, shapes, atom)
@@ -310,7 +251,6 @@ def test_a_bowl_stands_on_the_floor_of_a_drawer_and_one_in_a_stretched_hand_goes
     assert shapes.arm.follow(np.array(stretched), [pose])[1] < SEARCH.reach_tolerance
 
 
-@pytest.mark.sim
 def test_a_book_goes_down_between_walls_only_from_their_middle(view_of):
     """Held beside its place, the next move is level or up; over it, down."""
     view = view_of("libero_90/73")
@@ -327,7 +267,6 @@ def test_a_book_goes_down_between_walls_only_from_their_middle(view_of):
     assert rim > plan.place.pos[2] + 0.04
 
 
-@pytest.mark.sim
 def test_an_object_is_released_nearer_to_the_middle_of_a_narrow_place(view_of):
     """A clone misses the middle by more than the demonstrations do."""
     view = view_of("libero_goal/9")
@@ -349,17 +288,6 @@ def test_an_object_is_released_nearer_to_the_middle_of_a_narrow_place(view_of):
     assert next_move(0.006, found.room) == "arrived"
 
 
-@pytest.mark.sim
-def test_an_object_in_a_drawer_is_grasped_where_the_hand_has_room(view_of):
-    """Of the first few grasps of an approach all may hit the drawer or the cabinet, and a later one nothing."""
-    view = view_of("libero_spatial/4")
-    (step,) = plan_goal(get_task("libero_spatial/4").problem.goal, view)
-    shapes = Shapes(view.scene)
-    grasp = plan_pick(view, shapes, step.atom).grasp
-    fixtures = np.concatenate([shapes.points(view, name, 0.006) for name in view.scene.fixtures])
-    assert open_hand_collision_depth(fixtures, grasp.pos_world, grasp.mat) == 0.0
-
-
 def test_what_hangs_over_an_object_is_told_from_a_wall_beside_it():
     y, z = (grid.ravel() for grid in np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(0.0, 0.2, 41)))
     wall = np.stack([np.full_like(y, 0.047), y, z], axis=1)
@@ -375,7 +303,6 @@ def test_what_hangs_over_an_object_is_told_from_a_wall_beside_it():
     assert not len(overhang(NOTHING, middle, 0.05, 0.06, 0.3))
 
 
-@pytest.mark.sim
 def test_a_bowl_below_an_open_drawer_is_drawn_out_before_it_is_lifted():
     """Lifted straight up, the bowl meets the drawer; a hand that pulls harder slips off the handle."""
     recorder = DemoRecorder(DemoConfig("libero_goal/3", (64, 64)))
@@ -385,27 +312,22 @@ def test_a_bowl_below_an_open_drawer_is_drawn_out_before_it_is_lifted():
     assert max(map(len, attempts)) < 240
 
 
-@pytest.mark.sim
 def test_the_arm_keeps_its_elbow_bent(view_of):
     view = view_of("libero_goal/1")
     arm, start = Shapes(view.scene).arm, view.simulations.fields["qpos"][view.index][:7]
     down = downward(0.0, X_AXIS)
     near, error = arm.solve(start, Pose(np.array([0.0, 0.0, 1.0]), down))
     assert error == 0.0 and near[3] < -0.9
-    far, error = arm.solve(
-        start, Pose(np.array([0.35, 0.0, 1.0]), down)
-    )  # could be touched with a straight arm
+    far, error = arm.solve(start, Pose(np.array([0.35, 0.0, 1.0]), down))  # a straight arm could touch it
     assert error > 0.0 and far[3] <= -0.9
 
 
-@pytest.mark.sim
 def test_the_gripper_opens_as_far_as_its_model(view_of):
     model = view_of("libero_object/0").scene.model
     ranges = [model.joint(name).range for name in FINGER_JOINTS]
     assert sum(float(np.ptp(limits)) for limits in ranges) == pytest.approx(GRIPPER.max_opening)
 
 
-@pytest.mark.sim
 def test_another_skill_takes_over_from_one_that_failed(view_of):
     view = view_of("libero_object/0")
     expert = Expert(get_task("libero_object/0"), np.random.default_rng(0))
@@ -420,7 +342,6 @@ def test_another_skill_takes_over_from_one_that_failed(view_of):
     assert expert.failure_reason == "no grasp" and expert.skill.fallback() is None
 
 
-@pytest.mark.sim
 def test_the_elbow_is_not_straightened_further(view_of):
     view = view_of("libero_goal/1")
     qpos, outward = view.simulations.fields["qpos"][view.index], np.array([1.0, 0, 0, 0.2, 0, 0, -1.0])
@@ -446,7 +367,6 @@ def attempt_of(closing):
     return act
 
 
-@pytest.mark.sim
 @pytest.mark.slow
 @pytest.mark.parametrize("task_id, start", [
     ("libero_spatial/4", 16), ("libero_90/5", 4), ("libero_90/13", 12), ("libero_90/19", 4),
@@ -459,38 +379,30 @@ def test_narrow_places_leaning_hands_and_small_knobs(attempt_of, task_id, start)
     assert attempt.success and attempt.retries < 4, attempt.reason
 
 
-@pytest.mark.sim
-def test_an_attempt_whose_simulation_diverges_fails_for_that_reason_and_the_other_goes_on():
+def test_an_attempt_whose_simulation_diverges_fails_for_that_reason_and_the_other_goes_on(closing):
     class Breaking(Expert):
         def act(self, view):
             if view is env.views[0] and env.simulations.time(0) > 0.07:
                 env.simulations.fields["qvel"][0, 12] = np.nan
             return super().act(view)
 
-    env = BatchEnv("libero_goal/1", 2, cameras=())
+    env = closing(BatchEnv("libero_goal/1", 2, cameras=()))
     env.reset(options={"init_state": 0})
-    broken, whole = run_experts(
-        env, [Breaking(env.task, np.random.default_rng(0)) for _ in range(2)], max_steps=9
-    )
-    env.close()
+    experts = [Breaking(env.task, np.random.default_rng(0)) for _ in range(2)]
+    broken, whole = run_experts(env, experts, max_steps=9)
     assert "diverged" in broken.reason and not broken.success and (len(broken), len(whole)) == (3, 9)
     assert whole.reason.startswith("in phase")
 
 
-@pytest.mark.sim
-@pytest.mark.parametrize(
-    "task_id", ["libero_goal/1", "libero_goal/5", "libero_spatial/0", "libero_90/73", "libero_90/65"]
-)
-def test_walls_plates_mugs_and_books(attempt_of, task_id):
+@pytest.mark.parametrize("task_id", ["libero_90/73", "libero_90/65"])
+def test_mugs_and_books(attempt_of, task_id):
     attempt, _ = attempt_of(task_id, 0, 0, max_steps=300)
     assert attempt.success, attempt.reason
 
 
-@pytest.mark.sim
-@pytest.mark.parametrize(
-    "task_id, onward",
-    [("libero_goal/1", (0, 0, -1)), ("libero_spatial/0", (0, 0, -1)), ("libero_10/9", (0, 1, 0))],
-)
+@pytest.mark.parametrize(("task_id", "onward"), [
+    ("libero_goal/1", (0, 0, -1)), ("libero_spatial/0", (0, 0, -1)), ("libero_10/9", (0, 1, 0))
+])  # fmt: skip
 def test_a_hand_lets_go_in_motion(attempt_of, task_id, onward):
     """A clone of a hand that comes to rest before it lets go comes to rest and stays there."""
     attempt, _ = attempt_of(task_id, 3, 1, noise=2, max_steps=200)
@@ -501,15 +413,17 @@ def test_a_hand_lets_go_in_motion(attempt_of, task_id, onward):
     assert (motion > 0.1).all(), motion
 
 
-@pytest.mark.sim
-@pytest.mark.parametrize("task_id, start, most", [("libero_goal/3", 0, 240), ("libero_goal/5", 2, 110)])
-def test_a_hand_does_not_wait_for_what_cannot_happen(attempt_of, task_id, start, most):
-    """A tilted hand leaves its line faster than it descends; a fixture keeps a hand from going lower."""
-    attempt, _ = attempt_of(task_id, start, start, max_steps=400)
+@pytest.mark.parametrize(("task_id", "start", "disturbed", "most"), [
+    ("libero_goal/3", 0, False, 240),  # a tilted hand leaves its line faster than it descends
+    ("libero_goal/5", 2, False, 110),  # a fixture keeps a hand from going lower
+    ("libero_object/0", 8, True, 160),  # a push leaves a finger standing on a wide can
+])  # fmt: skip
+def test_a_hand_does_not_wait_for_what_cannot_happen(attempt_of, task_id, start, disturbed, most):
+    style, noise = np.random.SeedSequence([0, start]).spawn(2) if disturbed else (start, None)
+    attempt, _ = attempt_of(task_id, start, style, noise, max_steps=400)
     assert attempt.success and len(attempt) < most
 
 
-@pytest.mark.sim
 @pytest.mark.parametrize("task", get_suite("libero_object").tasks, ids=lambda task: task.name)
 def test_every_task_is_reached_and_stays_reached(attempt_of, task):
     attempt, env = attempt_of(task, 31, 0, noise=5, max_steps=200)
@@ -521,53 +435,43 @@ def test_every_task_is_reached_and_stays_reached(attempt_of, task):
     assert env.check_goal(0)[0]
 
 
-@pytest.mark.sim
-def test_what_one_simulation_does_depends_on_no_other():
+def test_what_one_simulation_does_depends_on_no_other(closing):
     task = get_task("libero_object/6")
 
-    def run(starts, slot):
-        env = BatchEnv(task, len(starts), num_threads=2, cameras=())
-        env.reset(seed=starts)
+    def run(*starts):
+        env = closing(BatchEnv(task, len(starts), num_threads=2, cameras=()))
+        env.reset(seed=list(starts))
         shapes = Shapes(env.scene)
         experts = [Expert(task, np.random.default_rng(s), shapes=shapes) for s in starts]
         noise = [ActionNoise(np.random.default_rng(s)) for s in starts]
-        attempt = run_experts(env, experts, noise, max_steps=60)[slot]
-        env.close()
-        return attempt
+        return run_experts(env, experts, noise, max_steps=60)
 
-    alone, among = run([11], 0), run([5, 11, 8], 1)
+    (alone,), (_, among, _) = run(11), run(5, 11, 8)
     np.testing.assert_array_equal(alone.actions, among.actions)
     np.testing.assert_array_equal(alone.states, among.states)
 
 
-@pytest.mark.sim
-def test_what_falls_into_place_after_the_expert_gave_up_is_no_success():
+def test_what_falls_into_place_after_the_expert_gave_up_is_no_success(closing):
     """One simulation goes on while its expert has given up, because that of the other has not."""
 
     class Patient(Expert):
-        def __init__(self, task, rng, steps):
-            super().__init__(task, rng)
-            self.steps = steps
-
         failure_reason = property(lambda self: "" if self.steps else "it gave up")
 
         def act(self, view):
             self.steps -= 1
             return np.array([0.0] * 6 + [-1.0])
 
-    env = BatchEnv("libero_object/0", 2, cameras=())
+    env = closing(BatchEnv("libero_object/0", 2, cameras=()))
     env.reset(options={"init_state": 0})
-    state, model = env.simulations.physics_state(0), env.scene.model
-    soup = 1 + model.jnt_qposadr[model.body("alphabet_soup_1_main").jntadr[0]]
+    state, soup = env.simulations.physics_state(0), 1 + env.scene.pose_address("alphabet_soup_1")
     state[soup : soup + 3] = env.views[0].body_pos("basket_1") + [0.0, 0.0, 0.6]
     env.simulations.set_physics_state(0, state)
-    attempt, _ = run_experts(env, [Patient(env.task, np.random.default_rng(0), n) for n in (2, 40)])
-    reached = env.check_goal(0)[0]
-    env.close()
-    assert reached and not attempt.success and attempt.reason == "it gave up"
+    experts = [Patient(env.task, np.random.default_rng(0)) for _ in range(2)]
+    experts[0].steps, experts[1].steps = 2, 40
+    attempt, _ = run_experts(env, experts)
+    assert env.check_goal(0)[0] and not attempt.success and attempt.reason == "it gave up"
 
 
-@pytest.mark.sim
 def test_an_object_that_slipped_is_picked_again(closing):
     task = get_task("libero_object/7")
     env = closing(LiberoEnv(task, cameras=()))
@@ -582,11 +486,3 @@ def test_an_object_that_slipped_is_picked_again(closing):
         if success:
             break
     assert dropped == 8 and expert.retries >= 1 and success
-
-
-@pytest.mark.sim
-def test_a_finger_on_the_rim_goes_up_again(attempt_of):
-    """A push leaves a finger standing on a wide can; pressing on would last for seventy steps."""
-    style, noise = np.random.SeedSequence([0, 8]).spawn(2)
-    attempt, _ = attempt_of("libero_object/0", 8, style, noise)
-    assert attempt.success and len(attempt) < 160

@@ -13,7 +13,6 @@ from libero_env.limited import call_limited, limited_process
 @pytest.mark.parametrize(("function", "args", "message"), [
     (time.sleep, (60,), "f: reading it takes more than"),
     (os._exit, (0,), "f: reading it ends the process"),
-    (os.abort, (), "f: reading it ends the process"),
     (bytearray, (1 << 40,), "f: it needs more than 3 GiB"),
     (int, ("x",), "f: it cannot be read .invalid literal"),
 ])  # fmt: skip

@@ -3,10 +3,6 @@
 import json
 import math
 import re
-import subprocess
-import sys
-from dataclasses import replace
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -14,13 +10,12 @@ import pytest
 
 from libero_cli import main as cli
 from libero_env.assets.arena import load_workspace
+from libero_env.design.lint import scene as lint_scene
 from libero_env.design.lint.checks import Finding, lint_file, lint_task, lint_text, lint_yaml
 from libero_env.design.lint.scene import furthest_reach, reach
 from libero_env.init_states.store import load_init_states
-from libero_env.sim.predicates import PREDICATES
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite, get_task, read_task, suite_names
-from libero_env.tasks.rules import KINDS
 from libero_env.workspaces import WORKSPACES
 
 SOUND = get_task("libero_goal/3").bddl_text  # open the top layer of the drawer and put the bowl inside
@@ -44,12 +39,8 @@ def found(text: str, rule: str, starts: int = 0) -> Finding:
 FAULTS = [
     ("plate_1 - plate", "plate_1 - plat", "unknown-category", "error", "did you mean plate"),
     ("main_table - table", "main_table - tabel", "unknown-category", "error", "did you mean .*table"),
-    ("(On plate_1 main", "(Onto plate_1 main", "unknown-predicate", "error", "On"),
-    ("(On plate_1 main_table_plate_region)", "(On plate_1 main_table_plat_region)", "unknown-name", "error",
-     "Did you mean .main_table_plate_region"),
     ("    (On plate_1 main_table_plate_region)\n", "", "not-placed", "error", r"\(On plate_1 REGION\)"),
     ("    (On flat_stove_1 main_table_stove_region)\n", "", "not-placed", "warning", "centre of the workspace"),
-    ("(On flat_stove_1 main_table_stove_region)", "(On flat_stove_1 plate_1)", "kind", "error", "workspace"),
     ("(-0.060000000000000005 0.12000000000000001 -0.04 0.14)", "(0.04 -0.03 0.060000000000000005 -0.01)",
      "duplicate-region", "warning", "same region as main_table_plate_region"),
     ("    akita_black_bowl_1\n    wooden_cabinet_1_top_region", "    akita_bowl_1", "unknown-name", "warning",
@@ -84,6 +75,7 @@ def test_all_undeclared_names_are_reported_at_once():
     text = SOUND.replace("(On plate_1 main", "(On plat_1 main").replace(GOAL, "(And (In bowl_9 nowhere))")
     findings = [f for f in lint_text(text, "mine.bddl", starts=0) if f.rule == "unknown-name"]
     assert [re.search(r"(\w+) is not", f.what)[1] for f in findings] == ["plat_1", "bowl_9", "nowhere"]
+    assert "Did you mean 'plate_1" in str(findings[0])
     assert text.splitlines()[findings[0].line - 1].strip().startswith("(On plat_1")
 
 
@@ -129,21 +121,13 @@ def test_lines_of_a_yaml_file_are_those_that_its_user_wrote(tmp_path, tasks):
     path.write_text(YAML)
     if tasks:
         (tmp_path / "scene.yaml").write_text("".join(YAML.splitlines(True)[:5]))
-        own = "".join(f"    {line}" for line in path.read_text().splitlines(True)[5:]).replace(
-            "    goal", "  - goal", 1
-        )
+        own = "".join(f"    {line}" for line in YAML.splitlines(True)[5:]).replace("    goal", "  - goal", 1)
         path.write_text(f"scene: scene.yaml\ntasks:\n{own}")
         at = -3
     (findings,) = lint_yaml(path)
     found = {(f.line, f.rule) for f in findings if f.level != "info"}
-    assert found >= {(1 if tasks else 5, "off-table"), (9 + at, "no-joint"), (10 + at, "instruction")}, (
-        findings
-    )
+    assert found >= {(1 if tasks else 5, "off-table"), (9 + at, "no-joint"), (10 + at, "instruction")}
     assert {f.file for f in findings} == {str(path)}
-
-
-def test_every_predicate_has_its_kinds():
-    assert set(PREDICATES) == set(KINDS)
 
 
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
@@ -161,8 +145,6 @@ def test_the_reach_is_a_ring_before_the_robot(category):
 
 @pytest.mark.sim
 def test_the_dimensions_of_the_arm_are_those_of_its_model():
-    from libero_env.design.lint import scene as lint_scene
-
     model = build_scene(get_task("libero_object/0").problem).model
     data = mujoco.MjData(model)
     data.qpos[[3, 5]] = -lint_scene._MAX_BEND, 1.0  # any bend of the elbow, by the law of cosines
@@ -195,7 +177,6 @@ PLACES = [
     ("(0.04 -0.03 0.060000000000000005 -0.01)", "(-0.1 -0.01 -0.08 0.01)", "placement", "error", "still collide"),
     ("(On plate_1 main_table_plate_region)", "(On plate_1 wine_bottle_1)", "unstable-start", "warning", "than 5 mm"),
     (GOAL, "(And (Open plate_1))", "no-joint", "error", "no joint"),
-    (GOAL, "(And (Turnon wooden_cabinet_1_top_region))", "no-joint", "error", "'turnon'"),
     (GOAL, "(And (On plate_1 main_table_plate_region))", "goal-at-start", "error", "5 of 5|3 of 3"),
     (GOAL, "(And (On plate_1 main_table_plate_region) (Open wooden_cabinet_1_top_region))", "goal-at-start", "info",
      "plate_region\\) holds from the beginning"),
@@ -208,23 +189,6 @@ def test_a_fault_of_the_scene_is_reported(old, new, rule, level, says):
     text, _ = mutated(old, new)
     hits = [f for f in lint_text(text, "mine.bddl", starts=3) if f.rule == rule and re.search(says, str(f))]
     assert level in [f.level for f in hits], [str(f) for f in lint_text(text, "mine.bddl", starts=3)]
-
-
-@pytest.mark.sim
-def test_a_missing_place_is_reported_with_the_existing_ones():
-    text = SOUND.replace(
-        "(top_region (:target wooden_cabinet_1))", "(upper_region (:target wooden_cabinet_1))"
-    )
-    text = text.replace("wooden_cabinet_1_top_region", "wooden_cabinet_1_upper_region")
-    (finding,) = [f for f in lint_text(text, "mine.bddl", starts=1) if f.level == "error"]
-    assert finding.rule == "no-site" and "top_region" in finding.remedy
-    assert "(upper_region" in text.splitlines()[finding.line - 1]
-
-
-@pytest.mark.sim
-@pytest.mark.parametrize("key", ["libero_goal/3", "libero_object/0", "libero_90/86", "libero_spatial/5"])
-def test_tasks_of_the_benchmark_are_sound(key):
-    assert [str(f) for f in lint_task(get_task(key), starts=2) if f.level != "info"] == []
 
 
 @pytest.mark.sim
@@ -273,18 +237,3 @@ goal: On akita_black_bowl_1 plate_1
     cli.main(["tasks", "lint", str(tmp_path / "a.yaml"), "--starts", "1", "--json", "--level", "info"])
     rules = {one["rule"] for one in json.loads(capsys.readouterr().out)}
     assert not rules & {"unused-region", "goal-at-start"}
-
-
-def test_a_surface_that_no_hand_reaches_has_no_ring():
-    high = replace(load_workspace("kitchen_table"), offset=(0.0, 0.0, 3.0))
-    assert furthest_reach(high) == 0.0
-
-
-def test_linting_texts_needs_no_torch():
-    code = (
-        "import sys, libero_env.design.lint.checks, libero_env.design.certify\n"
-        "print('torch' in sys.modules, 'matplotlib' in sys.modules)"
-    )
-    command, folder = [sys.executable, "-c", code], Path(__file__).parents[2]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["False", "False"]

@@ -104,27 +104,18 @@ def test_files_in_the_folder_are_found_as_mujoco_finds_them(home):
 
 
 @pytest.mark.parametrize(("parts", "message"), [
-    ({"inside": '<replicate count="100000"><geom size=".01"/></replicate>'}, ":1: .*100001 elements <geom>"),
     ({"inside": '<replicate count="300"><replicate count="300"><site/></replicate></replicate>'}, "90000"),
     ({"inside": "<body><joint/><geom size='.01'/></body>" * 101}, "101 elements <joint>; .* at most 100"),
     ({"inside": "<frame>" * 200 + "</frame>" * 200}, ":3: elements within elements, more than 80 deep"),
     ({"inside": '<composite type="cable" count="9 1 1"/>'}, ":3: <composite> in <body> is not used"),
-    ({"inside": '<flexcomp name="f" type="grid" count="300 300 30"/>'}, "<flexcomp> in <body>"),
-    ({"inside": '<attach model="x" prefix="y"/>'}, "<attach> in <body>"),
     ({"geom": '<geom type="box" size=".02 .02 .02"><plugin/></geom>'}, "<plugin> in <geom> .* it has no elements"),
-    ({"around": '<extension><plugin plugin="x"/></extension>'}, ":1: <extension>"),
-    ({"assets": '<hfield name="h" nrow="9999" ncol="9999" size="1 1 1 1"/>'}, ":2: <hfield>"),
-    ({"assets": '<model name="x" file="m.xml"/>'}, "<model> in <asset>"),
     ({"assets": '<mseh name="x" file="m.stl"/>'}, "Did you mean 'mesh'"),
-    ({"assets": '<texture name="t" type="2d" builtin="flat" width="60000" height="9"/>'}, "width .*60000"),
     ({"assets": '<texture name="t" builtin="flat" width="8192" height="8192"/>'}, "width .* value 8192"),
     ({"assets": '<mesh name="m" vertex="nan 0 0 1 0 0 0 1 0 0 0 1"/>'}, "vertex of <mesh> has the value nan"),
-    ({"geom": '<geom size="nan"/>'}, ":3: size of <geom> has the value nan"),
     ({"geom": '<geom size="1e30"/>'}, "value 1e[+]30; expected numbers up to 10"),
     ({"geom": '<geom size="5"/>'}, "it reaches 5 m"),
     ({"geom": '<geom size="1.5" mass="1"/>' * 20}, "20 collision geoms have 45 m.2 in all"),
     ({"geom": '<geom size=".01"/>' * 1500}, "3000 geoms with their copies for display"),
-    ({"geom": '<geom size=".02" mass="1e308"/>'}, "mass of <geom> has the value 1e[+]308"),
     ({"geom": '<geom size=".02" mass="1e9"/>'}, "its mass is 1e[+]09 kg"),
     ({"geom": '<geom size=".02" rgba="red"/>'}, "rgba of <geom> is 'red'; expected numbers"),
     ({"geom": '<geom size=".02" group="1.5"/>'}, "group of <geom> is '1.5'; expected a whole number"),
@@ -170,9 +161,8 @@ def test_what_belongs_to_a_scene_is_left_out(home):
 
 def test_parts_may_be_joined_and_keep_clear_of_each_other(home):
     inside = '<body name="c"><joint/><geom size=".01"/></body>'
-    around = (
-        '<contact><exclude body1="b" body2="c"/></contact><equality><weld body1="b" body2="c"/></equality>'
-    )
+    exclude, weld = '<exclude body1="b" body2="c"/>', '<weld body1="b" body2="c"/>'
+    around = f"<contact>{exclude}</contact><equality>{weld}</equality>"
     add_object(mjcf(home, inside=inside, around=around))
     model = get_object("thing").spec.compile()
     assert (model.nexclude, model.neq) == (1, 1)
@@ -191,14 +181,8 @@ def obj(home: Path, *lines: str, materials: str = "") -> Path:
     """An OBJ file of a box, with these lines before it."""
     path = home / "own" / "box.obj"
     mesh = trimesh.creation.box((0.04, 0.05, 0.06))
-    text = [
-        *lines,
-        *(f"v {x} {y} {z}" for x, y, z in mesh.vertices),
-        "vt 0 0",
-        "vt 1 0",
-        "vt 1 1",
-        "usemtl q",
-    ]
+    text = [*lines, *(f"v {x} {y} {z}" for x, y, z in mesh.vertices)]
+    text += ["vt 0 0", "vt 1 0", "vt 1 1", "usemtl q"]
     text += [f"f {a}/1 {b}/2 {c}/3" for a, b, c in mesh.faces + 1]
     path.write_text("\n".join(text) + "\n")
     path.with_name("box.mtl").write_text(f"newmtl q\n{materials}\n")
@@ -255,13 +239,12 @@ def test_meshes_name_files_of_their_folder_and_hold_what_is_usual(home, line, ma
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    (lambda g: g["buffers"][0].update(uri="../secret/x.bin"), "outside of the folder"),
     (lambda g: g["buffers"][0].update(uri="%2e%2e/secret/x.bin"), "outside of the folder"),
     (lambda g: g["buffers"][0].update(uri="http://127.0.0.1/x.bin"), "outside of the folder"),
     (lambda g: g.update(images=[{"uri": "file:///etc/passwd"}]), "outside of the folder"),
-    (lambda g: g.update(images=[{"uri": "/etc/passwd"}]), "outside of the folder"),
     (lambda g: g.update(images=[{"uri": "nothing.png"}]), "nothing.png is missing"),
     (lambda g: g.update(images=3), "cannot be read"),
+    (lambda g: g.update(images=[{"uri": 7}]), r"images\[0\].uri is 7; expected the name of a file"),
     (lambda g: g["accessors"][0].update(count=10**9), "cannot be read"),
     (lambda g: g["accessors"][0].update(count=-1), "cannot be read"),
     (lambda g: g["nodes"][0].update(children=[1, 1]), "cannot be read"),
@@ -273,6 +256,9 @@ def test_gltf_files_likewise(home, change, message):
     assert "\n" not in str(caught.value)
 
 
+NUMBERED = b'{"asset": {"version": "2.0"}, "images": [{"uri": 7}], "scenes": [{}]}  '
+
+
 @pytest.mark.parametrize(("name", "data", "message"), [
     ("a.stl", bytes(80) + struct.pack("<I", 2**31) + bytes(50), "no triangles|cannot be read"),
     ("a.stl", bytes(80) + struct.pack("<I12fH", 1, *[float("nan")] * 12, 0), "not finite"),
@@ -281,7 +267,7 @@ def test_gltf_files_likewise(home, change, message):
     ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 2000000000\nend_header\n", "cannot be read"),
     ("a.ply", b"ply\nformat ascii 1.0\ncomment TextureFile ../secret/s.png\nend_header\n", "outside of the folder"),
     ("a.glb", b"glTF" + bytes(60), "cannot be read"),
-    ("a.glb", b"glTF", "cannot be read"),
+    ("a.glb", b"glTF" + struct.pack("<III", 2, 20 + len(NUMBERED), len(NUMBERED)) + b"JSON" + NUMBERED, "uri is 7"),
     ("a.gltf", b"[" * 100_000, "cannot be read"),
     ("a.gltf", b"\xff\xfe", "cannot be read"),
 ])  # fmt: skip
@@ -294,17 +280,8 @@ def test_other_formats_likewise(home, name, data, message):
 
 @pytest.mark.parametrize(("options", "message"), [
     ({"size": float("nan")}, "size is nan"),
-    ({"size": float("inf")}, "size is inf"),
     ({"size": 1e-300}, "size is 1e-300; expected greater than or equal to 0.001"),
-    ({"size": "big"}, "size is 'big'; expected a valid number"),
     ({"mass": 1.0, "density": 2.0}, "give only one of them"),
-    ({"up": "x"}, "expected .y. or .z."),
-    ({"mass": 1e300}, "mass is 1e[+]300; expected less than or equal to 10000"),
-    ({"density": -1.0}, "density is -1.0; expected greater than 0"),
-    ({"faces": 0}, "faces is 0; expected greater than or equal to 1"),
-    ({"faces": 1.5}, "faces is 1.5; expected a valid integer"),
-    ({"container": "no"}, "container is 'no'; expected a valid boolean"),
-    ({"siz": 0.1}, "siz is an unknown key. Did you mean 'size'"),
     ({"name": "../x"}, "not a valid name"),
     ({"name": "class"}, "reserved word"),
 ])  # fmt: skip

@@ -141,13 +141,6 @@ def test_compartments_are_open(category, site, way):
         assert met < 0 or met > 0.5
 
 
-def test_shelves_and_boxes_stand_with_their_tops_up():
-    """Fixtures are never turned but about the vertical: the last axis of the body is up."""
-    for category in ("wooden_shelf", "wooden_two_layer_shelf", "white_storage_box", "wine_rack"):
-        name = "top_region" if category == "wine_rack" else "top_side"
-        assert Alone(category).data.site(f"a_{name}").xpos[2] > 0.13
-
-
 @pytest.mark.parametrize("category", BOOKS)
 def test_books_show_their_colour_from_all_sides_but_the_pages(category):
     pixels = get_object(category).spec.compile().tex_data.reshape(-1, 3).astype(float)

@@ -12,7 +12,7 @@ from libero_env.assets.original import OriginalPack, is_original
 from libero_env.assets.original_arena import TEXTURES
 from libero_env.assets.pack import BuiltinPack, problems
 from libero_env.assets.published import check_folder
-from libero_env.assets.simplify import decimate, nearest
+from libero_env.assets.simplify import decimate
 from libero_env.demos.stored_model import compile_stored, model_xml, spec_without_textures
 from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.objects import ObjectModel, register_object
@@ -65,9 +65,8 @@ def test_joints_are_in_order_and_move_the_same_way(pack, measured_objects, compi
     for category in pack.categories():
         model, names = compiled(category), _CUT.get(category, {})
         expected = [joint for joint in measured_objects[category]["joints"] if joint["type"] != "free"]
-        assert [model.joint(j).name for j in range(model.njnt)] == [
-            names.get(j["name"], j["name"]) for j in expected
-        ]
+        ours = [model.joint(j).name for j in range(model.njnt)]
+        assert ours == [names.get(j["name"], j["name"]) for j in expected]
         for found, joint in zip(map(model.joint, range(model.njnt)), expected, strict=True):
             np.testing.assert_allclose(found.range, joint["range"], atol=1e-5)
             np.testing.assert_allclose(found.axis, joint["axis"], atol=1e-4)
@@ -78,13 +77,11 @@ def test_joints_are_in_order_and_move_the_same_way(pack, measured_objects, compi
 
 def test_sites_are_where_regions_expect_them(pack, measured_objects, compiled):
     for category in pack.categories():
-        model = compiled(category)
+        model, sites = compiled(category), measured_objects[category]["sites"]
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        assert [model.site(s).name for s in range(model.nsite)] == [
-            s["name"] for s in measured_objects[category]["sites"]
-        ]
-        for i, site in enumerate(measured_objects[category]["sites"]):
+        assert [model.site(s).name for s in range(model.nsite)] == [site["name"] for site in sites]
+        for i, site in enumerate(sites):
             np.testing.assert_allclose(data.site_xpos[i], site["pos"], atol=2e-5, err_msg=category)
             np.testing.assert_allclose(data.site_xmat[i], site["xmat"], atol=2e-4, err_msg=category)
             used = {"box": 3, "cylinder": 2, "sphere": 1}.get(site["type"], 3)
@@ -130,10 +127,8 @@ def test_the_builtin_pack_has_the_same_physics(pack, compiled):
             assert ours.mass[0] == pytest.approx(theirs.mass[0], rel=2e-3), (category, name)
             np.testing.assert_allclose(ours.inertia, theirs.inertia, rtol=2e-2, atol=1e-9, err_msg=category)
         for field in ("geom_friction", "geom_solimp", "geom_condim"):
-            found = [
-                np.unique(getattr(m, field)[(m.geom_contype | m.geom_conaffinity) > 0], axis=0)
-                for m in (original, builtin)
-            ]
+            solid = [(m, (m.geom_contype | m.geom_conaffinity) > 0) for m in (original, builtin)]
+            found = [np.unique(getattr(m, field)[collide], axis=0) for m, collide in solid]
             np.testing.assert_allclose(*found, err_msg=f"{category} {field}")
 
 
@@ -197,10 +192,8 @@ def test_rooms_are_the_original(pack, measured_workspaces, workspace):
     room = measured_workspaces[load_workspace(workspace).problem.lower()]
     assert model.ngeom == len(room["arena_geoms"])
     for geom, expected in enumerate(room["arena_geoms"]):
-        assert (model.geom(geom).name, model.body(model.geom_bodyid[geom]).name) == (
-            expected["name"],
-            expected["body"],
-        )
+        assert model.geom(geom).name == expected["name"]
+        assert model.body(model.geom_bodyid[geom]).name == expected["body"]
         assert bool(model.geom_contype[geom] or model.geom_conaffinity[geom]) == expected["collides"]
         assert model.geom_group[geom] == expected["group"]
         if expected["type"] != "mesh":  # where the frame of a mesh lies depends on MuJoCo's version
@@ -234,10 +227,7 @@ def test_every_style_has_its_picture(pack):
 
 def test_level_of_detail_leaves_physics_alone(pack, shared, tmp_path, monkeypatch):
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path))
-    whole, light = (
-        pack.build("milk").spec.compile(),
-        OriginalPack(pack.root, 300).build("milk").spec.compile(),
-    )
+    whole, light = (one.build("milk").spec.compile() for one in (pack, OriginalPack(pack.root, 300)))
     assert whole.nmeshface > 10_000 and light.nmeshface <= 320
     assert light.nmeshtexcoord > 0
     np.testing.assert_array_equal(whole.body_mass, light.body_mass)
@@ -256,19 +246,11 @@ def test_simplifying_keeps_the_picture_in_place():
     x, y = (axis.ravel() for axis in np.meshgrid(side, side))
     vertices = np.stack([x, y, 0.02 * np.sin(9 * x)], axis=1)
     corner = np.array([i * 21 + j for i in range(20) for j in range(20)])
-    triangles = np.concatenate(
-        [np.stack([corner, corner + 1, corner + 22], 1), np.stack([corner, corner + 22, corner + 21], 1)]
-    )
+    halves = ((0, 1, 22), (0, 22, 21))
+    triangles = np.concatenate([corner[:, None] + np.array(half) for half in halves])
     points, faces, texcoords, indices = decimate(vertices, triangles, vertices[:, :2], triangles, 100)
     assert len(faces) <= 120 < len(triangles)
     np.testing.assert_allclose(texcoords[indices], points[faces][:, :, :2], atol=0.06)
-
-
-def test_nearest_is_the_nearest():
-    rng = np.random.default_rng(0)
-    points, among = rng.normal(size=(300, 3)), rng.normal(size=(80, 3))
-    distances = np.linalg.norm(points[:, None] - among[None], axis=2)
-    np.testing.assert_array_equal(nearest(points, among), distances.argmin(axis=1))
 
 
 def test_a_scene_is_written_without_textures_and_read_again(pack):

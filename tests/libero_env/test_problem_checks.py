@@ -38,22 +38,16 @@ TEXT = """(define (problem LIBERO_Kitchen_Tabletop_Manipulation) (:domain robosu
 GOAL = TEXT[TEXT.index("(:goal") :]
 FAULTS = [  # old, new, line, message
     ("(-0.03 -0.02 0.03 0.02)", "(0.03 -0.02 -0.03 0.02)", 4, "swapped corners; expected (X0 Y0 X1 Y1) with X0 <= X1"),
-    ("(-0.03 -0.02 0.03 0.02)", "(-0.03 0.02 0.03 -0.02)", 4, "swapped corners"),
     ("(-0.03 -0.02 0.03 0.02)", "(-1e308 -0.02 1e308 0.02)", 4, "is -1e+308; expected greater than or equal to -10"),
-    ("(-0.03 -0.02 0.03 0.02)", "(0 0 0 10.1)", 4, "ranges.0.3 is 10.1; expected less than or equal to 10"),
     ("(0 pi/2)", "(pi/2 0)", 4, "LOW <= HIGH"),
     ("(0 pi/2)", "(0 1e300)", 4, "expected less than or equal to 100"),
     ("(On bowl_1 plate_1)", "(On bowl_1)", 15, "(On bowl_1) has 1 name; expected 2: On takes 2 names"),
-    ("(On bowl_1 plate_1)", "(Up bowl_1 plate_1)", 15, "has 2 names; expected 1: Up takes 1 name"),
     ("(On bowl_1 plate_1)", "(In bowl_1 plate_1)", 15, "plate_1 is an object; expected a region there"),
-    ("(On bowl_1 plate_1)", "(On kitchen_table plate_1)", 15, "kitchen_table is a workspace"),
     ("(On bowl_1 plate_1)", "(On bowl_1 bowl_1)", 15, "is of bowl_1 and itself"),
-    ("(On bowl_2 plate_1)", "(On bowl_2 bowl_2)", 13, "is of bowl_2 and itself"),
     ("(On plate_1 kitchen_table_plate_place)", "(On plate_1 bowl_2)", 12, "by way of others, on itself"),
     ("(On bowl_2 plate_1)", "(On bowl_2 plate_1) (On bowl_2 kitchen_table_plate_place)", 13, "is placed 2 times"),
     ("(Open wooden", "(On) (Open wooden", 16, "not an atom"),
     (GOAL, "(:goal (And)))", 15, "an empty And is always true"),
-    (GOAL, "(:goal (Or (Up bowl_1) (Or))))", 15, "an empty Or is never true"),
     (GOAL, "(:goal (ForAll (?x - milk) (Up ?x))))", 15, "no object is a milk"),
     (GOAL, "(:goal (ForAll (bowl_1 - plate) (Up bowl_1))))", 15, "the variable 'bowl_1'; expected a new name"),
     (GOAL, f"(:goal {'(ForAll (?x ?y - akita_black_bowl) ' * 8}(Up ?x){')' * 10}", 15, "stand for 65536 atoms"),
@@ -62,11 +56,9 @@ FAULTS = [  # old, new, line, message
      "ranges are for the workspace only"),
     ("(plate_place (:target kitchen_table) (:ranges ((0.04 0.18 0.06 0.22))))", "(plate_place (:target kitchen_table))",
      5, "has no extent"),
-    ("(:target wooden_cabinet_1)", "(:target wooden_cabinet_1) (:rgba (0 0 1 1))", 0, ""),
     ("((0 pi/2))", "((0 pi/2) (1 2))", 4, "has 2 ranges of yaw; expected one"),
     ("(:target wooden_cabinet_1)", "(:target wooden_cabinet_1) (:yaw_rotation ((0 1)))", 7, "but no rectangle"),
     ("1 kitchen_table_cabinet_place)", "1 plate_1)", 14, "does not place it: a fixture stands on a rectangle"),
-    ("(On wooden_cabinet_1 kitchen", "(In wooden_cabinet_1 kitchen", 14, "a fixture stands on a rectangle"),
 ]  # fmt: skip
 NAMES = (
     *("robot0_base", "robot", "world", "gripper0", "mount0_x", "ee", "a/b", "../x", "x" * 200),
@@ -78,9 +70,6 @@ NAMES = (
 def test_the_parser_and_the_linter_name_the_line(old, new, line, message):
     assert old in TEXT
     text = TEXT.replace(old, new)
-    if not line:
-        assert bddl.parse(text)
-        return
     with pytest.raises(BDDLError) as caught:
         bddl.parse(text, "mine.bddl")
     assert str(caught.value).startswith(f"mine.bddl:{line}: ") and message in str(caught.value)
@@ -101,10 +90,9 @@ def test_a_region_is_not_also_an_object():
 
 def test_a_file_that_is_too_large_is_refused(tmp_path):
     path = tmp_path / "large.bddl"
-    for size in (1 << 21, 1 << 22):
-        path.write_text("; " + "x" * size)
-        with pytest.raises(BDDLError, match="expected a task file of at most 1048576"):
-            bddl.read(path)
+    path.write_text("; " + "x" * (1 << 21))
+    with pytest.raises(BDDLError, match="expected a task file of at most 1048576"):
+        bddl.read(path)
 
 
 PROBLEM = bddl.parse(TEXT)
@@ -113,14 +101,9 @@ PROBLEM = bddl.parse(TEXT)
 @pytest.mark.parametrize(("changes", "message"), [
     ({"language": 3}, "Problem: language is 3; expected a valid string"),
     ({"language": "a\nb"}, "expected one line without ( ) and ;"),
-    ({"objects": ["plate"]}, "objects is ['plate']; expected a valid dictionary"),
-    ({"fixtures": {"kitchen_table": 1}}, "fixtures.kitchen_table is 1; expected a valid string"),
-    ({"regions": [PROBLEM.regions[0]]}, "expected a valid tuple"),
     ({"init": (Atom("On", ("bowl_1", "nowhere")),)}, "(On bowl_1 nowhere): nowhere is not declared"),
     ({"goal": "Up bowl_1"}, "goal is 'Up bowl_1'; expected an instance of Expression"),
-    ({"scene_properties": {"floor": "a b)"}}, "expected one line without"),
     ({"name": "a b"}, "the name 'a b' is not valid"),
-    ({"obj_of_interest": "bowl_1"}, "obj_of_interest is 'bowl_1'; expected a valid tuple"),
 ], ids=str)  # fmt: skip
 def test_a_problem_made_in_python_is_checked(changes, message):
     with pytest.raises(InvalidInputError) as caught:
@@ -131,9 +114,7 @@ def test_a_problem_made_in_python_is_checked(changes, message):
 
 @pytest.mark.parametrize("make", [
     lambda: Region("a", "kitchen_table", ((0.0, 0.0, 1.0),)),
-    lambda: Region("a", "kitchen_table", (("0", 0.0, 1.0, 1.0),)),
     lambda: Region("a", "kitchen_table", ((0.0, 0.0, math.nan, 1.0),)),
-    lambda: Region("a", "kitchen_table", rgba=(1.0, 0.0)),
     lambda: Atom("On", ()),
     lambda: Not("Up bowl_1"),
     lambda: Or([Atom("Up", ("bowl_1",))]),
@@ -186,12 +167,8 @@ def test_a_predicate_has_numbers_and_words_of_the_task_file(closing):
     progress = env.reset(seed=0)[1]["progress"]
     assert list(progress.values()) == [False, True, True, False, False]
     assert "(Within butter_1 plate_1 0.2 outside)" in progress
-    for wrong, message in (
-        ("far", "far is not a number; expected one such as 0.05"),
-        ("plate_1", "plate_1 is not a number"),
-    ):
-        with pytest.raises(InvalidInputError, match=message):
-            make_task(goal=("Within", "butter_1", "plate_1", wrong, "inside"), **definition)
+    with pytest.raises(InvalidInputError, match="plate_1 is not a number; expected one such as 0.05"):
+        make_task(goal=("Within", "butter_1", "plate_1", "plate_1", "inside"), **definition)
 
 
 def task(text: str) -> Task:

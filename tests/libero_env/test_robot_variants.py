@@ -14,6 +14,7 @@ from libero_env.sim.osc import rotate
 from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_task
 
+pytestmark = pytest.mark.sim
 WRIST = '<geom type="mesh" group="0" mesh="link7" name="link7_collision"/>'
 
 
@@ -32,7 +33,6 @@ def colliders(model: mujoco.MjModel) -> list[str]:
     return [model.geom(g).name for g in np.flatnonzero(model.geom_contype)]
 
 
-@pytest.mark.sim
 def test_only_the_wrist_differs():
     ours, later = (arm(name) for name in ROBOTS)
     assert set(colliders(later)) - set(colliders(ours)) == {"robot0_link7_collision"}
@@ -41,7 +41,6 @@ def test_only_the_wrist_differs():
         np.testing.assert_array_equal(getattr(ours, field), getattr(later, field))
 
 
-@pytest.mark.sim
 @pytest.mark.parametrize("name", ROBOTS)
 def test_either_version_of_the_package_supplies_both(name, tmp_path, monkeypatch):
     folder, expected = robot_assets(), arm(name)
@@ -62,7 +61,6 @@ def test_either_version_of_the_package_supplies_both(name, tmp_path, monkeypatch
     assert ("robot0_link7_collision" in colliders(model)) == (name != DEFAULT_ROBOT)
 
 
-@pytest.mark.sim
 def test_environments_have_the_robot_that_they_name():
     task = get_task("libero_object/0")
     assert build_scene(task.problem).robot == DEFAULT_ROBOT
@@ -75,7 +73,6 @@ def test_environments_have_the_robot_that_they_name():
         LiberoEnv(task, robot="robosuite-1.5")
 
 
-@pytest.mark.sim
 def test_the_arm_carries_its_mount():
     model = build_scene(get_task("libero_goal/0").problem).model
     mount = model.body("mount0_base")

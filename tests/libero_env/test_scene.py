@@ -36,9 +36,8 @@ def scene(task):
 @pytest.fixture
 def view(scene):
     simulations = LoopSimulations(scene.model)
-    simulations.reset(
-        [0], sample_start(scene, np.random.default_rng(0)).qpos[None], np.zeros((1, scene.model.nv))
-    )
+    start = sample_start(scene, np.random.default_rng(0))
+    simulations.reset([0], start.qpos[None], np.zeros((1, scene.model.nv)))
     return StateView(scene, simulations)
 
 
@@ -56,11 +55,8 @@ def test_the_workspace_has_the_measured_parameters(scene, measured_workspaces):
     data.qpos[:9] = figures["arm_qpos"]
     mujoco.mj_forward(model, data)
     assert model.opt.timestep == figures["timestep"]
-    assert (model.opt.impratio, model.opt.cone, model.opt.integrator) == (
-        20.0,
-        figures["cone"],
-        figures["integrator"],
-    )
+    assert model.opt.impratio == 20.0
+    assert (model.opt.cone, model.opt.integrator) == (figures["cone"], figures["integrator"])
     assert (model.opt.density, model.opt.viscosity) == (figures["density"], figures["viscosity"])
     np.testing.assert_allclose(data.site("gripper0_grip_site").xpos, figures["grip_site_world"], atol=1e-5)
     for name, camera in figures["cameras"].items():
@@ -77,11 +73,6 @@ def test_the_workspace_has_the_measured_parameters(scene, measured_workspaces):
     for i, actuator in enumerate(figures["actuators"]):
         assert model.actuator(i).name == actuator["name"]
         np.testing.assert_allclose(model.actuator_ctrlrange[i], actuator["ctrlrange"])
-
-
-def test_the_scene_has_few_faces(scene):
-    drawn = scene.model.geom_dataid[(scene.model.geom_group == 1) & (scene.model.geom_dataid >= 0)]
-    assert scene.model.mesh_facenum[drawn].sum() < 10_000
 
 
 def test_placement_fills_the_regions_and_nothing_touches(scene, task):
@@ -108,18 +99,6 @@ def test_sampling_in_the_model_of_a_simulation_leaves_it_as_it_was():
     assert np.array_equal(model.body_pos, poses[0]) and np.array_equal(model.body_quat, poses[1])
 
 
-def test_a_full_region_is_an_error_with_remedies(task):
-    text = task.bddl_text
-    crowded = bddl.parse(text)
-    region = crowded.region("floor_bin_region").ranges[0]
-    for other in crowded.regions:
-        if other.ranges:
-            numbers = " ".join(repr(v) for v in other.ranges[0])
-            text = text.replace(f"({numbers})", f"({' '.join(repr(v) for v in region)})")
-    with pytest.raises(PlacementError, match="make their regions larger"):
-        sample_start(build_scene(bddl.parse(text)), np.random.default_rng(0))
-
-
 def test_an_object_without_a_place_is_an_error(task):
     text = task.bddl_text.replace("(On milk_1 floor_other_object_region_2)", "")
     with pytest.raises(PlacementError, match="milk_1"):
@@ -135,10 +114,7 @@ def test_predicates_do_not_change_the_state(view, task):
 
 
 def test_goals_can_be_nested(view):
-    yes, no = (
-        Atom("In", ("milk_1", "floor_other_object_region_2")),
-        Atom("In", ("milk_1", "basket_1_contain_region")),
-    )
+    no = Atom("In", ("milk_1", "basket_1_contain_region"))
     assert not evaluate(no, view)
     yes = Not(no)
     assert evaluate(And((yes, Not(no))), view) and not evaluate(And((yes, no)), view)
@@ -153,11 +129,10 @@ def test_images_are_upright_and_reproducible():
     frame = env.reset(options={"init_state": 0})[0]["agentview_rgb"]
     again = env.reset(options={"init_state": 0})[0]["agentview_rgb"]
     np.testing.assert_array_equal(frame, again)
-    brown = lambda image: ((image[..., 0] > image[..., 2] * 1.6) & (image[..., 0] > 60)).sum()  # noqa: E731
-    assert brown(frame[24:48, 40:]) > 5 * max(brown(frame[:16, :32]), 1), (
-        "the basket stands on the right, below middle"
+    brown = (frame[..., 0] > frame[..., 2] * 1.6) & (frame[..., 0] > 60)
+    assert brown[24:48, 40:].sum() > 5 * max(brown[:16, :32].sum(), 1), (
+        "the basket is on the right, below middle"
     )
-    env.close()
     env.close()
 
 
@@ -192,9 +167,8 @@ def test_images_do_not_depend_on_the_threads_of_the_software_renderer():
         environment = {k: v for k, v in os.environ.items() if k != "LP_NUM_THREADS"}
         environment |= {} if threads is None else {"LP_NUM_THREADS": threads}
         command = [sys.executable, "-c", PICTURE]
-        return subprocess.run(
-            command, env=environment, capture_output=True, text=True, check=True
-        ).stdout.split()
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return done.stdout.split()
 
     (default, without), (threaded, three) = draw(None), draw("3")
     assert (without, three) == ("0", "3") and default == threaded

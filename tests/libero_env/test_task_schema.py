@@ -37,45 +37,26 @@ scene_properties: {floor: light-gray}
 BAD = [  # old, new, line, message
     ("scene: kitchen", "scene: 5", 1, "scene is 5; expected one of kitchen"),
     ("scene: kitchen", "scene: ../scene.yaml", 1, "is not in the folder of the task's file"),
-    ("scene: kitchen", "scene: mine.yaml", 1, "scenes include each other without end: mine.yaml -> mine.yaml"),
     ("scene: kitchen", f"scene: {'x' * 300}.yaml", 1, "is not the name of a file"),
-    ("[wooden_cabinet]", "{wooden_cabinet: many}", 2, "wooden_cabinet is 'many'; expected a valid integer"),
     ("plate: 1", "plate: 1000000000", 5, "plate is 1000000000; expected less than or equal to 100"),
     ("- akita_black_bowl", "- ../akita", 4, "is not valid; expected letters"),
-    ("furniture: [wooden_cabinet]", "regions: 7", 2, "regions is 7; expected an object"),
-    ("[0, 0]", "[0, .nan]", 8, "place.akita_black_bowl_1.1 is nan; expected a finite number"),
     ("[0, 0]", "[0, there]", 8, "'there' is not a finite number; expected one such as 0.25 or -pi/4"),
     ("[0, 0]", "{ranges: [[0, 0, -1, 1]]}", 8, "has swapped corners"),
     ("[0, 0]", "{at: [0, 0], hafl: 0.1}", 8, "hafl is an unknown key"),
     ("[0, 0]", "12", 8, "is 12; expected [x, y], {at: [x, y], half: h}, or the name of what it is on"),
     ("[0, 0]", "'On On On'", 8, "'On On On' is not a place; expected such as plate_1"),
-    ("[0, 0]", "akita_black_bowl_1", 8, "is of akita_black_bowl_1 and itself"),
-    ("half: [0.01, 0.02]", "half: -1", 11, "plate_1.half"),
     ("yaw: pi", "yaw: 90", 7, "90 rad is more than two turns; expected radians: 90 degrees are pi/2"),
-    ("yaw: pi", "yaw: [pi, 0]", 7, "is not a range; expected (LOW HIGH)"),
     ("init: [Open", "init: [Opened", 12, "Opened is not a predicate. Did you mean 'Open'?"),
     ("  - Up plate_1", "  - Up", 15, "not an atom"),
-    ("  - Up plate_1", "  - 5", 15, "goal.1 is 5; expected a valid string"),
     ("  - Up plate_1", "  - (Or (Up plate_1)", 15, "is not an atom or expression"),
     ("Put the bowl on the plate", '"Put the bowl\\non the plate"', 16, "cannot be written; expected one line"),
     ("Put the bowl on the plate", "x\nname: ../../x", 17, "is not a valid name of a name"),
     ("Put the bowl on the plate", "x\nregions: {kitchen_table: {a: {at: [0, 0]}}}", 1, "it has at, but no half"),
     ("Put the bowl on the plate", "x\nfixtures: {x: nothing}", 17, "fixture category"),
     ("Put the bowl on the plate", "x\ntasks: 5", 17, "expected a list of at most 1000 tasks"),
-    ("Put the bowl on the plate", "x\ntasks: [{goal: Up plate_1}, {goal: 5}]", 17, "goal is 5; expected"),
     ("Put the bowl on the plate", "x\ntasks: [{name: a}, {name: a, init: []}]", 17, "two tasks are named a; give each"),
-    ("{floor: light-gray}", "[light-gray]", 17, "scene_properties is ['light-gray']"),
     ("scene: kitchen", "scene: kitchen\nscene: floor", 2, "the key scene occurs twice"),
-    ("scene: kitchen", "5: kitchen", 1, "the key 5 is not a text"),
 ]  # fmt: skip
-
-
-def test_the_text_is_a_task(tmp_path):
-    (tmp_path / "mine.yaml").write_text(TEXT.replace("light-gray", "rustic_floor"))
-    task = read_task(tmp_path / "mine.yaml")
-    assert task.name == "mine" and task.problem.region("kitchen_table_plate_1_start").ranges == (
-        (0.04, 0.18, 0.06, 0.22),
-    )
 
 
 @pytest.mark.parametrize(("old", "new", "line", "message"), BAD, ids=lambda value: str(value)[:40])
@@ -124,28 +105,23 @@ def test_a_goal_of_no_predicate_is_refused_where_it_is_read(tmp_path, word, mess
     with pytest.raises(InvalidInputError) as caught:
         read_goal(tmp_path, goal)
     assert f"{tmp_path}/mine.yaml:13: (" in str(caught.value) and message in str(caught.value)
-    (tmp_path / "mine.bddl").write_text(
-        get_task("libero_goal/8").bddl_text.replace("(And ", f"(And {goal} ", 1)
-    )
+    text = get_task("libero_goal/8").bddl_text.replace("(And ", f"(And {goal} ", 1)
+    (tmp_path / "mine.bddl").write_text(text)
     with pytest.raises(BDDLError, match=f"mine.bddl:[0-9]+: .*{message[:14]}"):
         read_task(tmp_path / "mine.bddl")
 
 
 @pytest.mark.parametrize("goal", ["[true, plate_1]", "[True, a, b]", "[[FALSE, a], [Up, plate_1]]", "true"])
 def test_a_boolean_is_no_word_of_a_goal(tmp_path, goal):
-    with pytest.raises(
-        InvalidInputError,
-        match=r"mine.yaml:13: goal.* is (True|\[True|\[False|False).*expected a valid string",
-    ):
+    told = r"mine.yaml:13: goal.* is (True|\[True|\[False|False).*expected a valid string"
+    with pytest.raises(InvalidInputError, match=told):
         read_goal(tmp_path, goal)
 
 
 def test_scenes_that_include_each_other_end(tmp_path):
     for name, other in (("a", "b"), ("b", "c"), ("c", "a")):
         (tmp_path / f"{name}.yaml").write_text(f"scene: {other}.yaml\n")
-    with pytest.raises(
-        InvalidInputError, match=r"c.yaml:1: scenes include each other without end: .*c.yaml -> a.yaml"
-    ):
+    with pytest.raises(InvalidInputError, match=r"c.yaml:1: scenes include each other .*c.yaml -> a.yaml"):
         read_task(tmp_path / "a.yaml")
 
 
@@ -168,9 +144,8 @@ def test_a_scene_in_a_folder_below_may_name_one_beside_the_task(tmp_path):
 
 
 def test_parameters_of_a_scene_have_types_too():
-    with pytest.raises(
-        LiberoError, match=r"task, in grocery_floor: regions\.floor\.target_object_region\.at is 'x'"
-    ):
+    told = r"task, in grocery_floor: regions\.floor\.target_object_region\.at is 'x'"
+    with pytest.raises(LiberoError, match=told):
         make_task(scene="grocery_floor", language="x", **{"with": {
             "target": "milk", "other": ["butter"] * 5, "target_at": "x", "first_other_at": [0, 0]
         }})  # fmt: skip
@@ -180,13 +155,11 @@ def test_parameters_of_a_scene_have_types_too():
     "name", ["", "..", ".x", "a/b", "a\\b", "a\0b", "a\nb", " x", "x" * 201, "\u202ex", 5]
 )
 def test_a_task_has_a_name_that_files_can_have(name):
-    problem = make_task(
-        "x", scene="table", objects="plate", place={"plate": [0, 0]}, goal="Up plate_1"
-    ).problem
+    task = make_task("x", scene="table", objects="plate", place={"plate": [0, 0]}, goal="Up plate_1")
     with pytest.raises(InvalidInputError, match="is not a valid name of a task"):
-        Task("file", 0, name, "x", "x", problem)
+        Task("file", 0, name, "x", "x", task.problem)
     with pytest.raises(InvalidInputError, match="is not a valid name of a suite"):
-        Task(name, 0, "x", "x", "x", problem)
+        Task(name, 0, "x", "x", "x", task.problem)
 
 
 def test_a_template_is_a_task_whatever_the_language_is(tmp_path, capsys):
@@ -208,14 +181,8 @@ MODEL = '<mujoco><worldbody><body name="main"><geom name="g0" size="0.02"/></bod
 
 @pytest.mark.parametrize(("old", "new", "line", "message"), [
     ("-0.03]", "deep]", 1, "bottom_offset.2 is 'deep'; expected a valid number"),
-    ("[0, 0, 0.03]", "[0, 0]", 2, "top_offset is [0, 0]; list should have at least 3 items"),
     ("0, 0.03]", "0, -0.3]", 2, "its highest point is below its lowest"),
-    ("0.04", ".nan", 3, "horizontal_radius is nan; expected a finite number"),
-    ("0.04", "1e9", 3, "expected less than or equal to 10"),
-    ("{z: [0, 1]}", "{w: [0, 1]}", 4, "expected 'x', 'y' or 'z'"),
     ("{z: [0, 1]}", "{z: [1, 0]}", 4, "is no range"),
-    ("{z: [0, 1]}", "{z: 1}", 4, "rotation.z is 1; expected a valid array"),
-    ("horizontal_radius", "horizontal_radus", 3, "horizontal_radus is an unknown key. Did you mean 'horizontal_r"),
     ("rotation: {z: [0, 1]}", "name: other", 4, "the name 'other' is not that of its folder thing"),
     ("rotation: {z: [0, 1]}", "grasp: {width: null}", 4, "reason is missing"),
     (OBJECT, "- 1\n", 1, "expected an object"),

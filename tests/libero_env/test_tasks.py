@@ -10,9 +10,8 @@ import pytest
 import yaml
 
 from libero_env.errors import UnknownNameError
-from libero_env.storage import read_yaml
-from libero_env.tasks import bddl, builder, get_suite, get_task, read_task, suite_names
-from libero_env.tasks.builder import build_problem, language_from_name
+from libero_env.tasks import bddl, get_suite, get_task, read_task, suite_names
+from libero_env.tasks.builder import build_problem
 from libero_env.tasks.expression import Atom, Not, Or
 from libero_env.tasks.problem import differences
 
@@ -104,18 +103,6 @@ def test_libero_100_is_90_then_10():
     assert get_task("libero_130/30") is get_task("libero_90/0")
 
 
-def test_every_scene_is_used_and_has_a_description():
-    folder = Path(builder.__file__).parent / "data" / "scenes"
-    facts = [
-        read_yaml(f"tasks/data/{name}.yaml")
-        for name in suite_names()
-        if name not in ("libero_100", "libero_130")
-    ]
-    used = {task.get("scene", suite.get("scene")) for suite in facts for task in suite["tasks"]}
-    assert {file.stem for file in folder.iterdir()} == used
-    assert all(file.read_text().startswith("# ") for file in folder.iterdir())
-
-
 @pytest.mark.parametrize("name", suite_names())
 def test_orders_are_permutations(name):
     suite = get_suite(name)
@@ -127,14 +114,11 @@ def test_orders_are_permutations(name):
 @pytest.mark.parametrize(("ask", "hint"), [
     (lambda: get_suite("libero_objects"), "Did you mean 'libero_object'? Valid: libero_10, libero_100, libero_130, "),
     (lambda: get_suite("libero_90").order(1), "task order of libero_90 1. Valid: 0"),
-    (lambda: get_suite("libero_object").order(21), "task order of libero_object 21"),
     (lambda: get_suite("libero_object").order(-1), "Valid: 0 to 20"),
     (lambda: get_task("libero_object/10"), "index of libero_object '10'"),
     (lambda: get_task("LIBERO_OBJECT"), "unknown suite 'LIBERO_OBJECT'. Did you mean 'libero_object'?"),
-    (lambda: get_task("libero-object"), "unknown suite 'libero-object'. Did you mean 'libero_object'?"),
     (lambda: get_task("libero_object-12"), "index of libero_object '12'. Valid: 0 to 9"),
     (lambda: get_task("nope"), "libero_100/0 to libero_100/99, libero_130/0 to libero_130/129, "),
-    (lambda: get_task("libero_object/-1"), "index of libero_object '-1'"),
     (lambda: get_task("pick_up_the_milk_and_put_it_in_the_basket"),
      "Did you mean 'pick_up_the_milk_and_place_it_in_the_basket'"),
 ])  # fmt: skip
@@ -142,22 +126,6 @@ def test_unknown_names_are_answered_with_the_valid_ones(ask, hint):
     with pytest.raises(UnknownNameError, match="Valid: ") as caught:
         ask()
     assert hint in str(caught.value)
-
-
-def test_language_of_names_with_a_scene():
-    assert language_from_name("KITCHEN_SCENE10_close_the_top_drawer") == "close the top drawer"
-    assert language_from_name("pick_up_the_milk") == "pick up the milk"
-
-
-def test_a_scene_with_fixtures_yaw_and_parameters():
-    problem = build_problem(SCENE, TASK)
-    assert list(problem.objects) == ["black_bowl_1", "black_bowl_2", "plate_1"]
-    assert list(problem.objects.values()) == ["black_bowl", "black_bowl", "plate"]
-    assert problem.region("kitchen_table_stove_region").ranges == (pytest.approx((0.09, 0.18, 0.11, 0.22)),)
-    assert problem.region("kitchen_table_stove_region").yaw == ((3.141592653589793, 3.141592653589793),)
-    assert problem.region("kitchen_table_front").yaw == ((-1.5707963267948966, 0.0),)
-    assert problem.init[1] == Atom("On", ("plate_1", "black_bowl_2"))
-    assert bddl.parse(bddl.write(problem)) == problem
 
 
 def test_a_task_adds_to_its_scene():
@@ -170,11 +138,6 @@ def test_a_task_adds_to_its_scene():
     assert problem.goal == Or((back, Not(Atom("Turnon", ("stove_1",)))))
     assert Atom("On", ("black_bowl_1", "kitchen_table_back")) in problem.init
     assert SCENE["regions"]["kitchen_table"].keys() == {"stove_region", "front"}
-
-
-def test_atoms_that_a_task_adds_come_first():
-    problem = build_problem(SCENE, {**TASK, "init_also": ["Turnon stove_1"]})
-    assert problem.init == (Atom("Turnon", ("stove_1",)), *build_problem(SCENE, TASK).init)
 
 
 def test_sites_may_be_a_list():

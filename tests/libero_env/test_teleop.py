@@ -22,7 +22,6 @@ from libero_env.teleop.session import (
     RESET,
     Keyboard,
     SpaceMouse,
-    Status,
     Teleop,
     record_session,
 )
@@ -231,8 +230,3 @@ def test_the_command(tmp_path, monkeypatch, capsys):
     assert cli.main(["teleop", TASK, "--out", str(out), "--pos-sensitivity", "0.1", "--size", "16"]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"{out}: 1 of 1 demonstrations"
     assert len(read_demos(out)) == 1
-
-
-def test_a_status_reads_as_a_line():
-    status = Status("close it", {"(Close door_1)": False}, 7, 1, 3)
-    assert str(status) == "close it | (Close door_1) no | step 7 | 1 of 3 recorded"

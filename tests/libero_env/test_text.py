@@ -12,7 +12,6 @@ from libero_env.storage import read_json, write_json
 from libero_env.text import (
     Cell,
     Table,
-    closest,
     duration,
     flatten,
     json_safe,
@@ -21,7 +20,6 @@ from libero_env.text import (
     shorten,
     show_bytes,
     shown,
-    suggest,
 )
 
 
@@ -29,12 +27,6 @@ from libero_env.text import (
 class Sample:
     path: Path
     rows: np.ndarray
-
-
-def test_names_are_suggested_whatever_their_case():
-    assert closest("Libero_Gaol", ["libero_goal", "libero_10"]) == "libero_goal"
-    assert suggest("PLATE", ["plate"]) == " Did you mean 'plate'?"
-    assert closest("x", ["libero_goal"]) is None and suggest("x", []) == ""
 
 
 def test_long_values_are_cut():

@@ -31,14 +31,11 @@ class Content(TypedDict, total=False):
 @pytest.mark.parametrize(("value", "message"), [
     ({"parts": 5}, "parts is 5; expected a valid array"),
     ({"parts": [{"share": 0}]}, "parts.0.share is 0; expected greater than 0"),
-    ({"parts": [{"share": 1.5}]}, "parts.0.share is 1.5; expected less than or equal to 1"),
     ({"parts": [{"share": "1"}]}, "parts.0.share is '1'; expected a valid number"),
     ({"parts": [{"share": float("nan")}]}, "parts.0.share is nan; expected a finite number"),
     ({"parts": [{"share": 1, "count": True}]}, "parts.0.count is True; expected a valid integer"),
-    ({"parts": [{"share": 1, "count": 1.5}]}, "parts.0.count is 1.5; expected a valid integer"),
     ({"parts": [{}]}, "parts.0.share is missing"),
     ({"parts": [{"share": 1, "cuont": 2}]}, "parts.0.cuont is an unknown key. Did you mean 'count'? Valid: "),
-    ({"names": []}, "should have at least 1 item"),
     ({"names": ["bowl"] * 3}, "should have at most 2 items"),
     ({"names": ["plat"]}, "expected 'bowl' or 'plate'. Did you mean 'plate'?"),
     ({"mode": "fsat"}, "expected 'fast' or 'faithful'. Did you mean 'fast'?"),
@@ -92,7 +89,6 @@ def test_a_checked_class_is_a_frozen_dataclass():
 @pytest.mark.parametrize(("make", "message"), [
     (lambda: Box(0), "Box: size is 0; expected greater than 0"),
     (lambda: Box(1, ["a"]), "Box: names is ['a']; expected a valid tuple"),
-    (lambda: Box(1, (5,)), "Box: names.0 is 5; expected a valid string"),
     (lambda: Box(), "Box: size is missing"),
     (lambda: Box(1, nmaes=()), "Box: nmaes is an unknown key. Did you mean 'names'? Valid: size, names"),
     (lambda: Box(11), "too large"),

@@ -22,6 +22,7 @@ from lifelong.nn.flow import prefix_weights
 from lifelong.policies.bc_mlp import BCMLP
 from lifelong.seeding import generator
 from lifelong.types import PolicySpec, Unfinished
+from tests.harness.evaluations import write_policy
 
 STILL = [0, 0, 0, 0, 0, 0, -1]
 
@@ -54,13 +55,10 @@ def run(words: str, length: int, replan: int | None = None, steps: int = 12, cou
 
 @pytest.mark.parametrize(("text", "stored"), [
     ("latency=120ms,merge=replace", "latency=120ms"),
-    ("latency=0.12s", "latency=120ms"),
     ("wait=hold, latency=3steps", "latency=3steps,wait=hold"),
     ("every=8,merge=rtc", "latency=0ms,merge=rtc,every=8"),
     ("merge=ensemble,m=0.1,latency=1e2ms", "latency=100ms,merge=ensemble,m=0.1"),
-    ("latency=normal:0.12/0.02s", "latency=normal:120/20ms"),
     ("latency=lognormal:0.12/0.4s", "latency=lognormal:120/0.4ms"),
-    ("latency=uniform:1/3steps", "latency=uniform:1/3steps"),
     ("latency=40/45.5/210ms", "latency=40/45.5/210ms"),
 ])  # fmt: skip
 def test_words_of_a_clock(text, stored):
@@ -70,34 +68,25 @@ def test_words_of_a_clock(text, stored):
 
 @pytest.mark.parametrize(("text", "told"), [
     ("latency=-50ms", "'-50' is not a number from 0"),
-    ("latency=nanms", "'nan' is not a number from 0"),
-    ("latency=infs", "'inf' is not a number from 0"),
     ("latency=50", "latency=50: expected 120ms"),
     ("latency=normal:1/2/3ms", "expected 120ms"),
-    ("latency=gamma:1/2ms", "expected 120ms"),
     ("latency=uniform:9/2ms", "second number is the largest"),
-    ("latency=", "expected 120ms"),
     ("latency=trace:nowhere.txt", "trace:nowhere.txt: No such file"),
     ("latency=trace:/dev/zero", "it is a folder, a pipe or a device"),
-    ("latency=trace:.", "it is a folder, a pipe or a device"),
     ("latency=trace:empty.txt", "expected a line with the unit .*got '' and 0"),
     ("latency=trace:bare.txt", "expected a line with the unit .*got '45' and 1"),
-    ("latency=trace:unit.txt", "got 'ms' and 0"),
     ("latency=trace:words.txt", "words.txt, line 3: 'soon' is not a number"),
     ("latency=trace:bytes.txt", "not text"),
     ("merge=average", "clock.merge is 'average'; expected .*'rtc'"),
-    ("wait=stop", "clock.wait is 'stop'; expected .*'hold'"),
     ("every=0", "every.*1"),
-    ("every=two", "every"),
     ("m=0.1", "m is of merge=ensemble"),
-    ("merge=ensemble,m=-1", "'-1' is not a number from 0"),
     ("merge=rtc,wait=hold", "merge=rtc executes the rest .*wait=rest"),
     ("wait=hold,wait=rest", "wait is named twice"),
     ("latencies=5ms", "Did you mean 'latency'"),
 ])  # fmt: skip
 def test_words_that_mean_nothing_take_one_line(text, told, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    contents = {"empty": b"", "bare": b"45\n50", "unit": b"ms\n", "words": b"ms\n45\nsoon", "bytes": b"\xff"}
+    contents = {"empty": b"", "bare": b"45\n50", "words": b"ms\n45\nsoon", "bytes": b"\xff"}
     for name, content in contents.items():
         (tmp_path / f"{name}.txt").write_bytes(content)
     with pytest.raises(LiberoError, match=told) as caught:
@@ -109,8 +98,6 @@ def test_a_protocol_keeps_a_clock_in_the_words_that_are_stored(tmp_path):
     plain = load_protocol("openpi")
     with pytest.raises(ProtocolError, match="in the words that are stored it is 'latency=100ms'"):
         plain.changed({"action.clock": "latency=0.1s"})
-    with pytest.raises(ProtocolError, match="action.clock: clock: latency=-1ms"):
-        plain.changed({"action.clock": "latency=-1ms"})
     os.mkfifo(tmp_path / "pipe")  # which nobody opens: a result or a protocol may be somebody else's
     with pytest.raises(ProtocolError, match="a protocol has the latencies, and only --clock names a file"):
         plain.changed({"action.clock": f"latency=trace:{tmp_path / 'pipe'}"})
@@ -166,11 +153,8 @@ WAITS, HOLDS = (0.0, 0.0, -1.0), (0.0, 0.0, 0.5)  # before it has acted, and lat
     # single actions are late, and none is lost
     ("latency=100ms", 1, 1,
      [WAITS, WAITS, (0, 0), HOLDS, HOLDS, (3, 0), HOLDS, HOLDS, (6, 0), HOLDS, HOLDS, (9, 0)]),
-    ("latency=100ms,wait=repeat", 1, 1,
-     [WAITS, WAITS, (0, 0), (0, 0), (0, 0), (3, 0), (3, 0), (3, 0), (6, 0), (6, 0), (6, 0), (9, 0)]),
     ("latency=0ms", 5, 2,
      [(0, 0), (0, 1), (2, 0), (2, 1), (4, 0), (4, 1), (6, 0), (6, 1), (8, 0), (8, 1), (10, 0), (10, 1)]),
-    ("latency=1s", 5, 2, [WAITS] * 12),
 ])  # fmt: skip
 def test_what_is_executed_while_an_answer_is_awaited(words, length, replan, wanted):
     found = run(words, length, replan)[2][:, 0]
@@ -227,7 +211,6 @@ def test_a_policy_that_inpaints_is_told_what_is_left():
 
 @pytest.mark.parametrize(("words", "length", "told"), [
     ("merge=ensemble", 1, "merge=ensemble merges chunks, and the policy answers with single actions"),
-    ("merge=rtc", 1, "merge=rtc merges chunks"),
     ("every=5", 4, "every=5, and the policy's answers have 4 actions"),
 ])  # fmt: skip
 def test_answers_that_cannot_be_merged_are_refused(words, length, told):
@@ -338,20 +321,6 @@ def test_the_soft_mask():
         np.testing.assert_allclose(prefix_weights(length, delay), wanted, atol=1e-6)
 
 
-POLICY = """
-import numpy as np
-
-
-class Chunks:
-    cameras, camera_size = ("agentview", "robot0_eye_in_hand"), (16, 16)
-
-    def predict(self, observations):
-        return np.tanh(np.arange(56).reshape(8, 7) * observations["state"][:, :7, None].swapaxes(1, 2))
-
-
-def make():
-    return Chunks()
-"""
 WORDS = [
     "chunks:make", "--suite", "libero_goal/1", "--episodes", "4", "--horizon", "12", "--threads", "1",
     "--protocol", "openpi", "--names", "protocol", "--json"
@@ -361,7 +330,9 @@ WORDS = [
 @pytest.fixture
 def chunks(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "chunks.py").write_text(POLICY)
+    predicted = "np.tanh(np.arange(56).reshape(8, 7) * observations['state'][:, :7, None].swapaxes(1, 2))"
+    own = "cameras, camera_size = ('agentview', 'robot0_eye_in_hand'), (16, 16)"
+    write_policy(tmp_path / "chunks.py", predicted, own)
     return tmp_path
 
 
@@ -399,10 +370,8 @@ def test_an_evaluation_on_a_clock(chunks, capsys):
 @pytest.mark.sim
 @pytest.mark.parametrize(("words", "told"), [
     (["expert", "--clock", "merge=ensemble"], "the policy answers with single actions"),
-    (["expert", "--clock", "every=2"], "every=2, and the policy's answers have 1 actions"),
     (["chunks:make", "--clock", "merge=rtc"], "merge=rtc needs a policy that inpaints its chunks"),
     (["chunks:make", "--clock", "latency=-50ms"], "is not a number from 0"),
-    (["chunks:make", "--names", "native", "--clock", "merge=average"], "merge"),
 ])  # fmt: skip
 def test_a_clock_that_cannot_be_is_refused_before_anything_runs(chunks, words, told, capsys):
     assert main(["eval", *words, "--suite", "libero_goal/1", "--out", "found"]) == 2

@@ -138,10 +138,8 @@ def learned(tmp_path, monkeypatch):
             if after not in there:
                 raise LifelongError(f"{path} has no checkpoint after task {after}; valid: {there}")
             state = load(folder.task_path(after))
-            policy, found = (
-                run_context(tmp_path, algorithm).policy,
-                run_context(tmp_path, algorithm).algorithm,
-            )
+            fresh = run_context(tmp_path, algorithm)
+            policy, found = fresh.policy, fresh.algorithm
             policy.load_state_dict(state["policy"])
             found.load_state_dict(state["algorithm"], {k: dataset(k) for k in range(3)})
             return LoadedRun(
@@ -166,9 +164,8 @@ def test_a_finished_run_is_diagnosed_and_its_page_written(learned, tab):
     assert found.learned == 3 and not found.notes
     assert [s.task for s in found.swaps] == [0, 1]
     assert [o.tasks for o in found.overlaps] == [(0, 1), (0, 2), (1, 2)]
-    assert {(u.task, u.part) for u in found.updates} == {(2, "encoder"), (2, "temporal"), (2, "head")}, (
-        "task 1 kept the weights that it began with, those of its best epoch"
-    )
+    # task 1 kept the weights that it began with, those of its best epoch
+    assert {(u.task, u.part) for u in found.updates} == {(2, "encoder"), (2, "temporal"), (2, "head")}
     assert [m.task for m in found.moved] == [1, 2] and found.moved[0].kl == 0 < found.moved[1].kl
     assert all(0 < o.all <= 1 for o in found.overlaps)
     assert diagnose(request) == found, "the same call gives the same numbers"

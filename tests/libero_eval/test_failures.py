@@ -61,20 +61,6 @@ def test_results_keep_causes_and_their_digest_is_that_without(tmp_path):
     assert "failed because" not in total_rows(plain)[-1]
 
 
-def test_comparisons_show_the_causes_of_each_policy(tmp_path):
-    policies = [
-        Group("good", (with_failures(drawn_result(0.9, 1), HIT),), ("a",)),
-        Group("bad", (with_failures(drawn_result(0.7, 2, policy="other:make"), AWAY),), ("b",)),
-    ]
-    found = compare_groups(policies)
-    assert list(found.rates[0].causes) == ["collided"] and list(found.rates[1].causes) == ["never reached"]
-    rows = [line.split() for line in render(found).splitlines()]
-    assert ["failed", "because", "collided", "never", "reached"] in rows
-    assert ["bad", "0", str(found.rates[1].causes["never reached"])] in rows
-    page = write_page(found, tmp_path / "page.html").read_text()
-    assert "Why episodes failed" in page and "Never reached" in page
-
-
 def with_costs(result, *costs):
     """Return a result whose episodes have these costs, in turn."""
     tasks = [replace(t, costs=tuple(costs[i % len(costs)] for i in t.init_states)) for t in result.tasks]
@@ -96,30 +82,19 @@ def test_results_keep_costs_and_say_how_many_episodes_were_safe_and_successful(t
     assert total_rows(unseen) == total_rows(plain), "nothing is said where no costs were seen"
 
 
-def test_comparisons_show_how_many_episodes_of_each_policy_were_safe(tmp_path):
-    plain = result_of(task_result("libero_goal/0", [True, False]))
-    other = result_of(task_result("libero_goal/0", [True, True]), policy="other:make")
-    groups = [
-        Group("good", (with_costs(plain, Costs()),), ("a",)),
-        Group("bad", (with_costs(other, SPILT),), ("b",)),
-    ]
-    found = compare_groups(groups)
-    rows = [line.split() for line in render(found).splitlines()]
-    assert ["safety", "safe", "success", "unsafe", "success", "safe", "failure", "unsafe", "failure"] in rows
-    assert ["good", "1", "0", "1", "0"] in rows and ["bad", "0", "2", "0", "0"] in rows
-    page = write_page(found, tmp_path / "page.html").read_text()
-    assert "<h2>Safety</h2>" in page and "Unsafe success" in page and "Why episodes failed" not in page
-
-
 def test_a_policy_whose_costs_and_causes_were_not_seen_is_not_shown_as_one_without(tmp_path):
     plain = result_of(task_result("libero_goal/0", [True, False, False]))
     other = result_of(task_result("libero_goal/0", [True, True, False]), policy="other:make")
     seen = with_failures(with_costs(plain, Costs()), HIT)
     found = compare_groups([Group("good", (seen,), ("a",)), Group("bad", (other,), ("b",))])
     rows = [line.split() for line in render(found).splitlines()]
+    lines = {" ".join(row) for row in rows}
+    assert "failed because collided not seen" in lines
+    assert "safety safe success unsafe success safe failure unsafe failure not seen" in lines
     assert ["good", "1", "0", "2", "0", "0"] in rows and ["bad", "0", "0", "0", "0", "3"] in rows
     assert ["good", "2", "0"] in rows and ["bad", "0", "1"] in rows
-    assert write_page(found, tmp_path / "page.html").read_text().count("Not seen") == 2
+    page = write_page(found, tmp_path / "page.html").read_text()
+    assert page.count("Not seen") == 2 and "Why episodes failed" in page and "<h2>Safety</h2>" in page
     both = [replace(seen.tasks[0], task="libero_goal/1"), other.tasks[0]]
     assert total_rows(replace(plain, tasks=tuple(both)))[-2:] == [
         "failed because     collided 2, not seen 1",
@@ -130,10 +105,8 @@ def test_a_policy_whose_costs_and_causes_were_not_seen_is_not_shown_as_one_witho
 
 
 @pytest.mark.parametrize(("costs", "message"), [
-    (5, "costs is 5; expected a valid array"),
     ([{}], "costs has 1 entries, init_states has 2"),
     ([{"force": -1}, None], "costs.0.force is -1; expected greater than or equal to 0"),
-    ([{"tilt": float("nan")}, None], "costs.0.tilt is nan; expected a finite number"),
     ([{"heat": 3}, None], "costs.0.heat is an unknown key. Valid: force, shift"),
     ([None, {"moved": "bowl_1"}], "costs.1.moved is 'bowl_1'; expected a valid array"),
 ])  # fmt: skip

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import yaml
 
-from libero_cli.main import main  # noqa: E402
-from libero_eval.evaluation_file import Stopped  # noqa: E402
-from libero_eval.judging.comparability import Group, check_comparable, match, settings  # noqa: E402
-from libero_eval.judging.comparison import Comparison, compare_groups, gate, write_comparison  # noqa: E402
-from libero_eval.judging.group_scores import group_scores  # noqa: E402
-from libero_eval.judging.page import forest_figure, gate_text, render  # noqa: E402
-from libero_eval.stats.power import Question, paired_power, shown_difference  # noqa: E402
-from libero_integrations.exports.results import export_eval_results, export_lerobot, export_vla_eval  # noqa: E402
-from lifelong.errors import ComparisonError, ConfigError, ResultsError  # noqa: E402
-from tests.harness.evaluations import evaluate  # noqa: E402
-from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result  # noqa: E402
+from libero_cli.main import main
+from libero_eval.evaluation_file import Stopped
+from libero_eval.judging.comparability import Group, check_comparable, match
+from libero_eval.judging.comparison import Comparison, compare_groups, gate, write_comparison
+from libero_eval.judging.group_scores import group_scores
+from libero_eval.judging.page import forest_figure, gate_text, render
+from libero_eval.stats.power import Question, paired_power, shown_difference
+from libero_integrations.exports.results import export_eval_results, export_lerobot, export_vla_eval
+from lifelong.errors import ComparisonError, ConfigError, ResultsError
+from tests.harness.evaluations import evaluate
+from tests.harness.results import ENVIRONMENT, PROTOCOL, drawn_result, result_of, task_result
 
 
 def side(label: str, *results) -> Group:
@@ -51,7 +51,7 @@ def test_differences_are_those_of_the_same_starts(found):
     assert sum(p.difference.counts.discordant for p in first.tasks) == total.counts.discordant
 
 
-@pytest.mark.parametrize("wins", [(6, 1), (1, 1), (3, 0), (10, 10), (19, 1)])
+@pytest.mark.parametrize("wins", [(6, 1), (3, 0), (10, 10)])
 @pytest.mark.parametrize("turned", [False, True])
 def test_policies_that_never_win_the_same_start_are_compared(wins, turned):
     """And those that never lose the same one: as many starts differ as the rates allow."""
@@ -113,10 +113,8 @@ def test_the_order_of_the_policies_turns_the_sign_only():
 
 def test_texts_name_what_is_shown_and_what_is_not(found):
     text = render(found)
-    assert (
-        "good is better than bad in these starts: +" in text
-        and "Stopped at any time: decided for good" in text
-    )
+    assert "good is better than bad in these starts: +" in text
+    assert "Stopped at any time: decided for good" in text
     assert "control arm: good − good again, one policy twice" in text
     assert "tasks that differ most (of 20)" in text and len(render(found, tasks=True)) > len(text)
     equal = compare_groups([side("a", drawn_result(0.9, 1)), side("b", drawn_result(0.9, 2, policy="b:b"))])
@@ -134,8 +132,6 @@ def test_texts_name_what_is_shown_and_what_is_not(found):
 @pytest.mark.parametrize(("changes", "field", "values"), [
     ({"protocol": PROTOCOL | {"settle_steps": 5}}, "protocol.settle_steps", "10 in a, 5 in b"),
     ({"environment": ENVIRONMENT | {"robot": "robosuite-1.4.1"}}, "environment.robot", "libero in a, robosuite"),
-    ({"environment": ENVIRONMENT | {"drawing": "faithful"}}, "environment.drawing", "fast in a, faithful in b"),
-    ({"environment": ENVIRONMENT | {"models": "original"}}, "environment.models", "builtin in a, original in b"),
     ({"protocol": {**PROTOCOL, "horizon": {"libero_goal": 600}}}, "protocol.horizon.libero_goal", "300 in a, 600"),
 ])  # fmt: skip
 def test_results_made_differently_are_refused(changes, field, values):
@@ -147,17 +143,6 @@ def test_results_made_differently_are_refused(changes, field, values):
     notes = compare_groups(sides, allow=allowed).notes
     assert any(note.startswith(f"{field}: {values}") and note.endswith("; allowed") for note in notes)
     assert check_comparable(sides, allow=[field.partition(".")[0]])
-
-
-def test_other_instructions_are_refused():
-    sides = [
-        side("a", result_of(task_result("libero_goal/0", [1, 0]))),
-        side("b", result_of(task_result("libero_goal/0", [1, 0], instruction="open it"), policy="b:b")),
-    ]
-    with pytest.raises(
-        ComparisonError, match="tasks.libero_goal/0.instruction: do what libero_goal/0 asks in a, open it"
-    ):
-        compare_groups(sides)
 
 
 def test_versions_and_renderers_are_told_but_not_refused():
@@ -184,10 +169,8 @@ def test_episodes_without_a_partner_are_dropped_and_counted():
     matched = match(*sides)
     assert matched.dropped == (4, 1) and matched.tasks == ("s/0",)
     assert matched.pairs.starts.tolist() == [2, 3] and matched.pairs.second[:, 0].tolist() == [True, False]
-    assert any(
-        "2 pairs; without a partner and not counted: 4 episodes of a, 1 of b" in n
-        for n in compare_groups(sides).notes
-    )
+    notes = "\n".join(compare_groups(sides).notes)
+    assert "2 pairs; without a partner and not counted: 4 episodes of a, 1 of b" in notes
 
 
 def test_no_common_start_is_refused():
@@ -195,9 +178,7 @@ def test_no_common_start_is_refused():
         side("a", result_of(task_result("s/0", [1, 1]))),
         side("b", result_of(task_result("s/0", [1, 0, 0], starts=(7, 8, 40)), policy="b:b")),
     ]
-    with pytest.raises(
-        ComparisonError, match="1 tasks from s/0, starts 0–1 against 1 tasks from s/0, starts 7–8, 40"
-    ):
+    with pytest.raises(ComparisonError, match="s/0, starts 0–1 against 1 tasks from s/0, starts 7–8, 40"):
         compare_groups(sides)
 
 
@@ -229,22 +210,14 @@ def test_one_policy_under_two_protocols_is_no_control_arm():
 
 
 def test_weights_identify_a_policy():
-    first, second = (
-        {"run": path, "weights": "abc", "seed": s} for s, path in enumerate(("runs/a", "/x/runs/a"))
-    )
-    sides = [
-        side("a", drawn_result(0.9, 1, evaluated=first)),
-        side("b", drawn_result(0.9, 2, evaluated=second)),
-    ]
+    of_one = [{"run": path, "weights": "abc", "seed": s} for s, path in enumerate(("runs/a", "/x/runs/a"))]
+    sides = [side(f"{k}", drawn_result(0.9, k, evaluated=one)) for k, one in enumerate(of_one)]
     assert len(compare_groups(sides).controls) == 1
 
 
-def test_too_few_results_and_equal_names_are_refused():
-    one = side("a", drawn_result(0.9, 1))
-    with pytest.raises(ConfigError, match="needs two results"):
-        compare_groups([one])
+def test_equal_names_are_refused():
     with pytest.raises(ConfigError, match="two policies are called a"):
-        compare_groups([one, side("a", drawn_result(0.8, 2, policy="b:b"))])
+        compare_groups([side("a", drawn_result(0.9, 1)), side("a", drawn_result(0.8, 2, policy="b:b"))])
 
 
 def test_a_run_counts_once_in_its_group():
@@ -275,9 +248,7 @@ def test_runs_of_methods_are_aggregated_by_rliable():
     other = np.array([[np.mean(t.successes) for t in r.tasks] for r in groups[1]])
     expected = metrics.probability_of_improvement(scores, other)
     assert found.improvement["good", "bad"].value == pytest.approx(expected)
-    assert (
-        group_scores({"good": scores, "bad": other}).iqm["good"] == found.iqm["good"]
-    )  # whatever was drawn before
+    assert group_scores({"good": scores, "bad": other}).iqm["good"] == found.iqm["good"], "drawn again"
 
 
 def test_aggregates_over_runs_are_of_the_starts_that_all_have():
@@ -325,11 +296,8 @@ def test_exports_to_vla_eval(tmp_path):
     paths = export_vla_eval(result, tmp_path)
     assert [p.name for p in paths] == ["libero_goal_aggregate.json", "libero_object_aggregate.json"]
     values = json.loads(paths[0].read_text())
-    assert (
-        values["mean_success"] == 0.6667
-        and values["num_errors"] == 1
-        and values["metric_keys"] == {"success": "mean"}
-    )
+    assert (values["mean_success"], values["num_errors"]) == (0.6667, 1)
+    assert values["metric_keys"] == {"success": "mean"}
     collector = pytest.importorskip("vla_eval.results.collector", reason="vla-eval is not installed here")
     expected = collector.ResultCollector("libero_goal", metric_keys={"success": "mean"})
     for episode in values["tasks"][0]["episodes"]:
@@ -349,10 +317,8 @@ def test_exports_to_lerobot(tmp_path):
     result = result_of(task_result("libero_goal/3", [1, 0, 1]), task_result("libero_object/0", [0, 0, 0]))
     values = json.loads(export_lerobot(result, tmp_path)[0].read_text())
     assert (tmp_path / "eval_info.json").is_file()
-    assert [(t["task_group"], t["task_id"]) for t in values["per_task"]] == [
-        ("libero_goal", 3),
-        ("libero_object", 0),
-    ]
+    tasks = [(t["task_group"], t["task_id"]) for t in values["per_task"]]
+    assert tasks == [("libero_goal", 3), ("libero_object", 0)]
     assert values["per_task"][0]["metrics"]["successes"] == [True, False, True]
     assert values["per_group"]["libero_goal"]["pc_success"] == pytest.approx(200 / 3)
     assert values["overall"]["pc_success"] == pytest.approx(100 / 3) and values["overall"]["eval_ep_s"] == 10
@@ -366,9 +332,7 @@ def test_exports_to_model_cards_are_entries_as_the_hub_documents_them(tmp_path):
         task_result("libero_object/0", [1, 1, 1, 1]),
         environment=ENVIRONMENT | {"models_digest": "fa0e"},
     )
-    with pytest.raises(
-        ConfigError, match=r"not the whole of the suite: libero_goal \(1 of 10 tasks\); with --partial"
-    ):
+    with pytest.raises(ConfigError, match=r"the suite: libero_goal \(1 of 10 tasks\); with --partial"):
         export_eval_results(result, tmp_path, "org/libero")
     paths = export_eval_results(result, tmp_path, "org/libero", "https://example.org/eval.json", partial=True)
     assert [str(p.relative_to(tmp_path)) for p in paths] == [
@@ -395,18 +359,12 @@ def test_exports_to_model_cards_are_entries_as_the_hub_documents_them(tmp_path):
         protocol={"name": "libero", "world": {"perturb": "gain=0.5"}, "action": {"clock": "latency=100ms"}},
         stopped=Stopped("width=0.9", "known", 20),
     )
-    (entry, *_) = yaml.safe_load(
-        export_eval_results(changed, tmp_path, "org/libero", partial=True)[0].read_text()
-    )
-    assert (
-        "perturbed by gain=0.5, clock latency=100ms, stopped after 10 of 20; width=0.9: known"
-        in entry["notes"]
-    )
-    interval = replace(changed, tasks=changed.tasks[:1]).success  # wider, as that of a stopped evaluation is
-    assert (
-        f"95 % interval {100 * interval.low:.1f} to {100 * interval.high:.1f}" in entry["notes"]
-        and interval.low < 0.2
-    )
+    path, _ = export_eval_results(changed, tmp_path, "org/libero", partial=True)
+    (entry, *_) = yaml.safe_load(path.read_text())
+    notes = entry["notes"]
+    assert "perturbed by gain=0.5, clock latency=100ms, stopped after 10 of 20; width=0.9: known" in notes
+    end = replace(changed, tasks=changed.tasks[:1]).success  # wider, as that of a stopped evaluation is
+    assert f"95 % interval {100 * end.low:.1f} to {100 * end.high:.1f}" in notes and end.low < 0.2
     bare = export_eval_results(replace(result, times={}), tmp_path, "org/libero", partial=True)
     assert not {"date", "source"} & yaml.safe_load(bare[1].read_text())[0].keys()
 
@@ -432,10 +390,8 @@ def test_commands(tmp_path, monkeypatch, capsys):
     assert main(["power", "--difference", "0.03", "--correlation", "0.3", "--tests", "4"]) == 0
     assert "over 4 comparisons" in capsys.readouterr().out
     assert main(["power", "--base", "0.9", "--episodes", "114", "--correlation", "0.5"]) == 0
-    assert "worse by 10.0 points" in capsys.readouterr().out, (
-        "as --difference=-0.1 --correlation 0.5 asks for 114"
-    )
-    assert main(["power", "--episodes", "500"]) == 0 and "worse by" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "worse by 10.0 points" in said, "of which --difference=-0.1 --correlation 0.5 asks for 114"
     assert main(["power", "--base", "0.99"]) == main(["power", "--base", "0.99", "--episodes", "100"]) == 0
     assert "--difference 0.03" not in capsys.readouterr().err
     assert main(["results", "export", "a", "--as", "lerobot", "--out", "x"]) == 0
@@ -455,7 +411,7 @@ def lost(count: int, episodes: int = 100):
 @pytest.mark.parametrize(("failures", "margin", "verdict", "status"), [
     (20, 0.05, "regression", 1),
     (0, 0.05, "no regression", 0),
-    (5, 0.05, "undecided", 3),
+    (5, 0.05, "undecided", 3),  # more episodes do not help
     (8, 0.05, "undecided", 3),
 ])  # fmt: skip
 def test_a_gate_says_what_it_decided_and_why(
@@ -471,10 +427,7 @@ def test_a_gate_says_what_it_decided_and_why(
     said = json.loads(capsys.readouterr().out)["gate"]
     assert json.loads(Path("page/compare.json").read_text())["gate"] == said
     assert said["verdict"] == verdict and said["loss"]["value"] == pytest.approx(failures / 100)
-    assert ("would decide" in line) == (verdict == "undecided" and failures != 5), (
-        "with a loss that is the margin, more episodes do not help"
-    )
-    # the other way round, nothing is lost
+    assert ("would decide" in line) == (failures == 8)
     assert main(["compare", "new", "old", "--gate", str(margin), "--quiet"]) == 0
 
 
@@ -502,15 +455,10 @@ def test_a_gate_judges_a_policy_against_its_own_earlier_result():
 @pytest.mark.parametrize(("words", "message"), [
     (["compare", "a"], "needs two results"),
     (["compare", "a", "b", "--open"], "--open shows a page, and none was written"),
-    (["compare", "a", "nothing"], "nothing does not exist"),
-    (["compare", "a", "old"], "the format is libero-evaluation/99"),
-    (["compare", "a", "nan"], "successes.3 is nan; expected a valid boolean"),
     (["compare", "--group", "a"], "--group NAME RESULT"),
     (["power", "--base", "0.9", "--difference", "0.2"], "above 1"),
     (["power", "a"], "takes two results, not 1"),
     (["compare", "a", "folder"], "folder/eval.json: it is a folder, a pipe or a device"),
-    (["compare", "a", "none"], "none: there are no tasks"),
-    (["results", "export", "pyproject", "--as", "lerobot"], "pyproject is not JSON"),
     (["results", "export", "a", "--as", "eval-results"], "data set of the benchmark is ''; expected ORG/NAME"),
     (["results", "export", "a", "--as", "lerobot", "--dataset", "a/b"], "are of --as eval-results, not of --as ler"),
     (["results", "export", "a", "--as", "eval-results", "--dataset", "a/b", "--source", "x"], "the source is 'x'"),
@@ -518,18 +466,11 @@ def test_a_gate_judges_a_policy_against_its_own_earlier_result():
     (["power", "--difference", "0.05", "--discordance", "0.01"], "is impossible"),
     (["power", "--difference", "0.05", "--episodes", "100"], "leave --difference out"),
     (["power", "--discordance", "0.1"], "of one case; name it"),
-    (["power", "--correlation", "0.1"], "of one case; name it"),
 ])  # fmt: skip
 def test_bad_input_is_one_line(words, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     written(tmp_path, a=drawn_result(0.9, 1), b=drawn_result(0.8, 2, policy="b:b"))
-    values = json.loads(Path("a/eval.json").read_text())
-    Path("old").write_text(json.dumps(values | {"format": "libero-evaluation/99"}))
-    Path("none").write_text(json.dumps(values | {"tasks": []}))
     Path("folder/eval.json").mkdir(parents=True)
-    Path("pyproject").write_text("[project]")
-    values["tasks"][0]["successes"][3] = float("nan")
-    Path("nan").write_text(json.dumps(values))
     assert main(words) == 2
     said = capsys.readouterr().err
     assert message in said and said.count("\n") == 1
@@ -558,9 +499,3 @@ def test_on_a_full_disk_nothing_is_lost(words, tmp_path, monkeypatch, capsys):
     said = capsys.readouterr()
     assert "No space left on device" in said.err and said.err.count("\n") == 1 and not said.out
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-
-
-def test_settings_are_flat():
-    found = settings(drawn_result(0.9, 1, tasks=1))
-    assert found["protocol.horizon.libero_goal"] == 300 and found["environment.robot"] == "libero"
-    assert "environment.renderer" not in found

@@ -36,10 +36,7 @@ MANY = {
 }  # fmt: skip
 CHANGES = {
     "episode.horizon 6 (300)": {"episode.horizon": 6},
-    "world.control_freq 10 (20)": {"world.control_freq": 10},
-    "world.robot libero (robosuite-1.4.1)": {"world.robot": "libero"},
     "action.clock latency=120ms (none)": {"action.clock": "latency=120ms"},
-    "action.replan 10 (5)": {"action.replan": 10},
     "episode.settle_counted true (false)": {"episode.settle_counted": True},
     "world.models builtin (original), world.init_states builtin (original), world.fixture_poses stored (drawn), "
     "world.perturb camera=0.5 (none), episode.horizon 6 (300), pixels.render_size [128, 128] ([256, 256])": MANY,
@@ -63,7 +60,7 @@ def surfaces(result, folder) -> dict[str, str]:
     }
     return {
         "page": write_evaluation_page(result, folder / "eval").read_text(),
-        "terminal": "\n".join(total_rows(result)),
+        "page in the terminal": "\n".join(total_rows(result)),
         "board": write_board(board, groups, folder / "board.html").read_text(),
         "board in the terminal": render_board(board),
         "comparison": write_page(comparison, folder / "compare.html").read_text(),
@@ -96,14 +93,12 @@ def test_a_long_name_fits_a_phone(tmp_path, tab):
     assert len(pages) == 4 and [tab.faults_on_a_phone(page) for page in pages] == [[]] * 4
 
 
-@pytest.mark.parametrize("name", ["openpi", "libero", "lerobot", "vla-eval"])
-def test_a_protocol_that_is_run_as_it_is_has_its_name_alone(name):
-    protocol = load_protocol(name)
-    assert protocol_label(protocol.resolved()) == name
-    there = protocol.changed({"world.control_freq": 10})
-    assert protocol_label(there.changed({"world.control_freq": 20}).resolved()) == name, "and back again"
+def test_a_protocol_that_is_run_as_it_is_has_its_name_alone():
+    assert protocol_label(OPENPI.resolved()) == "openpi"
+    there = OPENPI.changed({"world.control_freq": 10})
+    assert protocol_label(there.changed({"world.control_freq": 20}).resolved()) == "openpi", "and back again"
     again = EvalProtocol.read(json.loads(json.dumps(there.resolved())), "result")
-    assert again == there and again.digest == there.digest != protocol.digest
+    assert again == there and again.digest == there.digest != OPENPI.digest
 
 
 def test_whatever_a_file_says_of_itself_it_is_compared_with_the_protocol_of_its_name(tmp_path):
@@ -128,22 +123,15 @@ def test_one_success_has_one_interval_everywhere(tmp_path):
     result = drawn_result(0.7, 1, tasks=3, protocol=OPENPI.resolved())
     shown = {name: text.replace("−", "-") for name, text in surfaces(result, tmp_path).items()}
     wanted = interval_text(result.success)
-    for name in (
-        "page",
-        "terminal",
-        "board",
-        "board in the terminal",
-        "comparison",
-        "comparison in the terminal",
-    ):
-        assert wanted in shown[name], name
+    for name in ("page", "board", "comparison"):
+        assert wanted in shown[name] and wanted in shown[f"{name} in the terminal"], name
     outcomes = read_study(tmp_path).outcomes
     assert outcomes.success(()) == result.success == result.suites["libero_goal"]
     (notes,) = (one["notes"] for one in yaml.safe_load(shown["eval-results"]))
     assert wanted[1:-1].replace(", ", " to ") in notes
 
 
-@pytest.mark.parametrize("count", [1, 2, 4, 5])
+@pytest.mark.parametrize("count", [1, 4, 5])
 def test_fewer_than_five_episodes_have_no_interval_and_none_leaves_0_to_100(count, tmp_path):
     result = result_of(task_result("libero_goal/0", [True] * count), protocol=OPENPI.resolved())
     texts = surfaces(result, tmp_path)
@@ -152,9 +140,8 @@ def test_fewer_than_five_episodes_have_no_interval_and_none_leaves_0_to_100(coun
     ends = [read_study(tmp_path).outcomes.axes[0]]
     for e in (ends[0].area, ends[0].kept, *ends[0].success):
         assert np.isnan([e.low, e.high]).all() if count < 5 else 0 <= e.low <= e.value <= e.high <= 1
-    assert (
-        json.loads((tmp_path / "robustness.json").read_text())["policies"][0]["axes"][0]["kept"]["value"] == 1
-    )
+    (policy,) = json.loads((tmp_path / "robustness.json").read_text())["policies"]
+    assert policy["axes"][0]["kept"]["value"] == 1
 
 
 def test_what_two_perturbations_leave_stays_within_everything():
@@ -239,10 +226,8 @@ def test_a_board_of_a_folder_ranks_what_can_be_compared_and_names_the_rest(tmp_p
         result.write(tmp_path / "eval" / name / "eval.json")
     assert main(["board", "eval"]) == 0
     out = capsys.readouterr().out
-    assert (
-        out.count("left out: ") == 2
-        and "left out: eval/b/latency=120ms/eval.json, whose protocol.action.clock" in out
-    )
+    assert out.count("left out: ") == 2
+    assert "left out: eval/b/latency=120ms/eval.json, whose protocol.action.clock" in out
     assert "eval/c/openpi/eval.json, whose protocol.name is openpi" in out and "conditions" not in out
     assert main(["board", "eval/a", "eval/b/latency=120ms"]) == 2, "what is named is not left out"
     assert "protocol.action.clock" in capsys.readouterr().err

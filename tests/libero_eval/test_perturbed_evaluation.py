@@ -10,47 +10,25 @@ from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.judging.comparability import Group, check_comparable, match
 from libero_eval.protocols.environment import ProtocolEnv
 from libero_eval.protocols.files import load_protocol
-from libero_eval.protocols.protocol import EvalProtocol
-from lifelong.errors import ComparisonError, ProtocolError
+from lifelong.errors import ComparisonError
+from tests.harness.evaluations import write_policy
 
 pytestmark = pytest.mark.sim
 EVAL = ["eval", "told_policy:make", "--suite", "libero_goal/1", "--episodes", "3", "--horizon", "3"]
 EVAL += ["--threads", "1"]
-POLICY = """
-import numpy as np
 
 
-class Told:
-    cameras, camera_size, observations = ("agentview",), (32, 32), ("rgb", "proprioception")
-
-    def reset(self, instruction, num_envs):
-        with open("told.txt", "a") as file:
-            print(instruction, file=file)
-
-    def predict(self, observations):
-        moved = observations["agentview_rgb"].mean(axis=(1, 2, 3)) / 255
-        return np.outer(moved, [1, 0, 0, 0, 0, 0, -1])
-
-
-def make():
-    return Told()
-"""
-
-
-def test_a_protocol_without_perturbations_is_as_it_was():
-    card = load_protocol("libero")
-    assert card.world.perturb == ""
-    moved = card.changed({"world.perturb": "camera=0.3"})
-    assert moved.digest != card.digest and moved.changed({"world.perturb": ""}).digest == card.digest
-    assert EvalProtocol.read(moved.resolved(), "here") == moved
-    for wrong in ("camra=0.3", "camera=2", "noise=0.1,camera=0.3"):
-        with pytest.raises(ProtocolError, match="world.perturb"):
-            card.changed({"world.perturb": wrong})
-
-
-def test_an_evaluation_records_its_perturbations(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def told(tmp_path, monkeypatch):
+    """A folder with a policy that notes what it is told, and moves as bright as what it sees."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "told_policy.py").write_text(POLICY)
+    own = "cameras, camera_size, observations = ('agentview',), (32, 32), ('rgb', 'proprioception')"
+    moved = "np.outer(observations['agentview_rgb'].mean(axis=(1, 2, 3)) / 255, [1, 0, 0, 0, 0, 0, -1])"
+    write_policy(tmp_path / "told_policy.py", moved, own)
+    return tmp_path
+
+
+def test_an_evaluation_records_its_perturbations(told, tmp_path, capsys):
     perturb = ["--perturb", "noise=0.2,instruction=0.5,robot=0.4,distractors=0.1"]
     assert main([*EVAL, "--out", "plain"]) == 0
     assert main([*EVAL, "--out", "changed", *perturb]) == 0
@@ -58,9 +36,9 @@ def test_an_evaluation_records_its_perturbations(tmp_path, monkeypatch, capsys):
     assert plain.protocol["world"]["perturb"] == "" and plain.tasks[0].attempts == ()
     assert changed.protocol["world"]["perturb"] == "distractors=0.1,instruction=0.5,robot=0.4,noise=0.2"
     assert np.shape(changed.tasks[0].attempts) == (3, 4)
-    told = (tmp_path / "told.txt").read_text().splitlines()
-    assert told == ["put the bowl on the stove", changed.tasks[0].instruction] and len(set(told)) == 2
-    assert changed.tasks[0].name == plain.tasks[0].name and "_" not in told[1]
+    words = (tmp_path / "told.txt").read_text().splitlines()
+    assert words == ["put the bowl on the stove", changed.tasks[0].instruction] and len(set(words)) == 2
+    assert changed.tasks[0].name == plain.tasks[0].name and "_" not in words[1]
 
     sides = [Group("plain", (plain,)), Group("changed", (changed,))]
     with pytest.raises(ComparisonError, match="protocol.world.perturb"):
@@ -72,20 +50,8 @@ def test_an_evaluation_records_its_perturbations(tmp_path, monkeypatch, capsys):
     again = ["eval", "changed", "--allow", "told_policy", "--out", "again", "--threads", "1"]
     assert main(again) == 0
     assert EvaluationResult.read(tmp_path / "again").actions == changed.actions
-    assert (
-        main([*EVAL, "--out", "changed", "--perturb", "camera=0.1"]) == 2
-    )  # another evaluation is in the folder
+    assert main([*EVAL, "--out", "changed", "--perturb", "camera=0.1"]) == 2, "another is in the folder"
     assert "world.perturb" in capsys.readouterr().err
-
-
-def test_a_units_episodes_do_not_depend_on_the_unit(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "told_policy.py").write_text(POLICY)
-    perturb = ["--perturb", "light=0.5,robot=0.4,noise=0.2,action_noise=0.3"]
-    for size in ("1", "3"):
-        assert main([*EVAL, *perturb, "--unit-starts", size, "--out", size]) == 0
-    found = [EvaluationResult.read(tmp_path / size).tasks[0] for size in ("1", "3")]
-    assert found[0].lengths == found[1].lengths and found[0].actions == found[1].actions
 
 
 def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypatch):
@@ -106,23 +72,25 @@ def test_fixtures_that_a_protocol_draws_are_those_of_the_plain_episode(monkeypat
     assert moved == pytest.approx(KINDS["layout"].amount(0.3))  # the same for all starts
 
 
-def test_an_evaluation_with_events_says_where_they_began(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "told_policy.py").write_text(POLICY)
-    words = ["--perturb", "noise=0.2", "--event", "camera=0.5@step6", "light=1@touched"]
+def test_an_evaluation_with_events_says_where_they_began(told, tmp_path, capsys):
+    words = [
+        "--perturb",
+        "robot=0.4,noise=0.2,action_noise=0.3",
+        "--event",
+        "camera=0.5@step6",
+        "light=1@touched",
+    ]
     words += ["--clock", "latency=uniform:0/200ms", "--unit-starts"]
     assert main([*EVAL, "--out", "events", *words, "2"]) == 0
     assert "(events began in 3 of 3 (the expert solves 0 from there), 0 of 3)" in capsys.readouterr().out
     found = EvaluationResult.read(tmp_path / "events")
-    assert found.protocol["world"]["perturb"] == "camera=0.5@step6,light=1@touched,noise=0.2"
+    perturb = found.protocol["world"]["perturb"]
+    assert perturb == "camera=0.5@step6,light=1@touched,robot=0.4,noise=0.2,action_noise=0.3"
     assert found.tasks[0].began == ((6, -1),) * 3
     assert found.tasks[0].solved == ((0, -1),) * 3, "three steps are not enough"
     page = (tmp_path / "events" / "eval.html").read_text()
-    assert (
-        "events began in 3 of 3 (the expert solves 0 from there), 0 of 3" in page
-        and "failed because never reached 3" in page
-    )
-    assert "camera=0.5@step6,light=1@touched,noise=0.2" in page
+    assert "events began in 3 of 3 (the expert solves 0 from there), 0 of 3" in page and perturb in page
+    assert "failed because never reached 3" in page
     assert main([*EVAL, "--out", "apart", *words, "1", "--workers", "2"]) == 0
     again = EvaluationResult.read(tmp_path / "apart")
     assert again.tasks == found.tasks and again.actions == found.actions

@@ -3,7 +3,6 @@
 import asyncio
 import io
 import socket
-import struct
 import sys
 import threading
 import time
@@ -98,12 +97,8 @@ def test_arrays_keep_their_bits_in_every_encoding():
 
 def test_the_maps_that_stand_for_arrays():
     array = np.zeros((1, 2), np.float32)
-    assert msgpack.unpackb(OPENPI.pack({"a": array}))["a"] == {
-        b"__ndarray__": True,
-        b"data": bytes(8),
-        b"dtype": "<f4",
-        b"shape": [1, 2],
-    }
+    wanted = {b"__ndarray__": True, b"data": bytes(8), b"dtype": "<f4", b"shape": [1, 2]}
+    assert msgpack.unpackb(OPENPI.pack(array)) == wanted
     assert msgpack.unpackb(OPENPI.pack(np.int16(3))) == {b"__npgeneric__": True, b"data": 3, b"dtype": "<i2"}
     image = msgpack.unpackb(VLA_EVAL.pack(np.zeros((2, 2, 3), np.uint8)))
     assert image["__image__"] and image["format"] == "png" and image["data"].startswith(b"\x89PNG")
@@ -193,27 +188,7 @@ def test_only_images_that_are_seen_are_drawn(settle, record, drawn):
     assert rollouts.episodes[0].success and env.render_images
 
 
-def test_the_order_of_answers_makes_no_difference():
-    found = []
-    for slow in (0, 2):
-
-        async def handler(socket, slow=slow):
-            await socket.send(OPENPI.pack({}))
-            async for data in socket:
-                state = OPENPI.unpack(data)["observation/state"]
-                await asyncio.sleep(0.1 if state[0] == slow else 0)
-                await socket.send(OPENPI.pack({"actions": chunk(state, 1)}))
-
-        with (
-            policy_servers.web_socket(handler) as address,
-            remote(OpenpiClient(address, SHORT), 3, replan=1) as actor,
-        ):
-            found.append([actor.act(observations(3, step)) for step in range(2)])
-    np.testing.assert_array_equal(found[0], found[1])
-    np.testing.assert_array_equal(found[0][1][:, 0], [0, 2, 4])
-
-
-@pytest.mark.parametrize("in_flight", [1, 2, None])
+@pytest.mark.parametrize("in_flight", [2, None])
 def test_requests_in_flight(in_flight):
     waiting, most = 0, 0
 
@@ -235,32 +210,21 @@ def test_requests_in_flight(in_flight):
     assert most == (in_flight or 5)
 
 
-def deep(count: int) -> bytes:
-    return b"\x81\xa1a" * count + b"\x01"
-
-
-def maps(count: int) -> bytes:
-    return b"\x81\xa7actions\xdd" + struct.pack(">I", count) + b"\x80" * count
-
-
 @pytest.mark.parametrize(("answer", "message"), [
     ({"actions": np.full((4, 7), np.nan)}, "must be finite; entry .* is nan"),
     ({"actions": np.zeros((4, 8))}, r"shape \(4, 8\); expected \(H, 7\) with H >= 2"),
     ({"actions": np.zeros((1, 7))}, "1 actions; the protocol executes 2"),
-    ({"actions": [["a"] * 7] * 2}, "<U1 is not a real number"),
     ({"actions": [[1.0], [2.0, 3.0]]}, r"expected finite numbers of shape \(H, 7\).*inhomogeneous"),
-    ({"actions": None}, "NoneType is not a real number"),
     ({"action": np.zeros((4, 7))}, r"\['action'\] and without `actions`"),
     ([1, 2], "sent a list as actions; expected a map"),
     (b"\xc1\x00garbage", "9 bytes that are not a message of openpi"),
     ("Traceback ...\nValueError: no such key", "(?s)its traceback:.*no such key"),
-    *((deep(count), "within each other, more than 30 deep") for count in (31, 500)),
-    (maps(1 << 20), "more than 10000 lists and maps"),
+    (b"\x81\xa1a" * 31 + b"\x01", "within each other, more than 30 deep"),
+    (b"\x81\xa7actions\xdd\x00\x10\x00\x00" + b"\x80" * (1 << 20), "more than 10000 lists and maps"),
     ("X" * (1 << 20), r"its traceback:\n\.\.\. X{2000}$"),
     ({"k" * 100_000: 1}, "without `actions`"),
-    ({str(i): 1 for i in range(10_000)}, "without `actions`"),
     ({"actions": [["x" * 100_000] * 7] * 2}, "is not a real number"),
-], ids=range(17))  # fmt: skip
+], ids=range(13))  # fmt: skip
 def test_answers_that_are_not_valid_are_named(answer, message):
     with (
         policy_servers.openpi(lambda _: answer) as address,
@@ -282,15 +246,6 @@ def test_a_server_that_is_silent():
     with (
         policy_servers.openpi(lambda _: time.sleep(1) or {}) as address,
         pytest.raises(ServerError, match=r"nothing within 0\.2 s \(actions\); --timeout"),
-    ):
-        ask(address, Limits(5, 0.2))
-
-    async def mute(socket):
-        await socket.wait_closed()
-
-    with (
-        policy_servers.web_socket(mute) as address,
-        pytest.raises(ServerError, match="nothing within .*metadata"),
     ):
         ask(address, Limits(5, 0.2))
 
@@ -394,8 +349,6 @@ def test_what_openpi_announces_identifies_the_policy_and_is_compared_with_the_pr
     with pytest.raises(ConfigError, match=r"--seed 3: ws://.* is sent no seed; leave it out.*--out"):
         policy(about, seed=3).protocol(base)
     assert policy(about, seed=3, clock="latency=uniform:50/150ms").protocol(base) is base
-    with pytest.raises(ConfigError, match="does not say which policy it serves.*--name"):
-        policy({"action.replan": replan})
     assert policy({"action.replan": replan}, name="pi0_1").protocol(base) is base
     with pytest.raises(ServerError, match="metadata"):
         policy([1])
@@ -432,12 +385,8 @@ def test_answers_that_nobody_has_asked_for_are_refused(when):
 
 @pytest.mark.parametrize(("hello", "message"), [
     ({"action_spec": [1]}, r"action_spec is \[1\]; expected an object"),
-    ({"action_spec": "x"}, "action_spec"),
     ({"action_spec": {"position": 5}}, "action_spec.position"),
-    ({"observation_params": [1]}, "observation_params"),
-    ({"observation_params": "x"}, "observation_params"),
-    *(({"observation_params": {"seed": x}}, "observation_params.seed") for x in ("abc", [1])),
-    ({"observation_params": {"max_steps": float("inf")}}, "observation_params.max_steps"),
+    ({"observation_params": {"seed": "abc"}}, "observation_params.seed"),
     ({"observation_params": {"max_steps": np.zeros(3)}}, "observation_params.max_steps"),
 ])  # fmt: skip
 def test_hellos_of_vla_eval_that_are_not_valid(hello, message):
@@ -450,19 +399,19 @@ def test_hellos_of_vla_eval_that_are_not_valid(hello, message):
 
 
 @pytest.mark.parametrize(
-    "config", [5, [1], {"modality_keys": 5}, {"modality_keys": [["x"]]}, {"delta_indices": 5}]
+    ("modality", "config", "message"),
+    [
+        ("video", 5, "video"),
+        ("video", {"modality_keys": [["x"]]}, "video"),
+        ("action", {"modality_keys": policy_servers.MODALITIES["action"], "delta_indices": 5}, "action"),
+        ("state", {"modality_keys": ["left_arm"]}, r"state keys \['left_arm'\]; LIBERO's are x, y"),
+    ],
 )
-@pytest.mark.parametrize("modality", ["video", "action"])
-def test_modalities_of_groot_that_are_not_valid(modality, config):
+def test_modalities_of_groot_that_are_not_valid(modality, config, message):
     endpoints = policy_servers.groot_endpoints(None)
     whole = endpoints["get_modality_config"]()
-    config = (
-        {"modality_keys": policy_servers.MODALITIES[modality], **config}
-        if isinstance(config, dict)
-        else config
-    )
     endpoints["get_modality_config"] = lambda: whole | {modality: config}
-    with policy_servers.groot(endpoints) as address, pytest.raises(ServerError, match=modality) as caught:
+    with policy_servers.groot(endpoints) as address, pytest.raises(ServerError, match=message) as caught:
         GrootClient(address, SHORT)
     assert address in str(caught.value) and "\n" not in str(caught.value)
 
@@ -509,9 +458,8 @@ def test_vla_eval_episodes():
             for step in range(2):
                 np.testing.assert_array_equal(actor.act(observations(1, step))[0, :2], [0, 2 * step])
             actor.note(np.array([True]), np.array([True]))
-    assert [m["type"] for m in heard] == [
-        "hello", "hello", "episode_start", "observation", "observation", "episode_end"
-    ]  # fmt: skip
+    kinds = ["hello", "hello", "episode_start", "observation", "observation", "episode_end"]
+    assert [m["type"] for m in heard] == kinds
     assert [m["seq"] for m in heard] == [1, 1, 2, 3, 4, 5]
     assert heard[2]["payload"]["task"] == {
         "name": TASK.language, "suite": "libero_goal", "task_id": 0, "episode_idx": 4
@@ -575,13 +523,10 @@ def test_groot_observations_of_many_simulations():
 @pytest.mark.parametrize(("get_action", "message"), [
     (lambda **_: policy_servers.flat(np.full((1, 8, 7), np.inf)), "must be finite; entry .* is inf"),
     (lambda **_: policy_servers.flat(np.zeros((2, 8, 7))), r"shapes \[\(2, 8, 1\)\]; expected \(1, H, 1\)"),
-    (lambda **_: policy_servers.flat(np.zeros((1, 1, 7))), "1 actions; the protocol executes 2"),
     (lambda **_: [{"x": np.zeros((1, 8, 1))}, {}], r"answered \['x'\].*--use-sim-policy-wrapper"),
-    (lambda **_: "what?", "answered str without"),
     (lambda **_: {"error": "x" * 1_000_000}, r"failed \(get_action\): \.\.\. x{2000}$"),
     (lambda **_: [{f"action.{k}": [[1], [2, 3]] for k in ACTION}, {}], "not arrays"),
     (lambda **_: b"\xc1", "1 bytes that are not a message of GR00T"),
-    (lambda observation, options: {}["key"], r"failed \(get_action\): 'key'"),
     (lambda **_: time.sleep(1), r"nothing within 0\.3 s \(get_action\)"),
 ])  # fmt: skip
 def test_groot_answers_that_are_not_valid_are_named(get_action, message):
@@ -620,11 +565,6 @@ def test_groot_and_vla_eval_take_no_other_state():
             client.ask({0: replace(given, state=np.zeros(0))})
 
 
-def test_groot_servers_of_other_embodiments_and_none_at_all():
-    with (
-        policy_servers.groot(policy_servers.groot_endpoints(None, state=["left_arm"])) as address,
-        pytest.raises(ServerError, match=r"state keys \['left_arm'\]; LIBERO's are x, y"),
-    ):
-        GrootClient(address, SHORT)
+def test_no_groot_server_at_all():
     with pytest.raises(ServerError, match="no GR00T server at .* within 0.3 s"):
-        GrootClient(address, Limits(0.3, 1))
+        GrootClient("tcp://127.0.0.1:9", Limits(0.3, 1))

@@ -8,27 +8,11 @@ from libero_env.sim.scene import build_scene
 from libero_env.tasks import get_suite
 from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.protocols.files import load_protocol
+from tests.harness.evaluations import write_policy
 from tests.harness.published import REWORDED, base_task, write_plus, write_pro
 
+pytestmark = pytest.mark.sim
 EVAL = ["eval", "told_policy:make", "--horizon", "2", "--threads", "1"]
-POLICY = """
-import numpy as np
-
-
-class Told:
-    cameras, camera_size, observations = ("agentview",), (32, 32), ("rgb",)
-
-    def reset(self, instruction, num_envs):
-        with open("told.txt", "a") as file:
-            print(instruction, file=file)
-
-    def predict(self, observations):
-        return np.zeros((len(observations["agentview_rgb"]), 7))
-
-
-def make():
-    return Told()
-"""
 
 
 @pytest.fixture
@@ -38,12 +22,12 @@ def folder(tmp_path, monkeypatch):
     states = load_init_states(base_task(), scene)[:, : 1 + scene.model.nq + scene.model.nv]
     monkeypatch.setenv("LIBERO_PLUS", str(write_plus(tmp_path / "plus", states)))
     monkeypatch.setenv("LIBERO_PRO", str(write_pro(tmp_path / "pro", states)))
-    (tmp_path / "told_policy.py").write_text(POLICY)
+    own = "cameras, camera_size, observations = ('agentview',), (32, 32), ('rgb',)"
+    write_policy(tmp_path / "told_policy.py", "np.zeros((len(observations['agentview_rgb']), 7))", own)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-@pytest.mark.sim
 def test_variants_have_one_trial_each_and_are_reported_by_kind(folder, capsys):
     assert main([*EVAL, "--suite", "libero_plus_goal:available", "--out", "out"]) == 0
     result = EvaluationResult.read(folder / "out")
@@ -56,7 +40,6 @@ def test_variants_have_one_trial_each_and_are_reported_by_kind(folder, capsys):
         assert f"  {kind} " in shown
 
 
-@pytest.mark.sim
 def test_what_cannot_be_run_ends_before_anything_runs(folder, capsys):
     assert main([*EVAL, "--suite", "libero_plus_goal", "--out", "out"]) != 0
     assert "3 of 8 tasks need files" in (error := capsys.readouterr().err) and error.count("\n") == 1
@@ -66,7 +49,6 @@ def test_what_cannot_be_run_ends_before_anything_runs(folder, capsys):
     assert not (folder / "out").exists()
 
 
-@pytest.mark.sim
 def test_tasks_and_variants_are_listed(folder, capsys):
     assert main(["tasks", "list"]) == 0
     assert "libero_plus_goal             8 variants" in capsys.readouterr().out
@@ -78,7 +60,6 @@ def test_tasks_and_variants_are_listed(folder, capsys):
     assert "nothing to generate" in capsys.readouterr().err
 
 
-@pytest.mark.sim
 def test_a_protocol_has_the_horizon_of_the_base_task(folder):
     card = load_protocol("openpi")
     for name in ("libero_plus_goal", "libero_pro_goal_task"):

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from libero_eval.evaluation_file import EvaluationResult, TaskResult
+from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.robustness.page import curves_figure, render, verdict, write_robustness
 from libero_eval.robustness.results import (
     Condition,
@@ -19,6 +19,7 @@ from libero_eval.robustness.results import (
 )
 from libero_eval.robustness.study import read_study
 from lifelong.errors import ConfigError, ResultsError
+from tests.harness.results import result_of, task_result
 
 TASKS, STARTS = ("libero_goal/0", "libero_goal/1"), tuple(range(10))
 A, B = (("camera", 0.5),), (("camera", 1.0),)
@@ -31,19 +32,9 @@ def outcomes(rates: dict[Condition, int], starts: int = 10) -> Outcomes:
     return Outcomes(TASKS, tuple(range(starts)), tuple(rates), np.array(rows))
 
 
-def result(wins: int, starts: tuple[int, ...] = STARTS) -> EvaluationResult:
-    tasks = tuple(
-        TaskResult(
-            name,
-            name,
-            "do it",
-            init_states=starts,
-            successes=tuple(s < wins for s in starts),
-            lengths=(5,) * len(starts),
-        )
-        for name in TASKS
-    )
-    return EvaluationResult({"run": "r"}, {}, starts, {}, tasks)
+def result(wins: int, starts: tuple[int, ...] = STARTS, **changes) -> EvaluationResult:
+    rows = [task_result(name, [s < wins for s in starts], starts) for name in TASKS]
+    return replace(result_of(*rows, versions={}, protocol={}, evaluated={"run": "r"}), **changes)
 
 
 def test_area_and_kept_are_those_of_the_trapezoids() -> None:
@@ -82,23 +73,16 @@ def test_a_kind_that_takes_everything_is_shown_to() -> None:
 def test_two_that_act_independently_have_no_excess() -> None:
     rng = np.random.default_rng(0)
     base, camera, light = (rng.random((2, 400)) < p for p in (0.9, 0.6, 0.5))
-    found = Outcomes(
-        TASKS,
-        tuple(range(400)),
-        ((), B, C, BOTH),
-        np.array([base, base & camera, base & light, base & camera & light]),
-    )
+    rows = np.array([base, base & camera, base & light, base & camera & light])
+    found = Outcomes(TASKS, tuple(range(400)), ((), B, C, BOTH), rows)
     (pair,) = found.interactions
+    assert not outcomes({(): 10, A: 6, C: 5, BOTH: 2}).interactions, (
+        "a part was not run alone at its severity"
+    )
     assert pair.expected == pytest.approx(0.27, abs=0.05)
     assert pair.excess.low < 0 < pair.excess.high and abs(pair.excess.value) < 0.04
-    worse = Outcomes(
-        found.tasks, found.starts, found.conditions, np.array([base, base & camera, base & light, base & 0])
-    )
+    worse = replace(found, successes=np.array([*rows[:3], base & 0]))
     assert worse.interactions[0].excess.high < -0.2
-
-
-def test_a_pair_whose_parts_were_not_run_alone_at_the_same_severity_is_no_interaction() -> None:
-    assert not outcomes({(): 10, A: 6, C: 5, BOTH: 2}).interactions
 
 
 def test_results_are_paired_by_task_and_start() -> None:
@@ -110,32 +94,30 @@ def test_results_are_paired_by_task_and_start() -> None:
         Outcomes.of({B: result(2)})
 
 
+LATE = (("clock", 0.05),)
+
+
+def played(**sections) -> dict:
+    return {"protocol": sections}
+
+
 @pytest.mark.parametrize(("condition", "base", "other", "told"), [
-    (B, {"world": {"perturb": ""}}, {"world": {"perturb": "camera=1"}}, ""),
-    (B, {"episode": {"horizon": 5}}, {"episode": {"horizon": 6}}, "protocol.episode.horizon: 6 instead of 5"),
-    (B, {"action": {"clock": ""}}, {"action": {"clock": "latency=50ms"}}, "protocol.action.clock: latency=50ms"),
-    ((("clock", 0.05),), {"action": {"clock": ""}}, {"action": {"clock": "latency=50ms"}}, ""),
-    ((("clock", 0.05),), {}, {"action": {"clock": "latency=50ms,wait=hold"}}, "protocol.action.clock"),
+    (B, played(world={"perturb": ""}), played(world={"perturb": "camera=1"}), ""),
+    (B, played(episode={"horizon": 5}), played(episode={"horizon": 6}), "protocol.episode.horizon: 6 instead of 5"),
+    (B, played(action={"clock": ""}), played(action={"clock": "latency=50ms"}), "protocol.action.clock: latency=50ms"),
+    (LATE, played(action={"clock": ""}), played(action={"clock": "latency=50ms"}), ""),
+    (LATE, {}, played(action={"clock": "latency=50ms,wait=hold"}), "protocol.action.clock"),
+    (B, {}, {"evaluated": {"run": "other"}}, r"camera=1 .* \(evaluated.run: other instead of r\)"),
+    (B, {"versions": {"torch": "3"}}, {"versions": {"torch": "4"}}, ""),
+    (B, {"versions": {"mujoco": "3"}}, {"versions": {"mujoco": "4"}}, r"\(versions.mujoco: 4 instead of 3\)"),
 ])  # fmt: skip
 def test_conditions_have_the_settings_of_the_base(condition, base, other, told) -> None:
-    results = {(): replace(result(8), protocol=base), condition: replace(result(2), protocol=other)}
+    results = {(): result(8, **base), condition: result(2, **other)}
     if not told:
         assert Outcomes.of(results).conditions == ((), condition)
         return
     with pytest.raises(ResultsError, match=told):
         Outcomes.of(results)
-
-
-def test_conditions_are_of_one_policy() -> None:
-    with pytest.raises(ResultsError, match=r"camera=1 .* \(evaluated.run: other instead of r\)"):
-        Outcomes.of({(): result(8), B: replace(result(2), evaluated={"run": "other"})})
-
-
-def test_conditions_are_of_one_mujoco() -> None:
-    old, new = (replace(result(8), versions={"mujoco": version, "torch": version}) for version in "34")
-    assert Outcomes.of({(): old, B: old}).conditions == ((), B)
-    with pytest.raises(ResultsError, match=r"camera=1 .* \(versions.mujoco: 4 instead of 3\)"):
-        Outcomes.of({(): old, B: new})
 
 
 def test_only_the_conditions_that_are_asked_for_are_read(tmp_path) -> None:
@@ -203,13 +185,8 @@ def test_a_start_from_which_a_simulation_error_ended_an_episode_is_left_out_of_a
 
 
 def test_the_page_and_the_text_say_the_same_numbers(tmp_path, tab) -> None:
-    policy = Robustness(
-        "sequential",
-        outcomes({(): 10, A: 3, B: 0, C: 9, BOTH: 0}),
-        ("eval/a",),
-        {name_of(B): 2, name_of(C): 0},
-        horizon=130,
-    )
+    found, given_up = outcomes({(): 10, A: 3, B: 0, C: 9, BOTH: 0}), {name_of(B): 2, name_of(C): 0}
+    policy = Robustness("sequential", found, ("eval/a",), given_up, horizon=130)
     expert = Robustness("expert", outcomes({(): 10, A: 10, B: 10, C: 10}), horizon=600)
     page = write_robustness([policy, expert], tmp_path)
     assert tab.faults_on_a_phone(page) == []

@@ -3,30 +3,16 @@
 import json
 import pickle
 
-import numpy as np
 import pytest
 
 from libero_cli.main import main
 from libero_eval.evaluation_file import EvaluationResult
-from libero_eval.requests import KINDS, PAIRS, SEVERITIES, RobustnessRequest
+from libero_eval.requests import SEVERITIES, RobustnessRequest
 from libero_eval.robustness.study import conditions_of
+from tests.harness.evaluations import write_policy
 
 pytestmark = pytest.mark.sim
 
-POLICY = """
-import numpy as np
-
-
-class Still:
-    cameras, camera_size, observations = ("agentview",), (16, 16), ("rgb",)
-
-    def predict(self, observations):
-        return np.zeros((len(observations["agentview_rgb"]), 7))
-
-
-def make():
-    return Still()
-"""
 LATE = "{extends: libero, name: late, title: late, action: {clock: 'latency=50ms,wait=hold'}}"
 WORDS = [
     "still_policy:make", "--suite", "libero_goal/1", "--episodes", "2", "--horizon", "2", "--threads", "1"
@@ -37,7 +23,8 @@ TWO = ["--kinds", "noise", "robot", "--severities", "1", "0.5", "--pairs", "nois
 @pytest.fixture
 def still(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "still_policy.py").write_text(POLICY)
+    own = "cameras, camera_size, observations = ('agentview',), (16, 16), ('rgb',)"
+    write_policy(tmp_path / "still_policy.py", "np.zeros((len(observations['agentview_rgb']), 7))", own)
     (tmp_path / "late.yaml").write_text(LATE)
     (tmp_path / "dim.yaml").write_text("{extends: libero, world: {perturb: light=0.5}}")
     return tmp_path
@@ -48,16 +35,14 @@ def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> N
     said = capsys.readouterr().out
     assert "nan" not in said
     page = (still / "found" / "robustness.html").read_text()
-    assert ", inf]" not in page and str(still) not in page and page.count("<svg") == 1, (
-        "no radar of two kinds"
-    )
+    assert ", inf]" not in page and str(still) not in page and "robot" in page
+    assert page.count("<svg") == 1, "no radar of two kinds"
     folders = sorted(path.parent.name for path in still.glob("found/conditions/*/eval.json"))
     assert folders == ["noise=0.5", "noise=1", "none", "robot=0.5", "robot=0.5,noise=0.5", "robot=1"]
     assert "6/6" in said and "nothing to lose" in said
     record = json.loads((still / "found" / "robustness.json").read_text())["policies"][0]
     assert record["label"] == "still_policy:make" and len(record["axes"]) == 2
     assert [pair["condition"] for pair in record["interactions"]] == ["robot=0.5,noise=0.5"]
-    assert "robot" in (still / "found" / "robustness.html").read_text()
     for folder, perturb in (("none", ""), ("robot=1", "robot=1")):
         result = EvaluationResult.read(still / "found" / "conditions" / folder)
         assert result.protocol["world"]["perturb"] == perturb and len(result.tasks[0].successes) == 2
@@ -72,13 +57,10 @@ def test_all_conditions_are_run_once_and_the_page_is_written(still, capsys) -> N
     assert labels == ["first", "second"]
     assert main(["robustness", "--report", "found", "found", "--out", "both"]) == 2
     assert "two policies are named found" in capsys.readouterr().err
-    (still / "found").rename(still / "a=b")
-    assert (
-        main(["robustness", "--report", "a=b", "c=a=b"]) == 0 and (still / "a=b" / "robustness.html").exists()
-    )
-    text = (still / "a=b" / "robustness.json").read_text()
-    assert [policy["label"] for policy in json.loads(text)["policies"]] == ["a=b", "c"]
-    (still / "a=b").rename(still / "found")
+    (still / "a=b").symlink_to(still / "found")
+    assert main(["robustness", "--report", "a=b", "c=a=b", "--out", "both"]) == 0
+    labels = [p["label"] for p in json.loads((still / "both" / "robustness.json").read_text())["policies"]]
+    assert labels == ["a=b", "c"]
 
     others = ["--kinds", "noise", "--severities", "1", "--pairs", "--perturb-seed", "3", "--out", "found"]
     assert main(["robustness", *WORDS, *others]) == 0
@@ -97,15 +79,9 @@ def test_latency_is_a_kind_whose_severity_is_in_seconds(still, capsys) -> None:
     latencies = ["--kinds", "clock", "--severities", "0", "0.05", "0.2", "--pairs"]
     assert main(["robustness", *WORDS, *latencies, "--clock", "wait=hold", "--out", "found"]) == 0
     assert "3/3" in capsys.readouterr().out
-    clocks = {
-        path.parent.name: EvaluationResult.read(path).protocol["action"]["clock"]
-        for path in still.glob("found/conditions/*/eval.json")
-    }
-    assert clocks == {
-        "none": "latency=0ms,wait=hold",
-        "clock=0.05": "latency=50ms,wait=hold",
-        "clock=0.2": "latency=200ms,wait=hold",
-    }
+    for folder, ms in (("none", 0), ("clock=0.05", 50), ("clock=0.2", 200)):
+        protocol = EvaluationResult.read(still / "found" / "conditions" / folder).protocol
+        assert protocol["action"]["clock"] == f"latency={ms}ms,wait=hold"
     (axis,) = json.loads((still / "found" / "robustness.json").read_text())["policies"][0]["axes"]
     assert axis["kind"] == "clock" and axis["severities"] == [0, 0.05, 0.2]
     words = ["--kinds", "noise", "--severities", "1", "--pairs", "--clock", "latency=50ms", "--out", "both"]
@@ -122,9 +98,7 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
     record = json.loads((still / "found" / "robustness.json").read_text())["policies"][0]
     rows = {row["name"]: (row["episodes"], row["began"], row["solved"]) for row in record["events"]}
     assert rows == {"camera=1@step1": (2, 2, 0), "light=1@touched": (2, 0, 0)}
-    assert {row["p_value"] for row in record["events"]} == {1.0} and not record["events"][0]["difference"][
-        "value"
-    ]
+    assert {(row["p_value"], row["difference"]["value"]) for row in record["events"]} == {(1.0, None)}
     assert "<h2>Events</h2>" in (still / "found" / "robustness.html").read_text()
     conditions = conditions_of(RobustnessRequest(events=True))
     assert len(conditions) == 19 and {"object=0.6@step20", "camera=1@lifted"} <= {*conditions}
@@ -136,11 +110,9 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
     (["--kinds", "object@lifted"], "the robot touches the object then"),
     (["--kinds", "goal@touched"], "goal=0.2@touched: still_policy:make cannot be told another instruction"),
     (["--kinds", "clock", "--clock", "latency=50ms", "--pairs"], "latency is named twice"),
-    (["--kinds", "camra"], "Did you mean 'camera'"),
     (["--severities", "2"], "--severities"),
     (["--kinds", "noise", "--severities", "1", "--pairs", "noise=1,robot=1"], "must also be run alone"),
     (["--pairs", "noise=1"], "expected two perturbations"),
-    (["--kinds", "noise", "--pairs", "camera=0.4,light=0.4"], "must also be run alone"),
     (["--kinds", "noise", "noise@3"], "differ in their seeds alone"),
     (["--kinds"], "name no condition"),
     (["--kinds", "clock", "--pairs", "--protocol", "late.yaml"], "has the clock latency=50ms,wait=hold"),
@@ -173,31 +145,8 @@ def test_nothing_is_removed_where_a_link_leads(still, link, capsys) -> None:
     assert "is a link, or is not a folder" in capsys.readouterr().err and (still / "mine" / "units").is_dir()
 
 
-def test_default_kinds_and_pairs_exist() -> None:
-    from libero_env.perturbations import KINDS as ALL
-    from libero_env.perturbations import parse_perturbations
-
-    assert set(KINDS) <= set(ALL) and len(KINDS) == 12
-    for text in PAIRS:
-        pair = parse_perturbations(text)
-        assert {one.kind for one in pair} <= set(KINDS)
-        assert {one.severity for one in pair} <= set(SEVERITIES)
-
-
 def test_worker_processes_find_the_same_conditions() -> None:
     """Requests are pickled on their way to them; the default pairs of kinds that are not run are left out."""
     request = RobustnessRequest(kinds=("noise",), severities=(0.4,))
     conditions = conditions_of(request)
     assert conditions == ["", "noise=0.4"] == conditions_of(pickle.loads(pickle.dumps(request)))
-
-
-def test_the_expert_is_a_policy_that_can_be_evaluated(tmp_path, monkeypatch, capsys) -> None:
-    monkeypatch.chdir(tmp_path)
-    words = ["eval", "expert", "--suite", "libero_goal/7", "--threads", "1", "--out"]
-    assert main([*words, "both", "--episodes", "2"]) == 0
-    both = EvaluationResult.read(tmp_path / "both")
-    assert both.evaluated["policy"] == "expert" and both.tasks[0].successes == (True, True)
-    assert main([*words, "one", "--episodes", "1"]) == 0
-    one = EvaluationResult.read(tmp_path / "one")
-    assert one.tasks[0].actions == both.tasks[0].actions[:1], "what it does does not depend on the batch"
-    assert np.all(np.array(both.tasks[0].lengths) < 120)

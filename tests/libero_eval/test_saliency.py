@@ -116,12 +116,6 @@ def test_overlays_are_grey_where_saliency_is_zero():
     np.testing.assert_array_equal(sheet[2:26:3, 2:26:3], image)
 
 
-def test_windows_end_at_the_step():
-    frames = [{"x": torch.full((1, 1, 1), float(step))} for step in range(5)]
-    assert window_at(frames, 3, 2)["x"].flatten().tolist() == [2, 3]
-    assert window_at(frames, 1, 4)["x"].flatten().tolist() == [0, 1]
-
-
 @pytest.mark.parametrize("memory", ["reset", "window", "none"])
 def test_the_explained_action_is_that_of_the_frames_that_it_was_taken_from(memory):
     spec = replace(SPEC, seq_len=3)

@@ -133,17 +133,13 @@ def test_requests_that_are_refused(folder):
         "not a list": ([1], "not a list"),
         "lacks": ({k: v for k, v in good.items() if "joint" not in k}, "lacks observation/joint_states; it"),
         "dtype": (good | {"observation/agentview_rgb": np.zeros((32, 32, 3))}, "dtype float64; valid: uint8"),
-        "text": (good | {"observation/ee_pos": ["a", "b", "c"]}, "dtype <U1; valid: floats"),
         "shape": (good | {"observation/agentview_rgb": np.zeros((8, 8, 3), np.uint8)}, r"\(8, 8, 3\).*\(32, 32, 3\)"),
         "nan": (good | {"observation/ee_pos": np.full(3, np.nan)}, "not finite"),
         "prompt": (good | {"prompt": "dance"}, f"no task with prompt 'dance'.*{task.language}"),
         "words": (good | {"instruction": "x" * 10_000_000}, "instruction is not a text of at most 1000"),
-        "no text": (good | {"prompt": np.zeros(3)}, "prompt is not a text"),
         "reset": (good | {"reset": "no"}, "reset is neither true nor false"),
         "ragged": (good | {"observation/agentview_rgb": [[1], [2, 3]]}, "agentview_rgb is not an array"),
-        "many": (good | {"observation/ee_pos": np.zeros((2, 3))}, r"shape \(2, 3\); this policy's is \(3,\)"),
         "task": (good | {"task": "../../secrets.bddl"}, "no task with prompt"),
-        "other": (good | {"task": served.run.tasks[1].id}, "no task with prompt"),
         "unknown": (good | {"rest": True}, "unknown key of a request 'rest'. Did you mean 'reset'"),
         "far": (good | {"observation/joint_states": np.full(7, 1e30)}, "actions that are not finite"),
         "seed": (good | {"seed": ["a"]}, r"seed is \['a'\]; valid: a list of integers"),
@@ -156,14 +152,11 @@ def test_requests_that_are_refused(folder):
             raise AssertionError(name)
 
 
-@pytest.mark.parametrize("host", ["nowhere.invalid", "127.0.0.1"])
-def test_an_address_that_cannot_be_listened_on_is_named(folder, host):
+def test_an_address_that_cannot_be_listened_on_is_named(folder):
     served = run_of(folder, "algo=er")
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        server = PolicyServer(served.metadata, served.session, host=host, port=taken.getsockname()[1])
-        with pytest.raises(
-            ServerError, match=rf"--host {host} --port \d+ cannot be listened on: .*; --port 0"
-        ):
+        server = PolicyServer(served.metadata, served.session, port=taken.getsockname()[1])
+        with pytest.raises(ServerError, match=r"--port \d+ cannot be listened on: .*; --port 0"):
             asyncio.run(server.run())
 
 
@@ -186,14 +179,9 @@ def test_openpi_names(folder):
     wanted = served.session().infer(request(obs, prompt=task.language))["actions"]
     raw = {name: obs[f"{name}_rgb"][0, ::-1] for name in ("agentview", "eye_in_hand")}  # the simulator's rows
     state = np.concatenate([obs["ee_pos"][0], np.full(3, 9.0), obs["gripper_states"][0]])
-    found = served.session().infer(
-        {
-            "observation/image": raw["agentview"][::-1, ::-1],
-            "observation/wrist_image": raw["eye_in_hand"][::-1, ::-1],
-            "observation/state": state,
-            "prompt": task.language,
-        }
-    )["actions"]
+    sent = {"observation/image": raw["agentview"][::-1, ::-1], "observation/state": state}
+    sent |= {"observation/wrist_image": raw["eye_in_hand"][::-1, ::-1], "prompt": task.language}
+    found = served.session().infer(sent)["actions"]
     np.testing.assert_array_equal(found, wanted)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from libero_env.errors import LiberoError
-from libero_eval.evaluation_file import EvaluationResult, Stopped
+from libero_eval.evaluation_file import EvaluationResult
 from libero_eval.judging.comparability import Group
 from libero_eval.judging.comparison import compare_groups
 from libero_eval.judging.evaluation_page import write_evaluation_page
@@ -17,7 +17,6 @@ from libero_eval.work.stopping import StoppingRule
 from libero_eval.work.worker import Worker
 from lifelong.errors import ConfigError
 from tests.harness.evaluations import QUICK, TASKS, Countdown, evaluate, evaluation
-from tests.harness.results import result_of, task_result
 
 IDS = [task.id for task in TASKS]
 STARTS = tuple(range(1, 31))  # those after 10 steps fail: the horizon
@@ -72,16 +71,7 @@ def test_it_stops_after_the_round_that_makes_the_interval_narrow(tmp_path):
     assert everything.tasks == plain.tasks and everything.outcomes == plain.outcomes
 
 
-def test_rows_of_suites_have_the_interval_of_the_rule_too():
-    tasks = [task_result(f"{suite}/0", [1] * 6) for suite in ("libero_goal", "libero_object")]
-    result = result_of(*tasks, stopped=Stopped("width=0.5", "known", 100))
-    end = anytime_interval(6, 6)
-    assert {*result.suites.values()} == {end}
-    rows = [row for row in total_rows(result) if row.startswith("libero_")]
-    assert len(rows) == 2 and all(f"[{100 * end.low:.1f}, 100.0]" in row for row in rows)
-
-
-@pytest.mark.parametrize("size", [2, 4, 7, 30])
+@pytest.mark.parametrize("size", [2, 7, 30])
 def test_the_result_does_not_depend_on_units_nor_on_what_else_is_done(tmp_path, size):
     class Some(Always):
         lost = (2, 5)
@@ -116,10 +106,8 @@ def test_it_stops_when_it_is_decided_against_a_result(tmp_path):
         tmp_path / "c", f"against={tmp_path / 'all'},margin=0.2", env=lambda task, count: Countdown(count)
     )
     assert result.stopped.verdict == "below"
-    groups = [
-        Group("a", (replace(result, evaluated={"policy": "a"}),)),
-        Group("b", (EvaluationResult.read(tmp_path / "all"),)),
-    ]
+    results = replace(result, evaluated={"policy": "a"}), EvaluationResult.read(tmp_path / "all")
+    groups = [Group(name, (one,)) for name, one in zip("ab", results, strict=True)]
     assert any("only the sequential test allows for that" in note for note in compare_groups(groups).notes)
 
 
@@ -147,13 +135,9 @@ def test_it_is_compared_with_the_same_tasks_in_the_same_world_only(tmp_path):
     ("text", "starts", "message"),
     [
         ("width=0", STARTS, "expected width=0.05"),
-        ("width=0.05,against=x", STARTS, "expected width=0.05"),
-        ("width=nan", STARTS, "expected width=0.05"),
         ("narrow", STARTS, "expected width=0.05"),
-        ("margin=0.1", STARTS, "expected width=0.05"),
         ("width=0.1,width=0.2", STARTS, "expected width=0.05"),
         ("width=0.1", (0,), "there is only one"),
-        ("against=nowhere", STARTS, "nowhere does not exist"),
         ("against=ref", (*STARTS, 40), "no episode of libero_goal/0, start 40"),
         ("against=slow", STARTS, "the protocol there differs in .*episode.horizon"),
     ],

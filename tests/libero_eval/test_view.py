@@ -224,9 +224,7 @@ def test_the_page_and_its_socket_are_served_and_a_client_may_come_back(viewer, c
     with urllib.request.urlopen(f"http://127.0.0.1:{view.port}/") as page:
         assert page.status == 200 and b"<html" in page.read(1000)
     for _ in range(2):
-        with connect(
-            f"ws://127.0.0.1:{view.port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None
-        ) as client:
+        with join(view) as client:
             text = b""
             while b"/bodies/flat_stove_1_main" not in text or b"**turn on the stove**" not in text:
                 text += messages(client.recv(timeout=30))
@@ -241,20 +239,12 @@ def join(view, **more):
     return connect(f"ws://127.0.0.1:{view.port}", subprotocols=[own], max_size=None, **more)
 
 
-@pytest.mark.parametrize(
-    "headers",
-    [
-        *(
-            {"Origin": origin}
-            for origin in ("http://evil.example", "null", "", "http://localhost:1", "file://")
-        ),
-        *(
-            {"Host": host}
-            for host in ("evil.example", "127.0.0.1.evil.example:80", "192.168.0.7", "", "[", "a@b")
-        ),
-    ],
-    ids=str,
-)
+ORIGINS = ("http://evil.example", "null", "", "http://localhost:1", "file://")
+HOSTS = ("127.0.0.1.evil.example:80", "192.168.0.7", "", "[", "a@b")
+OTHERS = [*({"Origin": origin} for origin in ORIGINS), *({"Host": host} for host in HOSTS)]
+
+
+@pytest.mark.parametrize("headers", OTHERS, ids=str)
 def test_pages_of_others_are_not_let_in(open_view, headers):
     request = urllib.request.Request(f"http://127.0.0.1:{open_view.port}/", headers=headers)
     with pytest.raises(urllib.error.HTTPError, match="403"):

@@ -68,14 +68,6 @@ def test_every_start_is_in_one_unit_and_units_do_not_depend_on_other_tasks():
             partition(TASKS, starts, 10)
 
 
-def test_the_result_is_the_same_however_episodes_are_divided(tmp_path):
-    whole = evaluate(tmp_path / "whole", unit_starts=4)
-    parts = evaluate(tmp_path / "parts", **TWO)
-    assert parts.tasks == whole.tasks and parts.outcomes == whole.outcomes and parts.actions == whole.actions
-    assert (whole.unit_starts, parts.unit_starts) == (4, 2)
-    assert len(list((tmp_path / "parts" / "units").iterdir())) == 4
-
-
 def test_processes_share_the_units_and_all_return_the_same(tmp_path):
     counted, results = [], []
 
@@ -137,7 +129,11 @@ def test_a_process_begins_with_a_task_that_nobody_works_on(tmp_path):
 def test_a_process_that_does_not_wait_leaves_what_others_hold(tmp_path):
     plan = evaluation(tmp_path)
     others = Claims(tmp_path / "claims")
-    assert others.take(plan.units[0].name) and Worker(plan).run(wait=False) is None
+    assert (
+        others.take(plan.units[0].name)
+        and not others.take(plan.units[0].name)
+        and Worker(plan).run(wait=False) is None
+    )
     assert set(plan.store.done(plan.units)) == {unit.name for unit in plan.units[1:]}
     others.release(plan.units[0].name)
     assert Worker(plan).run(wait=False) == evaluate(tmp_path / "other")
@@ -179,17 +175,6 @@ def test_a_running_batch_counts_its_steps_and_its_first_estimate_is_right_within
 
 
 # --- claims
-
-
-def test_a_claim_is_held_until_it_is_released(tmp_path):
-    first, second = Claims(tmp_path), Claims(tmp_path)
-    assert first.take("a") and not first.take("a") and not second.take("a")
-    assert second.take("b") and second.held() == first.held() == dict.fromkeys("ab", this_process())
-    first.release("a")
-    assert list(first.held()) == ["b"] and second.take("a")
-    second.release("a")
-    second.release("b")
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_claim_of_a_killed_process_is_taken_over_at_once(tmp_path):
@@ -347,31 +332,22 @@ def test_a_task_of_which_no_episode_counts_has_no_result_and_the_others_are_run(
 # --- bad input
 
 
-def test_a_unit_file_that_is_cut_off_or_from_another_evaluation_is_not_counted(tmp_path):
+def test_a_unit_file_from_another_evaluation_is_not_counted(tmp_path):
     evaluate(tmp_path, **TWO)
     path = tmp_path / "units" / "libero_goal_00_starts_03_04.json"
-    whole = path.read_text()
-    path.write_text(whole[:200])
-    with pytest.raises(LifelongError, match=r"starts_03_04\.json is not a valid result.*remove it"):
-        evaluate(tmp_path, **TWO)
-    path.write_text(whole.replace("libero-evaluation-unit/1", "libero-evaluation-unit/9"))
-    with pytest.raises(LifelongError, match="the format is 'libero-evaluation-unit/9'"):
-        evaluate(tmp_path, **TWO)
-    values = json.loads(whole)
+    values = json.loads(path.read_text())
     path.write_text(json.dumps(values | {"digest": "0123"}))
     with pytest.raises(ConfigError, match="another evaluation"):
         evaluate(tmp_path, **TWO)
     path.unlink()
     evaluate(tmp_path, **TWO)
-    again = json.loads(path.read_text())
-    assert again["result"] == values["result"]
+    assert json.loads(path.read_text())["result"] == values["result"]
 
 
 HOSTILE = {
     "deep": b"[" * 100_000,
     "binary": b"\xff\xfe\xfd",
     "empty": b"",
-    "a number": b"5",
     "a list": b"[1, 2]",
     "wrong kinds": b'{"format": 5, "units": [], "errors": [5], "pid": "../1", "unit": {}}',
 }
@@ -446,9 +422,6 @@ def test_a_folder_of_another_version_or_of_something_else_is_refused(tmp_path):
     (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/7"}')
     with pytest.raises(ConfigError, match="libero-evaluation-plan/7"):
         evaluate(tmp_path)
-    (tmp_path / "evaluation.json").write_text('{"format": "libero-evaluation-plan/1"}')
-    with pytest.raises(LifelongError, match="evaluated is missing.*: name another folder"):
-        evaluate(tmp_path)
     with pytest.raises(LifelongError, match="holds no evaluation"):
         describe_status(tmp_path / "old")
 
@@ -462,12 +435,6 @@ def test_a_policy_that_answers_a_fixed_observation_otherwise_is_another_one(tmp_
         ConfigError, match="another evaluation: the policy answers a fixed observation otherwise"
     ):
         evaluate(tmp_path, probe=now, **TWO)
-
-
-def test_a_folder_that_cannot_be_written_is_named(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ResultsError, match=r"file/eval.*cannot be written.*Not a directory"):
-        evaluate(tmp_path / "file" / "eval")
 
 
 def test_a_full_disk_counts_nothing_and_the_same_command_goes_on(tmp_path, monkeypatch):

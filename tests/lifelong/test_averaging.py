@@ -46,13 +46,6 @@ def test_after_every_task_the_weights_are_the_mean_of_the_solutions() -> None:
     assert any(not torch.equal(ends[3][name], value) for name, value in solutions[3].items())
 
 
-def test_a_constant_share_is_an_exponential_average() -> None:
-    solutions, ends = solutions_and_ends(Averaging(share=0.25), 3)
-    for name, value in ends[2].items():
-        expected = 0.75 * (0.75 * solutions[0][name] + 0.25 * solutions[1][name]) + 0.25 * solutions[2][name]
-        torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6)
-
-
 def test_with_a_share_of_one_it_is_fine_tuning_to_the_bit_and_with_zero_nothing_moves() -> None:
     plain, averaged, frozen = policy(), policy(), policy()
     learners = Sequential(), Averaging(share=1.0), Averaging(share=0.0)

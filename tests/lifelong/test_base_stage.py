@@ -160,18 +160,6 @@ def test_a_comparison_measures_the_later_tasks_alone(tmp_path) -> None:
     assert any(line.startswith("Later tasks alone: ") for line in comparison_text(page))
 
 
-def test_a_comparison_without_a_base_stage_names_no_later_tasks(tmp_path) -> None:
-    for algo in ("first", "second"):
-        log = ResultLog(tmp_path / algo / "results.jsonl")
-        log.append(replace(record((1, 1)), algo=algo))
-        fill(log, {(kind, 0, 5, 0): 0.5 for kind in ("curve", "matrix")})
-    page = write_report([tmp_path / "first", tmp_path / "second"], tmp_path / "page")
-    assert (
-        json.loads((page.parent / "comparison.json").read_text(encoding="utf-8"))["after_base_stage"] is None
-    )
-    assert "Of the later tasks alone" not in page.read_text(encoding="utf-8")
-
-
 def test_without_a_base_stage_nothing_is_measured_apart(tmp_path) -> None:
     for sizes in ((1, 1), (2, 2), (4,)):
         assert not record(sizes).has_base_stage
@@ -204,21 +192,16 @@ def test_a_loaded_run_acts_with_the_adapter_of_the_stage(tmp_path) -> None:
     sequences.sequence(found).run()
     asked = []
     learner.policy_for = lambda stage, policy: asked.append(stage) or LoRA.policy_for(learner, stage, policy)  # type: ignore[method-assign]
-    run = LoadedRun(
-        path=tmp_path,
-        checkpoint=tmp_path,
-        tasks=found.tasks,
-        learned=3,
-        policy=found.policy,
-        algorithm=learner,
-        eval=found.eval,
-        seed=1,
-        device=found.device,
-        language=None,
-        instructions=(),
-        data=None,
-        group_sizes=found.group_sizes,
-    )
+    given = {
+        "path": tmp_path,
+        "checkpoint": tmp_path,
+        "learned": 3,
+        "language": None,
+        "instructions": (),
+        "data": None,
+    }
+    of_run = ("tasks", "policy", "algorithm", "eval", "seed", "device", "group_sizes")
+    run = LoadedRun(**given, **{name: getattr(found, name) for name in of_run})
     for task in found.tasks:
         with run.acting(task):
             pass

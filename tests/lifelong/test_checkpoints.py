@@ -13,6 +13,7 @@ from safetensors.torch import save_file
 from lifelong import checkpoints
 from lifelong.errors import CheckpointError, DamagedCheckpointError
 from lifelong.results.run_directory import CheckpointFolder
+from tests.harness import sequences
 from tests.harness.checkpoints import write_forged
 
 
@@ -37,51 +38,6 @@ def test_a_tree_is_loaded_as_it_was_saved(tmp_path):
         assert torch.equal(back["opt"]["state"][0][key], value)
     assert back["opt"]["param_groups"] == tree["opt"]["param_groups"]
     assert [p.name for p in (tmp_path / "a").iterdir()] == ["state.safetensors"]
-
-
-@pytest.mark.parametrize("keep", [0, 5, 200])
-def test_a_truncated_file_is_named(tmp_path, keep):
-    path = tmp_path / "x.safetensors"
-    checkpoints.save(path, {"w": torch.ones(100)})
-    path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(CheckpointError, match=r"x\.safetensors is broken"):
-        checkpoints.load(path)
-
-
-def test_a_pickle_is_refused(tmp_path):
-    path = tmp_path / "x.safetensors"
-    path.write_bytes(pickle.dumps({"w": 1}))
-    with pytest.raises(CheckpointError, match="broken"):
-        checkpoints.load(path)
-
-
-def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(CheckpointError, match="no checkpoint at"):
-        checkpoints.load(tmp_path / "x.safetensors")
-
-
-def test_a_failed_write_leaves_the_old_file(tmp_path):
-    path = tmp_path / "x.safetensors"
-    checkpoints.save(path, {"n": 1})
-    with pytest.raises(CheckpointError, match="cannot store a object at /n"):
-        checkpoints.save(path, {"n": object()})
-    assert checkpoints.load(path) == {"n": 1}
-
-
-def test_weights_of_another_shape_are_refused(tmp_path):
-    net = torch.nn.Linear(3, 2)
-    before = net.weight.clone()
-    for state, message in [
-        ({"weight": torch.ones(2, 3)}, "lacks bias"),
-        ({"weight": torch.ones(2, 4), "bias": torch.ones(2)}, r"weight has shape \(2, 4\)"),
-        (
-            {"weight": torch.ones(2, 3), "bias": torch.ones(2), "z": torch.ones(1)},
-            "z is no weight of the policy",
-        ),
-    ]:
-        with pytest.raises(CheckpointError, match=message):
-            checkpoints.load_weights(net, state, tmp_path)
-    assert torch.equal(net.weight, before)
 
 
 TREE = {
@@ -125,7 +81,6 @@ def test_any_flipped_byte_is_found(tmp_path):
     "[]",
     '{"value": []}',
     '{"tensor": "/gone"}',
-    '{"tensor": 3}',
     '{"dict": [["a"]]}',
     '{"dict": [[null, {"value": 1}]]}',
     '{"dict": [["a", {"value": 1}], ["a", {"value": 2}]]}',
@@ -140,8 +95,9 @@ def test_a_tree_that_was_not_written_here_is_refused(tmp_path, tree):
         checkpoints.load(path)
 
 
-def test_what_cannot_be_read_again_is_not_written(tmp_path):
-    deep: dict = {}
+def test_what_cannot_be_read_again_is_not_written_and_leaves_the_old_file(tmp_path):
+    path, deep = tmp_path / "x.safetensors", {}
+    checkpoints.save(path, {"n": 1})
     for _ in range(100):
         deep = {"a": deep}
     for tree, message in [
@@ -149,10 +105,11 @@ def test_what_cannot_be_read_again_is_not_written(tmp_path):
         ({"a": torch.ones(1, dtype=torch.complex128)}, "complex128"),
         ({"a": torch.ones(2, 2).to_sparse()}, "sparse"),
         ({(1, 2): 3}, "not all str or int"),
+        ({"n": object()}, "cannot store a object at /n"),
     ]:
         with pytest.raises(CheckpointError, match=message):
-            checkpoints.save(tmp_path / "x.safetensors", tree)
-    assert not list(tmp_path.iterdir())
+            checkpoints.save(path, tree)
+    assert list(tmp_path.iterdir()) == [path] and checkpoints.load(path) == {"n": 1}
 
 
 def test_files_of_other_programs_are_refused_and_never_to_be_deleted(tmp_path):
@@ -160,7 +117,9 @@ def test_files_of_other_programs_are_refused_and_never_to_be_deleted(tmp_path):
     sparse = tmp_path / "sparse.safetensors"
     with open(sparse, "wb") as file:
         file.truncate(1 << 42)
-    for path in (tmp_path / "other.safetensors", "/etc/passwd", sparse):
+    pickled, missing = tmp_path / "pickled.safetensors", tmp_path / "missing.safetensors"
+    pickled.write_bytes(pickle.dumps({"w": 1}))
+    for path in (tmp_path / "other.safetensors", "/etc/passwd", sparse, pickled, missing):
         with pytest.raises(CheckpointError, match="no checkpoint") as caught:
             checkpoints.load(checkpoints.Path(path))
         assert "elete" not in str(caught.value)
@@ -175,9 +134,10 @@ def test_weights_that_are_not_finite_or_of_another_kind_are_refused(tmp_path):
         checkpoints.load_weights(net, state | {"weight": state["weight"] * torch.nan}, tmp_path)
     with pytest.raises(CheckpointError, match="int64"):
         checkpoints.load_weights(net, state | {"bias": torch.ones(2, dtype=torch.int64)}, tmp_path)
-    for odd in (None, [], {"weight": 1}, {1: torch.ones(2)}):
+    for odd in (None, [], {"weight": 1}, {1: torch.ones(2)}, {"weight": state["weight"]}):
         with pytest.raises(CheckpointError):
             checkpoints.load_weights(net, odd, tmp_path)
+    sequences.assert_same(dict(net.state_dict()), state)
 
 
 def test_a_form_names_the_first_difference():

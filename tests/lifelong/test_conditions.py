@@ -21,17 +21,8 @@ from lifelong.settings import BenchmarkSettings, RunSettings
 from tests.harness.records import run_start
 
 START = run_start(["a"], conditions=present_conditions(torch.device("cpu"), renderer="llvmpipe"))
-SETTINGS = RunSettings(
-    seed=1,
-    device="cpu",
-    threads=0,
-    runs_dir="runs",
-    run_id=None,
-    resume=True,
-    progress=None,
-    deterministic=False,
-    init_from=None,
-)
+NAMED = {"seed": 1, "device": "cpu", "threads": 0, "runs_dir": "runs", "resume": True, "deterministic": False}
+SETTINGS = RunSettings(**NAMED, run_id=None, progress=None, init_from=None)
 
 
 def test_paths_of_the_configuration_may_begin_in_the_home_folder(monkeypatch):
@@ -69,26 +60,18 @@ def test_the_conditions_name_what_decides_sums():
 
 
 def test_a_resume_under_other_conditions_is_told(tmp_path):
-    newer = replace(changed(threads="64", source="0" * 12), versions={**START.versions, "torch": "9.9"})
+    newer = changed(threads="64", source="0" * 12)  # and a task file that was edited meanwhile
+    newer = replace(newer, versions={**START.versions, "torch": "9.9"}, instructions=("other words",))
     found = changed_conditions(START, newer)
     assert found == [
+        f"instruction {START.instructions[0]!r} -> 'other words'",
         f"threads {START.conditions['threads']} -> 64",
         f"source {START.conditions['source']} -> {'0' * 12}",
         f"torch {START.versions['torch']} -> 9.9",
     ]
     (note,) = resume_notes(write(tmp_path, START, START, newer).read())
-    assert note.startswith("Resumed 2026-01-02 03:04:05 UTC under other conditions (threads")
+    assert note.startswith("Resumed 2026-01-02 03:04:05 UTC under other conditions (instruction")
     assert "bits differ" in note and note in load_run(tmp_path).notes, "the report shows it"
-
-
-def test_a_resume_with_other_instructions_is_told(tmp_path):
-    """Task files may be edited meanwhile."""
-    (note,) = resume_notes(write(tmp_path, START, replace(START, instructions=("other words",))).read())
-    assert f"(instruction {START.instructions[0]!r} -> 'other words')" in note
-
-
-def test_the_same_conditions_say_nothing(tmp_path):
-    assert resume_notes(write(tmp_path, START, START).read()) == []
 
 
 def test_a_resume_with_other_demonstrations_is_told(tmp_path):

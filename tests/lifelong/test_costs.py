@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from lifelong.algorithms import EWC, Algorithm, Sequential
+from lifelong.algorithms import Algorithm, Sequential
 from lifelong.algorithms.agem import AGEM
 from lifelong.algorithms.anchor import Anchored
 from lifelong.algorithms.er import ER
@@ -87,24 +87,15 @@ def test_a_penalty_of_ones_own_counts_by_its_element_wise_operations():
     assert 4 * weights < found - plain <= 5 * weights + 3 * tensors + 30
 
 
-@pytest.mark.parametrize("ratio", [0.125, 0.25, 0.375, 0.75, 1.5])
-def test_replay_counts_by_its_share_of_a_step(ratio):
+@pytest.mark.parametrize("ratio", [0.125, 0.375, 1.0, 1.5])
+def test_replay_counts_by_its_share_of_a_step_whose_gradient_costs_twice_the_loss(ratio):
     policy, first, second = make_policy(), dataset(0), dataset(1)
     costs = {}
     for algorithm in (Sequential(), ER(memory=ReplayMemory(9), ratio=ratio)):
         algorithm.end_task(0, first, policy, generator(0))
         costs[type(algorithm)] = step_costs(policy, algorithm, second, 16)["flops_per_step"]
     assert costs[ER] == (1 + ratio) * costs[Sequential]
-
-
-def test_replay_doubles_a_step_and_its_gradient_costs_twice_the_loss():
-    policy, first, second = make_policy(), dataset(0), dataset(1)
-    costs = {}
-    for algorithm in (Sequential(), ER(memory=ReplayMemory(9))):
-        algorithm.end_task(0, first, policy, generator(0))
-        costs[type(algorithm)] = step_costs(policy, algorithm, second, 8)["flops_per_step"]
-    assert costs[ER] == 2 * costs[Sequential]
-    forward = counted(lambda: policy.loss(second.batch(torch.arange(8))))
+    forward = counted(lambda: policy.loss(second.batch(torch.arange(16))))
     assert 2.5 * forward < costs[Sequential] < 3 * forward  # the images need no gradient
 
 
@@ -140,16 +131,6 @@ def test_an_action_of_a_recurrent_policy_costs_less_with_carried_memory():
     step = 2 * sum(w.numel() for w in window.rnn.parameters() if w.dim() == 2)
     costs = [action_costs(p, torch.ones(SPEC.language_dim))["flops_per_action"] for p in (window, carried)]
     assert costs[0] - costs[1] == read_anew * step
-
-
-def test_stored_bytes():
-    policy, first = make_policy(), dataset(0)
-    assert stored_bytes(Sequential()) == 0
-    ewc = EWC()
-    ewc.begin_task(0, first, policy)
-    ewc.end_task(0, first, policy, generator(0))
-    weights = 4 * sum(p.numel() for p in policy.parameters())
-    assert stored_bytes(ewc) == pytest.approx(2 * weights, rel=0.01)  # Fisher and anchor
 
 
 @pytest.mark.parametrize("stage", [False, True], ids=["a task", "two tasks learned together"])

@@ -1,14 +1,10 @@
 """Windows equal a naive reference; memory keeps its budget; broken files are refused."""
 
-from pathlib import Path
-
-import h5py
 import numpy as np
 import pytest
 import torch
 
 from libero_env.demos.read import Episode
-from libero_env.errors import DemoError
 from lifelong.data import ReplayMemory, SequenceVLDataset, fake_batch
 from lifelong.errors import DataError
 from lifelong.types import PolicySpec
@@ -28,17 +24,6 @@ def make_dataset(task_id: int = 0, lengths: tuple[int, ...] = LENGTHS, seed: int
     rng = np.random.default_rng(seed)
     demos = [make_demo(f"demo_{i}", n, rng) for i, n in enumerate(lengths)]
     return SequenceVLDataset.from_demos(demos, spec=SPEC, language=torch.arange(4.0), task_id=task_id)
-
-
-def write_hdf5(path: Path, demos: list[Episode]) -> Path:
-    """Write a file in the original's layout: images upside down, each action with the observation after it."""
-    with h5py.File(path, "w") as file:
-        for demo in demos:
-            group = file.create_group(f"data/{demo.name}")
-            group["actions"] = demo.actions
-            for key, value in demo.obs.items():
-                group[f"obs/{key}"] = value[:, ::-1] if key in SPEC.views else value
-    return path
 
 
 def test_every_window_equals_a_naive_reference() -> None:
@@ -95,33 +80,6 @@ def test_a_batch_keeps_the_requested_order_and_is_a_copy() -> None:
 def test_window_indices_out_of_range_are_refused(index: int) -> None:
     with pytest.raises(DataError, match="must lie in"):
         make_dataset().batch(torch.tensor([0, index]))
-
-
-def test_a_file_reads_upright_and_aligned(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    demos = [make_demo(f"demo_{i}", n, rng) for i, n in enumerate((6, 4))]
-    path = write_hdf5(tmp_path / "x_demo.hdf5", demos)
-    stored = SequenceVLDataset.from_file(path, spec=SPEC, language=torch.zeros(4), pairing="stored")
-    np.testing.assert_array_equal(stored.images[:6, 0], demos[0].obs[SPEC.views[0]])
-    np.testing.assert_array_equal(stored.actions[6:], demos[1].actions.astype(np.float32))
-    aligned = SequenceVLDataset.from_file(
-        path, spec=SPEC, language=torch.zeros(4), pairing="aligned", limit=1
-    )
-    np.testing.assert_array_equal(aligned.images[:, 1], demos[0].obs[SPEC.views[1]][:-1])
-    np.testing.assert_array_equal(aligned.actions, demos[0].actions[1:].astype(np.float32))
-
-
-def test_broken_files_raise_and_name_what_is_wrong(tmp_path: Path) -> None:
-    demos = [make_demo("demo_0", 6, np.random.default_rng(0))]
-    whole = write_hdf5(tmp_path / "whole.hdf5", demos)
-    read = lambda path: SequenceVLDataset.from_file(path, spec=SPEC, language=torch.zeros(4))  # noqa: E731
-    (tmp_path / "cut.hdf5").write_bytes(whole.read_bytes()[:2000])
-    with pytest.raises(DemoError, match=r"cut\.hdf5"):
-        read(tmp_path / "cut.hdf5")
-    with h5py.File(whole, "a") as file:
-        del file["data/demo_0/obs/gripper_states"]
-    with pytest.raises(DemoError, match=r"whole\.hdf5.*demo_0.*gripper_states"):
-        read(whole)
 
 
 @pytest.mark.parametrize(("change", "message"), [
@@ -193,21 +151,3 @@ def test_memory_round_trip() -> None:
     with pytest.raises(DataError, match="not those of the interrupted run"):
         other.load_state_dict(memory.state_dict(), datasets | {0: make_dataset(0, lengths=(1,))})
     assert torch.equal(draw(memory).actions, draw(other).actions)  # a failed load changes nothing
-
-
-def test_invalid_uses_of_memory_are_refused() -> None:
-    memory, generator = ReplayMemory(4), torch.Generator()
-    with pytest.raises(DataError, match="empty"):
-        memory.sample(1, generator)
-    memory.add(make_dataset(), generator)
-    with pytest.raises(DataError, match="already"):
-        memory.add(make_dataset(), generator)
-
-
-def test_fake_batches_fit_their_spec() -> None:
-    batch = fake_batch(SPEC, 3, torch.Generator().manual_seed(0))
-    real = make_dataset().batch(torch.arange(3))
-    assert batch.observation.images.shape == real.observation.images.shape
-    assert batch.actions.shape == real.actions.shape
-    joined = batch.join(real)
-    assert len(joined) == 6

@@ -1,24 +1,30 @@
-"""Wherever frames are held, batches are the same to the bit; robomimic reads the same."""
+"""However frames are read and held, batches are the same to the bit, as robomimic reads them; or one line."""
 
 import itertools
 import multiprocessing
 import os
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from libero_env.demos.read import Episode, demo_lengths, read_demos
 from libero_env.errors import LiberoError
-from lifelong.data import DemoSource, ReplayMemory, frame_cache, loading, open_windows
+from lifelong.data import DemoSource, SequenceVLDataset, dataset, frame_cache, loading, open_windows
 from lifelong.data.frame_cache import FrameFile, cache_root
 from lifelong.data.loading import choose_memory
 from lifelong.data.windows import JoinedWindows, WindowSubset, batches_in_order
 from lifelong.errors import DataError
 from lifelong.streams import StageWindows
 from lifelong.types import Batch, PolicySpec
+from tests.harness import sequences
+from tests.harness.demos import write_noise
+from tests.harness.fuzz import examples
+from tests.harness.robomimic_windows import read_with_robomimic
 
 SPEC = PolicySpec(image_size=(6, 8), language_dim=4, seq_len=5)
 LENGTHS = (7, 2, 4, 12)
@@ -32,45 +38,15 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def write_file(
-    path: Path,
-    seed: int = 0,
-    lengths: tuple[int, ...] = LENGTHS,
-    pairing: str = "libero",
-    expert: bool = False,
-) -> Path:
-    """Write a demonstration file in the original's layout, with images upside down."""
-    rng = np.random.default_rng(seed)
-    with h5py.File(path, "w") as file:
-        file.create_group("data").attrs["pairing"] = pairing
-        for number, steps in enumerate(lengths):
-            group = file.create_group(f"data/demo_{number}")
-            group.attrs["num_samples"] = steps
-            group["actions"] = rng.uniform(-1, 1, (steps, 7))
-            if expert:
-                group["expert_actions"] = rng.uniform(-1, 1, (steps, 7))
-            for view in SPEC.views:
-                group[f"obs/{view}"] = rng.integers(0, 256, (steps, *SPEC.image_size, 3), dtype=np.uint8)
-            for key, size in SPEC.proprio.items():
-                group[f"obs/{key}"] = rng.normal(size=(steps, size))
-    return path
-
-
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    return write_file(tmp_path / "task_demo.hdf5")
+    return write_noise(tmp_path / "task_demo.hdf5", SPEC, LENGTHS)
 
 
 def assert_same(one: Batch, other: Batch) -> None:
-    one, other = one.to("cpu"), other.to("cpu")
-    assert torch.equal(one.observation.images, other.observation.images)
-    assert one.observation.images.dtype == other.observation.images.dtype == torch.uint8
-    assert torch.equal(one.observation.language, other.observation.language)
-    assert one.observation.proprio.keys() == other.observation.proprio.keys()
-    for name, values in one.observation.proprio.items():
-        assert torch.equal(values, other.observation.proprio[name])
-    for name in ("actions", "task_ids", "window_ids"):
-        assert torch.equal(getattr(one, name), getattr(other, name))
+    sequences.assert_same(
+        *(asdict(replace(batch.to("cpu"), is_pad=batch.padding().cpu())) for batch in (one, other))
+    )
 
 
 def everything(dataset) -> Batch:
@@ -114,7 +90,7 @@ def test_frames_are_written_once_and_found_again(path: Path, monkeypatch: pytest
 
 
 def test_other_settings_have_other_frames(path: Path) -> None:
-    expert = write_file(path.with_name("other_demo.hdf5"), expert=True)
+    expert = write_noise(path.with_name("other_demo.hdf5"), SPEC, LENGTHS, labels=True)
     kinds = [{}, {"limit": 2}, {"pairing": "stored"}, {"labels": "executed"}]
     for kind in kinds:
         source = DemoSource(expert, SPEC, **kind)
@@ -127,7 +103,7 @@ def test_a_file_that_was_recorded_again_is_read_again(path: Path) -> None:
     source = DemoSource(path, SPEC)
     before = open_windows(source, language=LANGUAGE, memory="disk")
     kept, stat = before.images.to(CPU), path.stat()
-    write_file(path, seed=1)
+    write_noise(path, SPEC, LENGTHS, seed=1)
     os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))  # not even its time tells
     assert path.stat().st_size == stat.st_size
     after = open_windows(source, language=LANGUAGE, memory="disk")
@@ -288,17 +264,64 @@ def test_auto_chooses_by_what_is_free(monkeypatch, gpu, host, expected) -> None:
     assert choose_memory(21 * gib, GPU if gpu else CPU) == expected
 
 
-def test_replay_memory_accepts_windows_held_on_disk(path: Path) -> None:
-    def drawn(memory: str) -> Batch:
-        replay, draws = ReplayMemory(9), torch.Generator().manual_seed(0)
-        replay.add(open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory=memory), draws)
-        return replay.sample(6, draws)
+@given(
+    st.lists(st.integers(1, 6), min_size=1, max_size=4),
+    st.sampled_from([None, "libero", b"libero", "aligned", b"aligned"]),
+    st.sampled_from(["aligned", "stored"]),
+    st.sampled_from(["expert", "executed"]),
+    st.booleans(),
+    st.none() | st.integers(1, 5),
+)
+@examples(short=25, long=400)
+def test_windows_do_not_depend_on_how_they_are_read_and_held(
+    tmp_path_factory, lengths, stated, pairing, read, labels, limit
+):
+    pytest.importorskip("robomimic.utils.dataset")
+    path = write_noise(
+        tmp_path_factory.mktemp("x") / "x_demo.hdf5",
+        SPEC,
+        lengths,
+        pairing=stated,
+        labels=labels,
+        seed=sum(lengths),
+    )
+    shifted = pairing == "aligned" and stated in (None, "libero", b"libero")
+    frames = sum(n - shifted for n in lengths[:limit])
+    source = DemoSource(path, SPEC, limit, pairing, read)
+    ways = [{"memory": memory} for memory in ("host", "disk", "device", "auto")]
+    if not frames:
+        for how in ways:
+            with pytest.raises(DataError, match="demonstration"):
+                open_windows(source, language=LANGUAGE, **how)
+        return
+    first, *others = (
+        open_windows(source, language=LANGUAGE, **how).batch(torch.arange(frames)) for how in ways
+    )
+    others.append(read_with_robomimic(source, LANGUAGE))
+    assert len(others[-1]) == frames
+    for other in others:
+        assert_same(first, other)
+    with h5py.File(path) as file:  # written out: observation t with action t + 1, or with action t
+        key = "expert_actions" if labels and read == "expert" else "actions"
+        expected = np.concatenate(
+            [file[f"data/demo_{k}/{key}"][shifted:] for k in range(len(lengths))][:limit]
+        )
+    assert torch.equal(first.actions[:, 0], torch.from_numpy(expected.astype(np.float32)))
 
-    assert_same(drawn("disk"), drawn("host"))
+
+def test_rows_that_were_never_filled_are_refused(tmp_path, monkeypatch):
+    source = DemoSource(write_noise(tmp_path / "x_demo.hdf5", SPEC, (4, 3)), SPEC, pairing="stored")
+    for wrong in ([4, 4], [4, 2], [4], [4, 3, 1]):
+        monkeypatch.setattr(DemoSource, "lengths", wrong)
+        with pytest.raises(DataError, match="changed meanwhile"):
+            SequenceVLDataset.from_source(source, language=LANGUAGE)
 
 
-def test_lengths_are_those_of_the_demonstrations(path: Path) -> None:
-    for pairing in ("stored", "aligned"):
-        for limit in (None, 2):
-            found: list[Episode] = read_demos(path, [], limit, pairing=pairing)
-            assert demo_lengths(path, limit, pairing=pairing) == [len(demo) for demo in found]
+def test_frames_that_do_not_fit_into_memory_are_refused_before_they_are_read(tmp_path, monkeypatch):
+    path = write_noise(tmp_path / "x_demo.hdf5", SPEC, (4, 3))
+    monkeypatch.setattr(loading, "host_memory", lambda: (100, 1000))
+    monkeypatch.setattr(dataset.torch, "empty", None)
+    with pytest.raises(
+        DataError, match=r"needs 1\.4 kB of host memory and 100 B are free; set data\.memory=disk"
+    ):
+        open_windows(DemoSource(path, SPEC), language=LANGUAGE, memory="host")

@@ -39,11 +39,6 @@ def pairs(first, second, tasks: int = 1) -> Pairs:
     return Pairs(np.repeat(np.arange(tasks), each), np.tile(np.arange(each), tasks), *columns)
 
 
-def counts_as_pairs(both: int, only_first: int, only_second: int, neither: int) -> Pairs:
-    outcome = np.repeat([0, 1, 2, 3], [both, only_first, only_second, neither])
-    return pairs(np.isin(outcome, (0, 1)), np.isin(outcome, (0, 2)))
-
-
 @pytest.mark.parametrize(("cells", "confidence", "low", "high"), [
     ((1, 1, 7, 12), 0.95, -0.517, -0.026),  # Fagerland et al. 2014, airway hyper-responsiveness
     ((0, 28, 25, 565), 0.90, -0.0148, 0.0247),  # R, PropCIs::scoreci.mp(25, 28, 618, 0.90)
@@ -65,11 +60,6 @@ def test_mcnemar_is_the_binomial_test_of_the_discordant_pairs():
     for b, c in [(5, 0), (9, 3), (20, 31), (0, 0)]:
         expected = stats.binomtest(b, b + c).pvalue if b + c else 1.0
         assert mcnemar_exact(Counts(10, b, c, 3)) == pytest.approx(expected)
-
-
-def test_sign_flips_of_single_runs_are_mcnemars_test():
-    found = sign_flip_test(counts_as_pairs(20, 9, 2, 5).differences)
-    assert found == pytest.approx(mcnemar_exact(Counts(20, 9, 2, 5)))
 
 
 def test_sign_flips_of_several_runs_are_exact_for_few_starts():
@@ -115,23 +105,6 @@ def test_evidence_is_a_martingale_of_mean_one():
     for n in (1, 5, 30):
         won = np.arange(n + 1)
         assert stats.binom.pmf(won, n, 0.5) @ np.exp(log_evidence(won, n - won)) == pytest.approx(1)
-
-
-def test_looking_at_every_pair_is_rarely_wrong():
-    """Exact probability that e ever reaches 20 within 400 discordant pairs of equal policies."""
-    alive, stopped = {0: 1.0}, 0.0  # wins -> probability, not stopped so far
-    for n in range(1, 401):
-        after: dict[int, float] = {}
-        for won, p in alive.items():
-            for w in (won, won + 1):
-                after[w] = after.get(w, 0.0) + p / 2
-        alive = {}
-        for won, p in after.items():
-            if log_evidence(np.array(won), np.array(n - won)) >= math.log(20):
-                stopped += p
-            else:
-                alive[won] = p
-    assert 0.01 < stopped <= 0.05
 
 
 def test_the_sequential_test_goes_round_all_tasks():
@@ -221,20 +194,9 @@ def test_tables_of_power_name_what_is_impossible():
     assert "no difference that is possible" in shown(Question(0.99, 0.005), 20)
 
 
-# Of 8,000 matched pairs: successes without and with an event, and the share of the former lost, as LIBERO-MAX prints it
-LIBERO_MAX = {
-    "pi0.5": (6374, 5259, 21.6),
-    "OpenVLA-OFT": (5141, 3452, 37.1),
-    "MolmoAct2": (6427, 5355, 20.8),
-    "X-VLA": (5009, 3015, 43.3),
-    "GR00T N1.7": (5541, 4001, 33.7),
-    "SmolVLA": (2086, 1203, 56.1),
-}
-
-
-@pytest.mark.parametrize("name", LIBERO_MAX)
-def test_published_counts_under_events_pass_through_the_arithmetic_of_comparisons(name):
-    base, dynamic, loss = LIBERO_MAX[name]
+def test_published_counts_under_events_pass_through_the_arithmetic_of_comparisons():
+    """pi0.5 in LIBERO-MAX, of 8,000 pairs: successes without and with an event, and the share of the former lost."""
+    base, dynamic, loss = 6374, 5259, 21.6
     lost = round(base * loss / 100)
     cells = (base - lost, lost, dynamic - (base - lost), 8000 - dynamic - lost)  # as in Counts
     first, second = (
@@ -247,6 +209,4 @@ def test_published_counts_under_events_pass_through_the_arithmetic_of_comparison
     paired = (found.score.high - found.score.low) / (2 * 1.96)
     rates = np.array([base, dynamic]) / 8000
     unpaired = np.sqrt((rates * (1 - rates) / 8000).sum())
-    assert paired < unpaired
-    if name == "pi0.5":
-        assert (round(100 * paired, 2), round(100 * unpaired, 2)) == (0.48, 0.70)
+    assert (round(100 * paired, 2), round(100 * unpaired, 2)) == (0.48, 0.70)

@@ -87,14 +87,8 @@ def models(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     sizes = {"hidden_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2, "intermediate_size": 16}
     bert = transformers.BertConfig(vocab_size=len(words), max_position_embeddings=80, **sizes)
     clip = transformers.CLIPTextConfig(vocab_size=len(words), projection_dim=6, eos_token_id=3, **sizes)
-    roberta = transformers.RobertaConfig(
-        vocab_size=len(words),
-        max_position_embeddings=90,
-        pad_token_id=0,
-        bos_token_id=2,
-        eos_token_id=3,
-        **sizes,
-    )
+    ids = {"pad_token_id": 0, "bos_token_id": 2, "eos_token_id": 3}
+    roberta = transformers.RobertaConfig(vocab_size=len(words), max_position_embeddings=90, **ids, **sizes)
     gpt2 = transformers.GPT2Config(vocab_size=len(words), n_embd=8, n_layer=1, n_head=2, n_positions=80)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
@@ -164,14 +158,6 @@ def test_a_tasks_number_may_be_encoded_in_place_of_its_text(models: dict[str, Pa
     assert torch.equal(encoder.embed(TEXTS), encoder.embed(["any", "other"]))
 
 
-def test_padded_embeddings_are_cached_apart(models: dict[str, Path], tmp_path: Path) -> None:
-    folder = str(models["gpt2"])
-    plain, padded = (embed(TEXTS, folder, cache_dir=tmp_path, pad_to=length) for length in (0, 25))
-    assert len(list(tmp_path.glob("*.npz"))) == 4
-    assert torch.equal(embed(TEXTS, folder, cache_dir=tmp_path, pad_to=25), padded)
-    assert not torch.equal(plain, padded)
-
-
 @pytest.mark.parametrize("chosen", ["bert", "onehot"])
 def test_compat_libero_embeds_with_bert_as_the_original(
     chosen: str, models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -196,25 +182,16 @@ def test_compat_libero_without_berts_weights_is_one_line(
     assert "\n" not in str(error.value)
 
 
-def test_embeddings_are_cached_by_model_and_text(
+def test_embeddings_are_cached_by_model_padding_and_text(
     models: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made = {name: embed(TEXTS, str(path), cache_dir=tmp_path) for name, path in models.items()}
-    assert len(list(tmp_path.glob("*.npz"))) == 2 * len(models) == 8
+    kinds = [*((str(path), 0) for path in models.values()), (str(models["gpt2"]), 25)]
+    made = [embed(TEXTS, path, cache_dir=tmp_path, pad_to=length) for path, length in kinds]
+    assert len(list(tmp_path.glob("*.npz"))) == 2 * len(kinds) == 10
     assert not list(tmp_path.glob("*.part"))
     monkeypatch.setattr(language, "_load", lambda name: pytest.fail("encoded what was cached"))
-    for name, path in models.items():
-        assert torch.equal(embed(TEXTS[::-1], str(path), cache_dir=tmp_path), made[name].flip(0))
-
-
-def test_texts_that_are_not_shipped_are_cached_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(language, "minilm_folder", lambda: tmp_path)
-    monkeypatch.setattr(language, "encode_minilm", lambda texts, folder: torch.ones(len(texts), 384))
-    texts = ["fly to the moon", *TEXTS]
-    made = embed(texts, cache_dir=tmp_path / "cache")
-    monkeypatch.setattr(language, "encode_minilm", lambda *_: pytest.fail("encoded what was cached"))
-    assert torch.equal(embed(texts, cache_dir=tmp_path / "cache"), made)
-    assert len(list((tmp_path / "cache").glob("*.npz"))) == 1
+    for (path, length), vectors in zip(kinds, made, strict=True):
+        assert torch.equal(embed(TEXTS[::-1], path, cache_dir=tmp_path, pad_to=length), vectors.flip(0))
 
 
 def test_a_broken_embedding_of_the_cache_is_computed_again(
@@ -225,11 +202,17 @@ def test_a_broken_embedding_of_the_cache_is_computed_again(
     monkeypatch.setattr(
         language, "encode_minilm", lambda texts, _: encoded.append(texts) or torch.ones(len(texts), 384)
     )
-    made = embed(["fly to the moon"], cache_dir=tmp_path / "cache")
+    made = embed(["fly to the moon", *TEXTS], cache_dir=tmp_path / "cache")  # of which the others are shipped
     (path,) = (tmp_path / "cache").iterdir()
+    assert (
+        torch.equal(embed(["fly to the moon", *TEXTS], cache_dir=tmp_path / "cache"), made)
+        and len(encoded) == 1
+    )
     path.write_bytes(path.read_bytes()[:100])
-    assert torch.equal(embed(["fly to the moon"], cache_dir=tmp_path / "cache"), made)
-    assert len(encoded) == 2
+    assert (
+        torch.equal(embed(["fly to the moon", *TEXTS], cache_dir=tmp_path / "cache"), made)
+        and len(encoded) == 2
+    )
     assert path.stat().st_size > 100
 
 

@@ -109,16 +109,6 @@ def test_what_is_distilled_on_is_augmented_as_batches_are():
     assert not torch.equal(drawn.observation.images, kept.observation.images)
 
 
-def test_without_weights_it_is_replay_with_other_draws_and_no_gradient():
-    policy, algorithm = make_policy(), M2Distill(image=0, language=0, proprio=0, policy=0)
-    algorithm.end_task(0, sequences.dataset(0), policy, generator(0))
-    moved(policy, "")
-    algorithm.mix(sequences.dataset(1).batch(torch.arange(8)), generator(0))
-    penalty = algorithm.penalty(policy)
-    penalty.backward()
-    assert penalty.item() == 0 and not any(p.grad.any() for p in policy.parameters() if p.grad is not None)
-
-
 def test_distillation_keeps_features_and_actions_nearer_than_replay_alone():
     found = []
     for algorithm in (

@@ -20,10 +20,6 @@ from lifelong.stats.methods import (
 )
 from lifelong.stats.metrics import Curve, Scores
 
-# Student's own example (Biometrika 1908): hours of sleep gained with each of two drugs, by ten patients
-DEXTRO = np.array([0.7, -1.6, -0.2, -1.2, -0.1, 3.4, 3.7, 0.8, 0.0, 2.0])
-LAEVO = np.array([1.9, 0.8, 1.1, 0.1, -0.1, 4.4, 5.5, 1.6, 4.6, 3.4])
-
 
 def run(seed: int, final: float, order: str = "a") -> MethodRun:
     """A run of two tasks: 90 % just learned, and at the end a success of `final` on the first of them."""
@@ -34,20 +30,6 @@ def run(seed: int, final: float, order: str = "a") -> MethodRun:
 
 def method(*finals: float, first: int = 1) -> list[MethodRun]:
     return [run(seed, final) for seed, final in enumerate(finals, first)]
-
-
-def test_the_paired_test_is_students():
-    found = paired_difference(LAEVO - DEXTRO, margin=1.0)
-    assert found.p_value == pytest.approx(0.00283, abs=1e-5)  # R: t.test(extra ~ group, sleep, paired = TRUE)
-    assert (found.estimate.low, found.estimate.high) == pytest.approx((0.7001, 2.4599), abs=1e-4)
-    one_sided = stats.ttest_1samp(LAEVO - DEXTRO, 1.0, alternative="less")
-    assert found.equivalence == pytest.approx(one_sided.pvalue)
-
-
-def test_without_common_seeds_the_test_is_welchs():
-    found = welch_difference(LAEVO, DEXTRO)
-    assert found.p_value == pytest.approx(0.0794, abs=1e-4)  # R: t.test(extra ~ group, sleep)
-    assert (found.estimate.low, found.estimate.high) == pytest.approx((-0.2055, 3.3655), abs=1e-4)
 
 
 def test_the_number_of_seeds_is_that_of_the_noncentral_t_distribution():

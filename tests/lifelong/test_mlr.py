@@ -90,9 +90,7 @@ def test_without_a_camera_there_are_the_other_parts(kind):
 
 def test_a_policy_that_does_not_name_its_parts_says_so():
     policy = make_policy()
-    with pytest.raises(
-        PolicyError, match=r"BCTransformer has no modalities\(features\).*choose another algorithm"
-    ):
+    with pytest.raises(PolicyError, match=r"BCTransformer has no modalities\(features\).*choose another"):
         HistoryPolicy.modalities(policy, torch.zeros(1))
 
 
@@ -210,17 +208,6 @@ def test_the_adjustment_is_the_papers_formula():
     assert float(found) == pytest.approx(expected, rel=1e-4)
 
 
-def test_features_at_their_instruction_are_not_adjusted_and_those_at_another_one_are():
-    own, near = unit(0.2), unit(0.9)
-    assert float(adjust(unit(0.2), own, near, 0.72)) == 0.0
-    z = unit(0.9).requires_grad_()
-    adjust(z + 0.01, own, near, 0.72).backward()
-    towards = torch.autograd.functional.jvp(
-        lambda x: adjust(x, own, near, 0.72), unit(0.8), unit(0.2) - unit(0.8)
-    )[1]
-    assert towards < 0
-
-
 @pytest.mark.parametrize("kind", MIXING)
 def test_the_adjustment_acts_on_the_trained_part_of_any_policy(kind):
     policy, algorithm = learned(1, kind, adjustment=5.0)
@@ -271,9 +258,7 @@ def test_a_state_whose_parts_do_not_fit_is_refused(name, tmp_path):
 
 
 def test_what_it_cannot_work_with_is_said_in_a_line():
-    with pytest.raises(
-        PolicyError, match="LinearPolicy has no encode, over_time and head.*choose another algorithm"
-    ):
+    with pytest.raises(PolicyError, match="LinearPolicy has no encode, over_time and head.*choose another"):
         MLR(base_tasks=0).begin_task(0, Windows(0), LinearPolicy())
     memory = LatentMemory(3)
     with pytest.raises(DataError, match="the memory is empty"):

@@ -19,6 +19,14 @@ def policy() -> DeepPolicy:
     return DeepPolicy()
 
 
+def learned(algorithm: LoRA, tasks: int) -> DeepPolicy:
+    """Learn tasks of pairs, and return the policy."""
+    acting = policy()
+    for task in range(tasks):
+        learn(algorithm, acting, task)
+    return acting
+
+
 def adapter(algorithm: OMLA, task: int) -> dict[str, torch.Tensor]:
     """Return A, B and own copies of a learned task as one flat table."""
     state = algorithm.state_dict()
@@ -35,9 +43,7 @@ def prior(algorithm: OMLA) -> dict[str, torch.Tensor]:
 def test_without_a_rate_it_is_lora_to_the_bit() -> None:
     ends = []
     for learner in (LoRA(**SMALL), OMLA(prior_rate=0.0, **SMALL)):
-        acting = policy()
-        for task in range(4):
-            learn(learner, acting, task)
+        acting = learned(learner, 4)
         state = learner.state_dict()
         assert state.pop("prior", None) is None
         ends.append((dict(acting.state_dict()), state))
@@ -46,41 +52,34 @@ def test_without_a_rate_it_is_lora_to_the_bit() -> None:
 
 
 def test_the_first_adapter_is_learned_as_by_lora() -> None:
-    ends = []
-    for learner in (LoRA(**SMALL), OMLA(**SMALL)):
-        acting = policy()
-        for task in (0, 1):
-            learn(learner, acting, task)
-        ends.append(dict(acting.state_dict()))
+    ends = [dict(learned(learner, 2).state_dict()) for learner in (LoRA(**SMALL), OMLA(**SMALL))]
     sequences.assert_same(ends[1], ends[0])
 
 
 @pytest.mark.parametrize("rate", [0.25, 1.0])
 def test_the_prior_moves_by_its_rate_towards_each_learned_adapter(rate) -> None:
-    learner, acting = OMLA(prior_rate=rate, **SMALL), policy()
-    learn(learner, acting, 0)
+    learner = OMLA(prior_rate=rate, **SMALL)
+    acting = learned(learner, 1)
     assert learner.state_dict()["prior"] is None, "the base has no adapter"
     learner.begin_task(1, Windows(1), copy.deepcopy(acting))
     before = prior(learner)
     assert all(not value.any() for name, value in before.items() if name.endswith(".b"))
     learner = OMLA(prior_rate=rate, **SMALL)
-    acting = policy()
-    learn(learner, acting, 0)
+    acting = learned(learner, 1)
     for task in (1, 2, 3):
         learn(learner, acting, task)
-        learned, after = adapter(learner, task), prior(learner)
-        assert learned.keys() == after.keys() == before.keys()
+        own, after = adapter(learner, task), prior(learner)
+        assert own.keys() == after.keys() == before.keys()
         for name, value in after.items():
-            expected = before[name] + rate * (learned[name] - before[name])
+            expected = before[name] + rate * (own[name] - before[name])
             torch.testing.assert_close(value, expected, rtol=1e-5, atol=1e-6)
         assert any(not torch.equal(after[name], before[name]) for name in after)
         before = after
 
 
 def test_a_task_begins_with_the_adapted_weights_of_the_prior() -> None:
-    learner, acting = OMLA(**SMALL), policy()
-    for task in (0, 1):
-        learn(learner, acting, task)
+    learner = OMLA(**SMALL)
+    acting = learned(learner, 2)
     base, start = learner.state_dict()["base"], prior(learner)
     moved = 0
     learner.begin_task(2, Windows(2), acting)
@@ -107,9 +106,8 @@ def test_earlier_adapters_and_their_answers_never_change() -> None:
 
 
 def test_a_prior_of_other_weights_is_refused(tmp_path) -> None:
-    learner, acting = OMLA(**SMALL), policy()
-    for task in (0, 1):
-        learn(learner, acting, task)
+    learner = OMLA(**SMALL)
+    learned(learner, 2)
     state = learner.state_dict()
     name = next(iter(state["prior"]["pairs"]))
     wrong = {**state["prior"]["pairs"], name: {"a": torch.zeros(2, 1), "b": torch.zeros(1, 2)}}
@@ -120,12 +118,8 @@ def test_a_prior_of_other_weights_is_refused(tmp_path) -> None:
 
 
 def test_the_prior_costs_the_storage_of_one_adapter() -> None:
-    states = []
-    for learner in (LoRA(**SMALL), OMLA(**SMALL)):
-        acting = policy()
-        for task in (0, 1):
-            learn(learner, acting, task)
-        states.append(learner)
-    lora, omla = states
-    learned = [*lora.library.parameters(1), *lora.state_dict()["kept"][1].values()]
-    assert sum(value.numel() for value in prior(omla).values()) == sum(p.numel() for p in learned)
+    lora, omla = LoRA(**SMALL), OMLA(**SMALL)
+    for learner in (lora, omla):
+        learned(learner, 2)
+    adapted = [*lora.library.parameters(1), *lora.state_dict()["kept"][1].values()]
+    assert sum(value.numel() for value in prior(omla).values()) == sum(p.numel() for p in adapted)

@@ -157,10 +157,9 @@ def test_a_memory_holds_the_frames_of_its_windows_only(make, memory):
         assert_same(vars(given.observation), vars(wanted.observation))
         for name in ("actions", "task_ids", "window_ids", "is_pad"):
             assert torch.equal(getattr(given, name), getattr(wanted, name)), name
-    parts = [
-        part for held in memory._held.values() for part in getattr(held.dataset, "datasets", (held.dataset,))
-    ]
-    assert sum(len(part) for part in parts) == memory.count_frames() < 20 * 3
+    held_sets = [held.dataset for held in memory._held.values()]
+    sizes = [len(part) for one in held_sets for part in getattr(one, "datasets", (one,))]
+    assert sum(sizes) == memory.count_frames() < 20 * 3
     whole = weakref.ref(sources[1])
     del sources, source, given, wanted
     gc.collect()
@@ -169,15 +168,12 @@ def test_a_memory_holds_the_frames_of_its_windows_only(make, memory):
     again = type(memory)(1)
     again.load_state_dict(memory.state_dict(), {task: make(task) for task in (1, 2, 3)})
     assert again.count_frames() == memory.count_frames()
-    assert_same(
-        vars(again.sample(9, generator(4)).observation), vars(memory.sample(9, generator(4)).observation)
-    )
+    assert_same(*(vars(one.sample(9, generator(4)).observation) for one in (again, memory)))
 
 
 def test_a_task_without_a_share_keeps_next_to_nothing():
     memory = ReplayMemory(1)
     for task in range(3):
         memory.add(dataset(task), generator(task))
-    assert (
-        len(memory) == 1 and sum(len(held.dataset) for held in memory._held.values()) <= 3 * 3
-    )  # frames of a window
+    assert len(memory) == 1
+    assert sum(len(held.dataset) for held in memory._held.values()) <= 3 * 3  # frames of a window

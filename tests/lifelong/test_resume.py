@@ -10,7 +10,6 @@ import pytest
 from lifelong import Algorithm, checkpoints
 from lifelong.checkpoints import Weights
 from lifelong.errors import CheckpointError
-from lifelong.results.provenance import config_digest
 from lifelong.results.records import EvalRecord, LossRecord, from_line
 from lifelong.results.run_directory import RunDirectory
 from lifelong.sequence import TaskSequence, is_measured
@@ -142,9 +141,8 @@ def test_a_run_that_is_finished_but_lost_a_line_is_measured_again(tmp_path, whol
     curve = next(line for line in content.splitlines() if b'"curve", "learned": 1, "epoch": 1' in line)
     context.directory.log.path.write_bytes(content.replace(curve, curve.replace(b"1", b"2")))
     again = run_context(tmp_path, "sequential")
-    assert (
-        not is_measured(again, again.directory.log.read()) and len(again.directory.log.read().problems) == 1
-    )
+    found = again.directory.log.read()
+    assert not is_measured(again, found) and len(found.problems) == 1
     assert_resumes(tmp_path, "sequential", whole)
     assert is_measured(again, again.directory.log.read())
 
@@ -181,9 +179,7 @@ def test_checkpoints_of_another_run_are_named(tmp_path, monkeypatch):
             killed_run(tmp_path / f"run{seed}", "sequential", monkeypatch, LEARNING)
     ours, theirs = (RunDirectory(tmp_path / name).checkpoints for name in ("run1", "run2"))
     shutil.copy(theirs.progress_path, ours.progress_path)
-    with pytest.raises(
-        CheckpointError, match=r"progress\.safetensors belongs to a run of another configuration"
-    ):
+    with pytest.raises(CheckpointError, match=r"progress\.safetensors belongs to a run of another config"):
         sequence(run_context(tmp_path / "run1", "sequential")).run()
 
 
@@ -191,16 +187,8 @@ def test_checkpoints_of_another_run_are_named(tmp_path, monkeypatch):
 def test_the_state_of_another_algorithm_is_named(tmp_path, other):
     sequence(run_context(tmp_path, other, tasks=1)).run()
     for algo in sorted({"sequential", "er", "ewc", "packnet"} - {other}):
-        with pytest.raises(
-            CheckpointError, match=r"task_0\.safetensors: the state of the algorithm does not fit"
-        ):
+        with pytest.raises(CheckpointError, match=r"task_0\.safetensors: the state of the .* does not fit"):
             sequence(run_context(tmp_path, algo, tasks=1)).run()
-
-
-def test_the_digest_of_a_run_is_of_what_its_results_depend_on():
-    config = {"seed": 1, "train": {"lr": 0.1, "epochs": 3}, "data": {"memory": "host", "views": ["a"]}}
-    assert config_digest(config) == config_digest(config | {"device": "cuda", "runs_dir": "b", "threads": 4})
-    assert config_digest(config) != config_digest(config | {"seed": 2})
 
 
 def test_equal_runs_write_equal_checkpoints(tmp_path):
@@ -229,7 +217,6 @@ def test_the_optimiser_of_another_policy_is_named(tmp_path, monkeypatch):
         checkpoints.save(folder.progress_path, state | {"fit": state["fit"] | {"optimizer": odd}})
         with pytest.raises(CheckpointError, match="optimi"):
             sequence(run_context(tmp_path, "sequential")).run()
-    assert sequences.TASKS == 3
 
 
 class Forgetful(Algorithm):

@@ -8,6 +8,7 @@ import pytest
 import torch
 from scipy import special, stats
 
+from libero_env.text import quantity
 from lifelong.algorithms import ER
 from lifelong.context import RunContext
 from lifelong.data.memory import ReplayMemory
@@ -15,6 +16,7 @@ from lifelong.errors import ConfigError
 from lifelong.evaluation.environments import EnvPool
 from lifelong.nn import GMMHead
 from lifelong.policies.base import copy_weights
+from lifelong.report.tables import collection_table
 from lifelong.results.records import CollectionRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.reward import grpo as module
@@ -119,6 +121,9 @@ def test_a_bandit_is_solved(tmp_path):
     assert [one.epoch for one in iterations] == list(range(1, 26))
     assert iterations[0].successes < 32 and done.rewards.mean() > 0.9
     assert iterations[-1].entropy < iterations[0].entropy
+    (row,) = collection_table(context.directory.log.read().collections(), ["reach"]).rows
+    assert row[1:4] == ["reach", quantity(25 * 64), quantity(25 * 64)], "an episode has one step"
+    assert row[4] == f"{100 * iterations[0].successes / 64:.0f} %"
 
 
 def test_actions_are_drawn_by_the_policy_that_learns(tmp_path, monkeypatch):

@@ -23,9 +23,8 @@ def iscil(**changes) -> IsCiL:
 
 
 def clare(**changes) -> CLARE:
-    return CLARE(
-        **({"rank": 2, "hidden": 2, "discriminator_steps": 5, "threshold": 1.5, "windows": 8} | changes)
-    )
+    sizes = {"rank": 2, "hidden": 2, "discriminator_steps": 5, "threshold": 1.5, "windows": 8}
+    return CLARE(**(sizes | changes))
 
 
 BOTH = pytest.mark.parametrize("make", [iscil, clare], ids=["iscil", "clare"])
@@ -81,9 +80,8 @@ def test_actions_depend_on_no_other_episode(make, head):
         acting.eval().reset(2)
         both = torch.stack([acting.act(frame(seen, step)) for step in range(3)])
         for row in range(2):
-            alone = Observation(
-                seen.images[[row]], {k: v[[row]] for k, v in seen.proprio.items()}, seen.language[[row]]
-            )
+            proprio = {k: v[[row]] for k, v in seen.proprio.items()}
+            alone = Observation(seen.images[[row]], proprio, seen.language[[row]])
             acting.reset(1)
             actions = torch.stack([acting.act(frame(alone, step)) for step in range(3)])
             torch.testing.assert_close(both[:, [row]], actions, rtol=1e-4, atol=1e-5)
@@ -123,11 +121,8 @@ def test_iscil_retrieves_the_task_whose_prototype_is_most_similar():
 
 def retrieved(algorithm, policy, batch) -> list[int]:
     predict(algorithm, policy, batch)
-    seen = []
-    spied, algorithm.retrieve = (
-        algorithm.retrieve,
-        lambda x: seen.append(type(algorithm).retrieve(algorithm, x)) or seen[-1],
-    )
+    seen, spied = [], algorithm.retrieve
+    algorithm.retrieve = lambda x: seen.append(type(algorithm).retrieve(algorithm, x)) or seen[-1]
     predict(algorithm, policy, batch)
     algorithm.retrieve = spied
     return seen[-1].tolist()
@@ -205,9 +200,8 @@ def test_clare_picks_the_autoencoder_that_was_trained_on_such_inputs():
     known = fitted(1, 2, 3)
     algorithm = knowing(known, {1: {"layer": BASE}, 2: {"layer": 2}, 3: {"layer": 2}})
     for seed, used in ((1, BASE), (2, 2), (3, 2)):
-        fresh = torch.randn(40, 2, 2, generator=generator(7)) @ torch.randn(
-            2, 6, generator=generator(99, seed)
-        )
+        plane = torch.randn(2, 6, generator=generator(99, seed))
+        fresh = torch.randn(40, 2, 2, generator=generator(7)) @ plane
         assert (algorithm.route("layer", fresh) == used).float().mean() > 0.9
         assert known[seed].z_scores(fresh).mean() < 1.5 < 5 < known[1 + seed % 3].z_scores(fresh).mean()
 

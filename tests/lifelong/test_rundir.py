@@ -16,52 +16,41 @@ from lifelong.tracking import TensorBoard, Trackio, WandB
 CONFIG = {"seed": 1, "train": {"lr": 0.1, "epochs": 3}, "device": "cpu", "runs_dir": "a"}
 
 
-def test_a_directory_reopens_with_the_same_configuration(tmp_path):
-    directory = RunDirectory(tmp_path / "run")
-    for _ in range(2):
-        with directory.opened(CONFIG, resume=True):
-            assert (directory.path / "config.yaml").exists()
-
-
-def test_keys_that_change_no_result_may_differ(tmp_path):
+@pytest.fixture
+def directory(tmp_path) -> RunDirectory:
+    """A directory that a run has had."""
     directory = RunDirectory(tmp_path / "run")
     with directory.opened(CONFIG, resume=True):
-        pass
+        return directory
+
+
+def test_keys_that_change_no_result_may_differ(directory):
     with directory.opened(CONFIG | {"device": "cuda", "runs_dir": "b"}, resume=True):
-        pass
+        assert (directory.path / "config.yaml").exists()
 
 
-def test_another_configuration_is_refused_with_the_difference_and_the_remedy(tmp_path):
-    directory = RunDirectory(tmp_path / "run")
-    with directory.opened(CONFIG, resume=True):
-        pass
+def test_another_configuration_is_refused_with_the_difference_and_the_remedy(directory):
     other = CONFIG | {"train": {"lr": 0.2, "epochs": 3}}
     message = r"train\.lr 0\.1 -> 0\.2.*run_id=NAME"
     with pytest.raises(ConfigError, match=message), directory.opened(other, resume=True):
         pass
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"\xff\xfe\x00", b"- 1\n", b"a: [", b"7", b"!!python/object:os.x {}"]
-)
-def test_a_broken_configuration_is_one_line_with_its_file(tmp_path, content):
-    directory = RunDirectory(tmp_path / "run")
-    with directory.opened(CONFIG, resume=True):
-        pass
-    (directory.path / "config.yaml").write_bytes(content)
+def test_a_broken_configuration_is_one_line_with_its_file(directory):
+    (directory.path / "config.yaml").write_text("a: [")
     with pytest.raises(ConfigError, match=r"config\.yaml") as found, directory.opened(CONFIG, resume=True):
         pass
     assert "\n" not in str(found.value)
     with directory.opened(CONFIG, resume=False):
-        assert (directory.path / "config.yaml").read_bytes() != content
+        assert (directory.path / "config.yaml").read_text() != "a: ["
 
 
 @pytest.mark.parametrize("name", ["videos", "checkpoints"])
 @pytest.mark.parametrize("target", ["elsewhere", "nowhere", "run/videos/a"])
-def test_a_folder_that_is_a_link_out_of_the_run_is_refused_and_nothing_there_changes(tmp_path, name, target):
-    directory, elsewhere = RunDirectory(tmp_path / "run"), tmp_path / "elsewhere"
-    with directory.opened(CONFIG, resume=True):
-        pass
+def test_a_folder_that_is_a_link_out_of_the_run_is_refused_and_nothing_there_changes(
+    directory, tmp_path, name, target
+):
+    elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (elsewhere / ".a.part").touch()
     (directory.path / name).symlink_to(tmp_path / target)
@@ -74,32 +63,27 @@ def test_a_folder_that_is_a_link_out_of_the_run_is_refused_and_nothing_there_cha
     assert (elsewhere / ".a.part").exists()
 
 
-def test_starting_again_keeps_the_old_run(tmp_path):
-    directory = RunDirectory(tmp_path / "run")
-    for lr in (0.1, 0.2, 0.3):
+def test_starting_again_keeps_the_old_run(directory, tmp_path):
+    for lr in (0.2, 0.3):
         with directory.opened(CONFIG | {"train": {"lr": lr}}, resume=False):
             pass
     assert sorted(p.name for p in tmp_path.iterdir() if p.is_dir()) == ["run", "run.old1", "run.old2"]
 
 
-def test_a_second_writer_is_refused(tmp_path):
-    directory = RunDirectory(tmp_path / "run")
-    second = RunDirectory(tmp_path / "run")
+def test_a_second_writer_is_refused(directory):
+    second = RunDirectory(directory.path)
     with directory.opened(CONFIG, resume=True):  # noqa: SIM117
         with pytest.raises(LifelongError, match="another process is"), second.opened(CONFIG, resume=True):
             pass
 
 
-def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch) -> None:
+def test_a_file_system_without_locks_is_named(directory, monkeypatch) -> None:
     def no_locks(*_, **__) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
     monkeypatch.setattr(FileLock, "acquire", no_locks)
-    directory = RunDirectory(tmp_path / "run")
-    with (
-        pytest.raises(ConfigError, match="cannot lock files .No locks available"),
-        directory.opened(CONFIG, resume=True),
-    ):
+    message = "cannot lock files .No locks available"
+    with pytest.raises(ConfigError, match=message), directory.opened(CONFIG, resume=True):
         pass
 
 

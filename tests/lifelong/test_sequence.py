@@ -55,9 +55,8 @@ def actions(policy, windows):
     """Return the actions of an episode in which the windows' last frames are seen, (T, 7)."""
     policy.eval().reset(1)
     frames = [windows.batch(torch.tensor([k])).observation for k in range(0, 20, 4)]
-    return torch.cat(
-        [policy.act(frame(seen, seen.images.shape[1] - 1), [generator(k)]) for k, seen in enumerate(frames)]
-    )
+    frames = [frame(seen, seen.images.shape[1] - 1) for seen in frames]
+    return torch.cat([policy.act(seen, [generator(k)]) for k, seen in enumerate(frames)])
 
 
 @pytest.mark.parametrize("make", EVERY.values(), ids=EVERY)
@@ -111,9 +110,7 @@ def test_the_share_of_windows_that_is_kept_is_of_all_tasks_so_far(tmp_path, name
     found = [costs["kept_share"] for costs in results.costs_by_task().values()]
     assert found[-1] == pytest.approx(last)  # of 60: 12, none or 30
     updates = sum(costs["updates"] for costs in results.costs_by_task().values())
-    assert updates == (
-        16 if name == "multitask" else 18
-    )  # two epochs of 60 windows by eight, or of 20 thrice
+    assert updates == (16 if name == "multitask" else 18)  # epochs of 60 windows by eight, or of 20 thrice
 
 
 def test_select_last_keeps_the_last_weights(tmp_path):

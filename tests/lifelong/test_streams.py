@@ -85,14 +85,11 @@ def test_a_group_has_the_requested_windows_in_order_with_the_id_of_its_last_task
     group = data[3]
     assert len(group) == 65
     wanted = torch.tensor([64, 3, 25, 0, 24, 25])
-    batch = group.batch(wanted)
-    assert torch.equal(batch.window_ids, wanted)
-    assert (batch.task_ids == 3).all()
-    both = torch.cat([data.datasets[2].features, data.datasets[3].features])
-    assert torch.equal(batch.observation.proprio["x"][:, 0], both[wanted])
-    assert torch.equal(
-        batch.actions[:, 0], torch.cat([data.datasets[2].targets, data.datasets[3].targets])[wanted]
-    )
+    batch, two = group.batch(wanted), (data.datasets[2], data.datasets[3])
+    assert torch.equal(batch.window_ids, wanted) and (batch.task_ids == 3).all()
+    found = batch.observation.proprio["x"][:, 0]
+    assert torch.equal(found, torch.cat([one.features for one in two])[wanted])
+    assert torch.equal(batch.actions[:, 0], torch.cat([one.targets for one in two])[wanted])
 
 
 @pytest.mark.parametrize("reach", [1, 2, 9])
@@ -147,9 +144,8 @@ def test_a_replay_memory_of_stages_reloads_by_window_ids() -> None:
 ])  # fmt: skip
 def test_demonstrations_of_later_tasks(later, expected) -> None:
     assert StreamSettings(demos_later=later).demos(50, 3) == expected
-    assert StreamSettings(demos_later=later if not isinstance(later, list) else later[:1]).demos(
-        50, 3, first=2
-    )[:2] == (50, 50)
+    of_last = later[:1] if isinstance(later, list) else later
+    assert StreamSettings(demos_later=of_last).demos(50, 3, first=2)[:2] == (50, 50)
 
 
 @pytest.mark.parametrize("later", [0, -1, 1.5, 0.0, [1], [1, 0], [1, 0.5], "many"])
@@ -185,17 +181,15 @@ def test_group_sizes_must_divide_the_number_of_tasks() -> None:
 def test_pretraining_takes_a_suite_or_nothing() -> None:
     assert PretrainSettings().sequence() == ()
     assert [t.suite for t in PretrainSettings("libero_90", tasks=2).sequence()] == ["libero_90"] * 2
-    with pytest.raises(LookupError, match="libero_90"):
-        PretrainSettings("libero_9").sequence()
-    with pytest.raises(LookupError, match="unknown suite 'own'"):
-        PretrainSettings("own").sequence()
-    with pytest.raises(ConfigError, match="pretrain.tasks is 99; libero_goal has 10 tasks"):
-        PretrainSettings("libero_goal", tasks=99).sequence()
-    with pytest.raises(LiberoError, match="epochs is 0"):
-        PretrainSettings(epochs=0)
-    for key in ("tasks", "demos", "epochs"):
-        with pytest.raises(ConfigError, match=f"pretrain.{key} has no effect without pretrain.suite"):
-            PretrainSettings(**{key: 3})
+    for settings, told in (
+        ({"suite": "libero_9"}, "libero_90"),
+        ({"suite": "own"}, "unknown suite 'own'"),
+        ({"suite": "libero_goal", "tasks": 99}, "pretrain.tasks is 99; libero_goal has 10 tasks"),
+        ({"epochs": 0}, "epochs is 0"),
+        *(({key: 3}, f"pretrain.{key} has no effect without") for key in ("tasks", "demos", "epochs")),
+    ):
+        with pytest.raises(LiberoError, match=told):
+            PretrainSettings(**settings).sequence()
 
 
 def four(path: Path, algorithm, **changes) -> RunContext:
@@ -217,17 +211,12 @@ def test_groups_are_learned_evaluated_and_resumed(tmp_path, monkeypatch, algorit
     assert {(r.learned, r.task) for r in evals if r.phase == "matrix"} == {
         (1, 0), (1, 1), (3, 0), (3, 1), (3, 2), (3, 3)
     }  # fmt: skip
-    assert {(r.learned, r.task, r.epoch) for r in evals if r.phase == "curve"} == {
-        (last, task, epoch)
-        for last, group in ((1, (0, 1)), (3, (2, 3)))
-        for task in group
-        for epoch in (0, 1)
-    }
+    groups = ((1, 0), (1, 1), (3, 2), (3, 3))
+    learned = {(r.learned, r.task, r.epoch) for r in evals if r.phase == "curve"}
+    assert learned == {(*of_group, epoch) for of_group in groups for epoch in (0, 1)}
     assert [r.task for r in results.of(TaskEndRecord)] == [1, 3]
     filmed = {path.stem for path in (tmp_path / "whole" / "videos").glob("*.webp")}
-    assert filmed == {
-        f"task_0{task}_after_0{last}" for last, task in ((1, 0), (1, 1), *((3, k) for k in range(4)))
-    }
+    assert filmed == {f"task_0{task}_after_0{last}" for last, task in (*groups, (3, 0), (3, 1))}
 
 
 def test_a_policy_meets_each_of_the_tasks_that_are_learned_together(tmp_path) -> None:
@@ -273,16 +262,6 @@ def test_metrics_count_a_group_as_one_task(tmp_path) -> None:
     assert np.isnan(curve[0]).all() and np.isnan(curve[2]).all()
     assert set(results.curves()) == {0, 1, 2, 3}
     assert write_report([tmp_path]).stat().st_size > 10_000
-
-
-def test_without_groups_nothing_changes(tmp_path) -> None:
-    sequence(p := four(tmp_path, Sequential(), group_sizes=(1, 1, 1, 1))).run()
-    results = p.directory.log.read()
-    scores = results.scores()
-    rates, episodes = results.success_matrix()
-    np.testing.assert_array_equal(scores.matrix, rates)
-    np.testing.assert_array_equal(scores.episodes, episodes)
-    assert [r.task for r in results.of(TaskEndRecord)] == [0, 1, 2, 3]
 
 
 def before(context: RunContext, path: Path) -> None:
@@ -365,12 +344,9 @@ def test_orders_by_seed_hold_the_same_tasks():
     orders = [BenchmarkSettings("libero_10", tasks=6, order_seed=seed).sequence() for seed in (0, 1, 0)]
     assert orders[0] == orders[2] != orders[1] and {*orders[0]} == {*orders[1]} == {*published}
     assert len({*BenchmarkSettings("libero_130", order_seed=7).sequence()}) == 130
-    with pytest.raises(
-        ConfigError, match="benchmark.order is 3 and benchmark.order_seed 1; give one of them"
-    ):
-        BenchmarkSettings("libero_10", order=3, order_seed=1).sequence()
-    with pytest.raises(ConfigError, match="benchmark.order is 3 and benchmark.tasks a list"):
-        BenchmarkSettings("libero_10", order=3, tasks=(0, 1)).sequence()
+    for other, told in (({"order_seed": 1}, "order_seed 1; give one"), ({"tasks": (0, 1)}, "tasks a list")):
+        with pytest.raises(ConfigError, match=f"benchmark.order is 3 and benchmark.{told}"):
+            BenchmarkSettings("libero_10", order=3, **other).sequence()
 
 
 @pytest.mark.parametrize("word", [
@@ -397,9 +373,8 @@ def test_weights_that_were_learned_with_other_inputs_of_the_same_shapes_are_refu
 def test_a_run_that_was_pretrained_did_not_begin_with_the_weights_that_the_pretraining_began_with(
     tmp_path,
 ) -> None:
-    make_run(
-        tmp_path / "run", "pretrain.suite=libero_goal", "pretrain.tasks=1", f"init_from={tmp_path}/other"
-    )
+    words = ("pretrain.suite=libero_goal", "pretrain.tasks=1", f"init_from={tmp_path}/other")
+    make_run(tmp_path / "run", *words)
     with pytest.raises(ConfigError, match="began with pretrained weights; name them with --initial"):
         initial_policy(tmp_path / "run")
 
@@ -433,16 +408,18 @@ def test_weights_that_were_pretrained_under_other_conditions_are_named(tmp_path,
         assert err.endswith(said) if said else not err
 
 
-def test_a_pretraining_is_not_shared_by_runs_with_other_demonstrations(tmp_path, monkeypatch) -> None:
+@pytest.fixture
+def told_by_names(monkeypatch) -> None:
+    """Files of demonstrations need not exist, and are other ones where they have other names."""
+    facts, origin = {"models": "builtin", "labels": "intended"}, partial(SimpleNamespace, generator="")
+    monkeypatch.setattr(run_demonstrations, "stated_facts", lambda *_: facts)
+    monkeypatch.setattr(
+        run_demonstrations, "demo_origin", lambda path, count: origin(count=count, digest=path.name)
+    )
+
+
+def test_a_pretraining_is_not_shared_by_runs_with_other_demonstrations(tmp_path, told_by_names) -> None:
     context = run_context(tmp_path, "sequential")
-    monkeypatch.setattr(
-        run_demonstrations, "stated_facts", lambda *_: {"models": "builtin", "labels": "intended"}
-    )
-    monkeypatch.setattr(
-        run_demonstrations,
-        "demo_origin",
-        lambda path, count: SimpleNamespace(count=count, generator="", digest=path.name),
-    )
     first, other = ([Path(name)] * len(context.tasks) for name in "ab")
     for _ in range(2):
         run_demonstrations._record_demonstrations(context, first, True)
@@ -452,18 +429,11 @@ def test_a_pretraining_is_not_shared_by_runs_with_other_demonstrations(tmp_path,
 
 
 def test_a_finished_run_is_not_that_of_another_folder_with_other_demonstrations(
-    tmp_path, monkeypatch
+    tmp_path, monkeypatch, told_by_names
 ) -> None:
     context, found = run_context(tmp_path, "sequential"), iter("ab")
-    origin = partial(SimpleNamespace, generator="")
     monkeypatch.setattr(
         run_demonstrations, "find_demos", lambda tasks, *_, **__: [Path(next(found))] * len(tasks)
-    )
-    monkeypatch.setattr(
-        run_demonstrations, "demo_origin", lambda path, count: origin(count=count, digest=path.name)
-    )
-    monkeypatch.setattr(
-        run_demonstrations, "stated_facts", lambda *_: {"models": "builtin", "labels": "intended"}
     )
     monkeypatch.setattr(experiment, "_build_contexts", lambda *_: (context, None))
     monkeypatch.setattr(experiment, "_held", lambda *_: nullcontext())
@@ -478,7 +448,5 @@ def test_a_finished_run_is_not_that_of_another_folder_with_other_demonstrations(
 
     again("null")
     again("copied")
-    with pytest.raises(
-        DataError, match=f"{context.directory.path} has learned cannot be shared by a run with other"
-    ):
+    with pytest.raises(DataError, match=f"{context.directory.path} has learned cannot be shared by a run"):
         again("human_demos")

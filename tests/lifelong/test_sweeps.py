@@ -45,6 +45,11 @@ def file_of(folder: Path, number: int = 0) -> Path:
     return folder / "jobs" / str(number) / "job.json"
 
 
+def done(folder: Path, number: int, run: Path) -> JobRecord:
+    """Run a job that learns at once."""
+    return run_job(file_of(folder, number), job(number), lambda: learned(run), told)
+
+
 def test_a_job_that_is_done_is_not_run_again(tmp_path) -> None:
     ran = []
 
@@ -76,7 +81,7 @@ def test_an_error_is_kept_with_its_status_and_the_job_is_tried_again(tmp_path) -
     assert (failed.status, failed.exit_status, failed.error) == ("failed", 2, "train.lr is -1")
     begin_sweep(tmp_path, ["algo=er"], 1)
     assert read_sweep(tmp_path).exit_status == 2
-    run_job(file_of(tmp_path), job(), lambda: learned(tmp_path / "run"), told)
+    done(tmp_path, 0, tmp_path / "run")
     assert read_sweep(tmp_path).exit_status == 0
 
 
@@ -107,31 +112,26 @@ def test_a_run_that_another_process_writes_is_waited_for(tmp_path, monkeypatch, 
 
 def test_a_sweep_is_done_when_all_that_was_asked_for_is(tmp_path) -> None:
     begin_sweep(tmp_path, ["algo=er", "seed=1,2,3"], 3)
-    run_job(file_of(tmp_path, 2), job(2), lambda: learned(tmp_path / "other"), told)
+    done(tmp_path, 2, tmp_path / "other")
     for _ in range(2):  # another command in the same folder, and the same again
         begin_sweep(tmp_path, ["algo=er", "seed=0,1,2"], 3)
     for number in (0, 1):
-        run_job(
-            file_of(tmp_path, number),
-            job(number),
-            lambda number=number: learned(tmp_path / f"r{number}"),
-            told,
-        )
+        done(tmp_path, number, tmp_path / f"r{number}")
     sweep = read_sweep(tmp_path)
     assert (sweep.missing, sweep.exit_status, len(sweep.runs)) == (1, 1, 2)
-    run_job(file_of(tmp_path, 2), job(2), lambda: learned(tmp_path / "r2"), told)
+    done(tmp_path, 2, tmp_path / "r2")
     begin_sweep(tmp_path, ["algo=er", "seed=0,1,2"], 3)
     sweep = read_sweep(tmp_path)
     assert (sweep.missing, sweep.exit_status, [j.number for j in sweep.jobs]) == (0, 0, [0, 1, 2])
     begin_sweep(tmp_path, ["hydra/sweeper=optuna"], None)
-    run_job(file_of(tmp_path, 7), job(7), lambda: learned(tmp_path / "r7"), told)
+    done(tmp_path, 7, tmp_path / "r7")
     assert len(read_sweep(tmp_path).jobs) == 1, "a sweeper that chooses as it goes has no plan"
 
 
 def test_the_status_names_what_runs_failed_was_lost_and_is_left(tmp_path, capsys) -> None:
     begin_sweep(tmp_path / "sweep" / "algo-1", ["algo=er"], 6)
     folder = tmp_path / "sweep" / "algo-1"
-    run_job(file_of(folder, 0), job(0), lambda: learned(tmp_path / "r0"), told)
+    done(folder, 0, tmp_path / "r0")
     sweeps._write(file_of(folder, 1), job(1))
     sweeps._write(file_of(folder, 2), job(2, process="node7:3"))  # whose lock nobody has
     sweeps._write(file_of(folder, 3), job(3, status="failed", error="no memory", exit_status=2))

@@ -34,7 +34,7 @@ def trained(policy, **kwargs):
 
 
 def test_the_learning_rate_of_an_epoch_is_that_of_torchs_cosine():
-    settings = FitSettings(epochs=5, lr=1e-2, lr_min=1e-3, lr_every="epoch")
+    settings = FitSettings(epochs=5, batch_size=8, lr=1e-2, lr_min=1e-3, lr_every="epoch")
     optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=settings.lr)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, T_max=5, eta_min=settings.lr_min)
     rates = []
@@ -43,10 +43,6 @@ def test_the_learning_rate_of_an_epoch_is_that_of_torchs_cosine():
         rates.append(lr)
         return torch.zeros(()), torch.zeros(())
 
-    fit(LinearPolicy(), Windows(), Sequential(), settings=settings, seed=(0,), step=step)
-    assert len(rates) == 5  # one batch an epoch
-    settings = FitSettings(epochs=5, batch_size=8, lr=1e-2, lr_min=1e-3, lr_every="epoch")
-    rates.clear()
     fit(LinearPolicy(), Windows(), Sequential(), settings=settings, seed=(0,), step=step)
     for epoch in range(5):
         expected = optimizer.param_groups[0]["lr"]
@@ -57,15 +53,22 @@ def test_the_learning_rate_of_an_epoch_is_that_of_torchs_cosine():
     assert learning_rate(1, 50, warm, 0) == 5e-3 and learning_rate(6, 50, warm, 0) == 1e-2
 
 
-@pytest.mark.parametrize(("last", "sizes"), [("short", [8, 8, 4]), ("filled", [8, 8, 8])])
-def test_the_last_batch_of_an_epoch_is_filled_or_short(last, sizes):
+@pytest.mark.parametrize(
+    ("given", "sizes"),
+    [
+        ({"last_batch": "short"}, [8, 8, 4]),
+        ({"last_batch": "filled"}, [8] * 3),
+        ({"steps_per_epoch": 7}, [8] * 7),
+    ],
+)
+def test_an_epoch_sees_every_window_once_and_its_last_batch_is_filled_or_short(given, sizes):
     seen = []
 
     def step(batch, draws, lr):
         seen.append(batch.window_ids)
         return torch.zeros(()), torch.zeros(())
 
-    settings = FitSettings(epochs=1, batch_size=8, last_batch=last)
+    settings = FitSettings(epochs=1, batch_size=8, **given)
     fit(LinearPolicy(), Windows(), Sequential(), settings=settings, seed=(0,), step=step)
     assert [len(ids) for ids in seen] == sizes
     assert sorted(torch.cat(seen)[:20].tolist()) == list(range(20))
@@ -152,29 +155,6 @@ def test_the_fused_optimiser_moves_weights_as_the_plain_one_from_any_memory_form
     assert all(torch.equal(value, again[name]) for name, value in found.items())
 
 
-def test_the_loss_falls():
-    losses = []
-    trained(LinearPolicy(), on_epoch=lambda e: losses.append(e.loss))
-    assert losses[-1] < losses[1]
-
-
-def test_every_window_is_seen_once_an_epoch_and_steps_can_be_fixed():
-    seen = []
-
-    class Spy(Windows):
-        def batch(self, indices):
-            seen.append(indices.clone())
-            return super().batch(indices)
-
-    fit(LinearPolicy(), Spy(size=16), Sequential(), settings=FitSettings(epochs=1, batch_size=8), seed=(0,))
-    assert sorted(torch.cat(seen).tolist()) == list(range(16))
-    seen.clear()
-    settings = FitSettings(epochs=1, batch_size=8, steps_per_epoch=7)
-    fit(LinearPolicy(), Spy(size=16), Sequential(), settings=settings, seed=(0,))
-    assert [len(s) for s in seen] == [8] * 7
-    assert sorted(torch.cat(seen[:2]).tolist()) == list(range(16))
-
-
 def test_user_defined_step_and_loader_run_in_the_same_loop():
     """Use another optimiser with its own learning rate, and batches that are read elsewhere."""
     data, policy, twin = Windows(size=16), LinearPolicy(), LinearPolicy()
@@ -225,8 +205,9 @@ def test_the_penalty_is_reported_apart_from_the_loss():
 
 def test_learning_rate_rises_then_falls_to_its_end():
     rates = [learning_rate(k, 100, SETTINGS) for k in range(101)]
-    assert rates[0] == pytest.approx(SETTINGS.lr / 3)
-    assert max(rates) == pytest.approx(SETTINGS.lr) and rates[100] == pytest.approx(SETTINGS.lr_min)
+    assert [rates[0], max(rates), rates[100]] == pytest.approx(
+        [SETTINGS.lr / 3, SETTINGS.lr, SETTINGS.lr_min]
+    )
     assert rates[3:] == sorted(rates[3:], reverse=True)
 
 
@@ -251,16 +232,6 @@ def test_an_unquoted_off_in_yaml_means_off():
 # --- cut into micro-batches
 
 
-def test_rows_of_a_batch_join_to_the_batch():
-    batch = fake_batch(PolicySpec(image_size=(8, 8), seq_len=2), 5, generator(0))
-    joined = batch.rows(slice(0, 2)).join(batch.rows(slice(2, 5)))
-    assert len(batch.rows(slice(0, 2))) == 2
-    for part, whole in ((joined.actions, batch.actions), (joined.window_ids, batch.window_ids)):
-        assert torch.equal(part, whole)
-    assert torch.equal(joined.observation.images, batch.observation.images)
-    assert all(torch.equal(joined.observation.proprio[k], v) for k, v in batch.observation.proprio.items())
-
-
 @pytest.mark.parametrize(("algo", "parts"), [("er", 3), ("derpp", 2), ("agem", 2)])
 def test_micro_batches_learn_as_the_whole_batch_does(algo, parts, tmp_path):
     whole, _ = worker.learn(algo, tmp_path / "whole", Ranks(), epochs=4)
@@ -283,20 +254,11 @@ def test_micro_batches_have_at_most_the_requested_size(parts, expected):
 
 
 def test_batch_norm_forbids_dividing_the_batch():
-    cut = FitSettings(epochs=1, accumulate=2)
-    with pytest.raises(
-        ConfigError, match=r"norm takes its statistics over the batch.*policy\.encoder\.norm=group"
-    ):
-        fit(DeepPolicy(), Windows(), Sequential(), settings=cut, seed=(0,))
+    learned, told = (DeepPolicy(), Windows(), Sequential()), "norm takes its statistics over the batch"
+    with pytest.raises(ConfigError, match=rf"{told}.*policy\.encoder\.norm=group"):
+        fit(*learned, settings=FitSettings(epochs=1, accumulate=2), seed=(0,))
     with pytest.raises(ConfigError, match="several processes"):
-        fit(
-            DeepPolicy(),
-            Windows(),
-            Sequential(),
-            settings=FitSettings(epochs=1),
-            seed=(0,),
-            ranks=Ranks(0, 2),
-        )
+        fit(*learned, settings=FitSettings(epochs=1), seed=(0,), ranks=Ranks(0, 2))
 
 
 # --- compiled
@@ -402,9 +364,8 @@ def test_deterministic_kernels_are_enabled_and_the_setting_restored(monkeypatch)
 
 
 def test_an_operation_without_deterministic_kernel_is_reported_with_the_remedy():
-    message = "some_backward_cuda does not have a deterministic implementation, but you set it."
     with pytest.raises(TrainingError, match="some_backward_cuda.*deterministic=false"), deterministic(True):
-        raise RuntimeError(message)
+        raise RuntimeError("some_backward_cuda does not have a deterministic implementation, but you set it.")
     assert not torch.are_deterministic_algorithms_enabled()
 
 
@@ -459,38 +420,14 @@ def test_slca_moves_the_representation_slowly_after_the_first_task():
         SLCA(slow=["wings"]).begin_task(0, None, policy)
 
 
-@pytest.mark.parametrize(("device", "asynchronous"), [("cpu", False), ("cuda", True)])
-def test_only_copies_to_a_gpu_are_asynchronous(device, asynchronous, monkeypatch):
-    """The values of an asynchronous copy to the host may be read before they are there."""
-    from lifelong.data import fake_batch
-    from lifelong.types import PolicySpec
-
-    asked = []
-
-    def to(tensor, *, device, non_blocking):
-        asked.append(non_blocking)
-        return tensor
-
-    batch = fake_batch(PolicySpec(image_size=(4, 4)), 2, torch.Generator())
-    monkeypatch.setattr(torch.Tensor, "to", to)
-    batch.to(device)
-    assert len(asked) >= 6 and set(asked) == {asynchronous}
-
-
 @pytest.mark.parametrize(("precision", "tf32"), [("fp32", True), ("fp32_strict", False)])
 def test_only_strict_steps_have_no_tf32(precision, tf32, monkeypatch):
     seen = []
     monkeypatch.setattr(Step, "__call__", lambda *_: seen.append(_allowed()) or (torch.zeros(()),) * 2)
     before, ends = _allowed(), []
     settings = FitSettings(epochs=1, batch_size=8, precision=precision)
-    fit(
-        LinearPolicy(),
-        Windows(),
-        Sequential(),
-        settings=settings,
-        seed=(1,),
-        on_epoch=lambda _: ends.append(_allowed()),
-    )
+    learned = LinearPolicy(), Windows(), Sequential()
+    fit(*learned, settings=settings, seed=(1,), on_epoch=lambda _: ends.append(_allowed()))
     assert set(seen) == {(tf32 and before[0], tf32 and before[1])} != {(False, True)}
     assert ends[-1] == _allowed() == before and before[0]
 

@@ -32,13 +32,8 @@ assert TUNED
 STREAM = BenchmarkSettings("libero_90", tasks=[61, 62]).sequence()
 FAST = ("--steps", "2", "--starts", "2", "--stream", "61,62", "--beside")
 TRAINED = [word for word in TINY if not word.startswith(("benchmark", "eval", "seed"))]
-WORDS = [
-    *TRAINED,
-    "policy/head=deterministic_small",
-    "algo=ewc",
-    "algo.estimator.windows=2",
-    "train.batch_size=4",
-]
+HEAD = "policy/head=deterministic_small"
+WORDS = [*TRAINED, HEAD, "algo=ewc", "algo.estimator.windows=2", "train.batch_size=4"]
 
 
 def outcome(label: str, *finals: tuple[float, ...]) -> Outcome:
@@ -50,11 +45,8 @@ def outcome(label: str, *finals: tuple[float, ...]) -> Outcome:
 
 
 def test_the_choice_has_the_largest_success_on_all_tasks() -> None:
-    loose, right, stiff = (
-        outcome("1", (0.1, 0.1, 1.0)),
-        outcome("2", (0.5, 0.2, 0.9)),
-        outcome("3", (0.6, 0.3, 0.1)),
-    )
+    finals = ((0.1, 0.1, 1.0), (0.5, 0.2, 0.9), (0.6, 0.3, 0.1))
+    loose, right, stiff = (outcome(str(number), final) for number, final in enumerate(finals, 1))
     frontier = Frontier((loose, right, stiff))
     assert frontier.chosen is right and not frontier.at_edge() and frontier.equals() == (right,)
     assert right.kept.value == pytest.approx(0.35) and right.learned.value == 0.9
@@ -86,10 +78,8 @@ def test_the_frontier_is_what_nothing_else_is_better_than_in_both() -> None:
 def test_steps_are_scaled_with_their_warm_up() -> None:
     short = scaled(FitSettings(epochs=8, steps_per_epoch=100, warmup_steps=50), 160)
     assert (short.epochs, short.steps_per_epoch, short.warmup_steps) == (8, 20, 10)
-    assert (scaled(FitSettings(epochs=50), 5).epochs, scaled(FitSettings(epochs=50), 5).steps_per_epoch) == (
-        5,
-        1,
-    )
+    few = scaled(FitSettings(epochs=50), 5)
+    assert (few.epochs, few.steps_per_epoch) == (5, 1)
 
 
 @pytest.mark.parametrize("name", TUNED)
@@ -97,22 +87,24 @@ def test_settings_that_are_tuned_exist_and_do_not_act_before_the_end_of_the_firs
     kind = TUNED[name]
     plain = plain_data(composed(f"algo={kind.__module__.rpartition('.')[2]}"))
     for key, values in kind.tuned.items():
-        states = []
         for value in values:
             config = {**plain, "algo": {**plain["algo"], key: value}}
-            algorithm, policy = Configuration(config).build("algo"), torch.nn.Linear(1, 1)
-            assert getattr(algorithm, key) == value
-            states.append((algorithm, policy))
+            assert getattr(Configuration(config).build("algo"), key) == value
         assert sorted(values) == list(values)
     if kind.plain_start:
         untouched = Configuration(plain).build("algo").state_dict()
-        assert not any(isinstance(v, torch.Tensor) for v in _leaves(untouched)), (
-            "a state before the first end"
-        )
+        assert not any(isinstance(v, torch.Tensor) for v in _leaves(untouched)), "before the first end"
 
 
 def _leaves(tree):
     return [leaf for v in tree.values() for leaf in _leaves(v)] if isinstance(tree, dict) else [tree]
+
+
+def random_stream(*words: str) -> tuple[dict[str, Any], StreamData]:
+    """Return a configuration, and a stream of random frames for it."""
+    config = plain_data(composed(*TINY, *words))
+    spec = Configuration(config).build("data").spec(384)
+    return config, StreamData(spec, tuple(make_windows(task, spec) for task in range(2)))
 
 
 @pytest.fixture
@@ -232,11 +224,8 @@ def test_starts_are_not_shared_between_streams_by_whose_later_tasks_the_first_is
 def test_tasks_are_met_and_readings_normalised_as_in_a_run(
     algo, kind, counted, tmp_path, monkeypatch
 ) -> None:
-    words = [*TINY, "policy/head=deterministic_small", "train.batch_size=4", f"data.statistics={kind}"]
-    config = plain_data(composed(*words, f"algo={algo}"))
-    spec = Configuration(config).build("data").spec(384)
-    windows = tuple(make_windows(task, spec) for task in range(2))
-    data = StreamData(spec, windows)
+    config, data = random_stream(HEAD, "train.batch_size=4", f"data.statistics={kind}", f"algo={algo}")
+    spec, windows = data.spec, data.windows
     found, met, fit = [], [], trials.fit
 
     def watched(policy, *rest, **settings):
@@ -255,10 +244,7 @@ def test_tasks_are_met_and_readings_normalised_as_in_a_run(
 
 
 def test_statistics_adapt_before_the_first_phase_alone_as_in_a_run(tmp_path, monkeypatch) -> None:
-    config = plain_data(composed(*TINY, "algo=packnet", "train.statistics_first=true"))
-    spec, found = Configuration(config).build("data").spec(384), []
-    windows = tuple(make_windows(task, spec) for task in range(2))
-    data = StreamData(spec, windows)
+    (config, data), found = random_stream("algo=packnet", "train.statistics_first=true"), []
     monkeypatch.setattr(trials, "fit", lambda *_, settings, **rest: found.append(settings.statistics_first))
     monkeypatch.setattr(trials, "_success", lambda *_: 0.5)
     measure(Trial(config, STREAM, 1, 2, 1), lambda: data, tmp_path)
@@ -268,23 +254,15 @@ def test_statistics_adapt_before_the_first_phase_alone_as_in_a_run(tmp_path, mon
 @pytest.mark.sim
 def test_each_task_is_rolled_out_at_the_end_as_in_a_run(tmp_path, monkeypatch) -> None:
     """By what acts on it: of single_task, the first policy on the first task."""
-    words = (
-        "algo=single_task",
-        "benchmark=libero_90",
-        "eval.horizon=3",
-        "eval.settle_steps=1",
-        "eval.sim_threads=1",
-    )
-    config = plain_data(composed(*TINY, *words, "train.batch_size=4"))
-    spec, seen, rollout = Configuration(config).build("data").spec(384), [], trials.rollout
-    data = StreamData(spec, tuple(make_windows(task, spec) for task in range(2)))
+    words = ("benchmark=libero_90", "eval.horizon=3", "eval.settle_steps=1", "eval.sim_threads=1")
+    config, data = random_stream(*words, "algo=single_task", "train.batch_size=4")
+    seen, rollout = [], trials.rollout
 
     def watched(policy, env, init_states, **rest):
         done = rollout(policy, env, init_states, **rest)
         first = torch.cat([p.detach().flatten() for p in policy.parameters()])
-        seen.append(
-            (env.task, [e.init_state for e in done.episodes], [e.length for e in done.episodes], first)
-        )
+        starts, lengths = ([getattr(e, name) for e in done.episodes] for name in ("init_state", "length"))
+        seen.append((env.task, starts, lengths, first))
         return done
 
     monkeypatch.setattr(trials, "rollout", watched)
@@ -354,9 +332,8 @@ def test_a_preset_prevails_over_the_tuned_value_of_a_head(tmp_path) -> None:
 
 
 def test_lists_of_values_are_found_and_others_are_left() -> None:
-    assert swept(["algo=ewc", "algo.strength=1,1e3", "data.proprio=[a,b]"]) == {
-        "algo.strength": ["1", "1000.0"]
-    }
+    found = swept(["algo=ewc", "algo.strength=1,1e3", "data.proprio=[a,b]"])
+    assert found == {"algo.strength": ["1", "1000.0"]}
 
 
 @pytest.mark.parametrize(("words", "told"), [
@@ -390,12 +367,9 @@ def test_mistakes_take_one_line(words, told, capsys, tmp_path, fake_streams) -> 
     (["device=cuda"], "device"),
     (["tracker=wandb"], "tracker"),
     (["eval.episodes=1,2"], "eval.episodes"),
-    (["seed=1,2"], "seed"),
     (["seed=3"], "seed"),
-    (["train.steps_per_epoch=10,400"], "train.steps_per_epoch"),
     (["train.steps_per_epoch=10"], "train.steps_per_epoch"),
     (["benchmark=libero_goal"], "benchmark"),
-    (["eval.episodes=3"], "eval.episodes"),
 ])  # fmt: skip
 def test_what_no_trial_obeys_is_refused_by_name(words, key, capsys, tmp_path, fake_streams) -> None:
     assert tune(*WORDS, "threads=1", "progress=false", *words, *FAST, "--out", str(tmp_path)) != 0

@@ -60,26 +60,9 @@ def _(ran: Ran) -> None:
     ran.names["env"].close()
 
 
-@check("quick.2-1")
-def _(ran: Ran) -> None:
-    assert {"moka_pot", "plate", "microwave", "wooden_cabinet"} < set(ran.names["objects"])
-    assert {"on", "in", "open", "close", "turnon", "turnoff"} < set(ran.names["predicates"])
-
-
-@check("quick.2-2")
-def _(ran: Ran) -> None:
-    assert get_scene_class("my_kitchen_scene") is ran.names["MyKitchenScene"]
-
-
 @check("quick.2-3")
 def _(ran: Ran) -> None:
     reached_by_hand(next(ran.folder.joinpath("my_tasks").glob("*.bddl")), "moka_pot_1", "plate_1")
-
-
-@check("quick.3-xml", "3.5-mug")
-def _(ran: Ran) -> None:
-    (file,) = re.findall(r'model="(\w+)"', ran.source)
-    assert ran.folder.joinpath("custom_assets", file, f"{file}.xml").read_text() == ran.source
 
 
 @check("quick.3-folders", "3.5-folders")
@@ -101,14 +84,6 @@ def _(ran: Ran) -> None:
 @check("quick.3-2")
 def _(ran: Ran) -> None:
     assert get_scene_class("SceneWithCustomObject") is ran.names["SceneWithCustomObject"]
-
-
-@check("quick.4-1")
-def _(ran: Ran) -> None:
-    assert len(ran.names["datasets"]) == 2
-    window = ran.names["datasets"][0][0]
-    assert window["obs"]["agentview_rgb"].shape == (10, 3, 128, 128)
-    assert window["task_emb"].shape == (384,)
 
 
 @check("quick.4-2")
@@ -196,11 +171,6 @@ def _(ran: Ran) -> None:
     assert ran.names["get_libero_path"]("bddl_files") == ran.names["bddl_files_default_path"]
 
 
-@check("1.3")
-def _(ran: Ran) -> None:
-    assert "'libero_100': <class 'libero.libero.benchmark.LIBERO_100'>" in ran.out
-
-
 @check("1.3-output")
 def _(ran: Ran) -> None:
     shown = dict(re.findall(r"'(\w+)': <class '(\w+)'>", ran.source))
@@ -215,9 +185,8 @@ def _(ran: Ran) -> None:
 
 @check("1.5")
 def _(ran: Ran) -> None:
-    env = OffScreenRenderEnv(
-        bddl_file_name=ran.names["benchmark_instance"].get_task(0).bddl_file, use_camera_obs=False
-    )
+    file = ran.names["benchmark_instance"].get_task(0).bddl_file
+    env = OffScreenRenderEnv(bddl_file_name=file, use_camera_obs=False)
     rows, size = re.search(r"\((\d+), (\d+)\)", ran.out).groups()
     assert int(rows) == 50
     # [time, qpos, qvel] is 123 numbers long as in the text; the fixtures' poses come behind
@@ -239,32 +208,10 @@ def _(ran: Ran) -> None:
     assert len(ran.names["object_dict"]) == 50
 
 
-@check("2.2")
-def _(ran: Ran) -> None:
-    assert "MokaPot" in ran.out
-
-
 @check("2.3")
 def _(ran: Ran) -> None:
     shown = {"true", "false", "in", "on", "up", "open", "close", "turnon", "turnoff", "printjointstate"}
     assert shown <= set(ran.names["predicate_dict"])
-
-
-@check("2.3-one")
-def _(ran: Ran) -> None:
-    assert ran.names["on_predicate"] is get_predicate_fn_dict()["on"]
-
-
-@check("2.4")
-def _(ran: Ran) -> None:
-    scene = get_scene_class("kitchen_scene1")()
-    assert type(scene) is ran.names["KitchenScene1"]
-    assert len(scene.xy_region_kwargs_list) == 3
-
-
-@check("2.5")
-def _(ran: Ran) -> None:
-    assert ran.names["KitchenScene1PutBowlOnPlate"]().goal == [("On", "akita_black_bowl_1", "plate_1")]
 
 
 @check("2.5-goals")
@@ -286,12 +233,8 @@ def _(ran: Ran) -> None:
 def _(ran: Ran) -> None:
     written = bddl.read(ran.names["bddl_file_path"])
     shown = re.findall(r"\((On) (\w+) (\w+)\)", ran.source)
-    assert [(a.predicate, *a.args) for a in (*written.init, *written.goal.parts)] == sorted(
-        shown,
-        key=lambda atom: [*(a.args for a in written.init), *(a.args for a in written.goal.parts)].index(
-            atom[1:]
-        ),
-    )
+    atoms = (*written.init, *written.goal.parts)
+    assert sorted((atom.predicate, *atom.args) for atom in atoms) == sorted(shown)
     assert written.language in ran.source
     named = dict(re.findall(r"^(\w+) - (\w+)$", ran.source, re.M))
     assert named == {**written.fixtures, **written.objects}
@@ -300,30 +243,14 @@ def _(ran: Ran) -> None:
 # Objects ----------------------------------------------------------------------------------------------------------
 
 
-@check("3.1")
-def _(ran: Ran) -> None:
-    assert ran.names["CustomObjects"].__mro__[1].__module__.startswith("robosuite")
-
-
 @check("3.2")
 def _(ran: Ran) -> None:
     xml = ran.folder / "custom_assets" / "libero_mug" / "libero_mug.xml"
     yellow = ran.folder / "custom_assets" / "libero_mug_yellow" / "libero_mug_yellow.xml"
-    yellow.write_text(
-        xml.read_text().replace("libero_mug", "libero_mug_yellow").replace("0.8 0.8 0.8", "0.9 0.8 0.1")
-    )
+    yellow.write_text(xml.read_text().replace("libero_mug", "libero_mug_yellow"))
     mug = ran.names["LiberoMugYellow"](name="libero_mug_yellow_1")
     assert (mug.category_name, mug.joints) == ("libero_mug_yellow", ["libero_mug_yellow_1_joint0"])
     assert get_object_fn("libero_mug") is ran.names["LiberoMug"]
-
-
-@check("3.3")
-def _(ran: Ran) -> None:
-    assert get_scene_class("kitchen_demo_scene")().movable_objects == [
-        "libero_mug_1",
-        "libero_mug_yellow_1",
-        "plate_1",
-    ]
 
 
 @check("3.4")
@@ -341,11 +268,6 @@ def _(ran: Ran) -> None:
 # Learning ---------------------------------------------------------------------------------------------------------
 
 
-@check("4.1")
-def _(ran: Ran) -> None:
-    assert ran.names["cfg"].policy.policy_type == "BCTransformerPolicy"
-
-
 @check("4.1-config")
 def _(ran: Ran) -> None:
     """The keys that the text lists are there; it shortens and changes their values."""
@@ -360,16 +282,6 @@ def _(ran: Ran) -> None:
     assert cfg.data.obs.modality.keys() == {"rgb", "depth", "low_dim"}
 
 
-@check("4.2")
-def _(ran: Ran) -> None:
-    assert len(ran.names["datasets"]) == 10
-    assert (
-        ran.names["benchmark"].get_task_emb(9).shape
-        == ran.names["datasets"][9][0]["task_emb"].shape
-        == (384,)
-    )
-
-
 @check("4.3")
 def _(ran: Ran) -> None:
     policy = ran.names["CustomTransformerPolicy"](ran.names["cfg"], ran.names["shape_meta"])
@@ -378,17 +290,10 @@ def _(ran: Ran) -> None:
     assert policy.get_action(obs, window["task_emb"]).shape == (1, 7)
     # what is seen counts, and so does when
     policy.eval()
-    means = [
-        policy(o, window["task_emb"]).mean
-        for o in (obs, {"rgb": obs["rgb"] * 0}, {"rgb": obs["rgb"].flip(1)})
-    ]
+    seen = (obs, {"rgb": obs["rgb"] * 0}, {"rgb": obs["rgb"].flip(1)})
+    means = [policy(one, window["task_emb"]).mean for one in seen]
     assert not torch.allclose(means[0], means[1])
     assert not torch.allclose(means[0], means[2])
-
-
-@check("4.4")
-def _(ran: Ran) -> None:
-    assert issubclass(ran.names["CustomLifelongAlgorithm"], ran.names["Sequential"])
 
 
 @check("4.5")
@@ -405,13 +310,10 @@ def _(ran: Ran) -> None:
 @check("4.6")
 def _(ran: Ran) -> None:
     rates = ((0.8, 0.0, 0.0), (0.6, 0.9, 0.1), (0.2, 0.7, 0.6))
-    found = {
-        step: {
-            **{task: {"success_rate": rate} for task, rate in enumerate(row)},
-            "average": float(np.mean(row)),
-        }
-        for step, row in enumerate(rates)
-    }
+    found: dict[int, dict] = {}
+    for step, row in enumerate(rates):
+        found[step] = {task: {"success_rate": rate} for task, rate in enumerate(row)}
+        found[step]["average"] = float(np.mean(row))
     assert np.isclose(ran.names["compute_forgetting"](found), (0.6 + 0.2) / 2)
     assert np.isclose(ran.names["compute_forward_transfer"](found), (0.9 + 0.6) / 2)
     ran.names["visualize_results"](found, str(ran.folder))

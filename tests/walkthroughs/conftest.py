@@ -7,6 +7,7 @@ import pytest
 from libero.libero.benchmark import get_benchmark
 from tests.harness.demos import generate
 from tests.harness.facade_learning import write_demos
+from tests.harness.scenes import write_box
 from tests.walkthroughs.blocks import Block, load_blocks
 
 SIZE, STEPS = 128, 6
@@ -62,11 +63,3 @@ def folder(tmp_path, monkeypatch, demos) -> Path:
     GlobalHydra.instance().clear()
     yield tmp_path
     GlobalHydra.instance().clear()
-
-
-def write_box(path: Path, half: float) -> None:
-    """A cube as OBJ."""
-    corners = [(x, y, z) for x in (-half, half) for y in (-half, half) for z in (-half, half)]
-    quads = ((1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4))
-    lines = [f"v {x} {y} {z}" for x, y, z in corners]
-    path.write_text("\n".join([*lines, *(f"f {a} {b} {c} {d}" for a, b, c, d in quads)]))

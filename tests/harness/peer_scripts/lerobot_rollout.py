@@ -47,43 +47,36 @@ def downloaded(file: Path, cache: Path) -> str:
 def main() -> None:
     register_third_party_plugins()  # what LeRobot's commands do; nothing imports the plug-in
     recorded = np.load(sys.argv[1])
-    config = make_env_config(
-        "libero_lifelong",
-        task=str(recorded["suite"]),
-        task_ids=[int(recorded["index"])],
-        observation_height=SIZE,
-        observation_width=SIZE,
-    )
+    size = {"observation_height": SIZE, "observation_width": SIZE}
+    suite, tasks = str(recorded["suite"]), [int(recorded["index"])]
+    config = make_env_config("libero_lifelong", task=suite, task_ids=tasks, **size)
     hub = {"hub_cache_dir": "hub", "trust_remote_code": True}
     repository = downloaded(Path(sys.argv[2]), Path("hub"))
     everything = make_env(repository, n_envs=2, **hub)
-    own = OwnConfig(observation_height=SIZE, observation_width=SIZE)
+    own = OwnConfig(**size)
     before, after = config.get_env_processors()
     policies, frames = [], []
     for config.hub_path in (repository, None):
-        (env,) = make_env(config, n_envs=2, **hub)[str(recorded["suite"])].values()
+        (env,) = make_env(config, n_envs=2, **hub)[suite].values()
         policies.append(Replay(recorded["actions"]))
         steps = (before, after, lambda batch: batch, lambda action: action)
         result = rollout(env, policies[-1], *steps, seeds=[1000, 1001])
         frames.append(np.stack(env.call("render")))
         env.close()
     first = policies[1].seen[0]
-    print(
-        json.dumps(
-            {
-                "type": config.type,
-                "same_features": config.features == own.features and config.features_map == own.features_map,
-                "success": result["success"].any(dim=1).tolist(),
-                "steps": [int(row.int().argmax()) + 1 for row in result["success"]],
-                "task": first["task"],
-                "state": first["observation.state"][0].tolist(),
-                "image": (first["observation.images.image"][0] * 255).round().int().flatten().tolist(),
-                "frames": list(frames[1].shape),
-                "hub_tasks": {suite: len(envs) for suite, envs in everything.items()},
-                "hub_same": np.array_equal(*frames) and _equal(*(policy.seen for policy in policies)),
-            }
-        )
-    )
+    found = {
+        "type": config.type,
+        "same_features": config.features == own.features and config.features_map == own.features_map,
+        "success": result["success"].any(dim=1).tolist(),
+        "steps": [int(row.int().argmax()) + 1 for row in result["success"]],
+        "task": first["task"],
+        "state": first["observation.state"][0].tolist(),
+        "image": (first["observation.images.image"][0] * 255).round().int().flatten().tolist(),
+        "frames": list(frames[1].shape),
+        "hub_tasks": {suite: len(envs) for suite, envs in everything.items()},
+        "hub_same": np.array_equal(*frames) and _equal(*(policy.seen for policy in policies)),
+    }
+    print(json.dumps(found))
 
 
 def _equal(one: list[dict], other: list[dict]) -> bool:

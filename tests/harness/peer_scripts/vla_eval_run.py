@@ -11,15 +11,8 @@ from pathlib import Path
 
 import numpy as np
 import vla_eval
+from vla_eval import specs
 from vla_eval.model_servers.predict import PredictModelServer
-from vla_eval.specs import (
-    GRIPPER_CLOSE_POS,
-    IMAGE_RGB,
-    LANGUAGE,
-    POSITION_DELTA,
-    ROTATION_AA,
-    STATE_EEF_POS_AA_GRIP,
-)
 
 
 class Replay(PredictModelServer):
@@ -41,12 +34,12 @@ class Replay(PredictModelServer):
         return {"send_wrist_image": True, "send_state": True}
 
     def get_action_spec(self):
-        return {"position": POSITION_DELTA, "rotation": ROTATION_AA, "gripper": GRIPPER_CLOSE_POS}
+        position, rotation, gripper = specs.POSITION_DELTA, specs.ROTATION_AA, specs.GRIPPER_CLOSE_POS
+        return {"position": position, "rotation": rotation, "gripper": gripper}
 
     def get_observation_spec(self):
-        return {
-            "agentview": IMAGE_RGB, "wrist": IMAGE_RGB, "language": LANGUAGE, "state": STATE_EEF_POS_AA_GRIP
-        }  # fmt: skip
+        seen = {"agentview": specs.IMAGE_RGB, "wrist": specs.IMAGE_RGB, "language": specs.LANGUAGE}
+        return {**seen, "state": specs.STATE_EEF_POS_AA_GRIP}
 
 
 class Messages(logging.Handler):
@@ -72,20 +65,17 @@ def main() -> None:
         arrays |= {f"{i}/{name}": value for name, value in obs.items() if isinstance(value, np.ndarray)}
     np.savez(sys.argv[3], **arrays)
     episodes = [e for result in results for task in result["tasks"] for e in task["episodes"]]
-    print(
-        json.dumps(
-            {
-                "errors": [result["num_errors"] for result in results],
-                "success": [bool(e["metrics"]["success"]) for e in episodes],
-                "steps": [e["steps"] for e in episodes],
-                "prompts": [obs["task_description"] for obs in server.first],
-                "started": server.started,
-                "recordings": len(list(Path("results").glob("*.sqlite"))),
-                "specs": [text for text in said.texts if text.startswith("Spec")],
-                "torch": "torch" in sys.modules,
-            }
-        )
-    )
+    found = {
+        "errors": [result["num_errors"] for result in results],
+        "success": [bool(e["metrics"]["success"]) for e in episodes],
+        "steps": [e["steps"] for e in episodes],
+        "prompts": [obs["task_description"] for obs in server.first],
+        "started": server.started,
+        "recordings": len(list(Path("results").glob("*.sqlite"))),
+        "specs": [text for text in said.texts if text.startswith("Spec")],
+        "torch": "torch" in sys.modules,
+    }
+    print(json.dumps(found))
 
 
 if __name__ == "__main__":

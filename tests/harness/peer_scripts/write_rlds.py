@@ -28,10 +28,9 @@ class Mine(tfds.core.GeneratorBasedBuilder):
             for key, n in (("state", 8), ("joint_state", 7))
         }
         step = {"observation": observed, "action": tfds.features.Tensor(shape=(7,), dtype=numpy.float32)}
-        step |= {key: tfds.features.Scalar(dtype=numpy.float32) for key in ("discount", "reward")}
-        step |= {
-            key: tfds.features.Scalar(dtype=numpy.bool_) for key in ("is_first", "is_last", "is_terminal")
-        }
+        scalars = dict.fromkeys(("discount", "reward"), numpy.float32)
+        scalars |= dict.fromkeys(("is_first", "is_last", "is_terminal"), numpy.bool_)
+        step |= {key: tfds.features.Scalar(dtype=dtype) for key, dtype in scalars.items()}
         step |= {"language_instruction": tfds.features.Text()}
         path = tfds.features.FeaturesDict({"file_path": tfds.features.Text()})
         features = {"steps": tfds.features.Dataset(step), "episode_metadata": path}
