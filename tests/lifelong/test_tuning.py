@@ -225,7 +225,7 @@ def test_tasks_are_met_and_readings_normalised_as_in_a_run(
     algo, kind, counted, tmp_path, monkeypatch
 ) -> None:
     config, data = random_stream(HEAD, "train.batch_size=4", f"data.statistics={kind}", f"algo={algo}")
-    spec, windows = data.spec, data.windows
+    spec, windows = data.spec, data.training
     found, met, fit = [], [], trials.fit
 
     def watched(policy, *rest, **settings):
