@@ -13,8 +13,14 @@ import torch
 
 pytest.importorskip("torchrl")
 
+from tensordict import TensorDict
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torchrl.envs import LiberoEnv
 from torchrl.envs.utils import check_env_specs
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import ClipPPOLoss
+
+from lifelong.reward.grpo import clipped_loss
 
 pytestmark = [pytest.mark.sim, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
 PAGE = Path(__file__).parents[2] / "docs" / "migrating.md"
@@ -64,3 +70,28 @@ def test_the_group_of_the_page_has_advantages_and_gradients():
     expected = expected[:, None].expand(-1, steps, -1)
     torch.testing.assert_close(group["advantage"], expected, rtol=1e-3, atol=1e-3)
     assert any(p.grad is not None and p.grad.any() for p in names["network"].parameters())
+
+
+def test_the_objective_of_learning_from_reward_is_theirs():
+    torch.manual_seed(0)
+    network = torch.nn.Sequential(torch.nn.Linear(5, 14), NormalParamExtractor())
+    module = TensorDictModule(network, ["seen"], ["loc", "scale"])
+    policy = ProbabilisticActor(
+        module, ["loc", "scale"], distribution_class=TanhNormal, return_log_prob=True, log_prob_key="drawn"
+    )
+    with torch.no_grad():
+        batch = policy(TensorDict({"seen": torch.randn(200, 5)}, [200]))
+        batch["advantage"] = torch.randn(200, 1)
+        network[0].weight += 0.05 * torch.randn_like(network[0].weight)
+    loss = ClipPPOLoss(policy, critic_network=None, entropy_bonus=False, clip_epsilon=0.2)
+    loss.set_keys(sample_log_prob="drawn")
+    theirs = loss(batch.clone())["loss_objective"]
+    now = policy.get_dist(batch).log_prob(batch["action"])
+    ours = clipped_loss(now, batch["drawn"], batch["advantage"][:, 0], 0.2, 0.2)
+    assert ((now - batch["drawn"]).abs() > np.log(1.2)).float().mean() > 0.1, "some are clipped"
+    torch.testing.assert_close(ours, theirs)
+    weights = list(network.parameters())
+    for mine, other in zip(
+        torch.autograd.grad(ours, weights), torch.autograd.grad(theirs, weights), strict=True
+    ):
+        torch.testing.assert_close(mine, other)
