@@ -84,7 +84,7 @@ def read(folder: Path) -> tuple[dict[str, dict[int, set[str]]], dict[str, float]
         name = phase["id"] if phase["phase"] == "call" else phase["id"].partition("::")[0]
         seconds[name] += phase["wall"]
         for path, numbers in phase["lines"].items():
-            for number in numbers:
+            for number in numbers if path.endswith(".py") else ():  # and not of a page's template
                 runs[path][number].add(name)
     return runs, seconds
 
