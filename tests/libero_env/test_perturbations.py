@@ -27,6 +27,7 @@ from libero_env.perturbations.kinds import Episode
 from libero_env.perturbations.pairing import moved
 from libero_env.sim.appearance import Appearance, CameraView, Light
 from libero_env.sim.predicates import register_predicate
+from libero_env.sim.scene_spec import zone_boxes
 from libero_env.tasks import get_suite, get_task
 from libero_env.tasks.expression import Atom
 
@@ -245,6 +246,17 @@ def test_distractors_are_so_many_at_rest_and_leave_the_others_where_they_are(wor
     for _ in range(10):
         env.step(np.zeros(7))
     assert np.allclose(before, [env.view.body_pos(name) for name in added], atol=1e-3)
+
+
+def test_distractors_never_lie_where_the_goal_wants_an_object(closing):
+    env = closing(BatchEnv("libero_goal/5", 32, cameras=(), perturb="distractors=1"))
+    env.reset(options={"init_state": range(32)})
+    added = [name for name in env.scene.objects if name not in env.base_scene.objects]
+    region = env.scene.problem.region("main_table_stove_front_region")
+    ((centre, half),) = zone_boxes(region, env.scene.workspace)
+    places = np.array([[view.body_pos(name) for name in added] for view in env.views])
+    assert places.shape == (32, 6, 3)
+    assert not (np.abs(places - centre)[..., :2] < half[:2]).all(-1).any()
 
 
 def test_every_instruction_of_the_benchmark_can_be_reworded_at_a_given_distance():
