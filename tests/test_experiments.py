@@ -27,7 +27,7 @@ SCRIPTS = sorted(EXPERIMENTS.rglob("*.py"))
 PACKAGES = ("libero", "libero_cli", "libero_env", "libero_eval", "lifelong")
 # of extras, and of environments in which some scripts are run
 FOREIGN = (
-    "easydict", "gymnasium", "liberoplus", "robomimic", "robosuite", "tests", "torchrl", "warp",
+    "coverage", "easydict", "gymnasium", "liberoplus", "robomimic", "robosuite", "tests", "torchrl", "warp",
     "websocket_policy_server",
 )  # fmt: skip
 # started by another script, with arguments in order, in an environment without the project
