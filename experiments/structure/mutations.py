@@ -31,9 +31,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from measure import PACKAGES
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("libero_cli", "libero_env", "lifelong", "libero_eval", "libero", "libero_integrations")
 SECONDS = 60  # of tests that follow a mutation; what takes five times as long does not end
 COMPARED = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
