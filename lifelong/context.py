@@ -53,7 +53,7 @@ class RunContext:
 
     Attributes:
         tasks: The K tasks in learning order.
-        languages: (K, L) embeddings of `instructions`.
+        languages: (K + H, L) embeddings of `instructions`, then of the held-out tasks'.
         demos: Number of demonstrations of each task.
         policy: Policy, trained in place.
         algorithm: Lifelong algorithm.
@@ -72,6 +72,7 @@ class RunContext:
         perturb: Perturbations of each task, under which it is learned and evaluated; () for none at all.
         shift: Held-out shift under which policies are evaluated besides; None for none.
         learner: How stages are learned; None for behaviour cloning.
+        held_out: The H tasks that are evaluated and never learned; their positions follow those of the others.
     """
 
     tasks: tuple[Task, ...]
@@ -95,12 +96,23 @@ class RunContext:
     perturb: tuple[tuple[Perturbation, ...], ...] = ()
     shift: HeldOutShift | None = None
     learner: Learner | None = None
+    held_out: tuple[Task, ...] = ()
 
     @property
     def works_beside(self) -> bool:
         """Whether rollouts and recordings run in processes of their own while this one learns, see `eval.beside`."""
         alone = self.ranks.size == 1 and self.device.type == "cpu" and not self.eval.back_end.is_warp
         return self.eval.beside and alone and cpu_count() > 1
+
+    @property
+    def never_learned(self) -> range:
+        """Positions of the held-out tasks."""
+        return range(len(self.tasks), len(self.tasks) + len(self.held_out))
+
+    @property
+    def untrained(self) -> tuple[int, ...]:
+        """Positions of the tasks that are evaluated before the first is learned."""
+        return (*(range(len(self.tasks)) if self.eval.unseen != "none" else ()), *self.never_learned)
 
     @property
     def perturbed(self) -> tuple[tuple[Perturbation, ...], ...]:

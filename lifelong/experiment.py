@@ -191,14 +191,14 @@ def _build_contexts(
     if ranks.first and settings.device == "auto" and device.type == "cpu":
         _warn_of_cpu(data, parts["fit"])
 
-    first, said = len(plan.before), list(plan.instructions)
+    first, said = len(plan.before), [*plan.instructions, *(task.language for task in plan.held_out)]
     languages = ranks.broadcast(lambda: config.build("language").embed(said))
     shift = ranks.broadcast(
         lambda: held_out_shift(
             evaluation.shift_perturbations(),
             plan.tasks,
             plan.perturb,
-            languages[first:],
+            languages[first : first + len(plan.tasks)],
             data,
             lambda words: config.build("language").embed([*said, *words])[len(said) :],
         )
@@ -208,8 +208,10 @@ def _build_contexts(
     def make_env(key: Any) -> BatchEnv:
         """Build the environment of (task, number of simulations), with any third part under the shift."""
         task, simulations, *shifted = key
-        perturb = shift.perturb if shifted and shift is not None else plan.perturb
-        return run_environment(plan.tasks[task], simulations, spec, evaluation, data, perturb[task])
+        own = (*plan.perturb, *((),) * len(plan.held_out))
+        perturb = shift.perturb if shifted and shift is not None else own
+        acted_on = (*plan.tasks, *plan.held_out)[task]
+        return run_environment(acted_on, simulations, spec, evaluation, data, perturb[task])
 
     progress = True if settings.progress is None and sys.stderr.isatty() else settings.progress
     context = RunContext(
@@ -269,6 +271,7 @@ def _checked_parts(config: Configuration, device: torch.device) -> tuple[TaskPla
     if "learner" in config.values:
         parts["learner"] = config.build("learner")
     parts |= {"tasks": plan.tasks, "stream": plan.stream, "group_sizes": plan.group_sizes, "demos": demos}
+    parts["held_out"] = plan.held_out
     parts |= {"data": data, "fit": fit, "eval": evaluation, "algorithm": algorithm}
     return plan, parts | {"perturb": plan.perturb if plan.stream.perturb else ()}
 
@@ -320,6 +323,7 @@ def _record_start(
             preset=names.get("preset", ""),
             tasks=[t.name for t in context.tasks],
             instructions=context.instructions,
+            held_out=[t.name for t in context.held_out],
             perturbed=[format_perturbations(found) for found in context.perturb],
             backend=context.eval.back_end.name,
             config=plain,

@@ -177,6 +177,7 @@ def pretraining_context(
         stream=StreamSettings(),
         perturb=(),
         shift=None,
+        held_out=(),
         group_sizes=(1,) * len(tasks),
         directory=directory,
         tracker=Tracker(),

@@ -13,7 +13,7 @@ import torch
 from pydantic import Field
 
 from libero_env.perturbations import Perturbation, reword_task
-from libero_env.tasks import Task
+from libero_env.tasks import Task, get_suite
 from libero_env.validation import checked
 from lifelong.algorithms.base import Algorithm
 from lifelong.algorithms.multitask import Multitask
@@ -158,6 +158,7 @@ class TaskPlan:
         stream: Settings of the order in which data arrive.
         group_sizes: Number of tasks in each group that is learned together.
         perturb: Perturbations under which each task is learned and evaluated.
+        held_out: Tasks that are evaluated and never learned.
     """
 
     before: tuple[Task, ...]
@@ -165,6 +166,7 @@ class TaskPlan:
     stream: StreamSettings
     group_sizes: tuple[int, ...]
     perturb: tuple[tuple[Perturbation, ...], ...]
+    held_out: tuple[Task, ...] = ()
 
     @property
     def instructions(self) -> tuple[str, ...]:
@@ -185,7 +187,11 @@ def plan_tasks(config: Configuration) -> TaskPlan:
     benchmark, stream = config.build("benchmark"), config.build("stream")
     tasks, before = benchmark.sequence(), config.build("pretrain").sequence()
     groups = stream.group_sizes(len(tasks), benchmark.group_size)
-    plan = TaskPlan(before, tasks, stream, groups, stream.perturbations(groups))
+    own, suite = {task.digest for task in tasks}, config.build("eval").held_out
+    held_out = tuple(task for task in get_suite(suite).tasks if task.digest not in own) if suite else ()
+    plan = TaskPlan(before, tasks, stream, groups, stream.perturbations(groups), held_out)
+    if suite and not held_out:
+        raise ConfigError(f"eval.held_out={suite} holds nothing out: the run learns all of its tasks")
     if known := {task.digest for task in before} & {task.digest for task in tasks} if before else ():
         names = [task.name for task in before if task.digest in known]
         raise ConfigError(
@@ -193,10 +199,10 @@ def plan_tasks(config: Configuration) -> TaskPlan:
             "them would be measured as if they were new; name others in pretrain.suite or pretrain.tasks"
         )
     reworded = plan.instructions[len(before) :] != tuple(task.language for task in tasks)
-    if reworded and config.build("language").by_position:
+    if (reworded or held_out) and config.build("language").by_position:
+        what = "eval.held_out has tasks" if held_out else "stream.perturb changes instructions"
         raise ConfigError(
-            "stream.perturb changes instructions, and this language encoder knows tasks by their position; choose "
-            "another, such as language=minilm"
+            f"{what}, and this language encoder knows tasks by their position; choose another, such as language=minilm"
         )
     stages, base = len(config.build("algo").stages(len(groups))), config.values["algo"].get("base_tasks")
     if len(groups) == 1 < len(tasks) and not isinstance(config.build("algo"), Multitask):

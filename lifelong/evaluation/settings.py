@@ -39,6 +39,8 @@ class EvalSettings:
             error of the sample differs between seeds, and is in their intervals.
         unseen: Whether tasks are evaluated before they are learned: the `next` after each task, or `all` that are to
             come; and all before the first task. Zero-shot success and forward transfer in GEM's sense follow.
+        held_out: Suite whose tasks, but for those that the run learns, are evaluated before the first task and after
+            the last, by what acts on that one. None: no such evaluation.
         reuse: Whether rollouts that would repeat earlier ones to the bit are copied instead of run: same weights and
             whatever else acts, same starts, nothing random.
         horizon: Maximum number of control steps per episode.
@@ -72,6 +74,7 @@ class EvalSettings:
     cells_share: Annotated[float, Field(gt=0, le=1)] = 0.1
     cells_seed: Natural | None = None
     unseen: Literal["none", "next", "all"] = "none"
+    held_out: str | None = None
     reuse: bool = True
     horizon: Count = 600
     settle_steps: Natural = 5

@@ -126,8 +126,10 @@ def _of_one_run(records: Sequence[tuple[int, Record]]) -> tuple[list[Record], li
     kept: list[Record] = []
     odd: list[tuple[int, str]] = []
     for number, record in records:
-        highest = max(getattr(record, "task", 0), getattr(record, "learned", 0))
-        if run is not None and highest >= len(run.tasks):
+        task, learned = getattr(record, "task", 0), getattr(record, "learned", 0)
+        unlearned = len(run.held_out) if run and getattr(record, "phase", "") in ("initial", "unseen") else 0
+        if run is not None and max(task - unlearned, learned) >= len(run.tasks):
+            highest = max(task, learned)
             odd.append((number, f"a {record.kind!r} record of task {highest}, of {len(run.tasks)} from 0 on"))
         elif isinstance(record, RunRecord) and run is not None and record.tasks != run.tasks:
             odd.append((number, "a 'run' record of other tasks than the first one's"))

@@ -82,7 +82,7 @@ def start_record(*, config: Mapping[str, Any], overrides: Sequence[str] = (), **
         overrides: Those of the command, of which those that change no result are left out.
         facts: Other fields of `RunRecord`; those that are tuples may be any sequence.
     """
-    columns = ("tasks", "instructions", "perturbed", "group_sizes")
+    columns = ("tasks", "instructions", "held_out", "perturbed", "group_sizes")
     fields: Any = {name: tuple(value) if name in columns else value for name, value in facts.items()}
     return RunRecord(
         config_digest=config_digest(config),

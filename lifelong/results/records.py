@@ -54,6 +54,7 @@ class RunRecord:
     backend: str = "mujoco"  # of the rollouts: mujoco or warp
     data_seed: Count | None = None  # of the demonstrations, where the configuration names one
     overrides: tuple[str, ...] = ()  # of the command, but for what changes no result
+    held_out: tuple[str, ...] = ()  # names of the tasks that are evaluated and never learned
 
     def __post_init__(self) -> None:
         if not len(self.tasks) == len(self.instructions) > 0:
@@ -190,8 +191,8 @@ class Episodes:
 class EvalRecord(Episodes):
     """Rollouts on one task: `phase` "curve" while learning it, "matrix" after learning task `learned`.
 
-    Rollouts on a task that is learned later than `learned` have the phase "unseen"; those before the first task,
-    "initial" (`learned` and `epoch` are 0).
+    Rollouts on a task that is learned later than `learned`, or never (held out, at a position after those
+    of the run), have the phase "unseen"; those before the first task, "initial" (`learned` and `epoch` are 0).
 
     Rollouts under a held-out shift (`eval.shift`) after learning task `learned` have the phase "shift"; all others are
     under the perturbations of the run's task, see `RunRecord.perturbed`.

@@ -257,7 +257,7 @@ class Results:
         """Return success on tasks before they are learned, see `lifelong.stats.metrics.unseen_transfer`."""
         size, groups = len(self.run.tasks), self.run.groups
         before, initial = np.full((size, size), np.nan), np.full(size, np.nan)
-        for r in self.of(EvalRecord):
+        for r in (r for r in self.of(EvalRecord) if r.task < size):
             if r.phase == "unseen":
                 before[r.learned, r.task] = r.rate
             elif r.phase == "initial":
@@ -266,9 +266,16 @@ class Results:
         columns = [before[rows, g.start : g.stop].mean(1) for g in groups]
         return unseen_transfer(np.stack(columns, axis=1), [initial[g.start : g.stop].mean() for g in groups])
 
+    def held_out_success(self) -> dict[str, float]:
+        """Return the mean success on tasks that are never learned, before the first task and after the last."""
+        held = [r for r in self.of(EvalRecord) if r.task >= len(self.run.tasks)]
+        names = {"held_out_before": "initial", "held_out_after": "unseen"}
+        rates = {name: [r.rate for r in held if r.phase == phase] for name, phase in names.items()}
+        return {name: float(np.mean(found)) if found else float("nan") for name, found in rates.items()}
+
     def other_conventions(self) -> dict[str, float]:
         """Return what other papers print of the success matrix, see `lifelong.stats.metrics`."""
-        found = other_conventions(self.scores().matrix) | self.unseen_transfer()
+        found = other_conventions(self.scores().matrix) | self.unseen_transfer() | self.held_out_success()
         if self.run.cells == "sampled":  # the best of the cells that happen to be measured means nothing
             found["forgetting"] = float("nan")
         return found

@@ -26,7 +26,14 @@ from lifelong.results.records import CostRecord, EvalRecord, LossRecord, Phase, 
 from lifelong.seeding import BEGIN_TASK, END_TASK, FIT, generator, seeded
 from lifelong.sequence.measuring import Evaluator
 from lifelong.sequence.recovery import Recovery, say
-from lifelong.sequence.stages import TrainingPhase, lacks_row, mean_rate, missing_points, training_phases
+from lifelong.sequence.stages import (
+    TrainingPhase,
+    lacks_row,
+    mean_rate,
+    missing_points,
+    training_phases,
+    unseen_tasks,
+)
 from lifelong.streams import StageData, learning_stages
 from lifelong.training import costs
 from lifelong.training.fit import EpochEnd, fit
@@ -251,7 +258,7 @@ class TaskSequence:
         turn = 1 if self.stages.index(stage) % 2 else -1
         cells: list[tuple[Phase, int]] = [("matrix", seen) for seen in columns[::turn]]
         later = self.stages[self.stages.index(stage) + 1 :]
-        cells += [("unseen", unseen) for unseen in self.context.eval.unseen_tasks(later)]
+        cells += [("unseen", unseen) for unseen in unseen_tasks(self.context, stage)]
         shifted = self.context.eval.shifted_row(stage, len(self.context.tasks)) if self.context.shift else ()
         cells += [("shift", seen) for seen in shifted]
         sent = cells if later else cells[::2]
@@ -292,10 +299,9 @@ class TaskSequence:
             say(self.context, progress)
 
     def _evaluate_untrained(self) -> None:
-        """Evaluate all tasks before the first is learned, where transfer to unseen tasks is measured."""
-        if self.context.eval.unseen != "none":
-            for task in range(len(self.context.tasks)):
-                self.evaluator.evaluate("initial", 0, task, 0)
+        """Evaluate tasks before the first is learned, where that is asked for."""
+        for task in self.context.untrained:
+            self.evaluator.evaluate("initial", 0, task, 0)
 
     def _eta(self, task: int) -> str:
         """Return an estimate of the remaining time, from the time that training and evaluation took so far."""

@@ -73,7 +73,8 @@ class Evaluator:
             "task": task,
             "shift": shift,
         }
-        stage = next(stage for stage in self._stages if task in stage)
+        owner = learned if task in context.never_learned else task
+        stage = next(stage for stage in self._stages if owner in stage)
         with context.algorithm.policy_for(stage[-1], context.policy) as acting:
             decided_by = ""
             if context.eval.reuse:
@@ -103,7 +104,7 @@ class Evaluator:
         """Return what rollouts depend on besides what acts, within one run."""
         context, settings, (shift, languages) = self._context, self._context.eval, self._told(phase)
         starts = self._log.read().of(RunRecord)
-        perturb = format_perturbations(context.perturbed[task])
+        perturb = format_perturbations(() if task in context.never_learned else context.perturbed[task])
         return {
             **({"perturb": perturb} if perturb else {}),
             **({"shift": shift} if phase == "shift" else {}),
@@ -166,9 +167,10 @@ class Evaluator:
 
     def _is_filmed(self, key: Mapping[str, Any]) -> bool:
         """Return whether rollouts are filmed: those of a task just learned, and those at the end."""
-        wanted = self._context.eval.record_every and key["phase"] == "matrix"
+        if not self._context.eval.record_every or key["phase"] != "matrix":
+            return False
         learned = next(stage[-1] for stage in self._stages if key["task"] in stage)
-        return bool(wanted) and key["learned"] in (learned, len(self._context.tasks) - 1)
+        return key["learned"] in (learned, len(self._context.tasks) - 1)
 
     def _video(self, learned: int, task: int) -> Path:
         return self._context.directory.videos / f"task_{task:02d}_after_{learned:02d}.webp"

@@ -102,20 +102,22 @@ def missing_points(context: RunContext, stage: Sequence[int], results: Results) 
     What is measured before the first stage counts as its epoch 0, once its row is measured: pretraining has none.
     """
     found = [epoch for phase in training_phases(context, stage) for epoch in phase.missing_points(results)]
-    measured = 0 in stage and context.eval.unseen != "none" and results.task_end(stage[-1]) is not None
-    untrained = range(len(context.tasks)) if measured else ()
-    lost = any(results.evaluation("initial", 0, task) is None for task in untrained)
+    measured = 0 in stage and results.task_end(stage[-1]) is not None
+    lost = measured and any(results.evaluation("initial", 0, task) is None for task in context.untrained)
     return [0, *found] if lost and 0 not in found else found
+
+
+def unseen_tasks(context: RunContext, stage: Sequence[int]) -> list[int]:
+    """Return the tasks that are evaluated after a stage although they are not learned yet, or never."""
+    later = [s for s in learning_stages(context.algorithm, context.group_sizes) if s[0] > stage[-1]]
+    return context.eval.unseen_tasks(later) if later else [*context.never_learned]
 
 
 def lacks_row(context: RunContext, stage: Sequence[int], results: Results) -> bool:
     """Return whether a stage's row of the success matrix is incomplete, of the cells that are measured; see `eval`."""
     columns = context.eval.row(stage, len(context.tasks))
     row = [results.evaluation("matrix", stage[-1], seen) for seen in columns]
-    later = [
-        other for other in learning_stages(context.algorithm, context.group_sizes) if other[0] > stage[-1]
-    ]
-    row += [results.evaluation("unseen", stage[-1], task) for task in context.eval.unseen_tasks(later)]
+    row += [results.evaluation("unseen", stage[-1], task) for task in unseen_tasks(context, stage)]
     if context.shift is not None:
         for seen in context.eval.shifted_row(stage, len(context.tasks)):
             row.append(results.evaluation("shift", stage[-1], seen, shift=context.shift.text))

@@ -51,23 +51,25 @@ class Camera(FakeEnv):
         return super().reset(**given)
 
 
-def learn(path, algorithm, *, policy=None, tasks=TASKS, env=Camera, **settings):
+def learn(path, algorithm, *, policy=None, tasks=TASKS, env=Camera, held_out=0, **settings):
     """Learn the sequence; return its context and the tasks of the episodes that were run."""
     episodes = []
     env = type("Counted", (env,), {"episodes": episodes})
     context = run_context(path, "sequential", tasks)
     context = replace(
         context,
+        languages=run_context(path, "sequential", tasks + held_out).languages,
+        held_out=run_context(path, "sequential", tasks + held_out).tasks[tasks:],
         algorithm=algorithm,
         policy=policy or context.policy,
         envs=EnvPool(lambda key: env(*key), 2),
         eval=replace(context.eval, **settings),
     )
     if not context.directory.log.read().records:
-        names = [task.name for task in context.tasks]
+        names, never = ([task.name for task in tasks] for tasks in (context.tasks, context.held_out))
         cells = {"cells": context.eval.cells, "cells_seed": context.eval.cells_seed}
         cells |= {"cells_share": context.eval.cells_share} if context.eval.cells == "sampled" else {}
-        context.directory.log.append(run_start(names, **cells))
+        context.directory.log.append(run_start(names, held_out=never, **cells))
     sequence(context).run()
     return context, episodes
 
@@ -409,6 +411,28 @@ def test_tasks_to_come_are_evaluated_on_request(tmp_path, unseen):
     assert {r.phase for r in records.evaluations()} == {"matrix"}  # no metric or table has others
     again, more = learn(tmp_path, Sequential(), unseen=unseen, curve="none", select="last", reuse=False)
     assert more == [] and again.directory.log.read().records == records.records
+
+
+@pytest.mark.parametrize("algorithm", [Sequential, *FROZEN.values()])
+def test_tasks_that_are_never_learned_are_evaluated_before_and_after_the_others(tmp_path, algorithm):
+    settings = {"held_out": 2, "curve": "none", "select": "last", "cells": "diagonal", "reuse": False}
+    context, episodes = learn(tmp_path, algorithm(), **settings)
+    records = context.directory.log.read()
+    held = {(r.phase, r.learned, r.task): r.rate for r in records.of(EvalRecord) if r.phase != "matrix"}
+    assert set(held) == {
+        (*when, TASKS + k) for when in [("initial", 0), ("unseen", TASKS - 1)] for k in (0, 1)
+    }
+    found = summarize(records)["metrics_of_other_conventions"]
+    for name, phase in (("held_out_before", "initial"), ("held_out_after", "unseen")):
+        assert found[name] == pytest.approx(np.mean([rate for key, rate in held.items() if key[0] == phase]))
+    assert np.isnan(found["zero_shot"]) and records.success_matrix()[0].shape == (TASKS, TASKS)
+    log = tmp_path / "results.jsonl"
+    log.write_bytes(b"".join(line for line in log.read_bytes().splitlines(True) if b'"unseen"' not in line))
+    again, more = learn(tmp_path, algorithm(), **settings)
+    assert more == [TASKS] * 3 + [TASKS + 1] * 3
+    assert outcomes(again) == {
+        (r.phase, r.learned, r.task, r.epoch): r.outcome for r in records.of(EvalRecord)
+    }
 
 
 @pytest.mark.parametrize(("phase", "key", "ran"), [("unseen", (0, 2), 3), ("initial", (0, 1), 3)])

@@ -97,6 +97,7 @@ def test_in_a_sweep_a_key_is_refused_where_no_job_reads_it():
             "stream.base_tasks=10 joins all tasks, and joint training is algo=multitask",
         ),
         ("benchmark.tasks=2 benchmark.group_size=2 algo=er", "benchmark.group_size=2 joins all tasks"),
+        ("eval.held_out=libero_object", "eval.held_out=libero_object holds nothing out"),
     ],
 )
 def test_what_would_be_measured_as_something_else_is_refused(words, told):
@@ -105,11 +106,17 @@ def test_what_would_be_measured_as_something_else_is_refused(words, told):
 
 
 @pytest.mark.parametrize(
-    "words", [["pretrain=libero_90"], ["stream.base_tasks=10", "algo=multitask"], ["benchmark.tasks=1"]]
+    "words",
+    [
+        ["pretrain=libero_90"],
+        ["stream.base_tasks=10", "algo=multitask"],
+        ["benchmark.tasks=1", "eval.held_out=libero_object"],
+    ],
 )
 def test_what_is_what_it_is_called_is_not(words):
     plan = plan_tasks(Configuration(plain_data(compose_run(words)[0])))
     assert set(plan.tasks) <= set(get_suite("libero_object").tasks)
+    assert plan.held_out == (get_suite("libero_object").tasks[1:] if len(plan.tasks) == 1 else ())
 
 
 @pytest.mark.parametrize(

@@ -156,6 +156,7 @@ def _signed(text: str) -> str:
     (_signed('{"kind": "loss", "task": -1, "epoch": 1, "loss": 0.1, "seconds": 1}'),
      "task is -1; expected greater than or equal to 0"),
     (_signed('{"kind": "loss", "task": 2, "epoch": 1, "loss": 0.1, "seconds": 1}'), "task 2, of 2 from 0 on"),
+    (to_line(evaluation("unseen", 1, 1, 2, 1)).strip().decode(), "task 2, of 2 from 0 on"),
     ('{"kind": "loss", "task": 0, "epoch": 1, "loss": 0.1, "seconds": 1e400}', "not JSON compliant"),
     (to_line(RUN[3]).decode().strip().replace("-3.25", "-3.26"), "does not have its checksum"),
     (to_line(RUN[2]).decode().strip(), "repeats line 3"),

@@ -160,6 +160,7 @@ def test_invalid_numbers_of_demonstrations_are_refused(later) -> None:
     (["algo=lora", "algo.base_tasks=2"], "algo.base_tasks is 2; of 2 stages none would be left"),
     (["language=onehot", "stream=shift_instruction"], "stream.perturb changes instructions"),
     (["language.numbered=true", "stream=shift_instruction"], "stream.perturb changes instructions"),
+    (["language=onehot", "eval.held_out=libero_goal"], "eval.held_out has tasks"),
 ])  # fmt: skip
 def test_a_stream_without_effect_is_refused(words, told) -> None:
     tasks = [] if "benchmark.tasks=1" in words else ["benchmark.tasks=2"]
