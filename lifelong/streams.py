@@ -190,6 +190,9 @@ def plan_tasks(config: Configuration) -> TaskPlan:
     own, suite = {task.digest for task in tasks}, config.build("eval").held_out
     held_out = tuple(task for task in get_suite(suite).tasks if task.digest not in own) if suite else ()
     plan = TaskPlan(before, tasks, stream, groups, stream.perturbations(groups), held_out)
+    until = config.build("eval").until
+    if isinstance(until, Sequence) and len(until) != len(tasks):
+        raise ConfigError(f"eval.until has {len(until)} entries; the run has {len(tasks)} tasks")
     if suite and not held_out:
         raise ConfigError(f"eval.held_out={suite} holds nothing out: the run learns all of its tasks")
     if known := {task.digest for task in before} & {task.digest for task in tasks} if before else ():

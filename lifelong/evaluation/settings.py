@@ -15,7 +15,7 @@ from lifelong.errors import ConfigError
 from lifelong.results.cells import MatrixCells, measured_tasks
 from lifelong.results.records import Phase
 from lifelong.stats.metrics import Transfer
-from lifelong.types import Count, Natural
+from lifelong.types import Count, Natural, Share
 
 Selection = Literal["best", "first_best", "last"]
 
@@ -51,6 +51,9 @@ class EvalSettings:
         select: Weights that are kept of a task: those of the `best` epoch, the latest of equally good ones; of the
             `first_best`, the earliest of them, as in LIBERO's code: those from before the task where nothing succeeds;
             or of the `last`.
+        until: Success at a point of the learning curve at which a task counts as learned: training on it ends there. A
+            number, or one for each task in learning order. Curves then differ in length, and FWT is over what they
+            have. None: all epochs are trained.
         transfer: Estimate of forward transfer. `unbiased`: where the best epoch is kept, it is chosen without the start
             that measures it, and where the last one is, none is held. `published`: eq. 3 as written, which holds the
             largest of the measured points; so does `unbiased` where the best of points of one rollout is kept.
@@ -80,6 +83,7 @@ class EvalSettings:
     settle_steps: Natural = 5
     selection: Literal["apart", "reporting"] = "apart"
     select: Selection = "best"
+    until: Share | Sequence[Share] | None = None
     transfer: Literal["unbiased", "published"] = "unbiased"
     precision: Literal["auto", "bf16", "fp32", "fp32_strict"] = "auto"
     record_every: Natural = 4
@@ -100,6 +104,10 @@ class EvalSettings:
                     f"eval.{name} has no effect without eval.cells=sampled; leave it out, or set both"
                 )
         self.shift_perturbations()
+        if self.until is not None and (self.select, self.curve) not in (("last", "all"), ("last", "trained")):
+            raise ConfigError(
+                "eval.until keeps the weights that reach it: set eval.select=last, and a learning curve"
+            )
         points = 0 if self.curve == "none" else self.curve_episodes
         needed = self.episodes + (points if self.selection == "apart" else 0)
         if max(needed, points) > NUM_INIT_STATES:
@@ -124,6 +132,12 @@ class EvalSettings:
         if self.transfer == "unbiased" and self.select == "last":
             return "plain"
         return "published" if self.transfer == "published" or self.curve_episodes == 1 else "cross_fitted"
+
+    def enough(self, stage: Sequence[int]) -> float | None:
+        """Return the success at which training on a stage ends, of several tasks the mean; None for all epochs."""
+        if not isinstance(self.until, Sequence):
+            return self.until
+        return sum(self.until[task] for task in stage) / len(stage)
 
     def shift_perturbations(self) -> tuple[Perturbation, ...]:
         """Return the perturbations of the held-out shift; none without one.

@@ -186,28 +186,27 @@ class TaskSequence:
                 say(context, f"warning: no rollout has succeeded at any epoch: the weights {whose} are kept")
         context.algorithm.end_phase(phase.kind, context.policy)
 
-    def _after_epoch(self, phase: TrainingPhase, end: EpochEnd) -> None:
-        """Record the loss, save, and evaluate a point of the learning curve if one is due."""
+    def _after_epoch(self, phase: TrainingPhase, end: EpochEnd) -> bool:
+        """Record the loss, save, and evaluate a due point of the learning curve; return whether training ends here."""
         context, task, epoch = self.context, phase.task, phase.offset + end.epoch
         if end.epoch and not self.log.read().has_loss(task, epoch):
             self.log.append(LossRecord(task=task, epoch=epoch, loss=end.loss, seconds=end.seconds))
             values = {"epoch": epoch, f"loss/{task}": end.loss, f"penalty/{task}": end.penalty}
             context.tracker.log(values, len(self.log.read().of(LossRecord)))
-        if (phase.number, end.epoch) == (0, phase.epochs) and not self.log.read().costs(task):
-            spent = costs.step_costs(
-                context.policy, context.algorithm, self.data[task], context.fit.batch_size
-            )
-            self.log.append(CostRecord(task=task, costs=spent))
         due = end.epoch in context.eval.curve_epochs(phase.epochs)
         if due or self.recovery.is_due():
             self.recovery.save_progress(task, phase.number, end.state())
-        if not (due and phase.kind.measures_transfer):
-            return
-        success = mean_rate([self.evaluator.evaluate("curve", task, member, epoch) for member in phase.stage])
-        loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
-        self._tell(f"  epoch {epoch:3d}: {loss}success {success:4.0%}")
-        if phase.selects_best and phase.best_epoch(self.log.read(), end.epoch) == end.epoch:
-            self.recovery.save_best(phase, end)
+        if due and phase.kind.measures_transfer:
+            points = [self.evaluator.evaluate("curve", task, member, epoch) for member in phase.stage]
+            loss = f"loss {end.loss:7.3f}, " if end.epoch else ""
+            self._tell(f"  epoch {epoch:3d}: {loss}success {mean_rate(points):4.0%}")
+            if phase.selects_best and phase.best_epoch(self.log.read(), end.epoch) == end.epoch:
+                self.recovery.save_best(phase, end)
+        ended = end.epoch == phase.last_epoch(self.log.read())
+        if ended and not phase.number and not self.log.read().costs(task):
+            parts = (context.policy, context.algorithm, self.data[task], context.fit.batch_size)
+            self.log.append(CostRecord(task=task, costs=costs.step_costs(*parts)))
+        return ended
 
     def _end_task(self, task: int, dataset: TaskWindows) -> None:
         """Let the algorithm end the task, record the costs, and write the task's checkpoint."""
@@ -237,7 +236,8 @@ class TaskSequence:
         )
         return {
             "updates": sum(
-                p.epochs * (p.steps_per_epoch or math.ceil(windows / fit.batch_size)) for p in phases
+                p.last_epoch(results) * (p.steps_per_epoch or math.ceil(windows / fit.batch_size))
+                for p in phases
             ),
             "windows": windows,
             "kept_share": 100 * costs.windows_kept(self.context.algorithm) / seen,

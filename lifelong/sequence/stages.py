@@ -25,6 +25,7 @@ class TrainingPhase:
         offset: Number of epochs of the stage's earlier phases.
         curve: Epochs of the phase at which its learning curve has points; empty where success is not its measure.
         select: Weights that are kept, see `EvalSettings`.
+        enough: Success at a point of the curve at which training ends; None for all epochs.
     """
 
     stage: Sequence[int]
@@ -35,6 +36,7 @@ class TrainingPhase:
     offset: int
     curve: tuple[int, ...]
     select: Selection
+    enough: float | None = None
 
     @property
     def selects_best(self) -> bool:
@@ -56,6 +58,13 @@ class TrainingPhase:
                 found[epoch] = mean_rate(records)
         return found
 
+    def last_epoch(self, results: Results) -> int:
+        """Return the epoch at which training ends, as far as points of the curve are recorded."""
+        reached = (
+            e for e, rate in self.points(results).items() if self.enough is not None and rate >= self.enough
+        )
+        return next(reached, self.epochs)
+
     def best_epoch(self, results: Results, until: int) -> int:
         """Return the epoch with the highest recorded success; where the last weights are kept, the last epoch.
 
@@ -64,14 +73,14 @@ class TrainingPhase:
             until: Last epoch to consider.
         """
         if not self.selects_best:
-            return self.epochs
+            return self.last_epoch(results)
         rates = {epoch: rate for epoch, rate in self.points(results).items() if epoch <= until}
         return max(rates, key=lambda epoch: (rates[epoch], -epoch if self.select == "first_best" else epoch))
 
     def missing_points(self, results: Results, before: int | None = None) -> list[int]:
         """Return the epochs whose points of the curve are not recorded, of those before an epoch or of all."""
-        found = self.points(results)
-        return [e for e in self.curve if e not in found and (before is None or e < before)]
+        found, end = self.points(results), self.last_epoch(results)
+        return [e for e in self.curve if e not in found and e < (end + 1 if before is None else before)]
 
 
 def training_phases(context: RunContext, stage: Sequence[int]) -> list[TrainingPhase]:
@@ -89,6 +98,7 @@ def training_phases(context: RunContext, stage: Sequence[int]) -> list[TrainingP
             offset=offset,
             curve=context.eval.curve_epochs(count) if phase.measures_transfer else (),
             select=context.eval.select if phase.measures_transfer else "last",
+            enough=context.eval.enough(stage) if phase.measures_transfer else None,
         )
         for number, (phase, count, offset) in enumerate(
             zip(phases, epochs, accumulate(epochs, initial=0), strict=False)

@@ -69,7 +69,7 @@ def fit(
     settings: FitSettings,
     seed: Sequence[int],
     augment: BatchAugmentation | None = None,
-    on_epoch: Callable[[EpochEnd], None] = lambda end: None,
+    on_epoch: Callable[[EpochEnd], bool | None] = lambda end: None,
     resume: dict[str, Any] | None = None,
     progress: str | None = None,
     ranks: Ranks = Ranks(),  # noqa: B008 - frozen
@@ -92,7 +92,8 @@ def fit(
         settings: Epochs, batch size and optimiser.
         seed: Integers that identify this call within the run.
         augment: Augmentation of each mixed batch, with the epoch's generator.
-        on_epoch: Function called at the end of each epoch, at epoch 0 too, and again for the epoch resumed from.
+        on_epoch: Function called at the end of each epoch, at epoch 0 too, and again for the epoch resumed from;
+            training ends where it returns True.
         resume: State from `EpochEnd.state` to continue from.
         progress: Text before a progress bar with the remaining time; None for no bar.
         ranks: Rank of this process among those that train together.
@@ -124,11 +125,11 @@ def fit(
         with seeded(*seed, 0, 2, device=device), float32_products(settings.precision):
             _adapt_statistics(policy, dataset, algorithm, size, augment, generator(*seed, 0, 3))
     own_draws = () if ranks.first else (ranks.rank,)  # dropout differs between ranks
-    on_epoch(EpochEnd(first, loss, penalty, 0.0, policy, optimizer, more or {}))
+    ended = on_epoch(EpochEnd(first, loss, penalty, 0.0, policy, optimizer, more or {}))
     make_bar = partial(tqdm, desc=progress, disable=progress is None, unit="step", leave=False)
     total = settings.epochs * steps
     with make_bar(total=total, initial=first * steps) as bar:
-        for epoch in range(first, settings.epochs):
+        for epoch in () if ended else range(first, settings.epochs):
             began, draws = time.perf_counter(), generator(*seed, epoch, 0)
             order = _shuffled_indices(len(dataset), windows, draws)
             default_step.synchronise()
@@ -143,7 +144,8 @@ def fit(
                 )
             bar.set_postfix(loss=f"{loss:.3f}", refresh=False)
             seconds = time.perf_counter() - began
-            on_epoch(EpochEnd(epoch + 1, loss, penalty, seconds, policy, optimizer, more or {}))
+            if on_epoch(EpochEnd(epoch + 1, loss, penalty, seconds, policy, optimizer, more or {})):
+                break
 
 
 def _take_steps(

@@ -35,7 +35,17 @@ from lifelong.stats.metrics import lifelong_metrics
 from tests.harness.configs import composed
 from tests.harness.policies import small_transformer
 from tests.harness.records import run_start
-from tests.harness.sequences import SPEC, TASKS, FakeEnv, assert_same, outcome, run_context, sequence
+from tests.harness.sequences import (
+    SPEC,
+    TASKS,
+    FakeEnv,
+    Killed,
+    Killer,
+    assert_same,
+    outcome,
+    run_context,
+    sequence,
+)
 
 pytestmark = pytest.mark.usefixtures("uncounted")
 FROZEN = {"packnet": PackNet, "lora": lambda: LoRA(rank=2), "single_task": SingleTask}
@@ -391,6 +401,31 @@ def test_forward_transfer_without_epoch_0_is_the_mean_of_the_others(tmp_path):
     assert {tuple(curve.epochs) for curve in results.curves().values()} == {(1, 2)}
     held = [curve.held().mean() for curve in results.curves().values()]
     assert lifelong_metrics(results.scores(transfer="published")).fwt.value == pytest.approx(np.mean(held))
+
+
+@pytest.mark.parametrize("algorithm", [Sequential, PackNet])
+def test_training_ends_where_success_is_enough(tmp_path, monkeypatch, algorithm):
+    """Also where it was killed and goes on, to the same bits."""
+    settings = {"curve": "all", "select": "last", "until": (0.0, 0.9, 0.5)}
+    monkeypatch.setattr(EvalRecord, "rate", property(lambda record: (0.0, 0.5, 1.0)[record.epoch]))
+    context, _ = learn(tmp_path / "whole", algorithm(), **settings)
+    results = context.directory.log.read()
+    curves = {task: [*curve.epochs] for task, curve in results.curves().items()}
+    assert curves == {0: [0], 1: [0, 1, 2], 2: [0, 1]}
+    if algorithm is Sequential:
+        assert [results.task_end(task).best_epoch for task in range(TASKS)] == [0, 2, 1]
+        assert [results.costs(task)["updates"] for task in range(TASKS)] == [0, 6, 3]
+    for writes in (4, 11, 19):
+        path = tmp_path / str(writes)
+        with monkeypatch.context() as patch, pytest.raises(Killed):
+            patch.setattr(ResultLog, "append", Killer(patch, writes).guard(ResultLog.append))
+            learn(path, algorithm(), **settings)
+        again, _ = learn(path, algorithm(), **settings)
+        (records, state), (expected, last) = (
+            outcome(c.directory.path, c.directory.log) for c in (again, context)
+        )
+        assert records == expected
+        assert_same(state, last)
 
 
 @pytest.mark.parametrize("unseen", ["next", "all"])

@@ -97,6 +97,8 @@ def test_in_a_sweep_a_key_is_refused_where_no_job_reads_it():
             "stream.base_tasks=10 joins all tasks, and joint training is algo=multitask",
         ),
         ("benchmark.tasks=2 benchmark.group_size=2 algo=er", "benchmark.group_size=2 joins all tasks"),
+        ("benchmark.tasks=3 eval.until=[0.5,1] eval.curve=all eval.select=last", "eval.until has 2 entries"),
+        ("eval.until=0.5 eval.select=best", "set eval.select=last, and a learning curve"),
         ("eval.held_out=libero_object", "eval.held_out=libero_object holds nothing out"),
     ],
 )
