@@ -64,6 +64,8 @@ class Collected:
 
     def join(self, *others: "Collected") -> "Collected":
         """Return these episodes followed by others."""
+        if not others:
+            return self
         parts = (self, *others)
         starts = np.cumsum([0, *(len(part.rewards) for part in parts)]).tolist()
         return Collected(

@@ -160,8 +160,8 @@ class GRPO:
                 began = time.perf_counter()
                 first, *rest = [self._collect(context, task, (*seed, epoch), others) for task in stage]
                 done = first.join(*rest)
-                frames = self._kept(done)
-                record = self._record(done)
+                frames, record = self._kept(done), self._record(done)
+                del first, rest, done  # as large as what is kept of them
                 seconds = time.perf_counter() - began
                 log = context.directory.log
                 if not any(
