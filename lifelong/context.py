@@ -37,6 +37,7 @@ class Learner(Protocol):
         stage: Sequence[int],
         seed: Sequence[int],
         resume: Mapping[str, Any] | None,
+        offset: int = 0,
     ) -> AbstractContextManager[dict[str, Any]]:
         """Yield arguments of `lifelong.training.fit.fit` for a phase of training.
 
@@ -44,6 +45,7 @@ class Learner(Protocol):
             stage: Positions of the tasks.
             seed: Integers that identify the phase within the run.
             resume: State of `fit` that it goes on from; None from the start.
+            offset: Number of epochs of the stage's earlier phases.
         """
 
 

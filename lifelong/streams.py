@@ -191,6 +191,8 @@ def plan_tasks(config: Configuration) -> TaskPlan:
     held_out = tuple(task for task in get_suite(suite).tasks if task.digest not in own) if suite else ()
     plan = TaskPlan(before, tasks, stream, groups, stream.perturbations(groups), held_out)
     until = config.build("eval").until
+    if until is not None and not any(phase.measures_transfer for phase in config.build("algo").phases()):
+        raise ConfigError("eval.until has no effect on an algorithm without learning curves")
     if isinstance(until, Sequence) and len(until) != len(tasks):
         raise ConfigError(f"eval.until has {len(until)} entries; the run has {len(tasks)} tasks")
     if suite and not held_out:

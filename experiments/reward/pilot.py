@@ -75,8 +75,8 @@ def train(runs: Path, name: str, words: tuple[str, ...]) -> Path:
 def table() -> list[str]:
     """Return the lines of the table: ten iterations a row, of each seed."""
     lines = [
-        "| seed | iterations | drawn | groups with spread | entropy | mean actions, after them |",
-        "|---|---|---:|---:|---:|---:|",
+        "| seed | iterations | drawn | groups with spread | entropy | steps/s | mean actions, after them |",
+        "|---|---|---:|---:|---:|---:|---:|",
     ]
     for file in sorted(RECORDS.glob("pilot_seed*.jsonl.xz")):
         seed = file.name.removeprefix("pilot_seed").partition(".")[0]
@@ -87,15 +87,15 @@ def table() -> list[str]:
         log.unlink()
         collected = results.of(CollectionRecord)
         curve = {r.epoch: sum(r.successes) for r in results.of(EvalRecord) if r.phase == "curve"}
-        lines.append(f"| {seed} | before | | | | {curve[0]} of 40 |")
+        lines.append(f"| {seed} | before | | | | | {curve[0]} of 40 |")
         for last in sorted(curve)[1:]:
             rows = [r for r in collected if last - 10 < r.epoch <= last]
             drawn = sum(r.successes for r in rows) / sum(r.episodes for r in rows)
             groups = sum(r.groups for r in rows) / len(rows)
             entropy = sum(r.entropy for r in rows) / len(rows)
-            lines.append(
-                f"| | to {last} | {drawn:.0%} | {groups:.1f} of 16 | {entropy:.2f} | {curve[last]} of 40 |"
-            )
+            speed = sum(r.steps for r in rows) / sum(r.seconds for r in rows)
+            cells = (f"{drawn:.0%}", f"{groups:.1f} of 16", f"{entropy:.2f}", f"{speed:.0f}")
+            lines.append(f"| | to {last} | {' | '.join(cells)} | {curve[last]} of 40 |")
     return lines
 
 

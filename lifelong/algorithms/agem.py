@@ -24,6 +24,7 @@ class AGEM(Rehearsal):
     """
 
     draws_after_backward = True
+    adds_windows = False
     tuned = {"ratio": (0.5, 1.0, 2.0)}
 
     def __init__(self, *, memory: ReplayMemory, ratio: Positive = 1.0, augment_reference: bool = False):

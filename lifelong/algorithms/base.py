@@ -75,6 +75,9 @@ class Algorithm:
             first is the one it varies unasked. They do not act before the `end_task` of the first task.
         plain_start: Whether the first task is learned as by fine-tuning, with no state before its `end_task`;
             `libero tune` then learns it once for all such algorithms.
+        adds_windows: Whether `mix` adds windows of earlier tasks to batches.
+        needs_demonstrations: Whether its hooks take a batch for windows of demonstrations, so that it cannot learn from
+            reward.
         draws_after_backward: Whether `after_backward` draws at random, by dropout for instance: the gradients of the
             first rank are then those of all.
 
@@ -113,6 +116,8 @@ class Algorithm:
     acts_by_weights: ClassVar[bool] = False
     tuned: Mapping[str, tuple[float, ...]] = {}
     plain_start: ClassVar[bool] = False
+    adds_windows: ClassVar[bool] = False
+    needs_demonstrations: ClassVar[bool] = False
     draws_after_backward: ClassVar[bool] = False
 
     def set_augmentation(self, augment: Augmentation | None) -> None:

@@ -29,6 +29,8 @@ class MIR(ER):
     The stream is not online: the memory is filled when a task ends.
     """
 
+    needs_demonstrations = True  # for the virtual step
+
     def __init__(
         self,
         *,

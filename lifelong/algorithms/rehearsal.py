@@ -16,6 +16,7 @@ class Rehearsal(Algorithm):
 
     state_form = {"memory": MEMORY_FORM}
     plain_start = True
+    adds_windows = True
 
     def __init__(self, memory: ReplayMemory | CompressedMemory, ratio: float):
         """Create the algorithm.

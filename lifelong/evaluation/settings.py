@@ -53,7 +53,7 @@ class EvalSettings:
             or of the `last`.
         until: Success at a point of the learning curve at which a task counts as learned: training on it ends there. A
             number, or one for each task in learning order. Curves then differ in length, and FWT is over what they
-            have. None: all epochs are trained.
+            have. Phases without a curve, such as PackNet's after pruning, are trained whole. None: all epochs are.
         transfer: Estimate of forward transfer. `unbiased`: where the best epoch is kept, it is chosen without the start
             that measures it, and where the last one is, none is held. `published`: eq. 3 as written, which holds the
             largest of the measured points; so does `unbiased` where the best of points of one rollout is kept.
@@ -137,7 +137,7 @@ class EvalSettings:
         """Return the success at which training on a stage ends, of several tasks the mean; None for all epochs."""
         if not isinstance(self.until, Sequence):
             return self.until
-        return sum(self.until[task] for task in stage) / len(stage)
+        return round(sum(self.until[task] for task in stage) / len(stage), 9)
 
     def shift_perturbations(self) -> tuple[Perturbation, ...]:
         """Return the perturbations of the held-out shift; none without one.

@@ -134,7 +134,8 @@ def load_run(path: Path) -> Run:
 
 def _untrained(results: Results) -> list[str]:
     """Return sentences about the tasks that next to nothing was learned on, though they count as learned."""
-    kept = [f"task {end.task + 1}" for end in results.of(TaskEndRecord) if end.best_epoch == 0]
+    ends = [end for end in results.of(TaskEndRecord) if end.best_epoch == 0 and results.has_loss(end.task, 1)]
+    kept = [f"task {end.task + 1}" for end in ends]
     counts = {t: costs.get("parameters_trained", math.inf) for t, costs in results.costs_by_task().items()}
     usual = max((count for task, count in counts.items() if task and count < math.inf), default=0.0)
     full = [f"task {task + 1}" for task, count in counts.items() if count < max(1.0, 0.01 * usual)]

@@ -270,8 +270,13 @@ class Results:
         """Return the mean success on tasks that are never learned, before the first task and after the last."""
         held = [r for r in self.of(EvalRecord) if r.task >= len(self.run.tasks)]
         names = {"held_out_before": "initial", "held_out_after": "unseen"}
-        rates = {name: [r.rate for r in held if r.phase == phase] for name, phase in names.items()}
-        return {name: float(np.mean(found)) if found else float("nan") for name, found in rates.items()}
+        rates = {name: {r.task: r.rate for r in held if r.phase == phase} for name, phase in names.items()}
+        return {
+            name: float(np.mean([*found.values()]))
+            if found and len(found) == len(self.run.held_out)
+            else np.nan
+            for name, found in rates.items()
+        }
 
     def other_conventions(self) -> dict[str, float]:
         """Return what other papers print of the success matrix, see `lifelong.stats.metrics`."""

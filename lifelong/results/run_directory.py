@@ -173,7 +173,7 @@ class RunDirectory:
             atomic_write_text(file, text, fsync=True)
             return
         was, now = result_relevant(read_saved_config(file)), result_relevant(config)
-        changed = [k for k in {**was, **now} if was.get(k, "absent") != now.get(k, "absent")]
+        changed = [k for k in {**was, **now} if was.get(k) != now.get(k)]  # null: an older run may lack it
         if changed:
             pairs = [(k, was.get(k, "absent"), now.get(k, "absent")) for k in changed[:4]]
             listed = ", ".join(f"{k} {old!r} -> {new!r}" for k, old, new in pairs)

@@ -36,11 +36,12 @@ class Experience(Batch):
         return replace(cast(Experience, super().map(change)), **changed)
 
     def join(self, *others: Batch) -> "Experience":
-        """Return this experience followed by more, or by demonstrations."""
+        """Return this experience followed by more, or by demonstrations, on its device."""
+        others = tuple(one.to(self.actions.device) for one in others)
         of_others = [
             (one.log_probs, one.advantages)
             if isinstance(one, Experience)
-            else (torch.full((len(one),), torch.nan), torch.zeros(len(one)))
+            else (self.log_probs.new_full((len(one),), torch.nan), self.advantages.new_zeros(len(one)))
             for one in others
         ]
         log_probs, advantages = zip((self.log_probs, self.advantages), *of_others, strict=True)

@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from libero_env.validation import checked
-from lifelong.algorithms.base import Algorithm
+from lifelong.algorithms.frozen_base import RoutedExperts
 from lifelong.checkpoints import load_weights
 from lifelong.context import RunContext
 from lifelong.errors import ConfigError
@@ -73,8 +73,8 @@ class GRPO:
         episodes: Number of episodes from each.
         clip_low: How far below 1 the ratio of probabilities counts.
         clip_high: How far above 1 it counts.
-        kl: Weight of the divergence from the policy that began the stage, by the estimate of Schulman (2020),
-            "Approximating KL divergence", k3.
+        kl: Weight of the divergence from the policy that began the phase of training, by the estimate k3 of Schulman
+            (2020), "Approximating KL divergence".
         replay: Weight of the loss on the windows that an algorithm adds to batches, such as `er`.
         processes: Number of processes that run the episodes, each a share of them; results depend on it in bits.
     """
@@ -114,8 +114,21 @@ class GRPO:
             raise ConfigError(
                 f"data.seq_len is {policy.spec.seq_len}: learner=grpo learns from single frames, data.seq_len=1"
             )
-        if (type(algorithm).mix is not Algorithm.mix) != bool(self.replay):
-            name = type(algorithm).__name__
+        name = type(algorithm).__name__
+        if algorithm.needs_demonstrations:
+            raise ConfigError(
+                f"{name} needs windows of demonstrations, and learner=grpo has none of the present task"
+            )
+        if self.kl and isinstance(algorithm, RoutedExperts):
+            raise ConfigError(
+                f"learner.kl compares with weights, and {name} acts with experts beside them: set it to 0"
+            )
+        if context.fit.precision != context.eval.precision:
+            raise ConfigError(
+                f"train.precision={context.fit.precision} and eval.precision={context.eval.precision}: learner=grpo "
+                "compares probabilities when acting and when learning, which need the same"
+            )
+        if algorithm.adds_windows != bool(self.replay):
             raise ConfigError(
                 f"learner.replay is {self.replay:g}, and {name} adds no windows to batches: set it to 0"
                 if self.replay
@@ -137,7 +150,12 @@ class GRPO:
 
     @contextmanager
     def training(
-        self, context: RunContext, stage: Sequence[int], seed: Sequence[int], resume: Mapping[str, Any] | None
+        self,
+        context: RunContext,
+        stage: Sequence[int],
+        seed: Sequence[int],
+        resume: Mapping[str, Any] | None,
+        offset: int = 0,
     ) -> Iterator[dict[str, Any]]:
         """Yield what `lifelong.training.fit.fit` needs to learn a stage so.
 
@@ -145,6 +163,7 @@ class GRPO:
             stage: Positions of the tasks.
             seed: Integers that identify the call within the run.
             resume: State of `fit` that it goes on from; None from the start.
+            offset: Number of epochs of the stage's earlier phases.
         """
         policy = context.policy
         assert isinstance(policy, HistoryPolicy)
@@ -164,10 +183,10 @@ class GRPO:
                 del first, rest, done  # as large as what is kept of them
                 seconds = time.perf_counter() - began
                 log = context.directory.log
-                if not any(
-                    (r.task, r.epoch) == (stage[-1], epoch + 1) for r in log.read().of(CollectionRecord)
-                ):
-                    log.append(CollectionRecord(task=stage[-1], epoch=epoch + 1, seconds=seconds, **record))
+                place = {"task": stage[-1], "epoch": offset + epoch + 1}
+                known = ({"task": r.task, "epoch": r.epoch} for r in log.read().of(CollectionRecord))
+                if place not in known:
+                    log.append(CollectionRecord(**place, seconds=seconds, **record))
                 yield from _batches(frames, [len(chunk) for chunk in chunks])
 
             yield {
@@ -182,7 +201,7 @@ class GRPO:
 
         Args:
             batch: Experience, perhaps followed by windows of demonstrations.
-            reference: Policy that began the stage, where `kl` is not 0.
+            reference: Policy that began the phase, where `kl` is not 0.
         """
         assert isinstance(batch, Experience) and isinstance(policy.head, GMMHead)
         own = ~batch.log_probs.isnan()

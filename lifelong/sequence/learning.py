@@ -22,7 +22,14 @@ from lifelong.data.settings import Statistics
 from lifelong.data.windows import TaskWindows, frame_moments, frames_of
 from lifelong.evaluation.beside import RolloutProcess
 from lifelong.policies.base import Policy
-from lifelong.results.records import CostRecord, EvalRecord, LossRecord, Phase, TaskEndRecord
+from lifelong.results.records import (
+    CollectionRecord,
+    CostRecord,
+    EvalRecord,
+    LossRecord,
+    Phase,
+    TaskEndRecord,
+)
 from lifelong.seeding import BEGIN_TASK, END_TASK, FIT, generator, seeded
 from lifelong.sequence.measuring import Evaluator
 from lifelong.sequence.recovery import Recovery, say
@@ -156,7 +163,8 @@ class TaskSequence:
             context.algorithm.begin_phase(phase.kind, context.policy)
         seed, learner = (context.seed, FIT, phase.task, phase.number), context.learner
         cloning = nullcontext({"augment": context.augment})
-        with learner.training(context, phase.stage, seed, resume) if learner else cloning as options:
+        own = learner.training(context, phase.stage, seed, resume, phase.offset) if learner else cloning
+        with own as options:
             fit(
                 context.policy,
                 dataset,
@@ -234,11 +242,13 @@ class TaskSequence:
         seen = windows + sum(
             results.costs(stage[-1]).get("windows", 0.0) for stage in self.stages if stage[-1] < task
         )
+        epochs = [p.last_epoch(results) for p in phases]
+        epochs[-1] -= sum(
+            r.task == task and not r.groups for r in results.of(CollectionRecord)
+        )  # nothing told
+        steps = phases[0].steps_per_epoch or math.ceil(windows / fit.batch_size)
         return {
-            "updates": sum(
-                p.last_epoch(results) * (p.steps_per_epoch or math.ceil(windows / fit.batch_size))
-                for p in phases
-            ),
+            "updates": sum(epochs) * steps,
             "windows": windows,
             "kept_share": 100 * costs.windows_kept(self.context.algorithm) / seen,
         }

@@ -70,6 +70,8 @@ class Recovery:
             return False
         if any(phase.missing_points(results) for phase in phases[: state["phase"]]):
             return False
+        if 0 in stage and any(results.evaluation("initial", 0, t) is None for t in self.context.untrained):
+            return False
         if fit is None or state["phase"] == len(phases):
             return fit is None
         phase = phases[state["phase"]]

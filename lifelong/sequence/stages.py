@@ -144,4 +144,4 @@ def is_measured(context: RunContext, results: Results) -> bool:
 
 def mean_rate(records: Sequence[EvalRecord]) -> float:
     """Return the mean success of evaluations; NaN without any."""
-    return sum(record.rate for record in records) / len(records) if records else math.nan
+    return round(sum(record.rate for record in records) / len(records), 9) if records else math.nan

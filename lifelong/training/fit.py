@@ -137,8 +137,8 @@ def fit(
             rates = (learning_rate(n, total, settings, epoch * steps) for n in count(epoch * steps))
             with seeded(*seed, epoch, 1, *own_draws, device=device), float32_products(settings.precision):
                 losses = _take_steps(step, load(order.split(size)), rates, draws, bar)
-            loss, penalty = ranks.sum(losses.mean(0)).tolist()
-            if not math.isfinite(loss):
+            loss, penalty = ranks.sum(losses.mean(0)).tolist()  # NaN without a step
+            if len(losses) and not math.isfinite(loss):
                 raise TrainingError(
                     f"the loss is {loss}: lower train.lr or algo.strength, or set train.precision=fp32"
                 )
@@ -156,7 +156,7 @@ def _take_steps(
     for batch in batches:
         losses.append(torch.stack(step(batch, draws, next(rates))))
         bar.update()
-    return torch.stack(losses) if losses else torch.zeros(1, 2)
+    return torch.stack(losses) if losses else torch.zeros(0, 2)
 
 
 def _epoch_size(windows: int, settings: FitSettings) -> tuple[int, int]:

@@ -29,7 +29,7 @@ from lifelong.results.summary import summarize, write_episodes
 from lifelong.seeding import seeded
 from lifelong.sequence import is_measured
 from lifelong.sequence.measuring import digest
-from lifelong.sequence.stages import lacks_row
+from lifelong.sequence.stages import lacks_row, mean_rate
 from lifelong.settings import plain_data
 from lifelong.stats.metrics import lifelong_metrics
 from tests.harness.configs import composed
@@ -463,11 +463,29 @@ def test_tasks_that_are_never_learned_are_evaluated_before_and_after_the_others(
     assert np.isnan(found["zero_shot"]) and records.success_matrix()[0].shape == (TASKS, TASKS)
     log = tmp_path / "results.jsonl"
     log.write_bytes(b"".join(line for line in log.read_bytes().splitlines(True) if b'"unseen"' not in line))
+    assert np.isnan(ResultLog(log).read().other_conventions()["held_out_after"]), (
+        "of a part it is another number"
+    )
     again, more = learn(tmp_path, algorithm(), **settings)
     assert more == [TASKS] * 3 + [TASKS + 1] * 3
     assert outcomes(again) == {
         (r.phase, r.learned, r.task, r.epoch): r.outcome for r in records.of(EvalRecord)
     }
+
+
+def test_a_lost_evaluation_before_the_only_task_is_measured_again(tmp_path):
+    settings = {"tasks": 1, "held_out": 1, "reuse": False}
+    context, _ = learn(tmp_path, Sequential(), **settings)
+    log, whole = tmp_path / "results.jsonl", outcomes(context)
+    log.write_bytes(b"".join(line for line in log.read_bytes().splitlines(True) if b'"initial"' not in line))
+    again, _ = learn(tmp_path, Sequential(), **settings)
+    assert outcomes(again) == whole
+
+
+def test_equal_success_of_several_tasks_is_equal():
+    rates = [SimpleNamespace(rate=rate) for rate in (0.1, 0.7, 0.2, 0.7, 0.7, 0.7)]
+    assert mean_rate(rates[:3]) == mean_rate([rates[2], rates[0], rates[1]])
+    assert mean_rate(rates[3:]) == 0.7 == EvalSettings(until=(0.7,) * 3, select="last").enough((0, 1, 2))
 
 
 @pytest.mark.parametrize(("phase", "key", "ran"), [("unseen", (0, 2), 3), ("initial", (0, 1), 3)])

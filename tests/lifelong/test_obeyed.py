@@ -98,6 +98,7 @@ def test_in_a_sweep_a_key_is_refused_where_no_job_reads_it():
         ),
         ("benchmark.tasks=2 benchmark.group_size=2 algo=er", "benchmark.group_size=2 joins all tasks"),
         ("benchmark.tasks=3 eval.until=[0.5,1] eval.curve=all eval.select=last", "eval.until has 2 entries"),
+        ("algo=multitask eval.until=0.5 eval.select=last eval.curve=all", "eval.until has no effect"),
         ("eval.until=0.5 eval.select=best", "set eval.select=last, and a learning curve"),
         ("eval.held_out=libero_object", "eval.held_out=libero_object holds nothing out"),
     ],

@@ -9,7 +9,7 @@ import torch
 from scipy import special, stats
 
 from libero_env.text import quantity
-from lifelong.algorithms import ER
+from lifelong.algorithms import AGEM, ER, MIR, IsCiL, LwF, PackNet
 from lifelong.context import RunContext
 from lifelong.data.memory import ReplayMemory
 from lifelong.errors import ConfigError
@@ -17,10 +17,10 @@ from lifelong.evaluation.environments import EnvPool
 from lifelong.nn import GMMHead
 from lifelong.policies.base import copy_weights
 from lifelong.report.tables import collection_table
-from lifelong.results.records import CollectionRecord
+from lifelong.results.records import CollectionRecord, LossRecord
 from lifelong.results.run_directory import RunDirectory
 from lifelong.reward import grpo as module
-from lifelong.reward.experience import collect
+from lifelong.reward.experience import Experience, collect
 from lifelong.reward.grpo import GRPO, clipped_loss, group_advantages
 from lifelong.seeding import generator, seeded
 from lifelong.sequence import TaskSequence
@@ -200,15 +200,59 @@ def test_what_is_replayed_is_learned_beside_it(tmp_path):
     assert any((before[name] != value).any() for name, value in copy_weights(context.policy).items())
 
 
+@pytest.mark.parametrize("algorithm", [LwF, AGEM, PackNet])
+def test_algorithms_without_windows_of_their_own_learn_from_reward(tmp_path, algorithm):
+    own = {"memory": ReplayMemory(12)} if algorithm is AGEM else {}
+    learner = GRPO(starts=4, episodes=8, processes=1)
+    context = bandit_context(tmp_path, learner, algorithm=algorithm(**own))
+    learner.check(context)
+    with context.envs:
+        learn(context)
+    results = context.directory.log.read()
+    epochs = [record.epoch for record in results.of(CollectionRecord)]
+    assert epochs == [record.epoch for record in results.of(LossRecord)] == [*range(1, len(epochs) + 1)]
+    told = sum(record.groups > 0 for record in results.of(CollectionRecord))
+    assert results.costs(0)["updates"] == 4 * told
+
+
+def test_iterations_that_tell_nothing_make_no_update(tmp_path):
+    class Hopeless(Bandit):
+        def step(self, actions):
+            return super().step(np.zeros_like(actions))
+
+    learner = GRPO(starts=4, episodes=2, processes=1)
+    context = bandit_context(tmp_path, learner, envs=EnvPool(lambda key: Hopeless(*key[:2]), 8))
+    before = copy_weights(context.policy)
+    with context.envs:
+        learn(context)
+    assert_same(before, copy_weights(context.policy))
+    results = context.directory.log.read()
+    assert results.costs(0)["updates"] == 0 and np.isnan([r.loss for r in results.of(LossRecord)]).all()
+
+
+def test_experience_is_joined_where_it_lies():
+    frames = make_windows(0, SPEC).batch(torch.arange(2))
+    own = {name: torch.zeros(2) for name in ("log_probs", "advantages")}
+    elsewhere = Experience(**vars(frames), **own).to("meta")
+    assert elsewhere.join(frames).actions.device.type == "meta"
+
+
 @pytest.mark.parametrize(
     ("changes", "learner", "words"),
     [
         ({}, {"replay": 1.0}, "learner.replay"),
         ({"algorithm": ER(memory=ReplayMemory(12))}, {}, "replay"),
+        ({"algorithm": MIR(memory=ReplayMemory(12))}, {"replay": 1.0}, "MIR needs windows of demonstrations"),
+        ({"algorithm": IsCiL(rank=2)}, {"kl": 0.1}, "IsCiL acts with experts"),
+        ({"algorithm": LwF()}, {"replay": 1.0}, "LwF adds no windows"),
+        ({"fit": FitSettings(steps_per_epoch=4, precision="bf16")}, {}, "eval.precision=fp32"),
         ({"policy": small_mlp(SPEC, "deterministic")}, {}, "policy/head=gmm"),
         ({"policy": small_mlp(replace(SPEC, seq_len=3))}, {}, "data.seq_len=1"),
         (
-            {"fit": FitSettings(steps_per_epoch=4, accumulate=2), "algorithm": ER(memory=ReplayMemory(12))},
+            {
+                "fit": FitSettings(steps_per_epoch=4, accumulate=2, precision="fp32"),
+                "algorithm": ER(memory=ReplayMemory(12)),
+            },
             {"replay": 1.0},
             "train.accumulate=1",
         ),

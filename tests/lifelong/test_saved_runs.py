@@ -74,7 +74,8 @@ def generator_of(seed: int) -> torch.Generator:
 def test_a_saved_configuration_is_that_of_its_command(name):
     saved = yaml.safe_load((RUNS / name / "config.yaml").read_text())
     now = OmegaConf.to_container(composed(*SHORT, *COMMANDS[name]), resolve=True)
-    assert result_relevant(saved) == result_relevant(now)
+    was, now = ({k: v for k, v in result_relevant(one).items() if v is not None} for one in (saved, now))
+    assert was == now, "an older run may lack what is null"
 
 
 @every_run

@@ -59,6 +59,8 @@ class DMPEL(RoutedExperts):
         "episodes": ({}, {"queries": Tensor, "of_window": Tensor}),
     }
 
+    needs_demonstrations = True  # to whose contexts windows belong
+
     def __init__(
         self,
         *,
