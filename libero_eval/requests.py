@@ -118,7 +118,7 @@ class Request:
     assets: str | None = None
     robot: str | None = None
     backend: str | None = None
-    unit_starts: Positive = 10  # measured by experiments/benchmarks/evaluation_units.py
+    unit_starts: Positive = 10  # measured by experiments/kills/unit_sizes.py
     policy_threads: Processes | None = None
     out: FilePath | None = None
     workers: Processes = 1

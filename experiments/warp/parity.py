@@ -1,7 +1,7 @@
 """The back end `warp` against `mujoco`: free motion, the truth of predicates, the expert's success.
 
     python experiments/warp/parity.py motion --out motion.jsonl
-    python experiments/warp/parity.py truths --recordings ../shared/parity --out truths.jsonl
+    python experiments/warp/parity.py truths --recordings RECORDINGS --out truths.jsonl
     python experiments/warp/parity.py expert --out expert.jsonl
 
 Each line of a file is a task; what a file has is not done again, so that a killed command goes on.

@@ -64,7 +64,8 @@ class Published:
         """Return the command that evaluates it, under a name."""
         used = self.protocol["extends"] if len(self.protocol) == 1 else f"{name}.yaml"
         return (
-            f"libero eval {self.address} --name {name} --protocol {used} --suite {' '.join(self.successes)}"
+            f"libero eval {self.address} --name {name} --protocol {used} --suite {' '.join(self.successes)} "
+            f"--out eval/{name}"
         )
 
 
