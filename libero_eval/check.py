@@ -132,7 +132,7 @@ def _record_findings(results: Results, path: Path) -> Iterator[Finding]:
         return
     if not results.finished:
         yield Finding("note", f"the run is not finished: {learned} of {size} tasks are learned and evaluated")
-    for text in _missing_records(results):
+    for text in _missing_records(results, _ends_early(path)):
         yield Finding("fault", f"{log} lacks {text}; the run's command measures it again")
     for text in _false_copies(results):
         yield Finding("fault", f"{log}: {text}")
@@ -163,8 +163,18 @@ def _check_summary(file: Path, results: Results) -> None:
         raise ResultsError(f"{file} is not what results.jsonl gives ({', '.join(differing)})")
 
 
-def _missing_records(results: Results) -> Iterator[str]:
-    """Yield what the records of learned tasks lack, compared with each other."""
+def _ends_early(path: Path) -> bool:
+    """Return whether training on a task of the run ends at a success, see `eval.until`."""
+    try:
+        settings = read_saved_config(path / "config.yaml").get("eval")
+    except LifelongError:  # told elsewhere
+        return False
+    return isinstance(settings, dict) and settings.get("until") is not None
+
+
+def _missing_records(results: Results, ends_early: bool = False) -> Iterator[str]:
+    """Yield what the records of learned tasks lack, compared with each other as far as each was to be trained."""
+    last = {end.task: end.best_epoch for end in results.of(TaskEndRecord)} if ends_early else {}
     ended = sorted({record.task for record in results.of(TaskEndRecord)})
     for task in ended:
         run = results.run
@@ -173,10 +183,10 @@ def _missing_records(results: Results) -> Iterator[str]:
             yield f"evaluations after task {task} of tasks {_listed(absent)}"
     curves = {task: set(curve.epochs.tolist()) for task, curve in results.curves().items()}
     whole = {task: curves.get(task, set()) for task in range(max(ended, default=-1) + 1)}
-    for task, absent in _gaps(whole):
+    for task, absent in _gaps(whole, last):
         yield f"points of the learning curve of task {task}, epochs {_listed(absent)}"
     losses = {task: {r.epoch for r in results.of(LossRecord) if r.task == task} for task in ended}
-    for task, absent in _gaps(losses):
+    for task, absent in _gaps(losses, last):
         yield f"losses of task {task}, epochs {_listed(absent)}"
 
 
@@ -194,11 +204,11 @@ def _false_copies(results: Results) -> Iterator[str]:
             yield f"{name} is not what it is a copy of, that after task {learned}, epoch {epoch}"
 
 
-def _gaps(epochs: dict[int, set[int]]) -> Iterator[tuple[int, list[int]]]:
+def _gaps(epochs: dict[int, set[int]], last: dict[int, int]) -> Iterator[tuple[int, list[int]]]:
     every = set().union(*epochs.values())
     for task, there in epochs.items():
-        if every - there:
-            yield task, sorted(every - there)
+        if absent := sorted(e for e in every - there if e <= last.get(task, e)):
+            yield task, absent
 
 
 def _listed(numbers: list[int]) -> str:

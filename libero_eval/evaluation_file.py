@@ -348,7 +348,10 @@ class EvaluationResult:
             "success": asdict(self.success),
             "suites": {name: asdict(estimate) for name, estimate in self.suites.items()},
             "predicates": predicate_rates(self.tasks),
-            "tasks": [asdict(r) | {"success": asdict(r.success), "mean_steps": r.steps} for r in self.tasks],
+            "tasks": [
+                asdict(r) | {"success": asdict(self.success_of([r])), "mean_steps": r.steps}
+                for r in self.tasks
+            ],
             "times": dict(self.times),
         }
         return json_safe(values)

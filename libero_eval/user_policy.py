@@ -105,6 +105,10 @@ class UserPolicy(PolicyUnderTest):
                 f"the original's {' and '.join(unlike)} are in other units and numbers: --names native gives "
                 f"{self.request.policy_name} this package's"
             )
+        if self.request.videos and ("rgb" not in self.observations or self.cameras == ()):
+            raise ConfigError(
+                f"--videos: {self.request.policy_name} observes no images (cameras, observations)"
+            )
         return protocol
 
     def _names(self, protocol: EvalProtocol) -> str:

@@ -313,7 +313,8 @@ def test_names_that_are_none(words, message, here, capsys):
 
 
 @pytest.mark.parametrize("address", [
-    "ws://", "ws://host:99999", "ws://[::1", "ws://host:0x", "ws://a b:1", "vla-eval://", "gr00t://", "gr00t://host"
+    "ws://", "ws://host:99999", "ws://[::1", "ws://host:0x", "ws://a b:1", "vla-eval://", "gr00t://", "gr00t://host",
+    "gr00t://host:5555/", "gr00t://me@host:5555"
 ])  # fmt: skip
 def test_what_is_no_address_is_refused_at_once(address, here, capsys):
     assert cli.main(["eval", address, "--suite", "libero_goal/0"]) == ending.MISTAKE

@@ -22,6 +22,7 @@ from .files import (
     read_json,
     regular_file,
     sync_folder,
+    system_lock,
     write_json,
 )
 from .yaml_files import MAX_YAML_BYTES, YamlFile, parse_yaml, parse_yaml_text, read_yaml, read_yaml_file
@@ -57,6 +58,7 @@ __all__ = [
     "read_yaml_file",
     "regular_file",
     "sync_folder",
+    "system_lock",
     "write_cache",
     "write_json",
     "write_record",

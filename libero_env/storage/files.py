@@ -1,5 +1,6 @@
 """Files and folders that are replaced in one step."""
 
+import errno
 import fnmatch
 import json
 import os
@@ -9,10 +10,13 @@ import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from libero_env.errors import InvalidInputError, LiberoError
 from libero_env.text import to_json
+
+if TYPE_CHECKING:
+    from filelock import FileLock
 
 MAX_JSON_BYTES = 1 << 30
 PART_SUFFIX = ".part"  # of files and folders that are not yet complete
@@ -189,6 +193,27 @@ def create_text(target: Path, text: str) -> bool:
         return True
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def system_lock(path: Path) -> "FileLock":
+    """Take the system's lock of a file, which ends with the process, however that ends.
+
+    Raises:
+        filelock.Timeout: Another process holds it.
+        OSError: The file system cannot lock files.
+    """
+    from filelock import FileLock, SoftFileLock, Timeout  # which import asyncio
+
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        if not isinstance(lock, SoftFileLock):
+            raise
+    if isinstance(lock, SoftFileLock):  # what it becomes: a marker, which stays where a machine is lost
+        lock.release()
+        raise OSError(errno.ENOLCK, "its file system cannot lock files", str(path))
+    return lock
 
 
 def open_for_owner(path: str, flags: int) -> int:

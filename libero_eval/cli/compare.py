@@ -39,7 +39,7 @@ def compare(
         group: NAME RESULT...: results of several runs of one method, such as training seeds; give it once for each
             method.
         control: One policy evaluated twice, with different seeds.
-        allow: Compare although this setting differs, such as protocol.horizon, environment.robot or tasks.
+        allow: Compare although this setting differs, such as protocol.episode.horizon, environment.robot or tasks.
         alpha: Probability of a false difference.
         tasks: Show every task in the terminal.
         gate: Say whether the second result is worse than the first by more than this difference in success, such as
@@ -158,14 +158,16 @@ def board(
     Args:
         results: Files eval.json, or folders, for all such files in them that can be compared (those of robustness left
             out); NAME=RESULT names one. Results of one policy on other tasks make one row.
-        allow: Rank although this setting differs, such as protocol.horizon or environment.robot; starts: rank by the
-            episodes that all have.
+        allow: Rank although this setting differs, such as protocol.episode.horizon or environment.robot; starts: rank
+            by the episodes that all have.
         alpha: Probability of a false difference among all pairs.
         out: The page, or a folder for it.
     """
     words = [(word, given) for given in results for word in _results_in(given)]
     entries = _single_groups([word for word, _ in words], by_name=True)
-    searched = [word != given and not Path(named(given)[1], "eval.json").is_file() for word, given in words]
+    searched = [
+        word != given and Path(named(word)[1]) != Path(named(given)[1], "eval.json") for word, given in words
+    ]
     from libero_eval.judging.board import alike, make_board, render_board, write_board
 
     entries, notes = alike(entries, searched, allow)

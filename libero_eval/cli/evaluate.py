@@ -17,6 +17,7 @@ from lifelong.errors import ConfigError
 if TYPE_CHECKING:
     from libero_eval.evaluation_file import EvaluationResult, TaskResult
     from libero_eval.robustness.results import Robustness
+    from lifelong.stats.intervals import Estimate
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,15 +53,15 @@ def evaluate(options: EvalOptions) -> Answer:
         evaluation = plan_evaluation(options)
     heads = [HEADER]
 
-    def print_row(result: "TaskResult") -> None:
-        print(*heads, table_row(result), sep="\n", flush=True)
+    def print_row(result: "TaskResult", success: "Estimate | None" = None) -> None:
+        print(*heads, table_row(result, success), sep="\n", flush=True)
         heads.clear()
 
     early = evaluation.until is not None  # rows are known at the end only
     on_task = (lambda _: None) if early else print_row
     result = run(options, evaluation, on_task=on_task, on_progress=lambda now: tell_progress(str(now)))
     for task in result.tasks if early else ():
-        print_row(task)
+        print_row(task, result.success_of([task]))
     for name in ("renderer", "instruction_set"):
         if isinstance(values := result.environment.get(name), list):
             listed = ", ".join(map(str, values))
@@ -70,7 +71,7 @@ def evaluate(options: EvalOptions) -> Answer:
     data = {
         "success": result.success,
         "suites": result.suites,
-        "tasks": {task.task: task.success for task in result.tasks},
+        "tasks": {task.task: result.success_of([task]) for task in result.tasks},
         "episodes": {task.task: len(task.successes) for task in result.tasks},
         "stopped": result.stopped and asdict(result.stopped),
         "result": file,

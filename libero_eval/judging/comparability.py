@@ -55,7 +55,7 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
 
     Args:
         groups: Policies to be compared.
-        allow: Names of settings that may differ, or of groups of them: `protocol`, `protocol.horizon`,
+        allow: Names of settings that may differ, or of groups of them: `protocol`, `protocol.episode`,
             `environment.robot`, `tasks`.
 
     Returns:

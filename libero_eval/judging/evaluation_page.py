@@ -31,12 +31,15 @@ def write_evaluation_page(result: EvaluationResult, folder: Path) -> Path:
         title=f"{name_of(result)} on {', '.join(labels.values())}",
         facts=facts(result),
         notes=[f"{task.task}: {task.error_note}" for task in result.tasks if task.error_note]
-        + ([f"{result.stop_note}. The intervals of the means are always valid."] if result.stopped else []),
+        + ([f"{result.stop_note}. The intervals are always valid."] if result.stopped else []),
         means=[
             _row(labels.get(name, name), tasks) | {"success": result.suites.get(name, result.success)}
             for name, tasks in means.items()
         ],
-        tasks=[_row(task.task, [task], task.instruction) for task in result.tasks],
+        tasks=[
+            _row(task.task, [task], task.instruction) | {"success": result.success_of([task])}
+            for task in result.tasks
+        ],
         media=media(folder / "videos", "*_failure.*"),
         command=again(result, os.path.relpath(folder / FILE_NAME)),
         versions={**flatten(result.versions), **flatten(result.environment)},

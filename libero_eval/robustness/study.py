@@ -14,7 +14,7 @@ from libero_eval.judging.comparability import settings
 from libero_eval.plan import load_policy, plan_evaluation, setting
 from libero_eval.policies import PolicyUnderTest
 from libero_eval.protocols.files import load_protocol
-from libero_eval.protocols.naming import protocol_label
+from libero_eval.protocols.naming import protocol_label, section_of
 from libero_eval.requests import (
     CLOCK,
     EVENT_SEVERITIES,
@@ -98,12 +98,12 @@ def conditions_of(request: RobustnessRequest) -> list[str]:
         pair = parse_perturbations(text, seed, events=True)
         if len(pair) != 2:
             raise ConfigError(f"--pairs {text}: expected two perturbations, such as camera=0.4,light=0.4")
-        if all(one.name in kinds and one.severity in severities for one in pair):
+        if all(str(one) in conditions for one in pair):
             conditions.append(format_perturbations(pair))
         elif request.pairs is not None:
             raise ConfigError(
                 f"--pairs {text}: each must also be run alone; name its kind in --kinds and its severity in "
-                "--severities"
+                "--severities, and give it no other seed"
             )
     found: dict[Condition, str] = {}
     for text in ("", *conditions):
@@ -167,7 +167,7 @@ def read_study(folder: Path, name: str = "", conditions: Sequence[str] | None = 
     common = settings(base)
     common["versions.mujoco"] = base.versions.get("mujoco")
     common["seeds of perturbations"] = ", ".join(map(str, sorted(seeds)))
-    horizon = base.protocol["episode"]["horizon"]
+    horizon = section_of(base.protocol, "episode").get("horizon") or 0
     label = protocol_label(base.protocol, base.suites)
     return Robustness(name or folder.name, outcomes, (str(folder),), redrawn, events, horizon, label, common)
 

@@ -44,7 +44,8 @@ def checked_address(url: str, given: str) -> str:
     try:
         parts = urlsplit(url)
         valid = bool(parts.hostname) and parts.port != 0 and not re.search(r"[\s\x00-\x1f]", url)
-        valid = valid and (parts.scheme != "tcp" or parts.port is not None)
+        bare = parts.port is not None and not (parts.path or parts.query or parts.username)
+        valid = valid and (parts.scheme != "tcp" or bare)
     except ValueError:  # a port out of range, half of an IPv6 address
         valid = False
     if not valid:

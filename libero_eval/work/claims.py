@@ -12,7 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from libero_env.parallel import this_process
-from libero_env.storage import atomic_write_text, regular_file
+from libero_env.storage import atomic_write_text, regular_file, system_lock
 from libero_env.text import printable
 
 
@@ -63,14 +63,10 @@ class Claims:
 
     def _locked(self, unit: str) -> FileLock | None:
         """Return a lock of a unit's file; None if another process holds it."""
-        lock = FileLock(self._folder / f"{unit}.lock", timeout=0)
         try:
-            lock.acquire()
+            return system_lock(self._folder / f"{unit}.lock")
         except Timeout:
             return None
-        except NotImplementedError as error:  # of a file system without locks
-            raise OSError(f"its file system cannot lock files ({error})") from error
-        return lock
 
     def _unlock(self, unit: str, lock: FileLock) -> None:
         with suppress(OSError):  # a file server that is away for a moment

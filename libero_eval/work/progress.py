@@ -156,6 +156,8 @@ def describe_status(path: Path) -> tuple[str, Progress]:
         lines.append(f"error     {name}, {error.attempts} attempts: {error.last}; see {error.path}")
     if len(done) == len(units):
         lines.append(f"result    {path / FILE_NAME}")
+    elif not held and (path / FILE_NAME).is_file() and EvaluationResult.read(path).stopped:
+        lines.append(f"result    {path / FILE_NAME}, stopped early; the command goes on without --until")
     elif not held:
         lines.append("stopped   no process works on it; the same command goes on")
     return "\n".join(lines), progress
@@ -164,15 +166,19 @@ def describe_status(path: Path) -> tuple[str, Progress]:
 HEADER = f"{'task':<18} {'successes':>9} {'%':>6} {'95 %':>13} {'steps':>6}  instruction"
 
 
-def table_row(result: TaskResult) -> str:
-    """Format a task's row under `HEADER`: successes, rate and interval in percent, mean steps of the successes."""
+def table_row(result: TaskResult, success: Estimate | None = None) -> str:
+    """Format a task's row under `HEADER`: successes, rate and interval in percent, mean steps of the successes.
+
+    Args:
+        success: Its success; by default with Wilson's interval.
+    """
     wins = f"{sum(result.successes)}/{len(result.successes)}"
     steps = f"{result.steps:.0f}" if math.isfinite(result.steps) else "-"
     raised = sum(error is not None for error in result.errors)
     notes = [f"{raised} ended with an error"] if raised else []
     notes += filter(None, (result.error_note, result.event_note, result.clock_note))
     text = "".join(f"  ({note})" for note in notes)
-    return f"{result.task:<18} {wins:>9} {_percent(result.success)} {steps:>6}  {result.instruction}{text}"
+    return f"{result.task:<18} {wins:>9} {_percent(success or result.success)} {steps:>6}  {result.instruction}{text}"
 
 
 def total_rows(result: EvaluationResult) -> list[str]:

@@ -17,11 +17,18 @@ from typing import Any
 
 import torch
 import yaml
-from filelock import FileLock, Timeout
+from filelock import Timeout
 from torch import Tensor
 
 from libero_env.errors import InvalidInputError
-from libero_env.storage import PART_SUFFIX, atomic_write_text, leads_out, own_folder, read_yaml_file
+from libero_env.storage import (
+    PART_SUFFIX,
+    atomic_write_text,
+    leads_out,
+    own_folder,
+    read_yaml_file,
+    system_lock,
+)
 from lifelong import checkpoints
 from lifelong.errors import CheckpointError, ConfigError, RunLockedError
 from lifelong.results.log import ResultLog
@@ -215,18 +222,17 @@ def _locked(path: Path) -> Iterator[None]:
     """Hold a file lock within the context; the system releases it whenever the process ends."""
     if path.is_symlink():  # which would be emptied where it leads
         raise ConfigError(f"{path} is a link; remove it")
-    lock = FileLock(path)
     try:
-        lock.acquire(timeout=0)
+        lock = system_lock(path)
     except Timeout as error:
         raise RunLockedError(
             f"another process is writing to {path.parent / path.name[1:-5]}; wait for it, or give this "
             "run another name with run_id=NAME"
         ) from error
-    except (OSError, NotImplementedError) as error:  # such as ENOLCK of a network file system
+    except OSError as error:  # such as ENOLCK of a network file system
         raise ConfigError(
             f"runs_dir: {path.parent} is on a file system that cannot lock files "
-            f"({getattr(error, 'strerror', error)}); mount it with locks, or set runs_dir to another folder"
+            f"({error.strerror}); mount it with locks, or set runs_dir to another folder"
         ) from error
     try:
         yield

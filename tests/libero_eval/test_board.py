@@ -187,6 +187,14 @@ def test_the_command(there, capsys, monkeypatch):
     assert Path("x.html").is_file()
 
 
+def test_a_result_below_another_one_is_left_out_where_it_was_made_differently(there, capsys):
+    (good,) = won("good", first(90)).results
+    other = replace(good, protocol={**good.protocol, "name": "another"})
+    other.write("eval/good/another/eval.json")
+    assert main(["board", "eval/good", "eval/bad"]) == 0
+    assert "eval/good/another" in capsys.readouterr().out
+
+
 def test_without_a_browser_a_note_says_where_the_page_is(there, capsys, monkeypatch):
     monkeypatch.setattr("webbrowser.open", lambda address: False)
     assert main(["board", "eval", "--open"]) == 0

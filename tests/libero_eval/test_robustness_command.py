@@ -112,6 +112,7 @@ def test_events_are_conditions_and_the_page_says_what_each_takes(still, capsys) 
     (["--kinds", "clock", "--clock", "latency=50ms", "--pairs"], "latency is named twice"),
     (["--severities", "2"], "--severities"),
     (["--kinds", "noise", "--severities", "1", "--pairs", "noise=1,robot=1"], "must also be run alone"),
+    (["--kinds", "noise", "object", "--severities", "1", "--pairs", "noise=1@7,object=1"], "give it no other seed"),
     (["--pairs", "noise=1"], "expected two perturbations"),
     (["--kinds", "noise", "noise@3"], "differ in their seeds alone"),
     (["--kinds"], "name no condition"),

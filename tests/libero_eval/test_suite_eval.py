@@ -4,7 +4,7 @@ import json
 import shutil
 import sys
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -227,6 +227,13 @@ def test_task_files_are_evaluated_one_by_one_and_named_again(tmp_path):
 def test_a_result_that_was_stopped_stays_one_when_it_is_run_again(tmp_path):
     stopped = Stopped("width=0.5", "known", 100)
     assert evaluate(tmp_path, stopped=stopped).stopped == stopped == EvaluationResult.read(tmp_path).stopped
+
+
+def test_intervals_of_what_was_stopped_are_always_valid_for_each_task_too():
+    task = task_result("libero_goal/0", [True] * 15 + [False] * 5)
+    result = result_of(task, stopped=Stopped("width=0.5", "known", 100))
+    (plain,) = result.to_plain()["tasks"]
+    assert plain["success"] == result.to_plain()["success"] != asdict(task.success)
 
 
 @pytest.mark.parametrize("had", [True, False])

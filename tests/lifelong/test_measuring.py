@@ -415,6 +415,8 @@ def test_training_ends_where_success_is_enough(tmp_path, monkeypatch, algorithm)
     if algorithm is Sequential:
         assert [results.task_end(task).best_epoch for task in range(TASKS)] == [0, 2, 1]
         assert [results.costs(task)["updates"] for task in range(TASKS)] == [0, 6, 3]
+    (tmp_path / "whole" / "config.yaml").write_text("eval: {until: 0.5}")
+    assert not [found.text for found in examine(tmp_path / "whole").findings if "lacks" in found.text]
     for writes in (4, 11, 19):
         path = tmp_path / str(writes)
         with monkeypatch.context() as patch, pytest.raises(Killed):

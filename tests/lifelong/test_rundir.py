@@ -1,6 +1,7 @@
 """A run's directory: one configuration, one writer at a time, no results lost."""
 
 import errno
+import fcntl
 import os
 import sys
 from types import SimpleNamespace
@@ -84,6 +85,25 @@ def test_a_file_system_without_locks_is_named(directory, monkeypatch) -> None:
     monkeypatch.setattr(FileLock, "acquire", no_locks)
     message = "cannot lock files .No locks available"
     with pytest.raises(ConfigError, match=message), directory.opened(CONFIG, resume=True):
+        pass
+
+
+@pytest.mark.parametrize("left", [False, True])
+def test_a_marker_is_no_lock(directory, monkeypatch, left) -> None:
+    """It would stay where a machine is lost."""
+
+    def no_flock(*_) -> None:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+
+    monkeypatch.setattr(fcntl, "flock", no_flock)
+    directory.path.parent.mkdir(parents=True, exist_ok=True)
+    if left:
+        directory.path.with_name(f".{directory.path.name}.lock").write_text("4711\nanother-host\n")
+    with (
+        pytest.warns(UserWarning, match="flock not supported"),
+        pytest.raises(ConfigError, match="cannot lock files"),
+        directory.opened(CONFIG, resume=True),
+    ):
         pass
 
 
