@@ -183,10 +183,10 @@ class GRPO:
                 del first, rest, done  # as large as what is kept of them
                 seconds = time.perf_counter() - began
                 log = context.directory.log
-                place = {"task": stage[-1], "epoch": offset + epoch + 1}
-                known = ({"task": r.task, "epoch": r.epoch} for r in log.read().of(CollectionRecord))
-                if place not in known:
-                    log.append(CollectionRecord(**place, seconds=seconds, **record))
+                number = offset + epoch + 1
+                known = {(r.task, r.epoch) for r in log.read().of(CollectionRecord)}
+                if (stage[-1], number) not in known:
+                    log.append(CollectionRecord(task=stage[-1], epoch=number, seconds=seconds, **record))
                 yield from _batches(frames, [len(chunk) for chunk in chunks])
 
             yield {
