@@ -11,7 +11,7 @@ import numpy as np
 
 from libero_env.text import Table, counted, shorten
 from libero_eval.evaluation_file import EvaluationResult, by_start, overall, suite_label
-from libero_eval.judging.comparability import Group, check_comparable, facts, settings, starts_text
+from libero_eval.judging.comparability import Group, check_comparable, facts, is_of, settings, starts_text
 from libero_eval.judging.page import OF_ONE, interval_text, p_text
 from libero_eval.repeating import again
 from libero_eval.stats.episodes import PairedDifference, Pairs, difference
@@ -93,7 +93,7 @@ def make_board(entries: Sequence[Group], allow: Iterable[str] = (), alpha: float
     Raises:
         ComparisonError: The results were made differently, or have no episode in common; the message names both values.
     """
-    notes = check_comparable(entries, allow)
+    notes = check_comparable(entries, [name for name in allow if name != STARTS])
     groups = _joined(entries)
     notes += _check_starts(groups, STARTS in allow)
     tables = [by_start(group.results[0].tasks) for group in groups]
@@ -141,8 +141,8 @@ def alike(
 
     def key(entry: Group) -> tuple[tuple[str, str], ...]:
         values = settings(entry.results[0]).items()
-        skipped = ("tasks.", *allowed)
-        return tuple(sorted((name, str(value)) for name, value in values if not name.startswith(skipped)))
+        kept = ((k, str(value)) for k, value in values if not any(is_of(k, a) for a in ("tasks", *allowed)))
+        return tuple(sorted(kept))
 
     keys = [key(entry) for entry in entries]
     kinds = Counter(k for k, found in zip(keys, searched, strict=True) if not found) or Counter(keys)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from libero_env.errors import UnknownNameError
 from libero_env.text import flatten, plain, shorten
 from libero_eval.evaluation_file import WORLD, EvaluationResult, by_start, known_by
 from libero_eval.protocols.naming import compared, horizon_text, protocol_label, section_of
@@ -64,11 +65,16 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
 
     Raises:
         ComparisonError: A setting differs; the message names both values. Backends are never mixed.
+        UnknownNameError: No result has a setting that `allow` names.
     """
     rows = [(s.label, r) for s in groups for r in s.results]
     base_label, base = rows[0]
     check_same_back_end({label: result.backend for label, result in rows})
     expected = {key: (base_label, value) for key, value in settings(base).items()}
+    known = {"protocol", "environment", "tasks"}.union(*(settings(result) for _, result in rows))
+    for name in allow:
+        if not any(is_of(key, name) for key in known):
+            raise UnknownNameError("setting to allow", name, {k for k in known if "/" not in k})
     refused, notes = dict[str, str](), list[str]()
     undescribed = dict[str, None]()  # tasks whose digest one of two lacks
     for label, result in rows[1:]:
@@ -87,7 +93,7 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
             text = f"{key}: {one} in {first_label}, {other} in {label}"
             if UNKNOWN in values and key.startswith("environment."):
                 notes.append(f"{text}; taken to be the same")
-            elif any(key == a or key.startswith(a + ".") for a in allow):
+            elif any(is_of(key, a) for a in allow):
                 notes.append(f"{text}; allowed")
             else:
                 refused[text] = key
@@ -114,6 +120,11 @@ def check_comparable(groups: Sequence[Group], allow: Iterable[str] = ()) -> list
         if result.stopped
     ]
     return [*dict.fromkeys(notes), *remarks]
+
+
+def is_of(key: str, name: str) -> bool:
+    """Return whether a setting is the one of a name, or in the group of that name."""
+    return f"{key}.".startswith(f"{name}.")
 
 
 def protocol_labels(rows: Iterable[tuple[str, EvaluationResult]]) -> dict[str, str]:

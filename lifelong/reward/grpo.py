@@ -134,6 +134,10 @@ class GRPO:
                 if self.replay
                 else f"{name} adds windows to batches, which nothing learns with learner.replay=0: give it a weight"
             )
+        if context.stream.blur:
+            raise ConfigError(
+                "stream.blur mixes demonstrations, of which learner=grpo learns none: set it to 0"
+            )
         if not context.fit.steps_per_epoch:
             raise ConfigError("learner=grpo needs train.steps_per_epoch, the number of steps of an iteration")
         if self.replay and context.fit.accumulate > 1:

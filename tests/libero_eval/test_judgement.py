@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from libero_cli.main import main
+from libero_env.errors import UnknownNameError
 from libero_eval.evaluation_file import Stopped
 from libero_eval.judging.comparability import Group, check_comparable, match
 from libero_eval.judging.comparison import Comparison, compare_groups, gate, write_comparison
@@ -143,6 +144,8 @@ def test_results_made_differently_are_refused(changes, field, values):
     notes = compare_groups(sides, allow=allowed).notes
     assert any(note.startswith(f"{field}: {values}") and note.endswith("; allowed") for note in notes)
     assert check_comparable(sides, allow=[field.partition(".")[0]])
+    with pytest.raises(UnknownNameError, match="setting to allow"):
+        compare_groups(sides, allow=[*allowed, field[:-1]])
 
 
 def test_versions_and_renderers_are_told_but_not_refused():

@@ -24,6 +24,7 @@ from lifelong.reward.experience import Experience, collect
 from lifelong.reward.grpo import GRPO, clipped_loss, group_advantages
 from lifelong.seeding import generator, seeded
 from lifelong.sequence import TaskSequence
+from lifelong.streams import StreamSettings
 from lifelong.training.settings import FitSettings
 from lifelong.types import PolicySpec
 from tests.harness.policies import small_mlp
@@ -256,6 +257,7 @@ def test_experience_is_joined_where_it_lies():
             {"replay": 1.0},
             "train.accumulate=1",
         ),
+        ({"stream": StreamSettings(blur=0.1)}, {}, "stream.blur mixes demonstrations"),
         ({}, {"starts": 10**6, "episodes": 10**4}, "learner.starts=1000000"),
     ],
 )
