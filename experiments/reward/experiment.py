@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pilot import BASE, RECORDS, ROOT, train
+from pilot import RECORDS, ROOT, START, make_start, train
 from scipy.stats import spearmanr
 
 from lifelong.results.log import ResultLog
@@ -28,12 +28,12 @@ from lifelong.results.records import EvalRecord
 from lifelong.results.results import Results
 from lifelong.stats.intervals import mean_and_half_width
 
-KNOWN = (1, 2, 5, 7, 8)  # goals that the start solves in 45 to 95 % of 20, and that are never trained again
+KNOWN = (1, 2, 4, 5, 8)  # goals that the start solves in 45 to 95 % of 20, and that are never trained again
 NEW = {
-    1: (6, 4, 9),
-    2: (4, 9, 6),
-    3: (9, 6, 4),
-}  # goals that it solves in 20 to 40 %, in the order of each seed
+    1: (6, 9, 7),
+    2: (9, 7, 6),
+    3: (7, 6, 9),
+}  # goals that it solves in 25 to 35 %, in the order of each seed
 ITERATIONS = 12
 STREAM = (
     *("data.demos=20", "eval.episodes=20", "eval.cells=diagonal_and_last_row", "eval.curve=all"),
@@ -70,7 +70,7 @@ class Planned:
         """File that keeps its records and its diagnosis."""
         return RECORDS / f"{self.name}.json.xz"
 
-    def make(self, runs: Path, base: Path) -> None:
+    def make(self, runs: Path) -> None:
         """Make the run, diagnose it, and keep what came of it."""
         tasks = (*KNOWN, *NEW[self.seed])
         reached = [1.0] * len(NEW[self.seed])  # GRPO makes all its iterations, unless nothing fails
@@ -80,7 +80,7 @@ class Planned:
         words = (
             f"benchmark.tasks=[{','.join(map(str, tasks))}]",
             f"eval.until=[{until}]",
-            f"init_from={base}",
+            f"init_from={START}",
         )
         seeds = (f"seed={self.seed}", f"data.seed={self.seed}")
         directory = train(runs, self.name, (*STREAM, *ARMS[self.arm], *words, *seeds))
@@ -193,12 +193,12 @@ def main() -> None:
     args = parser.parse_args()
     if args.what == "run":
         folder = args.runs.resolve()
-        base = train(folder, "base", BASE)
+        make_start(folder)
         missing = [run for run in runs() if not run.record.exists()]
         for first in (True, False):  # the supervised arms stop where the first has come
             with ThreadPoolExecutor(args.jobs) as pool:
                 chosen = [run for run in missing if (run.arm == "reward") == first]
-                for _ in pool.map(lambda run: run.make(folder, base), chosen):
+                for _ in pool.map(lambda run: run.make(folder), chosen):
                     pass
     print("\n".join(table()))
 
