@@ -4,6 +4,7 @@ It looks at the end of each control step. What happens in between, such as a sho
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import compress
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from libero_env.objects.model import OPPOSITE_STATES
 from libero_env.sim.causes import HARD, Failure, Missing, Trace, explain
 from libero_env.sim.costs import LIMITS, Costs
 from libero_env.sim.predicates import PREDICATES, contains, ground, is_over, region_boxes
-from libero_env.sim.scene import ROBOT
+from libero_env.sim.scene import ROBOT, Scene
 from libero_env.sim.state import StateView
 from libero_env.tasks.expression import Atom, Expression, Never
 from libero_env.timing import TIMESTEP
@@ -68,6 +69,10 @@ class EpisodeWatch:
         addresses = [scene.pose_address(name) for name in self._idle]
         self._poses = np.reshape(addresses, (-1, 1)).astype(int) + np.arange(7)
         self._free = np.array([name not in self._named for name in self._owned.values()], bool)
+        free = [name for name, is_free in zip(self._owned.values(), self._free, strict=True) if is_free]
+        self._others = np.array([*self._idle, *free], object)
+        self._roots = [int(scene.bodies[name][0]) for name in scene.objects]
+        self._reach = [_reach(scene, name) + NEAR for name in scene.objects]
         self._slides = model.jnt_type[list(self._owned)] == mujoco.mjtJoint.mjJNT_SLIDE
         self._stood = np.zeros((len(views), len(self._idle), 3))
         self._uprights = np.zeros_like(self._stood)  # the vertical at the start, in their frames
@@ -178,8 +183,10 @@ class EpisodeWatch:
     def _note_closing(self, i: int, width: float) -> None:
         """Take note of the object to which fingers that have shut on nothing were nearest while they closed."""
         if width < self._apart[i] - _CLOSING:
-            here = ((self._distance(i, name), name) for name in self._scene.objects)
-            self._nearest[i] = min(self._nearest[i], *here)
+            ways = self.views[i].simulations.fields["xpos"][i, self._roots] - self.views[i].eef_pos
+            near = np.linalg.norm(ways, axis=1) < self._reach
+            here = [(self._distance(i, name), name) for name in compress(self._scene.objects, near)]
+            self._nearest[i] = min([self._nearest[i], *here])
         else:
             self._nearest[i] = (np.inf, "")
         if width < SHUT <= self._apart[i] and self._nearest[i][0] <= NEAR:
@@ -252,8 +259,7 @@ class EpisodeWatch:
         slid, turned = np.where(self._slides, moved, 0.0), np.where(self._slides, 0.0, moved)
         shifts = np.round([*np.linalg.norm(poses[:, :3] - self._stood[i], axis=1), *slid[self._free]], 4)
         tilts = np.round(np.degrees([*np.arccos(np.clip(heights, -1.0, 1.0)), *turned[self._free]]), 1)
-        names = np.array([*self._idle, *np.array([*self._owned.values()], object)[self._free]], object)
-        beyond = names[(shifts > LIMITS["shift"]) | (tilts > LIMITS["tilt"])]
+        beyond = self._others[(shifts > LIMITS["shift"]) | (tilts > LIMITS["tilt"])]
         force = max((needless.get(name, 0.0) for name in self._idle), default=0.0)
         press = max(
             (newtons for name, newtons in needless.items() if name not in self._scene.objects), default=0.0
@@ -323,6 +329,16 @@ def over(view: StateView, atom: Atom) -> bool:
 
 def _holds(view: StateView, atom: Atom) -> bool:
     return bool(PREDICATES[atom.predicate](view, *atom.args))
+
+
+def _reach(scene: Scene, name: str) -> float:
+    """Return how far the box of an object along the world axes reaches from its root in any pose, [m]."""
+    model, geoms = scene.model, scene.collision_geoms[name]
+    if (model.geom_bodyid[geoms] != scene.bodies[name][0]).any():
+        return np.inf  # it has parts, which may move
+    centres, halves = np.split(model.geom_aabb[geoms], 2, axis=1)
+    parts = (np.linalg.norm(values, axis=1) for values in (model.geom_pos[geoms], centres, halves))
+    return float(np.max(sum(parts)) * np.sqrt(3.0))
 
 
 def ancestors(model: mujoco.MjModel, body: int) -> set[int]:
