@@ -11,6 +11,7 @@ from collections import Counter, UserDict
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 
 from libero_env import parallel
@@ -133,6 +134,18 @@ def pytest_collection() -> Iterator[None]:
 
 
 PEAKS: dict[str, int] = {}  # process of tests -> KiB
+GROWTH = 200_000_000  # bytes after which what tests have freed is given back
+held = 0  # bytes
+
+
+def pytest_runtest_logfinish() -> None:
+    """Give memory back that tests have freed: as much again would be taken from the system by the next ones."""
+    global held
+    if psutil.Process().memory_info().rss > held + GROWTH:
+        gc.collect()
+        if hasattr(LIBC, "malloc_trim"):
+            LIBC.malloc_trim(0)
+        held = psutil.Process().memory_info().rss
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

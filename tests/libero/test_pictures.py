@@ -6,7 +6,8 @@ Under MuJoCo 3.3.2, which drew the recordings, they agree to the bit. `LIBERO_PI
 
 import json
 import os
-import runpy
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from libero_env.errors import LiberoError, UnknownNameError
 
 pytestmark = pytest.mark.sim
 
-FEW = ("libero_10-00", "libero_90-27", "libero_goal-00", "libero_object-02")
+FEW = ("libero_10-00", "libero_object-02")  # of goal and kitchen, other tests have pictures
 CAMERAS = ("agentview", "robot0_eye_in_hand")
 SIZE = 64
 RECORDED = sorted((Path(__file__).parent / "data").glob("*.npz"))
@@ -63,13 +64,13 @@ def assert_drawn(image, wanted, recorded):
 
 
 def test_pictures_are_the_originals(original, shared):
-    compare = runpy.run_path(str(shared / "pixels" / "compare.py"))["compare"]
     paths = sorted((shared / "pixels").glob("*.npz"))
     if os.environ.get("LIBERO_PICTURES") != "all":
         paths = [path for path in paths if path.stem in FEW]
     assert paths
-    short = {path.stem: text for path in paths for good, text in [compare(path)] if not good}
-    assert not short
+    command = [sys.executable, shared / "pixels" / "compare.py", *paths]  # whole models take memory
+    found = subprocess.run(command, capture_output=True, text=True)
+    assert found.returncode == 0 and f"{len(paths)}/{len(paths)} recordings agree" in found.stdout, found
 
 
 def test_native_environments_draw_the_same(original, shared):
