@@ -20,8 +20,8 @@ def resolved(request: RecordingRequest) -> RecordingRequest:
     data = data_settings(request.training)
     return replace(
         request,
-        size=request.size or (data.image_size, data.image_size),
-        drawing=request.drawing or data.drawing,
+        size=request.size or (None if request.no_images else (data.image_size, data.image_size)),
+        drawing=request.drawing or (None if request.no_images else data.drawing),
         robot=request.robot or data.robot,
         seed=data.seed if request.seed is None else request.seed,
     )

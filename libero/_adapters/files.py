@@ -3,6 +3,7 @@
 import codecs
 import hashlib
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -118,7 +119,7 @@ def _link_demos(root: Path) -> None:
         for name, file in files.items():
             link, target = suite / name, Path(file.parent.name, name)
             ours = is_recording(link)
-            if (link.exists() and not ours) or (ours and link.readlink() == target):
+            if (os.path.lexists(link) and not ours) or (ours and link.readlink() == target):
                 continue
             with suppress(OSError), atomic_path(link) as temporary:  # what cannot be written has no links
                 temporary.symlink_to(target)
@@ -126,7 +127,8 @@ def _link_demos(root: Path) -> None:
 
 def is_recording(path: Path) -> bool:
     """Return whether a path is a link to what was recorded here, and not a file, or link, of the user's."""
-    return path.is_symlink() and "-seed" in path.readlink().parent.name
+    target = path.readlink().parts if path.is_symlink() else ()
+    return len(target) == 2 and "-seed" in target[0]
 
 
 def _is_reserved(folder: Path) -> bool:

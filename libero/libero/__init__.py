@@ -93,7 +93,9 @@ def get_assets_path() -> str:
 
 
 def set_libero_default_path(custom_location: str | os.PathLike | None = None) -> None:
-    """Write the configuration file with the paths of `get_default_path_dict`."""
+    """Write the paths of `get_default_path_dict` into the configuration file; without a location, take paths out."""
     from libero_env.storage import atomic_write_text
 
-    atomic_write_text(_config_file(), yaml.safe_dump(get_default_path_dict(custom_location)), fsync=True)
+    kept = {key: value for key, value in read_config().items() if key not in _KEYS}
+    paths = {} if custom_location is None else get_default_path_dict(custom_location)
+    atomic_write_text(_config_file(), yaml.safe_dump(kept | paths), fsync=True)

@@ -169,7 +169,8 @@ def _check_observations(cfg: Any) -> None:
 
 def native_task(task: Any, bddl_folder: str | None) -> Task:
     """Return a benchmark's task as a `Task`: that of the suite, unless the folder has another file of its name."""
-    path = Path(bddl_folder or "", task.problem_folder, task.bddl_file)
+    folder = bddl_folder or get_libero_path("bddl_files")
+    path = Path(folder, task.problem_folder, task.bddl_file)
     tasks = get_suite(task.problem_folder).tasks if task.problem_folder in suite_names() else ()
     native = next((t for t in tasks if f"{t.name}.bddl" == task.bddl_file), None)
     if native is not None and (not path.is_file() or path.read_text(encoding="utf-8") == native.bddl_text):

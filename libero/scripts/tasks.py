@@ -40,7 +40,7 @@ def render_single_task(
         out: Folder.
     """
     named = None if benchmark_name is None or task_id is None else f"{benchmark_name.lower()}/{task_id}"
-    if (named is None) == (bddl_file is None):
+    if (named is None) == (bddl_file is None) or (benchmark_name is None) != (task_id is None):
         raise LiberoError("which task? Pass --benchmark_name and --task_id, or --bddl_file")
     out.mkdir(parents=True, exist_ok=True)
     task = bddl_file or named or ""

@@ -282,7 +282,7 @@ def contacts(scene: Scene, row: np.ndarray) -> set[tuple[int, int]]:
 def posed(scene: Scene, row: np.ndarray) -> tuple[mujoco.MjModel, mujoco.MjData]:
     """Return a copy of the model with the poses of the fixtures, and data with the positions."""
     if scene.model not in _geometry:
-        model = copy(scene.model) if scene.fixtures else scene.model
+        model = copy(scene.model)  # a value that held its key would never be freed
         _geometry[scene.model] = model, mujoco.MjData(model)
     model, data = _geometry[scene.model]
     qpos, _, fixtures = scene.split_states(row[None])

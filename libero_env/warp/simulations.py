@@ -169,9 +169,9 @@ class WarpSimulations(Simulations):
         fits = shares[started] < self.backend.contacts
         full = started if fits.all() else started[~fits]
         failed = {int(i): self._no_room(mjw.OverflowType.NARROWPHASE) for i in full}
+        self._unplaced[full] = True
         if len(full) == len(started):
             raise SimulationError(failed)
-        self._unplaced[full] = True
         self._start(started[fits], starts[fits], speeds[fits], time)
         self._no_start |= failed
 

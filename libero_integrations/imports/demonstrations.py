@@ -79,7 +79,7 @@ def _files(
     origin = _read_origin(folder, data_set.layout, where)
     if origin.get("actions_are") == "intended" and labels == "executed":
         raise DemoError(f"{where} has the intended actions only, and data.labels=executed")
-    place, jobs = cache_dir() / "sets" / _digest(where, folder), dict[str, SetJob]()
+    place, jobs = cache_dir() / "sets" / _digest(where, folder, origin), dict[str, SetJob]()
     for task in tasks:
         if task.id in counts:
             path = place / task_home(task) / f"{task.name}_demo.hdf5"
@@ -245,8 +245,9 @@ def _words(instruction: str | Task) -> str:
     return " ".join(text.split()).casefold()
 
 
-def _digest(where: str, folder: Path) -> str:
-    """Return 16 hex digits that change with the files of a folder, by their names, sizes and times."""
+def _digest(where: str, folder: Path, origin: Mapping[str, Any]) -> str:
+    """Return 16 hex digits that change with the files of a folder, by names, sizes and times, and with its origin."""
     stats = ((path, path.stat()) for path in sorted(files_below(folder.resolve(), "*")) if path.is_file())
     lines = "".join(f"{path}\0{stat.st_size}\0{stat.st_mtime_ns}\n" for path, stat in stats)
-    return hashlib.sha256(f"{where}\n{lines}".encode()).hexdigest()[:16]
+    made = json.dumps(origin, sort_keys=True, default=str)
+    return hashlib.sha256(f"{where}\n{lines}{made}".encode()).hexdigest()[:16]

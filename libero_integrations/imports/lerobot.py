@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,8 @@ from typing_extensions import TypedDict
 from libero_env.demos.hdf5 import BrokenDemoError, damage_named
 from libero_env.demos.read import Episode
 from libero_env.errors import DemoError, need
-from libero_env.storage import read_json
+from libero_env.memory import require_memory
+from libero_env.storage import read_json, regular_file
 from libero_env.validation import validate
 from libero_integrations.exports.layouts import PUBLISHED, RECORDED, Layout
 from libero_integrations.exports.lerobot import DATA_PATH, V2_DATA_PATH, V2_VIDEO_PATH, VIDEO_PATH
@@ -23,6 +24,8 @@ from libero_integrations.exports.lerobot import DATA_PATH, V2_DATA_PATH, V2_VIDE
 _NAMES = {
     tuple(one.state_names) for one in (*PUBLISHED.values(), *RECORDED.values())
 }  # of the 8 numbers of state
+
+_MAX_BYTES = 1 << 30  # of a list of episodes
 
 
 class _Info(TypedDict):
@@ -85,8 +88,8 @@ class LeRobotSet:
     def _rows(self) -> Iterator[Mapping[str, Any]]:
         """Yield what the metadata say of each episode."""
         if not self._is_v3:
-            file = self.root / "meta/episodes.jsonl"
-            with damage_named(str(file)), file.open(encoding="utf-8") as lines:
+            file, opener = self.root / "meta/episodes.jsonl", regular_file(_MAX_BYTES)
+            with damage_named(str(file)), open(file, encoding="utf-8", opener=opener) as lines:
                 yield from map(json.loads, lines)
         for file in sorted(self.root.glob("meta/episodes/*/*.parquet")) if self._is_v3 else ():
             with damage_named(str(file)):
@@ -108,7 +111,7 @@ class LeRobotSet:
             obs = {"ee_pos": state[:, :3], "ee_ori": state[:, 3:6], "gripper_states": state[:, 6:]}
             for key, kind in self._images.items():
                 if kind == "image":
-                    obs[key] = np.stack([decode_image(one["bytes"]) for one in table[key].to_pylist()])
+                    obs[key] = decode_images([one["bytes"] for one in table[key].to_pylist()], where)
                 else:
                     path = self.root / self._video.format(video_key=key, **self._place(row, f"videos/{key}/"))
                     start = float(row.get(f"videos/{key}/from_timestamp", 0.0))
@@ -137,10 +140,18 @@ def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
     return tuple(map(str, names))
 
 
-def decode_image(code: bytes) -> np.ndarray:
-    """Return the picture in a PNG or JPEG file, (H, W, 3) uint8."""
-    with Image.open(io.BytesIO(code), formats=["PNG", "JPEG"]) as picture:
-        return np.asarray(picture.convert("RGB"))
+def decode_images(codes: Sequence[bytes], where: str) -> np.ndarray:
+    """Return the pictures in PNG or JPEG files, (N, H, W, 3) uint8; DemoError where they would not fit into memory."""
+    frames: list[np.ndarray] = []
+    for code in codes:
+        with Image.open(io.BytesIO(code), formats=["PNG", "JPEG"]) as picture:
+            _check_size(len(codes), picture.width * picture.height, where)
+            frames.append(np.asarray(picture.convert("RGB")))
+    return np.stack(frames)
+
+
+def _check_size(count: int, pixels: int, where: str) -> None:
+    require_memory(count * pixels * 3, f"{where}: its images", "use smaller ones", DemoError)
 
 
 def read_frames(path: Path, start: float, count: int, fps: float) -> np.ndarray:
@@ -148,11 +159,13 @@ def read_frames(path: Path, start: float, count: int, fps: float) -> np.ndarray:
 
     Raises:
         BrokenDemoError: There are fewer, or they are not at the times that follow from the frames per second.
+        DemoError: They would not fit into memory.
     """
     frames: list[np.ndarray] = []
     with need("av").open(str(path)) as video:
         (stream,) = video.streams.video
         video.seek(int(start / stream.time_base), stream=stream)
+        _check_size(count, stream.width * stream.height, str(path))
         for frame in video.decode(video=0):
             shift = (frame.time - start) * fps - len(frames)  # [frames]
             if abs(shift) > 0.5 and not (shift < 0 and not frames):

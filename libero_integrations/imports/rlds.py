@@ -16,7 +16,7 @@ from libero_env.errors import DemoError
 from libero_env.storage import read_json
 from libero_integrations.exports.layouts import PUBLISHED
 from libero_integrations.exports.rlds import checksum
-from libero_integrations.imports.lerobot import decode_image
+from libero_integrations.imports.lerobot import decode_images
 
 _OBSERVED = "steps/observation/"
 _PUBLISHED = {"image", "wrist_image", "state", "joint_state"}  # observations of OpenVLA's sets
@@ -83,7 +83,8 @@ class RldsSet:
             if f"{_OBSERVED}joint_state" in values:
                 obs["joint_states"] = values[f"{_OBSERVED}joint_state"].reshape(len(actions), 7)
             for key in self._images:
-                obs[key] = np.stack([decode_image(bytes(code)) for code in values[f"{_OBSERVED}{key}"]])
+                codes = [bytes(code) for code in values[f"{_OBSERVED}{key}"]]
+                obs[key] = decode_images(codes, str(self.root / where))
             reached = values.get("steps/reward", np.ones(1))[-1] > 0
             return Episode(actions, np.zeros((len(actions), 0)), obs=obs, success=bool(reached), name=where)
 

@@ -115,10 +115,20 @@ def test_failures_keep_their_cause(tmp_path):
     for language, goal in wrong.items():
         register_task_info(language, "kitchen_demo_scene", goal_states=goal)
     register_task_info("find the scene", "kitchen_scene77", goal_states=[("Up", "plate_1")])
+    lifted = [("On", "akita_black_bowl_1", "plate_1")]
+    register_task_info("lift it", "kitchen_demo_scene", ["nonsense"], goal_states=lifted)
+    for language in ("put it there", "Put it THERE!"):
+        register_task_info(language, "kitchen_demo_scene", goal_states=lifted)
     paths, failures = generate_bddl_from_task_info(folder=tmp_path)
-    assert [failure.language for failure in failures] == [*wrong, "find the scene"]
-    assert paths == [] and isinstance(failures[0].cause, BDDLError)
-    causes = ("mug_1 is not declared", "Juggle is not a predicate", "On takes 2 names", "kitchen_scene77")
+    assert {failure.language for failure in failures} == {
+        *wrong,
+        "find the scene",
+        "lift it",
+        "Put it THERE!",
+    }
+    assert len(paths) == 1 and isinstance(failures[0].cause, BDDLError)
+    causes = ("mug_1 is not declared", "Juggle is not a predicate", "On takes 2 names")
+    causes += ("unknown object of interest 'nonsense'", "another task has this name", "kitchen_scene77")
     assert all(cause in str(failure.cause) for cause, failure in zip(causes, failures, strict=True))
     with pytest.raises(LiberoError, match="mug_1 is not declared"):
         generate_bddl_from_task_info(get_task_info("kitchen_demo_scene")[0], output_dir=tmp_path)

@@ -32,6 +32,11 @@ def test_configured_paths(tmp_path, monkeypatch):
         assert get_libero_path("bddl_files") == str(tmp_path / "here" / "bddl_files")
     with pytest.raises(UnknownNameError, match="Did you mean 'bddl_files'"):
         get_libero_path("bddl_file")
+    with open(libero.libero.config_file, "a") as file:
+        file.write("robot: robosuite-1.4.1\n")
+    set_libero_default_path()
+    assert Path(libero.libero.config_file).read_text() == "robot: robosuite-1.4.1\n"
+    assert get_libero_path("bddl_files") == get_default_path_dict()["bddl_files"]
     monkeypatch.delenv("LIBERO_CONFIG_PATH")
     monkeypatch.setenv("LIBERO_DEMOS", str(tmp_path / "none"))
     with pytest.warns(UserWarning, match="none, the default, does not exist"):
@@ -109,6 +114,11 @@ def test_recordings_are_linked_where_the_original_has_them(tmp_path, monkeypatch
     found.unlink()
     found.symlink_to("../blob")
     assert Path(get_libero_path("datasets"), name).read_text().startswith("a link of the user's")
+    for target in ("/mnt/elsewhere/x.hdf5", "/data/my-seed-study/x.hdf5"):  # a disk that is not there
+        found.unlink()
+        found.symlink_to(target)
+        get_libero_path("datasets")
+        assert found.readlink() == Path(target)
 
 
 def test_init_states_of_a_configured_folder(tmp_path, monkeypatch):

@@ -21,6 +21,7 @@ from libero_env.tasks import get_task
 from libero_integrations.exports.demonstrations import ORIGIN, export_demos, export_published
 from libero_integrations.exports.regeneration import Regeneration, published_noop_steps, regenerate
 from libero_integrations.imports.demonstrations import lerobot_files
+from libero_integrations.imports.lerobot import decode_images
 from tests.harness.demos import generate
 
 av = pytest.importorskip("av")
@@ -112,6 +113,24 @@ def test_read_back_images_are_as_the_camera_sees_the_scene(exported, expected, t
     for key, images in expected.items():
         if key.endswith("_rgb"):
             np.testing.assert_array_equal(read.obs[key][0], images[0])
+
+
+def test_a_first_episode_without_images_forbids_others_with_them(file, tmp_path):
+    (bare := tmp_path / "bare").mkdir()
+
+    def blind(one):
+        return replace(one, obs={k: v for k, v in one.obs.items() if not k.endswith("_rgb")})
+
+    _rewrite(file, bare / file.name, blind)
+    with pytest.raises(DemoError, match="as in the first"):
+        export_demos([bare / file.name, file], tmp_path / "set")
+
+
+def test_images_that_would_not_fit_into_memory_are_refused_before_they_are_read():
+    buffer = io.BytesIO()
+    Image.new("L", (4000, 4000)).save(buffer, format="png")
+    with pytest.raises(DemoError, match=r"its images needs about .* of memory"):
+        decode_images([buffer.getvalue()] * 10**6, "here")
 
 
 def test_paths_are_those_of_the_two_versions(exported, episode):

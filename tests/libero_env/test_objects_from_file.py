@@ -303,6 +303,15 @@ def test_registering_again_reads_what_the_file_names(tmp_path):
         (texture,) = get_object(register_object_file(mesh)).spec.textures
         seen.append(Image.open(texture.file).convert("RGB").getpixel((0, 0)))
     assert seen == [(250, 0, 0), (0, 0, 250)]
+    for turned in (False, True):
+        shape = trimesh.creation.icosphere(subdivisions=1, radius=0.02)
+        faces = shape.faces[:-4] if turned else shape.faces
+        shape = trimesh.Trimesh(shape.vertices, faces, process=False)
+        for name, content in trimesh.exchange.gltf.export_gltf(trimesh.Scene(shape)).items():
+            (tmp_path / name).write_bytes(content)
+        register_object_file(tmp_path / "model.gltf", mass=0.1)
+    made = list((tmp_path / "cache" / "objects").glob("*/model"))
+    assert len(made) == 2, "faces of a glTF file are in another"
 
 
 @pytest.mark.parametrize("missing", [True, False])

@@ -1,5 +1,6 @@
 """Perturbations: each kind does something, nothing at severity 0, and the same for the same seed in any batch."""
 
+import gc
 import pickle
 from dataclasses import replace
 from types import SimpleNamespace
@@ -25,6 +26,7 @@ from libero_env.perturbations.filters import PixelNoise
 from libero_env.perturbations.instructions import edit_distance, reword, split_clauses
 from libero_env.perturbations.kinds import Episode
 from libero_env.perturbations.pairing import moved
+from libero_env.perturbations.starts import posed
 from libero_env.sim.appearance import Appearance, CameraView, Light
 from libero_env.sim.predicates import register_predicate
 from libero_env.sim.scene_spec import zone_boxes
@@ -207,6 +209,12 @@ def test_the_robot_is_at_an_exact_distance_within_limits_and_touches_nothing(sev
     nq = env.scene.nq_robot
     rest = [e.simulations.fields["qpos"][0, nq:] for e in (base, env)]
     assert np.array_equal(*rest)
+
+
+def test_starts_hold_no_model_of_a_scene(closing):
+    scene = closing(BatchEnv("libero_object/0", 1, cameras=())).scene  # without fixtures
+    model, data = posed(scene, np.zeros(1 + scene.model.nq + scene.model.nv))
+    assert scene.model not in (model, *gc.get_referents(data))
 
 
 def test_noise_is_in_grey_levels(world_of):

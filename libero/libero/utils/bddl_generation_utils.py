@@ -181,6 +181,12 @@ def get_result(result: str | Sequence[str]) -> str:
     return result if isinstance(result, str) else "\n".join(result)
 
 
+def file_stem(scene_name: str, language: str) -> str:
+    """Return what a task file is named, as the benchmark names its files."""
+    words = re.sub(r"[^\w-]+", "_", language.strip().lower()).strip("_")
+    return f"{scene_name.upper()}_{words}"
+
+
 def save_to_file(
     result: str, scene_name: str, language: str, folder: str | Path = "", file_name: str = ""
 ) -> str:
@@ -188,8 +194,7 @@ def save_to_file(
 
     By default it is named as the benchmark names its files: `KITCHEN_SCENE1_open_the_bottom_drawer_of_the_cabinet`.
     """
-    words = re.sub(r"[^\w-]+", "_", language.strip().lower()).strip("_")
-    path = Path(folder) / f"{file_name or f'{scene_name.upper()}_{words}'}.bddl"
+    path = Path(folder) / f"{file_name or file_stem(scene_name, language)}.bddl"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(get_result(result), encoding="utf-8")
     return str(path)

@@ -10,6 +10,7 @@ from libero._adapters.lookup import lookup
 from libero._adapters.models import facade_pack
 from libero.libero.envs.predicates import get_predicate_fn
 from libero.libero.utils.bddl_generation_utils import (
+    file_stem,
     get_goal_state,
     get_result,
     get_suite_generator_func,
@@ -94,6 +95,9 @@ def generate_bddl_from_task_info(folder: Any = "", output_dir: str | os.PathLike
     failures: list[Failure] = []
     for task in itertools.chain(*TASK_INFO.values()):
         try:
+            name = task.file_name or file_stem(task.scene_name, task.language)
+            if name in (Path(path).stem for path in paths):
+                raise LiberoError(f"{name}: another task has this name")
             paths.append(_write(task, folder or output_dir))
         except _FAULTS as error:
             failures.append(Failure(task.scene_name, task.language, error))
@@ -105,6 +109,8 @@ def bddl_text(task: TaskInfoTuple) -> str:
     scene: InitialSceneTemplates = get_scene_class(task.scene_name)()
     goal, regions = get_goal_state(task.goal_states), region_module((), scene.affordance_region_kwargs_list)
     interest = entities_in_goal(goal, regions, scene.movable_objects, scene.fixtures)
+    for name in task.objects_of_interest:
+        require_known("object of interest", name, scene.possible_objects_of_interest)
     text = get_result(
         get_suite_generator_func(scene.workspace_name)(
             language=task.language,

@@ -164,10 +164,9 @@ def _content(path: Path) -> str:
     else:
         hashed.update(path.read_bytes())
         for surface in call_limited(load_surfaces, path, about=str(path)):
-            image = surface.image.tobytes() if surface.image else b""
-            hashed.update(
-                np.ascontiguousarray(surface.vertices).tobytes() + repr(surface.rgba).encode() + image
-            )
+            hashed.update(repr(surface.rgba).encode() + (surface.image.tobytes() if surface.image else b""))
+            for array in (surface.vertices, surface.faces, surface.texcoords):
+                hashed.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
     return hashed.hexdigest()
 
 
