@@ -37,7 +37,7 @@ NEW = {
 ITERATIONS = 12
 STREAM = (
     *("data.demos=20", "eval.episodes=20", "eval.cells=diagonal_and_last_row", "eval.curve=all"),
-    *("eval.curve_episodes=30", "eval.select=last", "eval.reuse=true"),
+    *("eval.curve_episodes=30", "eval.select=last", "eval.reuse=true", "policy.stochastic=true"),
 )
 REWARD = ("learner=grpo", "learner.processes=1", f"train.epochs={ITERATIONS}", f"eval.every={ITERATIONS}")
 CLONED = ("train.steps_per_epoch=10", "train.epochs=40", "eval.every=1")
