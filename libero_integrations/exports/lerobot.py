@@ -72,7 +72,8 @@ class DatasetWriter:
 
     def __init__(self, root: Path, layout: Layout):
         self.root, self.layout = root, layout
-        self._shapes: dict[str, tuple[int, ...]] | None = None  # of the first episode
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        self._is_first = True
 
     def _images(self, episode: Episode, where: str) -> dict[str, np.ndarray]:
         """Return the colour images of an episode by feature; DemoError where they are not those of the first."""
@@ -99,9 +100,9 @@ class DatasetWriter:
                 "draws them"
             )
         shapes = {key: frames.shape[1:] for key, frames in images.items()}
-        if self._shapes is not None and shapes != self._shapes:
+        if not self._is_first and shapes != self._shapes:
             raise DemoError(f"{where} has images {shapes}; expected {self._shapes} as in the first")
-        self._shapes = shapes
+        self._shapes, self._is_first = shapes, False
         return images
 
     def close(self) -> None:
