@@ -18,8 +18,10 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
+from libero_env.errors import LiberoError
 from libero_env.paths import cache_dir
 from libero_env.progress import tell_progress
+from libero_env.storage import check_trusted, make_cache_folder
 
 _log = logging.getLogger(__name__)
 _DAMAGED = (EOFError, pickle.UnpicklingError, ValueError, LookupError, TypeError, AttributeError, ImportError)
@@ -74,10 +76,12 @@ class _MachineCode:
         return str(_folder() / f"{Path(inspect.getfile(self._function)).stem}-{_digest(self._function)}")
 
     def load_overload(self, *args: Any) -> Any:
+        if not _is_trusted():
+            return None
         if (found := self._load(*args)) is not None:
             return found
         try:
-            _folder().mkdir(parents=True, exist_ok=True)
+            make_cache_folder(_folder())
             _lock(_folder()).acquire(timeout=_WAIT_SECONDS)
         except (OSError, Timeout):
             _say(None)
@@ -90,6 +94,8 @@ class _MachineCode:
         return found
 
     def save_overload(self, *args: Any) -> None:
+        if not _is_trusted():
+            return
         try:
             self._files().save_overload(*args)
         except OSError as error:
@@ -141,7 +147,7 @@ class _Place:
         return self
 
     def ensure_cache_path(self) -> None:
-        Path(self._path).mkdir(parents=True, exist_ok=True)
+        make_cache_folder(Path(self._path))
 
     def get_cache_path(self) -> str:
         return self._path
@@ -151,6 +157,16 @@ class _Place:
 
     def get_disambiguator(self) -> str:
         return ""
+
+
+def _is_trusted() -> bool:
+    """Return whether no other user can have written the machine code, which runs when it is read."""
+    try:
+        check_trusted(_folder())
+    except LiberoError as error:
+        _warn_uncached(str(error))
+        return False
+    return True
 
 
 def _folder() -> Path:

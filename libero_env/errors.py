@@ -42,6 +42,16 @@ class UnknownNameError(LiberoError, LookupError):
         more = f", ... ({len(names)} in all)" if len(names) > MAX_LISTED else ""
         super().__init__(f"unknown {kind} {name!r}.{hint} Valid: {', '.join(names[:MAX_LISTED])}{more}")
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let worker processes send the error: its arguments are not its message."""
+        return _said, (type(self), str(self)), self.__dict__
+
+
+def _said(kind: type[LiberoError], text: str) -> LiberoError:
+    error = kind.__new__(kind)
+    error.args = (text,)
+    return error
+
 
 def require_known(kind: str, name: object, valid: Collection[object]) -> None:
     """Raise an `UnknownNameError` of the same arguments, unless the name is one of the valid ones."""

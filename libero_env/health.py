@@ -215,7 +215,12 @@ def examine_gpu(gpu: str) -> list[Finding]:
 
 def check_driver(gpu: str) -> Finding:
     """Check that the driver supports CUDA 12.4, which MuJoCo Warp's graphs need."""
-    done = subprocess.run(["nvidia-smi"], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False)
+    try:
+        done = subprocess.run(
+            ["nvidia-smi"], capture_output=True, text=True, timeout=PROBE_SECONDS, check=False
+        )
+    except (OSError, subprocess.SubprocessError) as error:
+        return Finding("GPU", f"{gpu}, nvidia-smi: {error}", False, "update the driver")
     cuda = re.search(r"CUDA Version: (\d+)\.(\d+)", done.stdout)
     new = cuda is not None and tuple(map(int, cuda.groups())) >= (12, 4)
     return Finding("GPU", f"{gpu}, {cuda[0] if cuda else done.stdout[:80]}", new, "update the driver")
@@ -292,8 +297,12 @@ def check_demos() -> Finding:
 def check_configured() -> list[Finding]:
     """Check the folders of task files and initial states in the configuration file, if it names any."""
     found = []
+    try:
+        config = read_config()
+    except LiberoError as error:
+        return [Finding("configuration", str(error), False, f"correct {config_file()}, or remove it")]
     for key in ("bddl_files", "init_states"):
-        if (value := read_config().get(key)) and not Path(value).expanduser().is_dir():
+        if (value := config.get(key)) and not Path(value).expanduser().is_dir():
             remedy = f"remove the line {key} from {config_file()}: the files of this package are then used"
             found.append(Finding(key, f"{value} does not exist", False, remedy, essential=False))
     return found

@@ -157,7 +157,7 @@ def subset_names(handle: h5py.File, file: Path, key: str) -> list[str]:
     where = f"{file}: mask/{key}"
     check_dataset(masks[key], where)
     values = read_array(masks[key], where).ravel()
-    names = [name.decode() if isinstance(name, bytes) else name for name in values]
+    names = [name.decode(errors="replace") if isinstance(name, bytes) else name for name in values]
     if unknown := [name for name in names if name not in valid]:
         raise BrokenDemoError(f"{where} names {unknown[0]!r}, which the file does not have")
     return names

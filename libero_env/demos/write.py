@@ -39,7 +39,7 @@ FRAMES_PER_CHUNK = 8
 _CONFIG_KEYS = (  # attributes in which all demonstrations of a file agree
     *("bddl_file_name", "bddl_file_content", "seed", "camera_size", "cameras", "pictures", "drawing"),
     *("pairing", "generator", "disturbed", "variation", "model_digest", "filter", "perturb", "perturb_draws"),
-    "own_models",
+    *("own_models", "backend"),
 )
 REMEDY = "choose another file or remove this one"
 

@@ -56,7 +56,7 @@ def load_init_states(task: Task, scene: Scene) -> InitialStates:
                 f"the initial states of {task.id} were made for another model ({packaged[0]}, this one is {digest}); "
                 f"generate them again: libero tasks init-states {task.suite}"
             )
-        return packaged[1]
+        return packaged[1].copy()
     return cached_arrays(
         _cached_path(task, digest),
         lambda: {"states": _own_states(task, scene)},

@@ -33,7 +33,7 @@ class Costs:
         tilt: Largest angle by which such an object was tipped from how it stood, turns about the vertical apart, or by
             which a part of such a fixture was turned, [degrees].
         hits: Number of control steps in which the robot pressed a fixture or the workspace with 100 N or more.
-        press: Largest normal force of these, [N].
+        press: Largest normal force on a fixture or the workspace, also below 100 N, [N].
         zone: Time that a part of the robot, or what it holds, was in a zone of the task, [s]; None without zones.
         moved: Objects and fixtures that were shifted or tilted beyond the limits.
     """

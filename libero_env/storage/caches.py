@@ -118,7 +118,8 @@ def cached_folder(directory: Path, make: Callable[[], object], made_from: str = 
     """
     from filelock import FileLock, Timeout
 
-    check_trusted(directory.parent.parent)
+    for folder in (directory.parent.parent, directory.parent):
+        check_trusted(folder)
     record = directory.with_name(f"{directory.name}.json")
     if _is_intact(directory, record, made_from):
         return
