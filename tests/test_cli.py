@@ -311,6 +311,10 @@ def test_doctor_checks_folders(tmp_path, monkeypatch):
     (tmp_path / "open" / "meshes").chmod(0o777)
     monkeypatch.setenv("LIBERO_CACHE", str(tmp_path / "open"))
     assert "meshes is writable by every user: chmod" in health.check_cache().detail
+    monkeypatch.setenv("LIBERO_CONFIG_PATH", str(tmp_path))
+    (tmp_path / "config.yaml").write_text("assets: [")
+    (finding,) = health.check_configured()
+    assert not finding.ok and "config.yaml" in finding.detail
 
 
 def test_doctor_notes_a_gpu_that_is_not_used(monkeypatch):

@@ -164,6 +164,8 @@ def test_a_folder_where_everybody_writes_is_not_read(path, source, lines):
     for _ in range(2):
         assert_same(source.get(path))
     assert source.made == 3 and len(lines()) == 1
+    with pytest.raises(LiberoError, match="writable by every user"):
+        storage.cached_folder(path.parent / "folder", lambda: None)
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root makes files of others")
@@ -289,6 +291,14 @@ def test_functions_are_compiled_where_nothing_can_be_cached(tmp_path, function, 
     assert [compilation.compiled(function)(x) for x in (1, 2)] == [2, 4]
     (line,) = lines()
     assert "Set NUMBA_CACHE_DIR" in line
+
+
+def test_machine_code_that_others_can_write_is_not_run(tmp_path, function, lines):
+    assert compilation.compiled(function)(1) == 2
+    (tmp_path / "compiled").chmod(0o777)
+    again = compilation.compiled(function)
+    assert again(2) == 4 and not again.dispatcher.stats.cache_hits
+    assert "writable by every user" in lines()[0]
 
 
 def test_functions_are_compiled_where_the_disk_is_full(function, lines, monkeypatch):

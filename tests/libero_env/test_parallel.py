@@ -1,5 +1,6 @@
 """Pools of processes that hang."""
 
+import pickle
 import signal
 import subprocess
 import sys
@@ -7,7 +8,7 @@ import time
 
 import pytest
 
-from libero_env.errors import LiberoError
+from libero_env.errors import LiberoError, UnknownNameError
 from libero_env.parallel import (
     NO_PICTURE_TEXT,
     SilentWorkersError,
@@ -105,3 +106,10 @@ def test_a_signal_while_workers_start_is_heeded_when_they_have(monkeypatch):
         assert begun == [(print, 1)] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, handler)
+
+
+def test_errors_of_workers_keep_their_words_and_attributes():
+    error = UnknownNameError("camera", "frontvew", ["frontview", "agentview"])
+    error.path = "here"
+    sent = pickle.loads(pickle.dumps(error))
+    assert type(sent) is UnknownNameError and str(sent) == str(error) and sent.path == "here"
